@@ -1,0 +1,7 @@
+"""twin: a filmed place as a MuJoCo digital twin that a driving policy is trained and judged in."""
+
+# zlib before anything that may load pycolmap: the other order corrupts PNG and zlib for the whole process.
+import zlib  # noqa: F401
+from importlib import metadata
+
+__version__ = metadata.version("twin")

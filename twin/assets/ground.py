@@ -1,0 +1,40 @@
+"""The ground as a height field: a regular grid of heights over the xy plane."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Height z [m] at `origin + cell · (column, row)`."""
+
+    height: NDArray[np.float64]
+    """Shape (rows along y, columns along x) [m]; no holes."""
+    origin: NDArray[np.float64]
+    """x, y of cell (0, 0) [m], shape (2,)."""
+    cell: float
+    """Grid spacing [m]."""
+    measured: NDArray[np.bool_]
+    """False where the height was filled in rather than seen, shape as `height`."""
+    rgb: NDArray[np.uint8]
+    """Mean colour, shape (rows, columns, 3)."""
+
+    def at(self, xy: NDArray) -> NDArray[np.float64]:
+        """Bilinear height [m] at points (..., 2); beyond the edge, that of the edge."""
+        column_row = (np.asarray(xy) - self.origin) / self.cell
+        return map_coordinates(
+            self.height, np.moveaxis(column_row[..., ::-1], -1, 0).reshape(2, -1), order=1, mode="nearest"
+        ).reshape(np.shape(xy)[:-1])
+
+    def save(self, folder: Path) -> None:
+        """Writes `ground.npz`."""
+        np.savez(folder / "ground.npz", **vars(self))
+
+    @staticmethod
+    def load(folder: Path) -> "Ground":
+        with np.load(folder / "ground.npz", allow_pickle=False) as data:
+            return Ground(data["height"], data["origin"], float(data["cell"]), data["measured"], data["rgb"])

@@ -1,0 +1,155 @@
+"""Posed pinhole cameras.
+
+OpenCV axes: x right, y down, z forward. Pixel (0, 0) is the *corner* of the top-left pixel, whose centre is (0.5, 0.5)
+as in COLMAP. *depth* is the z coordinate in the camera, *distance* runs along the ray. The world is metric with z up
+once the metric stage has run; in `2_cameras` it is still the reconstruction's own frame.
+"""
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.geometry.poses import Similarity, inverse_pose
+from twin.scene import read_json, write_json
+
+Array = NDArray[np.float64]
+
+_CV_TO_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def opencv_to_mujoco(camera_to_world: Array) -> Array:
+    """Turns OpenCV camera axes into MuJoCo's (x right, y up, looking along −z); its own inverse. Shape (..., 4, 4)."""
+    return camera_to_world @ _CV_TO_GL
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """n undistorted pinhole views, with what is known of each frame. Order: by source, then by time."""
+
+    names: tuple[str, ...]
+    """Frame names, `<source>/<six digits>`; unique."""
+    camera_to_world: Array
+    """Shape (n, 4, 4)."""
+    intrinsics: Array
+    """fx, fy, cx, cy [px], shape (n, 4)."""
+    sizes: NDArray[np.int64]
+    """Width, height [px], shape (n, 2)."""
+    lightings: tuple[str, ...]
+    """Lighting name per frame."""
+    sources: tuple[str, ...]
+    """Source name per frame."""
+    times: Array
+    """Time within its source [s], shape (n,)."""
+    held_out: NDArray[np.bool_]
+    """True: never trained on, shape (n,)."""
+    images: Path
+    """Folder with `<name>.png`, undistorted, 8-bit RGB (or grey, read as RGB)."""
+    masks: Path | None = None
+    """Folder with `<name>.png`, 0 = ignore; None where nothing is masked."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def image_path(self, i: int) -> Path:
+        return self.images / f"{self.names[i]}.png"
+
+    def mask_path(self, i: int) -> Path | None:
+        """The mask of frame i, or None where it has none."""
+        path = self.masks / f"{self.names[i]}.png" if self.masks else None
+        return path if path and path.exists() else None
+
+    @property
+    def positions(self) -> Array:
+        """Camera centres, shape (n, 3)."""
+        return self.camera_to_world[:, :3, 3]
+
+    def select(self, index: NDArray) -> "Cameras":
+        """The frames of an index array or boolean mask."""
+        i = np.arange(len(self))[index]
+        return replace(
+            self,
+            names=tuple(self.names[k] for k in i),
+            camera_to_world=self.camera_to_world[i],
+            intrinsics=self.intrinsics[i],
+            sizes=self.sizes[i],
+            lightings=tuple(self.lightings[k] for k in i),
+            sources=tuple(self.sources[k] for k in i),
+            times=self.times[i],
+            held_out=self.held_out[i],
+        )
+
+    def transformed(self, similarity: Similarity) -> "Cameras":
+        return replace(self, camera_to_world=similarity.poses(self.camera_to_world))
+
+    def save(self, folder: Path) -> None:
+        """Writes `cameras.json` and `cameras.npz`; image folders are kept as relative paths."""
+        np.savez(
+            folder / "cameras.npz",
+            camera_to_world=self.camera_to_world,
+            intrinsics=self.intrinsics,
+            sizes=self.sizes,
+            times=self.times,
+            held_out=self.held_out,
+        )
+        # A stage folder is written as `<name>.partial` and renamed, so paths are relative to its parent, `build/`.
+        base = folder.resolve().parent
+        final = {p: Path(os.path.relpath(p.resolve(), base)).as_posix() for p in (self.images, self.masks) if p}
+        write_json(
+            folder / "cameras.json",
+            {
+                "names": self.names,
+                "lightings": self.lightings,
+                "sources": self.sources,
+                "images": final[self.images].replace(".partial/", "/"),
+                "masks": final[self.masks].replace(".partial/", "/") if self.masks else None,
+            },
+        )
+
+    @staticmethod
+    def load(folder: Path) -> "Cameras":
+        head = read_json(folder / "cameras.json")
+        base = folder.resolve().parent
+        with np.load(folder / "cameras.npz", allow_pickle=False) as data:
+            return Cameras(
+                names=tuple(head["names"]),
+                camera_to_world=data["camera_to_world"],
+                intrinsics=data["intrinsics"],
+                sizes=data["sizes"],
+                lightings=tuple(head["lightings"]),
+                sources=tuple(head["sources"]),
+                times=data["times"],
+                held_out=data["held_out"],
+                images=base / head["images"],
+                masks=base / head["masks"] if head["masks"] else None,
+            )
+
+
+def pixel_grid(width: int, height: int) -> Array:
+    """Pixel centres (u, v) [px], shape (height, width, 2)."""
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([u, v], -1)
+
+
+def unproject(pixels: Array, intrinsics: Array) -> Array:
+    """Rays through pixels, in the camera, with z = 1 (so that ray × depth is a point). Shapes (..., 2) → (..., 3)."""
+    fx, fy, cx, cy = np.moveaxis(np.asarray(intrinsics), -1, 0)
+    x, y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
+    return np.stack([x, y, np.ones_like(x)], -1)
+
+
+def project(points: Array, camera_to_world: Array, intrinsics: Array) -> tuple[Array, Array]:
+    """World points into one camera: pixels (..., 2) and depth (...). Behind the camera depth is negative."""
+    local = points @ inverse_pose(camera_to_world)[:3, :3].T + inverse_pose(camera_to_world)[:3, 3]
+    depth = local[..., 2]
+    fx, fy, cx, cy = intrinsics
+    safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+    return np.stack([fx * local[..., 0] / safe + cx, fy * local[..., 1] / safe + cy], -1), depth
+
+
+def scaled_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
+    """Intrinsics after resizing an image from `size` to `new_size` (width, height)."""
+    sx, sy = new_size[0] / size[0], new_size[1] / size[1]
+    return np.asarray(intrinsics) * np.array([sx, sy, sx, sy])

@@ -1,0 +1,110 @@
+"""Rigid and similarity transforms.
+
+A *pose* is a 4×4 matrix that maps one frame's homogeneous points to another's, and its name says both ends:
+`camera_to_world`. A *similarity* additionally scales: x ↦ s·R·x + t.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x ↦ scale · rotation · x + translation, from one frame to another."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    @staticmethod
+    def identity() -> "Similarity":
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
+    def points(self, x: Array) -> Array:
+        """Maps points, shape (..., 3)."""
+        return self.scale * x @ self.rotation.T + self.translation
+
+    def poses(self, pose: Array) -> Array:
+        """Maps camera-to-source poses to camera-to-target poses (rotation stays orthonormal), shape (..., 4, 4)."""
+        out = np.array(pose, dtype=np.float64)
+        out[..., :3, :3] = self.rotation @ out[..., :3, :3]
+        out[..., :3, 3] = self.points(out[..., :3, 3])
+        return out
+
+    def inverse(self) -> "Similarity":
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def compose(self, first: "Similarity") -> "Similarity":
+        """The similarity that applies `first` and then this one."""
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
+
+
+def umeyama(source: Array, target: Array, with_scale: bool = True) -> Similarity:
+    """Least-squares similarity (or rigid transform) that maps source points on to target points.
+
+    Umeyama 1991, eqs. 34 to 42.
+
+    Args:
+        source: Points, shape (n, 3), n ≥ 3 and not all on one line.
+        target: Their counterparts, shape (n, 3).
+        with_scale: Whether to estimate the scale, too.
+    """
+    mean_source, mean_target = source.mean(0), target.mean(0)
+    a, b = source - mean_source, target - mean_target
+    u, singular, vt = np.linalg.svd(b.T @ a / len(a))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(signs) @ vt
+    scale = float((singular * signs).sum() / (a**2).sum() * len(a)) if with_scale else 1.0
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def inverse_pose(pose: Array) -> Array:
+    """Inverse of rigid transforms, shape (..., 4, 4)."""
+    out = np.zeros_like(pose)
+    rotation_t = np.swapaxes(pose[..., :3, :3], -1, -2)
+    out[..., :3, :3] = rotation_t
+    out[..., :3, 3] = -(rotation_t @ pose[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def rotation_between(a: Array, b: Array) -> Array:
+    """The smallest rotation that turns unit vector a into unit vector b, shape (3, 3)."""
+    v, c = np.cross(a, b), float(a @ b)
+    if c < -1 + 1e-12:  # opposite: half a turn about any axis across a
+        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        axis /= np.linalg.norm(axis)
+        return 2.0 * np.outer(axis, axis) - np.eye(3)
+    k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + k + k @ k / (1.0 + c)
+
+
+def rotation_angle(rotation: Array) -> Array:
+    """Angle of rotation matrices [rad], shape (..., 3, 3) → (...)."""
+    # From the skew part as well as the trace: arccos alone loses half the digits near zero.
+    skew = np.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )
+    return np.arctan2(np.linalg.norm(skew, axis=-1), np.trace(rotation, axis1=-2, axis2=-1) - 1.0)
+
+
+def look_at(eye: Array, target: Array, up: Array | None = None) -> Array:
+    """camera_to_world of an OpenCV camera at `eye` that looks at `target`, shape (4, 4)."""
+    up = np.array([0.0, 0.0, 1.0]) if up is None else up
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = eye
+    return pose
