@@ -4,4 +4,8 @@
 import zlib  # noqa: F401
 from importlib import metadata
 
+from twin.errors import InputError
+from twin.loading import Twin, load_scene
+
+__all__ = ["InputError", "Twin", "load_scene"]
 __version__ = metadata.version("twin")

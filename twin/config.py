@@ -292,6 +292,7 @@ def _check(config: SceneConfig, path: Path) -> None:
         ("capture", "max_frames", 2),
         ("nerf", "steps", 1),
         ("nerf", "rays", 1),
+        ("metric", "camera_height", 0.0),
         ("mesh", "voxel", 1e-3),
         ("mesh", "ground_cell", 1e-3),
         ("mjcf", "half_width", 0.1),

@@ -1,0 +1,175 @@
+"""The laws of the build verb, on a pipeline of stages that take no time."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import types
+
+import pytest
+
+from twin import build as verb
+from twin.scene import SceneDir
+from twin.stamp import Stamp
+
+_TOML = '[[source]]\npath = "input/a.txt"\n[metric]\ncamera_height = 1.0\n'
+
+
+@pytest.fixture
+def pipeline(monkeypatch, tmp_path):
+    """A scene, and a pipeline capture → cameras → field whose stages write down that they ran."""
+    ran: list[str] = []
+    reads = {"capture": "capture.fps", "cameras": "cameras.features", "field": "nerf.steps"}
+    upstream = {"capture": (), "cameras": ("capture",), "field": ("cameras",)}
+    stages = []
+    for name, setting in reads.items():
+
+        def run(scene, config, out, name=name, setting=setting):
+            ran.append(name)
+            section, key = setting.split(".")
+            before = [(scene.stage(u) / "result.txt").read_text() for u in upstream[name]]
+            text = (scene.root / "input/a.txt").read_text() if not before else "".join(before)
+            # Only the whole part counts, so that a small change upstream may leave the result as it was.
+            (out / "result.txt").write_text(f"{text}|{int(getattr(getattr(config, section), key))}")
+            return {"ran": name}
+
+        module = types.ModuleType(f"fake_{name}")
+        module.run = run
+        monkeypatch.setitem(sys.modules, f"fake_{name}", module)
+        stages.append(verb.Stage(name, f"fake_{name}", 1, ("source", setting), upstream[name]))
+    monkeypatch.setattr(verb, "PIPELINE", tuple(stages))
+    root = tmp_path / "scene"
+    (root / "input").mkdir(parents=True)
+    (root / "input/a.txt").write_text("film")
+    (root / "scene.toml").write_text(_TOML)
+    return types.SimpleNamespace(root=root, ran=ran, scene=SceneDir(root))
+
+
+def _rerun(pipeline, *overrides, force=()):
+    pipeline.ran.clear()
+    verb.build(pipeline.root, force=force, overrides=overrides)
+    return list(pipeline.ran)
+
+
+def test_runs_once_then_only_what_a_change_touches(pipeline):
+    assert _rerun(pipeline) == ["capture", "cameras", "field"]
+    assert _rerun(pipeline) == []
+    assert _rerun(pipeline, "nerf.steps=7") == ["field"]
+    assert _rerun(pipeline, "nerf.steps=7", "cameras.features=9") == ["cameras", "field"]
+    assert _rerun(pipeline) == ["cameras", "field"]
+    assert _rerun(pipeline, "mesh.voxel=0.3") == []
+    assert _rerun(pipeline, "seed=5") == ["capture", "cameras", "field"]
+
+
+def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):
+    _rerun(pipeline)
+    assert _rerun(pipeline, "capture.fps=2.5") == ["capture"]
+
+
+def test_changed_input_version_damage_and_force(pipeline, monkeypatch):
+    _rerun(pipeline)
+    (pipeline.root / "input/a.txt").write_text("another film")
+    assert _rerun(pipeline) == ["capture", "cameras", "field"]
+    assert _rerun(pipeline, force=("cameras",)) == ["cameras"]
+    newer = [verb.dataclasses.replace(s, version=2) if s.name == "field" else s for s in verb.PIPELINE]
+    monkeypatch.setattr(verb, "PIPELINE", tuple(newer))
+    assert _rerun(pipeline) == ["field"]
+    (pipeline.scene.stage("cameras") / "result.txt").unlink()
+    assert _rerun(pipeline) == ["cameras"]
+
+
+def test_until_and_report(pipeline):
+    report = verb.build(pipeline.root, until="cameras")
+    assert pipeline.ran == ["capture", "cameras"] and list(report["stages"]) == ["capture", "cameras"]
+    written = json.loads(pipeline.scene.report_json.read_text())
+    assert written == json.loads(json.dumps(report))
+    assert written["peak_memory_bytes"] > 1e6 and written["seed"] == 0 and written["versions"]["numpy"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_a_full_or_read_only_disk_is_one_line_and_loses_nothing(pipeline, capsys, code):
+    _rerun(pipeline)
+    before = (pipeline.scene.stage("field") / "result.txt").read_text()
+
+    def refuse(scene, config, out):
+        (out / "half.txt").write_text("half")
+        raise OSError(code, os.strerror(code), str(out / "half.txt"))
+
+    sys.modules["fake_field"].run = refuse
+    capsys.readouterr()
+    assert verb.main([str(pipeline.root), "--set", "nerf.steps=9", "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "half.txt" in error and "run again" in error
+    assert (pipeline.scene.stage("field") / "result.txt").read_text() == before
+
+
+def test_bad_input_exits_2_and_a_bug_keeps_its_traceback(pipeline, capsys):
+    assert verb.main([str(pipeline.root), "--set", "nerf.stepz=9"]) == 2
+    assert "did you mean 'steps'" in capsys.readouterr().err
+    assert verb.main([str(pipeline.root / "nowhere")]) == 2
+    (pipeline.root / "input/a.txt").unlink()
+    assert verb.main([str(pipeline.root)]) == 2
+    assert "input/a.txt" in capsys.readouterr().err
+    (pipeline.root / "input/a.txt").write_text("film")
+
+    def bug(scene, config, out):
+        raise KeyError("bug")
+
+    sys.modules["fake_capture"].run = bug
+    with pytest.raises(KeyError):
+        verb.main([str(pipeline.root), "--quiet"])
+
+
+def test_a_killed_build_resumes_and_a_second_one_refuses(pipeline, tmp_path):
+    """Kill −9 in the middle of a stage; the folder it wrote goes, finished stages stay, the result is the same."""
+    script = textwrap.dedent(
+        """
+        import sys, time, types
+        from pathlib import Path
+        from twin import build as verb
+        def slow(scene, config, out):
+            (out / "half.txt").write_text("half")
+            Path(sys.argv[2]).touch()
+            time.sleep(60)
+        def quick(scene, config, out):
+            (out / "result.txt").write_text("film|2")
+            return {"ran": "capture"}
+        for name, run in (("capture", quick), ("cameras", slow)):
+            module = types.ModuleType(f"fake_{name}")
+            module.run = run
+            sys.modules[f"fake_{name}"] = module
+        verb.PIPELINE = (
+            verb.Stage("capture", "fake_capture", 1, ("source", "capture.fps"), ()),
+            verb.Stage("cameras", "fake_cameras", 1, ("source", "cameras.features"), ("capture",)),
+        )
+        verb.build(Path(sys.argv[1]))
+        """
+    )
+    started = tmp_path / "started"
+    process = subprocess.Popen([sys.executable, "-c", script, str(pipeline.root), str(started)])
+    try:
+        deadline = time.monotonic() + 60
+        while not started.exists():
+            assert time.monotonic() < deadline and process.poll() is None
+            time.sleep(0.05)
+        with pytest.raises(verb.InputError, match=f"process {process.pid}"):
+            verb.build(pipeline.root)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert pipeline.scene.partial("cameras").exists()
+    assert _rerun(pipeline) == ["cameras", "field"]
+    assert not pipeline.scene.partial("cameras").exists()
+    assert (pipeline.scene.stage("field") / "result.txt").read_text() == "film|2|3000|3000"
+
+
+def test_a_kill_between_the_two_renames_loses_nothing(pipeline):
+    _rerun(pipeline)
+    final = pipeline.scene.stage("cameras")
+    final.rename(final.with_name(final.name + ".old"))
+    assert _rerun(pipeline) == []
+    assert Stamp.load(final) is not None

@@ -1,0 +1,63 @@
+"""Opening a built twin from policy code: `twin.load_scene("scenes/demo")`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from twin.errors import InputError
+from twin.scene import STAGES, SceneDir, read_json
+
+if TYPE_CHECKING:
+    from twin.geometry.cameras import Cameras
+    from twin.mjcf.world import World
+    from twin.nerf.field import RadianceField
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A built scene. Every part is read from disk when it is asked for.
+
+    Each method raises InputError where the stage that makes its part has not been built.
+    """
+
+    scene: SceneDir
+
+    def cameras(self) -> Cameras:
+        """The filmed frames: metric poses, z up."""
+        from twin.geometry.cameras import Cameras
+
+        return Cameras.load(self._folder("metric"))
+
+    def field(self) -> RadianceField:
+        """The radiance field, with every lighting it was filmed under."""
+        from twin.nerf.field import RadianceField
+
+        return RadianceField.load(self._folder("field"))
+
+    def world(self) -> World:
+        """The MJCF scene with its route, corridor and goal."""
+        from twin.mjcf.world import World
+
+        return World.load(self._folder("mjcf"))
+
+    def report(self) -> dict[str, Any]:
+        """Every number of the last build."""
+        return read_json(self.scene.report_json)
+
+    def _folder(self, stage: str) -> Path:
+        folder = self.scene.stage(stage)
+        if not (folder / "stamp.json").exists():
+            raise InputError(
+                f"{self.scene.root} has no {STAGES[stage]} yet; run python -m twin.build {self.scene.root}"
+            )
+        return folder
+
+
+def load_scene(path: str | Path) -> Twin:
+    """Opens a scene folder that `python -m twin.build` has built. Raises InputError where there is none."""
+    scene = SceneDir(Path(path))
+    if not scene.config_file.exists():
+        raise InputError(f"no scene.toml in {path}; give the scene's folder, such as scenes/demo")
+    return Twin(scene)
