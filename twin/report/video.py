@@ -1,0 +1,114 @@
+"""H.264 films that any player opens, written without a display or a system codec.
+
+A *frame* is RGB uint8, shape (height, width, 3). Films are yuv420p in BT.709 (which every browser plays), have even
+sizes, and carry their index at the front so that playing starts before the whole file has arrived.
+"""
+
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+_BT709 = 1  # ITU-T H.273: matrix, primaries and transfer all number BT.709 as 1
+_LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
+
+
+def even(size: int) -> int:
+    """The next even number at or below `size`, at least 2: 4:2:0 halves both sides of the chroma planes."""
+    return max(2, size // 2 * 2)
+
+
+class VideoWriter:
+    """Writes an mp4 frame by frame; a context manager.
+
+    The film is written as `<name>.partial` and renamed on a clean exit, so a reader never sees half of one; an
+    exception inside the block removes the partial file.
+
+    Args:
+        path: Where the finished mp4 goes.
+        size: Width, height [px] of every frame; both even.
+        fps: Frames per second.
+        crf: Constant rate factor of x264: 18 looks lossless, 23 is its default, 28 is small.
+
+    Raises:
+        ValueError: An odd size.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], fps: int, crf: int = 23):
+        if size[0] % 2 or size[1] % 2 or min(size) < 2:
+            raise ValueError(f"film size {size[0]}×{size[1]}: expected even sides, see `even`")
+        self.path = path
+        self.size = size
+        self.fps = fps
+        self.frames = 0
+        self._partial = path.with_name(path.name + ".partial")
+        self._container = av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
+        self._stream = self._container.add_stream("libx264", rate=Fraction(fps))
+        # One key frame a second, so that a viewer can jump about in the film.
+        self._stream.options = {"crf": str(crf), "preset": "veryfast", "g": str(fps)}
+        self._stream.width, self._stream.height = size
+        self._stream.pix_fmt = "yuv420p"
+        codec = self._stream.codec_context
+        codec.colorspace = codec.color_primaries = codec.color_trc = _BT709
+        codec.color_range = _LIMITED_RANGE
+
+    def write(self, frame: NDArray[np.uint8], count: int = 1) -> None:
+        """Appends a frame, shown for `count` frame times.
+
+        Raises:
+            ValueError: A frame of another shape or type.
+        """
+        width, height = self.size
+        if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
+            raise ValueError(f"frame {frame.shape} {frame.dtype}: expected uint8 {(height, width, 3)}")
+        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+        picture = picture.reformat(
+            format="yuv420p", src_color_range="JPEG", dst_color_range="MPEG", dst_colorspace="ITU709"
+        )
+        picture.colorspace, picture.color_range = _BT709, _LIMITED_RANGE
+        for _ in range(count):
+            picture.pts = self.frames
+            picture.time_base = Fraction(1, self.fps)
+            self._container.mux(self._stream.encode(picture))
+            self.frames += 1
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._container.mux(self._stream.encode(None))
+            self._container.close()
+            if kind is None:
+                self._partial.replace(self.path)
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+
+def read_frames(path: Path, every: int = 1) -> Iterator[NDArray[np.uint8]]:
+    """Every `every`-th frame of a film, in order."""
+    with av.open(str(path)) as container:
+        for i, frame in enumerate(container.decode(video=0)):
+            if i % every == 0:
+                yield frame.to_ndarray(format="rgb24")
+
+
+def describe(path: Path) -> dict[str, str | int | float]:
+    """What a film is: codec, pixel format, width, height [px], fps, frames."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        return {
+            "codec": stream.codec_context.name,
+            "pixel_format": str(stream.codec_context.pix_fmt),
+            "width": stream.width,
+            "height": stream.height,
+            "fps": float(stream.average_rate or 0),
+            "frames": stream.frames,
+        }
