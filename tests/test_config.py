@@ -3,7 +3,8 @@ import pytest
 from twin.config import load_config
 from twin.errors import InputError
 
-_MINIMAL = '[[source]]\npath = "a.mp4"\n'
+_SOURCE = '[[source]]\npath = "a.mp4"\n'
+_MINIMAL = "metric.camera_height = 1.2\n" + _SOURCE
 
 
 def _write(tmp_path, text):
@@ -20,10 +21,10 @@ def test_defaults_and_name_from_folder(tmp_path):
 
 
 def test_nested_table_and_integer_for_float(tmp_path):
-    text = _MINIMAL + 'camera = {model="PINHOLE", params=[1, 2.5], width=4, height=3}\n[metric]\ncamera_height=2\n'
+    text = _MINIMAL + 'camera = {model="PINHOLE", params=[1, 2.5], width=4, height=3}\ncamera_height=2\n'
     config = load_config(_write(tmp_path, text))
     assert config.source[0].camera.params == (1.0, 2.5)
-    assert config.metric.camera_height == 2.0 and isinstance(config.metric.camera_height, float)
+    assert config.source[0].camera_height == 2.0 and isinstance(config.source[0].camera_height, float)
 
 
 @pytest.mark.parametrize(
@@ -33,8 +34,10 @@ def test_nested_table_and_integer_for_float(tmp_path):
         (_MINIMAL + "[nerf]\nsteps = 'many'\n", "expected int, got 'many'"),
         (_MINIMAL + "[nerf]\nsteps = true\n", "expected int, got True"),
         (_MINIMAL + "[nerf]\nsteps = 0\n", "expected at least 1"),
-        (_MINIMAL + "[metric]\ncamera_height = nan\n", "got nan"),
-        (_MINIMAL + "[metric]\ncamera_height = -1.0\n", "camera_height = -1"),
+        (_SOURCE + "[metric]\ncamera_height = nan\n", "got nan"),
+        (_SOURCE + "[metric]\ncamera_height = -1.0\n", "camera_height = -1"),
+        (_SOURCE, "no scale"),
+        (_SOURCE + "[metric]\ncamera_height = 1.0\ngps = true\n", "camera_height and gps"),
         (_MINIMAL + 'kind = "film"\n', "expected auto, video"),
         ("[[source]]\n", "no path"),
         ("seed = 1\n", "no [[source]]"),

@@ -278,6 +278,18 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     return value
 
 
+def scale_sources(metric: MetricConfig) -> tuple[str, ...]:
+    """Names of the scale sources that are given: camera_height, distance, gps, marker, poses_are_metric."""
+    given = {
+        "camera_height": metric.camera_height > 0.0,
+        "distance": metric.distance is not None,
+        "gps": metric.gps,
+        "marker": metric.marker is not None,
+        "poses_are_metric": metric.poses_are_metric,
+    }
+    return tuple(name for name, is_given in given.items() if is_given)
+
+
 def _check(config: SceneConfig, path: Path) -> None:
     if not config.source:
         raise InputError(f"{path}: no [[source]] given; add one per film, with path = and lighting =")
@@ -302,3 +314,11 @@ def _check(config: SceneConfig, path: Path) -> None:
         value = getattr(getattr(config, section), key)
         if not value >= low:
             raise InputError(f"{path}: {section}.{key} = {value}; expected at least {low:g}")
+    given = scale_sources(config.metric)
+    if len(given) != 1 and not (not given and any(source.camera_height > 0.0 for source in config.source)):
+        # Checked before anything runs, so that nobody waits minutes to learn it.
+        raise InputError(
+            f"{path}: [metric] gives {'no scale' if not given else ' and '.join(given)}; give exactly one of "
+            "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
+            "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true"
+        )
