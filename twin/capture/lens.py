@@ -1,0 +1,126 @@
+"""Camera models by COLMAP's names: checked, scaled, read as a matrix, and taken out of a picture.
+
+A *lens* is a camera model with its parameters at one image size. Its *intrinsics* are fx, fy, cx, cy [px]; what is left
+of the parameters is its *distortion*.
+"""
+
+import difflib
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from twin.errors import InputError
+from twin.geometry.cameras import pixel_grid, unproject
+
+_MODELS = tuple(name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR"))
+_MAX_ASPECT_ERROR = 0.01
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A COLMAP camera model, its parameters in COLMAP's order, and the image size they are for [px]."""
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    @property
+    def intrinsics(self) -> NDArray[np.float64]:
+        """fx, fy, cx, cy [px], shape (4,)."""
+        matrix = self._camera().calibration_matrix()
+        return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """The parameters beyond focal length and principal point."""
+        return tuple(self.params[i] for i in self._camera().extra_params_idxs())
+
+    @property
+    def is_distorted(self) -> bool:
+        return self.model not in ("SIMPLE_PINHOLE", "PINHOLE") and (
+            "FISHEYE" in self.model or any(value != 0.0 for value in self.distortion)
+        )
+
+    def with_intrinsics(self, intrinsics: NDArray[np.float64]) -> "Lens":
+        """The same model and distortion with other fx, fy, cx, cy [px]; a model with one focal length takes the mean."""
+        camera, params = self._camera(), list(self.params)
+        focal, center = camera.focal_length_idxs(), camera.principal_point_idxs()
+        values = intrinsics[:2] if len(focal) == 2 else [intrinsics[:2].mean()]
+        for index, value in zip([*focal, *center], [*values, *intrinsics[2:]], strict=True):
+            params[index] = float(value)
+        return Lens(self.model, tuple(params), self.width, self.height)
+
+    def scaled(self, width: int, height: int) -> "Lens":
+        """The lens of the same picture resized to another size [px]."""
+        if (width, height) == (self.width, self.height):
+            return self
+        camera = self._camera()
+        camera.rescale(width, height)
+        return Lens(self.model, tuple(float(p) for p in camera.params), width, height)
+
+    def fits(self, width: int, height: int) -> bool:
+        """True where an image of this size is the lens's picture, scaled: the aspect agrees within 1 %."""
+        return same_aspect((width, height), (self.width, self.height))
+
+    def _camera(self) -> pycolmap.Camera:
+        camera = pycolmap.Camera.create_from_model_name(0, self.model, 1.0, self.width, self.height)
+        camera.params = np.array(self.params)
+        return camera
+
+
+def checked_lens(model: str, params: tuple[float, ...], width: int, height: int, where: str) -> Lens:
+    """A lens whose model is known and whose numbers make sense.
+
+    Raises:
+        InputError: unknown model, wrong number of parameters, or values no camera has; `where` opens the message.
+    """
+    if model not in _MODELS:
+        near = difflib.get_close_matches(model.upper(), _MODELS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(_MODELS)}"
+        raise InputError(f"{where}: unknown camera model {model!r}; {hint}")
+    if width <= 0 or height <= 0:
+        raise InputError(f"{where}: image size {width}x{height}; give the width and height the calibration is for [px]")
+    camera = pycolmap.Camera.create_from_model_name(0, model, 1.0, width, height)
+    if len(params) != len(camera.params):
+        raise InputError(
+            f"{where}: {len(params)} parameters for {model}; expected {len(camera.params)}: {camera.params_info}"
+        )
+    lens = Lens(model, tuple(float(p) for p in params), int(width), int(height))
+    if not all(math.isfinite(p) for p in lens.params):
+        raise InputError(f"{where}: a parameter of the {model} camera is not a finite number; calibrate again")
+    fx, fy, cx, cy = lens.intrinsics
+    longer = max(width, height)
+    if not (0.05 * longer < fx < 100 * longer and 0.05 * longer < fy < 100 * longer):
+        raise InputError(f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}; expected pixels of that size")
+    if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
+        raise InputError(f"{where}: principal point {cx:g}, {cy:g} px lies far outside {width}x{height}; check the order")
+    return lens
+
+
+def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """True where two sizes (width, height) [px] are one picture at two scales, to 1 % or a rounded pixel."""
+    error = abs(a[0] * b[1] - a[1] * b[0])
+    return error <= max(_MAX_ASPECT_ERROR * a[0] * b[1], a[0], a[1], b[0], b[1])
+
+
+def undistort(image: Image, lens: Lens) -> tuple[Image, Image]:
+    """Resamples an image of a lens to the pinhole camera with the same intrinsics and size.
+
+    Returns:
+        The image, and the mask of what the lens saw (0 = nothing there), shape (h, w).
+    """
+    height, width = image.shape[:2]
+    rays = unproject(pixel_grid(width, height), lens.intrinsics).reshape(-1, 3)
+    seen = np.asarray(lens._camera().img_from_cam(rays)).reshape(height, width, 2)
+    # cv2 counts from the centre of the first pixel; outside the model's domain the projection is not finite.
+    maps = np.nan_to_num(seen - 0.5, nan=-1e6).astype(np.float32)
+    flat = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = ((maps >= 0.0) & (maps <= np.array([width - 1, height - 1]))).all(-1)
+    return flat.astype(np.uint8, copy=False), np.where(inside, 255, 0).astype(np.uint8)
