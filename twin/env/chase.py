@@ -1,0 +1,193 @@
+"""Pictures of a recorded drive: a chase camera behind the robot, and a map from above. No OpenGL and no display.
+
+`mujoco_warp`'s ray caster draws the scene twice: as it looks (ground, visual mesh, robot), and the convex collision parts
+alone with their identities. The parts are blended over the picture, half transparent and with outlines, wherever they are
+not hidden behind what is seen.
+"""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.geometry.cameras import opencv_to_mujoco
+from twin.geometry.poses import look_at
+from twin.mjcf.world import World, corridor_edges
+
+if TYPE_CHECKING:
+    from twin.env.follower import Drive
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+_FOVY = 55.0  # [°]
+_BEHIND, _ABOVE, _AHEAD = 3.6, 2.0, 2.0  # [m] of the chase camera, and of the point it looks at
+_SMOOTHING = 0.15  # share of the way the camera turns after the robot per 0.1 s
+_LOOK_GROUPS = [0, 1, 2]
+_PART_GROUPS = [3]
+_PART_ALPHA = 0.45
+_EDGE_RGB = (20, 20, 30)
+# A part hugs the visual mesh: what lies this far behind the visible surface still counts as seen [m].
+_SKIN = 0.6
+_MAP_MARGIN = 6.0  # [m] around the route
+_MAP_HEIGHT = 60.0  # [m] above the route
+
+
+class SceneCamera:
+    """Renders a world from free camera poses."""
+
+    def __init__(self, world: World, size: tuple[int, int], ortho_height: float = 0.0) -> None:
+        """
+        Args:
+            world: The scene.
+            size: Width, height of the pictures [px].
+            ortho_height: Height of what an orthographic camera sees [m]; 0 = perspective.
+        """
+        import mujoco_warp as mjw  # slow to import, and only needed where pictures are made
+        import warp as wp
+
+        self._mjw, self._wp = mjw, wp
+        spec = mujoco.MjSpec.from_file(str(world.model_path))
+        camera = spec.worldbody.add_camera(name="free", fovy=ortho_height or _FOVY)
+        if ortho_height:
+            camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.size = size
+        self._camera = self.model.camera("free").id
+        mujoco.mj_forward(self.model, self.data)
+        self._device_model = mjw.put_model(self.model)
+        self._device_data = mjw.put_data(self.model, self.data)
+        common = {"cam_res": size, "cam_active": ["free"], "render_rgb": True, "render_depth": True}
+        self._looks = mjw.create_render_context(
+            self.model,
+            enabled_geom_groups=_LOOK_GROUPS,
+            render_skybox=True,
+            use_shadows=True,
+            enable_backface_culling=False,
+            **common,
+        )
+        self._parts = None
+        if np.isin(self.model.geom_group, _PART_GROUPS).any():
+            self._parts = mjw.create_render_context(
+                self.model, enabled_geom_groups=_PART_GROUPS, render_seg=True, **common
+            )
+
+    def render(self, qpos: Array, camera_to_world: Array) -> Picture:
+        """One picture of the world with the robot at `qpos`, seen from an OpenCV pose. Shape (h, w, 3)."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        pose = opencv_to_mujoco(camera_to_world)
+        self.data.cam_xpos[self._camera] = pose[:3, 3]
+        self.data.cam_xmat[self._camera] = pose[:3, :3].ravel()
+        device = self._device_data
+        for name in ("geom_xpos", "cam_xpos", "light_xpos", "light_xdir"):
+            getattr(device, name).assign(getattr(self.data, name)[None].astype(np.float32))
+        for name in ("geom_xmat", "cam_xmat"):
+            getattr(device, name).assign(getattr(self.data, name).reshape(1, -1, 3, 3).astype(np.float32))
+        rgb, depth, _ = self._draw(self._looks)
+        if self._parts is None:
+            return rgb
+        part_rgb, part_depth, identity = self._draw(self._parts)
+        return overlay(rgb, depth, part_rgb, part_depth, identity)
+
+    def _draw(self, context) -> tuple[Picture, Array, NDArray[np.int32]]:  # type: ignore[no-untyped-def]
+        self._mjw.refit_bvh(self._device_model, self._device_data, context)
+        self._mjw.render(self._device_model, self._device_data, context)
+        width, height = self.size
+        packed = context.rgb_data.numpy()[0].reshape(height, width)
+        rgb = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], -1).astype(np.uint8)
+        depth = context.depth_data.numpy()[0].reshape(height, width)
+        identity = context.seg_data.numpy()[0, : 1 if context.seg_data.shape[1] == 1 else None, 0]
+        return rgb, depth, identity.reshape(height, width) if identity.size > 1 else np.full((height, width), -1)
+
+
+def overlay(rgb: Picture, depth: Array, part_rgb: Picture, part_depth: Array, identity: NDArray) -> Picture:
+    """Blends collision parts over a picture, with outlines, where they are not hidden.
+
+    Args:
+        rgb: Shape (h, w, 3).
+        depth: z-depth of the picture [m], 0 where nothing is; shape (h, w).
+        part_rgb: The parts alone, shape (h, w, 3).
+        part_depth: Their z-depth [m], shape (h, w).
+        identity: Which part is seen, −1 for none, shape (h, w).
+    """
+    seen = (identity >= 0) & ((depth <= 0) | (part_depth <= depth + _SKIN))
+    edge = np.zeros_like(seen)
+    edge[:, 1:] |= identity[:, 1:] != identity[:, :-1]
+    edge[1:] |= identity[1:] != identity[:-1]
+    out = rgb.astype(np.float32)
+    out[seen] = (1 - _PART_ALPHA) * out[seen] + _PART_ALPHA * part_rgb[seen]
+    line = edge & seen
+    out[line] = 0.4 * out[line] + 0.6 * np.array(_EDGE_RGB)
+    return out.astype(np.uint8)
+
+
+def chase_poses(base_to_world: Array) -> Array:
+    """Camera poses (OpenCV) behind and above a moving robot, shapes (k, 4, 4); its heading is low-passed."""
+    forward = base_to_world[:, :2, 0]
+    direction = forward[0] / np.linalg.norm(forward[0])
+    poses = []
+    for base, ahead in zip(base_to_world, forward, strict=True):
+        direction = direction + _SMOOTHING * (ahead - direction)
+        direction = direction / np.linalg.norm(direction)
+        along = np.array([*direction, 0.0])
+        eye = base[:3, 3] - _BEHIND * along + [0.0, 0.0, _ABOVE]
+        poses.append(look_at(eye, base[:3, 3] + _AHEAD * along + [0.0, 0.0, 0.2]))
+    return np.array(poses)
+
+
+def chase_frames(world: World, drive: "Drive", size: tuple[int, int], every: int = 1) -> Iterator[Picture]:
+    """The drive from a chase camera, one picture per `every` control steps (0.1 s), the last instant included.
+
+    Args:
+        world: The scene it was driven in.
+        drive: The recorded drive.
+        size: Width, height [px].
+        every: Control steps between pictures.
+    """
+    camera = SceneCamera(world, size)
+    poses = chase_poses(drive.base_to_world)
+    for i in frame_indices(len(drive.times), every):
+        yield camera.render(drive.qpos[i], poses[i])
+
+
+def frame_indices(count: int, every: int) -> list[int]:
+    """0, every, 2·every, ... and count − 1."""
+    indices = list(range(0, count, every))
+    return indices if indices[-1] == count - 1 else [*indices, count - 1]
+
+
+def map_view(world: World, drive: "Drive | None", size: tuple[int, int]) -> Picture:
+    """The scene from straight above, north (y) up, with corridor, route and driven path drawn in. Shape (h, w, 3)."""
+    width, height = size
+    low, high = world.route[:, :2].min(0) - _MAP_MARGIN, world.route[:, :2].max(0) + _MAP_MARGIN
+    center = (low + high) / 2
+    extent = max(high[1] - low[1], (high[0] - low[0]) * height / width)
+    camera = SceneCamera(world, size, ortho_height=float(extent))
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = *center, world.route[:, 2].max() + _MAP_HEIGHT
+    qpos = drive.qpos[0] if drive is not None else camera.model.key("spawn").qpos
+    picture = camera.render(qpos, pose)
+
+    def pixels(line: Array) -> NDArray[np.int32]:
+        offset = (line[:, :2] - center) * [1.0, -1.0] * height / extent + np.array([width, height]) / 2
+        return np.round(offset * 16).astype(np.int32)[:, None]
+
+    lines: list[tuple[Array, tuple[int, int, int]]] = [
+        (edge, (240, 230, 60)) for edge in corridor_edges(world.route, world.half_width)
+    ]
+    lines.append((world.route, (60, 220, 80)))
+    if drive is not None:
+        lines.append((drive.base_to_world[:, :3, 3], (230, 40, 40)))
+    picture = np.ascontiguousarray(picture)
+    for line, color in lines:
+        cv2.polylines(picture, [pixels(line)], False, color, 1, cv2.LINE_AA, shift=4)
+    for point, color in ((world.route[:1], (60, 220, 80)), (world.goal[None], (230, 40, 40))):
+        u, v = pixels(point)[0, 0]
+        cv2.circle(picture, (int(u), int(v)), 5 * 16, color, 2, cv2.LINE_AA, shift=4)
+    return picture

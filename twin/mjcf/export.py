@@ -1,0 +1,361 @@
+"""Stage `mjcf`: cameras, ground, parts and looks → `scene.xml` with `assets/` beside it, and `world.json`.
+
+Geom groups: 0 ground, 1 the robot's looks, 2 the visual mesh (touches nothing), 3 the convex parts `part_0000`...,
+4 the robot's collision shapes. Route, corridor and goal are sites of group 4. Every path in the XML is relative, so the
+folder may be moved, zipped, or handed to anyone who has plain MuJoCo.
+"""
+
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.assets.ground import Ground
+from twin.config import SceneConfig
+from twin.errors import InputError
+from twin.geometry.cameras import Cameras
+from twin.geometry.images import write_image
+from twin.mjcf import husky
+from twin.mjcf.files import face_tiles, write_hfield, write_obj
+from twin.mjcf.husky import PixelCamera
+from twin.mjcf.world import (
+    CAMERA_SIZE,
+    SCENE_XML,
+    World,
+    arc_lengths,
+    corridor_edges,
+    heading_at,
+    point_at,
+    total_turn,
+)
+from twin.scene import SceneDir
+
+Array = NDArray[np.float64]
+
+GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
+
+_HFIELD_BASE = 1.0  # [m] of solid below the lowest point, so that nothing tunnels through
+_SETTLE_TIME = 2.0  # [s]
+_REST_STEPS = 200  # of the check after writing
+_REST_DRIFT = 0.005  # [m] a robot that "stays put" may creep in that check
+_SITE_SPACING = 1.0  # [m] between the route's sites
+_CLEARANCE_RANGE = 5.0  # [m] within which parts are looked for around the spawn
+
+
+@dataclass(frozen=True)
+class Parts:
+    """P closed convex hulls [m]."""
+
+    vertices: list[NDArray[np.float32]]
+    faces: list[NDArray[np.int32]]
+
+    @staticmethod
+    def load(path: Path) -> "Parts":
+        with np.load(path, allow_pickle=False) as data:
+            v, f = data["vertex_start"], data["face_start"]
+            return (
+                Parts(np.split(data["vertices"], v[1:-1]), np.split(data["faces"], f[1:-1]))
+                if len(v) > 1
+                else Parts([], [])
+            )
+
+
+def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
+    """Writes the portable scene.
+
+    Args:
+        scene: Reads the stages `metric` (Cameras) and `mesh` (ground.npz, parts.npz, visual.npz and, for a drive,
+            route.npz).
+        config: `mjcf`.
+        out: Gets `scene.xml`, `assets/` and, for a drive, `world.json`.
+
+    Returns:
+        Metrics for the report.
+
+    Raises:
+        InputError: the route's start lies off the ground, or the robot does not come to rest there.
+    """
+    mesh = scene.stage("mesh")
+    ground = Ground.load(mesh)
+    parts = Parts.load(mesh / "parts.npz")
+    assets = out / "assets"
+    assets.mkdir(parents=True, exist_ok=True)
+
+    spec = mujoco.MjSpec()
+    spec.modelname = config.name or "twin"
+    spec.meshdir = spec.texturedir = "assets"
+    spec.modelfiledir = str(out.resolve())
+    husky.set_options(spec)
+    _add_surroundings(spec)
+    _add_ground(spec, ground, assets)
+    faces = _add_visual(spec, mesh / "visual.npz", assets)
+    _add_parts(spec, parts, assets)
+
+    route = load_route(mesh / "route.npz") if config.mjcf.route else None
+    metrics: dict[str, Any] = {"parts": len(parts.vertices), "visual_faces": faces, "has_route": route is not None}
+    if route is None:
+        (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
+        metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
+    else:
+        camera = front_camera(Cameras.load(scene.stage("metric")))
+        spawn = _add_robot(spec, ground, route, camera)
+        _add_route(spec, route, config.mjcf.half_width)
+        (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
+        World(route, config.mjcf.half_width, spawn, np.array(camera.intrinsics), out).save()
+        metrics |= {
+            "route_length_m": float(arc_lengths(route)[-1]),
+            "turn_deg": float(np.rad2deg(total_turn(route))),
+            "half_width_m": config.mjcf.half_width,
+            "camera_intrinsics_px": [float(x) for x in camera.intrinsics],
+        }
+    return metrics | check_portable(out, with_robot=route is not None)
+
+
+def load_route(path: Path) -> Array | None:
+    """The route [m], shape (m, 3); None where the mesh stage found none."""
+    if not path.exists():
+        return None
+    with np.load(path, allow_pickle=False) as data:
+        return np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
+
+
+def front_camera(cameras: Cameras) -> PixelCamera:
+    """The real camera at CAMERA_SIZE: of the first training frame, fx scaled by the width.
+
+    Pixels keep their shape, so fy scales like fx; where the aspect ratio differs, the middle of the picture's height is
+    cut out (or, for a picture wider than 16:9, extended).
+    """
+    training = np.flatnonzero(~cameras.held_out)
+    first = int(training[0]) if len(training) else 0
+    width, height = cameras.sizes[first]
+    fx, fy, cx, cy = cameras.intrinsics[first] * (CAMERA_SIZE[0] / width)
+    cut = (height * CAMERA_SIZE[0] / width - CAMERA_SIZE[1]) / 2
+    return PixelCamera((float(fx), float(fy), float(cx), float(cy - cut)), CAMERA_SIZE)
+
+
+def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
+    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane nearest the ground below them."""
+    forward = np.array([np.cos(yaw), np.sin(yaw)])
+    left = np.array([-forward[1], forward[0]])
+    local = husky.wheel_centers()[:, :2]
+    heights = ground.at(xy + local[:, :1] * forward + local[:, 1:] * left)
+    (slope_x, slope_y, height), *_ = np.linalg.lstsq(np.column_stack([local, np.ones(4)]), heights, rcond=None)
+    x_axis = np.array([*forward, slope_x])
+    y_axis = np.array([*left, slope_y])
+    z_axis = np.cross(x_axis, y_axis)
+    z_axis /= np.linalg.norm(z_axis)
+    x_axis /= np.linalg.norm(x_axis)
+    rotation = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1)
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    return np.array([*xy, height]) + z_axis * husky.BASE_HEIGHT, quaternion
+
+
+def _add_surroundings(spec: mujoco.MjSpec) -> None:
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.55, 0.68, 0.85),
+        rgb2=(0.86, 0.89, 0.92),
+        width=128,
+        height=128 * 6,
+    )
+    spec.worldbody.add_light(
+        name="sun",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(0, 0, 50),
+        dir=(0.35, 0.25, -0.9),
+        diffuse=(0.45, 0.45, 0.43),
+        ambient=(0.0, 0.0, 0.0),
+        specular=(0.2, 0.2, 0.2),
+        castshadow=True,
+    )
+    spec.visual.headlight.ambient = (0.4, 0.4, 0.42)
+    spec.visual.headlight.diffuse = (0.15, 0.15, 0.15)
+    spec.visual.headlight.specular = (0, 0, 0)
+    # Clipping planes are multiples of the extent: 0.1 m and 1 km, however large the scene is.
+    spec.stat.extent = 20.0
+    spec.visual.map.znear, spec.visual.map.zfar = 0.005, 50.0
+
+
+def _add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path) -> None:
+    write_hfield(assets / "ground.bin", ground.height)
+    # The texture's first row is the far (+y) edge.
+    write_image(assets / "ground.png", ground.rgb[::-1])
+    rows, columns = ground.height.shape
+    low, high = float(ground.height.min()), float(ground.height.max())
+    half = np.array([columns - 1, rows - 1]) * ground.cell / 2
+    # MuJoCo maps the file's lowest value to 0 and its highest to size[2]; a level field is all 0 at any size.
+    spec.add_hfield(name="ground", file="ground.bin", size=(*half, max(high - low, 1e-3), _HFIELD_BASE))
+    _add_textured(spec, "ground", emission=0.25)
+    spec.worldbody.add_geom(
+        name="ground",
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname="ground",
+        pos=(*(ground.origin + half), low),
+        material="ground",
+        group=GROUND_GROUP,
+    )
+
+
+def _add_textured(spec: mujoco.MjSpec, name: str, emission: float) -> None:
+    """A material with `assets/<name>.png` as its colour. Filmed colours carry their own light, hence the emission."""
+    spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
+    material = spec.add_material(name=name, emission=emission, specular=0.0, shininess=0.0)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+
+
+def _add_visual(spec: mujoco.MjSpec, path: Path, assets: Path) -> int:
+    with np.load(path, allow_pickle=False) as data:
+        vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
+    if len(faces) == 0:
+        return 0
+    texture, texcoords = face_tiles(colors[faces])
+    write_image(assets / "visual.png", texture)
+    write_obj(assets / "visual.obj", vertices, faces, texcoords)
+    mesh = spec.add_mesh(name="visual", file="visual.obj")
+    # An open surface has no volume.
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    _add_textured(spec, "visual", emission=0.4)
+    spec.worldbody.add_geom(
+        name="visual",
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname="visual",
+        material="visual",
+        group=VISUAL_GROUP,
+        contype=0,
+        conaffinity=0,
+    )
+    return len(faces)
+
+
+def _add_parts(spec: mujoco.MjSpec, parts: Parts, assets: Path) -> None:
+    for i, (vertices, faces) in enumerate(zip(parts.vertices, parts.faces, strict=True)):
+        name = f"part_{i:04d}"
+        write_obj(assets / f"{name}.obj", vertices, faces)
+        mesh = spec.add_mesh(name=name, file=f"{name}.obj")
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        # Neighbours in different hues, so that one sees where a part ends.
+        hue = (i * 0.618034) % 1.0
+        rgb = 0.5 + 0.4 * np.cos(2 * np.pi * (hue + np.array([0.0, 1 / 3, 2 / 3])))
+        spec.worldbody.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=PART_GROUP, rgba=(*rgb, 1.0)
+        )
+
+
+def _add_robot(
+    spec: mujoco.MjSpec, ground: Ground, route: Array, camera: PixelCamera
+) -> tuple[float, float, float, float]:
+    """Puts the Husky at the route's start, lets it settle, and keeps that as keyframe `spawn`. Returns x, y, z, yaw."""
+    yaw = float(heading_at(route, 0.0))
+    rows, columns = ground.height.shape
+    edge = np.minimum(
+        route[0, :2] - ground.origin, ground.origin + np.array([columns - 1, rows - 1]) * ground.cell - route[0, :2]
+    )
+    if edge.min() < 1.0:
+        raise InputError(
+            f"the route starts {edge.min():.2f} m from the edge of the ground, expected at least 1 m; raise mesh.margin"
+        )
+    position, quaternion = rest_pose(ground, route[0, :2], yaw)
+    husky.add_husky(spec, position, quaternion, camera=camera)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, int(_SETTLE_TIME / husky.TIMESTEP))
+    moved = float(np.linalg.norm(data.qpos[:2] - position[:2]))
+    if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
+        raise InputError(
+            f"the robot does not rest at the route's start: moved {moved:.2f} m, {data.qpos[2] - position[2]:+.2f} m up "
+            f"in {_SETTLE_TIME:g} s, expected < 0.05; is something solid there? look at 4_mesh or raise mesh.obstacle_height"
+        )
+    spec.add_key(name="spawn", qpos=data.qpos)
+    x, y, z = data.qpos[:3]
+    forward = data.body("husky").xmat.reshape(3, 3)[:, 0]
+    return float(x), float(y), float(z), float(np.arctan2(forward[1], forward[0]))
+
+
+def _add_route(spec: mujoco.MjSpec, route: Array, half_width: float) -> None:
+    s = np.arange(0.0, arc_lengths(route)[-1], _SITE_SPACING)
+    left, right = corridor_edges(route, half_width)
+    for prefix, line, rgba in (
+        ("route", route, (0.1, 0.8, 0.2, 1.0)),
+        ("corridor_left", left, (0.9, 0.9, 0.2, 1.0)),
+        ("corridor_right", right, (0.9, 0.9, 0.2, 1.0)),
+    ):
+        knots = arc_lengths(route)
+        points = np.stack([np.interp(s, knots, line[:, k]) for k in range(3)], 1)
+        for i, point in enumerate(points):
+            spec.worldbody.add_site(
+                name=f"{prefix}_{i:03d}", pos=point, size=(0.05, 0.05, 0.05), group=ROUTE_GROUP, rgba=rgba
+            )
+    spec.worldbody.add_site(
+        name="goal", pos=point_at(route, np.inf), size=(0.2, 0.2, 0.2), group=ROUTE_GROUP, rgba=(0.9, 0.1, 0.1, 1)
+    )
+
+
+def _to_xml(spec: mujoco.MjSpec) -> str:
+    spec.compile()
+    return spec.to_xml()
+
+
+def check_portable(folder: Path, with_robot: bool) -> dict[str, Any]:
+    """Loads a moved copy of the scene in plain MuJoCo; the robot must stay put there. Returns metrics.
+
+    Raises:
+        RuntimeError: the copy differs, or the robot creeps away: a bug of the exporter.
+    """
+    with tempfile.TemporaryDirectory(prefix="twin-moved-") as temporary:
+        moved = Path(temporary) / "elsewhere"
+        shutil.copytree(folder, moved)
+        model = mujoco.MjModel.from_xml_path(str(moved / SCENE_XML))
+    metrics: dict[str, Any] = {
+        "geoms": int(model.ngeom),
+        "xml_bytes": (folder / SCENE_XML).stat().st_size,
+        "assets_bytes": sum(path.stat().st_size for path in (folder / "assets").iterdir()),
+    }
+    if not with_robot:
+        return metrics
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
+    mujoco.mj_forward(model, data)
+    touched = touched_names(model, data)
+    metrics["spawn_clearance_m"] = spawn_clearance(model, data)
+    start = data.qpos[:3].copy()
+    for _ in range(_REST_STEPS):
+        mujoco.mj_step(model, data)
+        touched |= touched_names(model, data)
+    drift = float(np.linalg.norm(data.qpos[:3] - start))
+    if drift > _REST_DRIFT:
+        raise RuntimeError(f"the robot creeps {drift:.3f} m in {_REST_STEPS} steps at the route's start")
+    return metrics | {"spawn_touched": sorted(touched), "spawn_drift_m": drift}
+
+
+def robot_geoms(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Which geoms belong to the robot, shape (ngeom,)."""
+    return model.body_rootid[model.geom_bodyid] == model.body("husky").id
+
+
+def touched_names(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
+    """Names of the geoms that the robot touches now, besides the ground."""
+    pairs = data.contact.geom
+    mine = robot_geoms(model)[pairs]
+    other = pairs[mine[:, 0] != mine[:, 1]][~mine[mine[:, 0] != mine[:, 1]]]
+    return {model.geom(int(i)).name for i in np.unique(other)} - {"ground"}
+
+
+def spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
+    """Distance from the robot to the nearest convex part [m]; None where none is within 5 m."""
+    robot = np.flatnonzero(robot_geoms(model) & (model.geom_contype > 0))
+    parts = np.flatnonzero(model.geom_group == PART_GROUP)
+    center = data.body("husky").xpos
+    near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + _CLEARANCE_RANGE]
+    distances = [
+        mujoco.mj_geomDistance(model, data, int(a), int(b), _CLEARANCE_RANGE, None) for a in robot for b in near
+    ]
+    best = min(distances, default=_CLEARANCE_RANGE)
+    return float(best) if best < _CLEARANCE_RANGE else None

@@ -1,0 +1,177 @@
+"""What the Husky looks like: boxes, tubes and generated meshes without mass or contact, all in geom group 1.
+
+Nothing here is taken from Clearpath's meshes; proportions follow the published dimensions. The base frame is that of
+`twin.mjcf.husky`: x forward, y left, z up.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+LOOK_GROUP = 1
+
+_YELLOW = (0.96, 0.74, 0.05, 1.0)
+_BLACK = (0.06, 0.06, 0.065, 1.0)
+_DARK = (0.13, 0.13, 0.14, 1.0)
+_STEEL = (0.45, 0.46, 0.48, 1.0)
+_LAMP = (0.95, 0.95, 0.88, 1.0)
+_RED = (0.75, 0.06, 0.05, 1.0)
+
+_LUGS = 22  # tread blocks around a tyre
+
+
+def add_look(
+    spec: mujoco.MjSpec,
+    base: mujoco.MjsBody,
+    wheels: dict[str, mujoco.MjsBody],
+    camera: tuple[float, float, float],
+    radius: float,
+    width: float,
+) -> None:
+    """Dresses the base and its wheels.
+
+    Args:
+        camera: Position of the front camera in the base [m]; a small housing and its mast stand there.
+        radius: Of a wheel [m].
+        width: Of a wheel [m].
+    """
+    for name, rgba, specular in (("yellow", _YELLOW, 0.4), ("black", _BLACK, 0.2), ("dark", _DARK, 0.2)):
+        spec.add_material(name=f"husky_{name}", rgba=rgba, specular=specular, shininess=0.4)
+    for name, (vertices, faces) in {"hull": _hull(), "tyre": _tyre(radius, width)}.items():
+        mesh = spec.add_mesh(name=f"husky_{name}")
+        mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+
+    _mesh(base, "husky_hull", "husky_yellow")
+    _box(base, (0.66, 0.34, 0.11), (0.0, 0.0, 0.035), material="husky_dark")  # belly between the wheels
+    _box(base, (0.74, 0.50, 0.012), (0.0, 0.0, 0.236), material="husky_dark")  # top plate
+    for y in (-0.235, 0.235):  # rails along the top plate
+        _box(base, (0.74, 0.03, 0.02), (0.0, y, 0.250), material="husky_black")
+    for x in (-0.30, -0.10, 0.10, 0.30):  # slots of the top plate
+        _box(base, (0.012, 0.36, 0.004), (x, 0.0, 0.2435), rgba=_STEEL)
+    for end in (-1.0, 1.0):
+        _bumper(base, end)
+    _box(base, (0.16, 0.11, 0.05), (-0.29, 0.0, 0.267), material="husky_black")  # user panel and emergency stop
+    _cylinder(base, (-0.29, 0.0, 0.29), (-0.29, 0.0, 0.318), 0.024, rgba=_RED)
+    _mast(base, camera)
+    for wheel in wheels.values():
+        _mesh(wheel, "husky_tyre", "husky_black")
+        for y in (-1.0, 1.0):
+            _cylinder(wheel, (0, 0.30 * width * y, 0), (0, 0.44 * width * y, 0), 0.55 * radius, rgba=_STEEL)
+            _cylinder(wheel, (0, 0.40 * width * y, 0), (0, 0.47 * width * y, 0), 0.22 * radius, material="husky_yellow")
+            for angle in np.arange(5) * 2 * np.pi / 5:  # wheel bolts: one sees the wheel turn
+                x, z = 0.38 * radius * np.cos(angle), 0.38 * radius * np.sin(angle)
+                _cylinder(wheel, (x, 0.42 * width * y, z), (x, 0.465 * width * y, z), 0.012, material="husky_black")
+
+
+def _bumper(base: mujoco.MjsBody, end: float) -> None:
+    """A black bumper bar with two lamps, at the front (end = 1) or the rear (end = −1)."""
+    x = 0.455 * end
+    _tube(base, (x, -0.20, 0.075), (x, 0.20, 0.075), 0.024)
+    _tube(base, (x, -0.20, 0.165), (x, 0.20, 0.165), 0.018)
+    for y in (-0.20, 0.20):
+        _tube(base, (x, y, 0.075), (x, y, 0.165), 0.018)
+        _tube(base, (x, y, 0.075), (0.38 * end, y * 0.9, 0.075), 0.018)
+        _cylinder(
+            base, (0.395 * end, 0.65 * y, 0.12), (0.43 * end, 0.65 * y, 0.12), 0.03, rgba=_LAMP if end > 0 else _RED
+        )
+
+
+def _mast(base: mujoco.MjsBody, camera: tuple[float, float, float]) -> None:
+    """An arch of two tubes that carries the camera, and the camera's housing just behind its lens."""
+    x, y, z = camera
+    foot = min(x, 0.33) - 0.05
+    if z > 0.30:
+        for side in (-0.20, 0.20):
+            _tube(base, (foot, side, 0.25), (foot, side, z - 0.09), 0.014)
+            _tube(base, (foot, side, z - 0.09), (foot, 0.72 * side, z - 0.04), 0.014)
+        _tube(base, (foot, -0.144, z - 0.04), (foot, 0.144, z - 0.04), 0.014)
+        _tube(base, (foot, y, z - 0.04), (x - 0.03, y, z - 0.02), 0.012)
+    _box(base, (0.03, 0.175, 0.03), (x - 0.02, y, z), rgba=_STEEL)
+    for offset in (-0.06, 0.06):
+        _cylinder(base, (x - 0.01, y + offset, z), (x - 0.002, y + offset, z), 0.011, material="husky_black")
+
+
+def _geom(body: mujoco.MjsBody, kind: Any, **settings: Any) -> None:
+    body.add_geom(type=kind, contype=0, conaffinity=0, group=LOOK_GROUP, mass=0.0, **settings)
+
+
+def _mesh(body: mujoco.MjsBody, name: str, material: str) -> None:
+    _geom(body, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material)
+
+
+def _box(
+    body: mujoco.MjsBody, size: tuple[float, float, float], center: tuple[float, float, float], **look: Any
+) -> None:
+    _geom(body, mujoco.mjtGeom.mjGEOM_BOX, size=np.array(size) / 2, pos=center, **look)
+
+
+def _cylinder(body: mujoco.MjsBody, start: Any, end: Any, radius: float, **look: Any) -> None:
+    _geom(body, mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=(*start, *end), size=(radius, 0, 0), **look)
+
+
+def _tube(body: mujoco.MjsBody, start: Any, end: Any, radius: float) -> None:
+    _geom(body, mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*start, *end), size=(radius, 0, 0), material="husky_black")
+
+
+def _hull() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The yellow body: an eight-sided outline, wide above the wheels, drawn in towards the top and the bottom."""
+    levels = (  # height, half length, half width, corner cut [m]
+        (0.075, 0.36, 0.20, 0.04),
+        (0.140, 0.40, 0.22, 0.05),
+        (0.165, 0.41, 0.275, 0.06),
+        (0.215, 0.40, 0.275, 0.06),
+        (0.232, 0.38, 0.255, 0.06),
+    )
+    rings = []
+    for z, a, b, c in levels:
+        outline = [(a, b - c), (a - c, b), (c - a, b), (-a, b - c), (-a, c - b), (c - a, -b), (a - c, -b), (a, c - b)]
+        rings.append([(x, y, z) for x, y in outline])
+    return _lathe(np.array(rings))
+
+
+def _tyre(radius: float, width: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A tyre with chevron lugs about the y axis: rings of vertices whose radius drops between the lugs."""
+    steps = 4 * _LUGS
+    # Across the tyre: position [share of half width], radius at a lug and in a groove [share], lead of the chevron [lugs].
+    profile = (
+        (-0.62, 0.50, 0.50, 0.0),
+        (-0.98, 0.70, 0.70, 0.0),
+        (-1.00, 0.88, 0.86, 0.5),
+        (-0.80, 0.99, 0.93, 0.5),
+        (-0.40, 1.00, 0.945, 0.25),
+        (0.00, 1.00, 0.95, 0.0),
+        (0.40, 1.00, 0.945, 0.25),
+        (0.80, 0.99, 0.93, 0.5),
+        (1.00, 0.88, 0.86, 0.5),
+        (0.98, 0.70, 0.70, 0.0),
+        (0.62, 0.50, 0.50, 0.0),
+    )
+    rings = []
+    for y, lug, groove, lead in profile:
+        phase = (np.arange(steps) / 4 + lead) * 2 * np.pi  # one lug per 2π
+        angle = np.arange(steps) * 2 * np.pi / steps
+        r = radius * np.where(np.sin(phase + 0.1) > 0, lug, groove)
+        rings.append(np.stack([r * np.cos(angle), np.full(steps, y * width / 2), -r * np.sin(angle)], 1))
+    return _lathe(np.array(rings))
+
+
+def _lathe(rings: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A closed mesh from stacked closed rings of equal length, counter-clockwise about the stacking direction, with caps.
+
+    Args:
+        rings: Shape (levels, n, 3).
+    """
+    levels, n, _ = rings.shape
+    vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
+    i = np.arange(n)
+    j = (i + 1) % n
+    faces = []
+    for low in np.arange(levels - 1) * n:
+        faces += [np.stack([low + i, low + j, low + n + j], 1), np.stack([low + i, low + n + j, low + n + i], 1)]
+    bottom, top = levels * n, levels * n + 1
+    last = (levels - 1) * n
+    faces += [np.stack([np.full(n, bottom), j, i], 1), np.stack([np.full(n, top), last + i, last + j], 1)]
+    return vertices, np.concatenate(faces)

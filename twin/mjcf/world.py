@@ -1,0 +1,148 @@
+"""The finished scene: a portable MJCF folder, and what a driver must know about it.
+
+*Route*: the filmed path on the ground, a polyline in driving order. *Arc length* s runs along it in the plane, from 0 at
+its start. *Cross-track error*: distance from the route in the plane, positive to its left. *Heading*: angle of the route
+from the x axis, positive towards y. *Corridor*: what lies within `half_width` of the route.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.scene import read_json, write_json
+
+Array = NDArray[np.float64]
+
+SCENE_XML = "scene.xml"
+CAMERA_SIZE = (160, 90)
+"""Width, height of the front camera's picture [px]."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A drivable scene on disk."""
+
+    route: Array
+    """On the ground [m], shape (m, 3), m ≥ 2, in driving order."""
+    half_width: float
+    """Half width of the drivable corridor [m]."""
+    spawn: tuple[float, float, float, float]
+    """x, y, z of the robot's base origin [m] at rest at the start, and its yaw [rad]."""
+    intrinsics: Array
+    """fx, fy, cx, cy [px] of the front camera at CAMERA_SIZE, shape (4,)."""
+    folder: Path
+    """Holds `scene.xml`, `assets/` and `world.json`."""
+    names: dict[str, str] = field(
+        default_factory=lambda: {"body": "husky", "camera": "front", "ground": "ground", "keyframe": "spawn"}
+    )
+    """What the things in the MJCF are called."""
+
+    @property
+    def goal(self) -> Array:
+        """End of the route [m], shape (3,)."""
+        return self.route[-1]
+
+    @property
+    def model_path(self) -> Path:
+        return self.folder / SCENE_XML
+
+    def model(self) -> mujoco.MjModel:
+        return mujoco.MjModel.from_xml_path(str(self.model_path))
+
+    def save(self) -> None:
+        """Writes `world.json` into the folder."""
+        write_json(
+            self.folder / "world.json",
+            {
+                "route": self.route.tolist(),
+                "half_width": self.half_width,
+                "goal": self.goal.tolist(),
+                "spawn": list(self.spawn),
+                "camera": {"intrinsics": self.intrinsics.tolist(), "size": list(CAMERA_SIZE)},
+                "names": self.names,
+                "model": SCENE_XML,
+            },
+        )
+
+    @staticmethod
+    def load(folder: Path) -> "World":
+        head = read_json(folder / "world.json")
+        x, y, z, yaw = head["spawn"]
+        return World(
+            route=np.array(head["route"]),
+            half_width=float(head["half_width"]),
+            spawn=(x, y, z, yaw),
+            intrinsics=np.array(head["camera"]["intrinsics"]),
+            folder=folder,
+            names=head["names"],
+        )
+
+
+def arc_lengths(route: Array) -> Array:
+    """Arc length at each vertex [m], shape (m, ≥2) → (m,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route[:, :2], axis=0), axis=1))])
+
+
+def point_at(route: Array, s: Array | float) -> Array:
+    """Points at arc lengths s [m]; beyond an end, that end. Shapes (m, d) and (...) → (..., d)."""
+    knots = arc_lengths(route)
+    return np.stack([np.interp(s, knots, route[:, k]) for k in range(route.shape[1])], -1)
+
+
+def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
+    """Heading [rad] at arc lengths s: of the chord over `window` [m] around each, shape as s."""
+    length = arc_lengths(route)[-1]
+    window = min(window, length)
+    middle = np.clip(s, window / 2, length - window / 2)
+    chord = point_at(route[:, :2], middle + window / 2) - point_at(route[:, :2], middle - window / 2)
+    return np.arctan2(chord[..., 1], chord[..., 0])
+
+
+def nearest(route: Array, xy: Array, around: tuple[float, float] | None = None) -> tuple[Array, Array]:
+    """Foot of the perpendicular on the route.
+
+    Args:
+        route: Shape (m, ≥2).
+        xy: Points, shape (..., 2).
+        around: Arc lengths between which to look [m], for a route that meets itself; everywhere by default.
+
+    Returns:
+        Arc length of the foot [m] and cross-track error [m], both of shape (...).
+    """
+    knots = arc_lengths(route)
+    start, step = route[:-1, :2], np.diff(route[:, :2], axis=0)
+    if around is not None:
+        inside = (knots[1:] >= around[0]) & (knots[:-1] <= around[1])
+        start, step, knots = start[inside], step[inside], knots[:-1][inside]
+    offset = np.asarray(xy)[..., None, :] - start
+    length_2 = np.maximum((step**2).sum(-1), 1e-18)
+    share = np.clip((offset * step).sum(-1) / length_2, 0.0, 1.0)
+    miss = offset - share[..., None] * step
+    best = np.argmin((miss**2).sum(-1), -1)[..., None]
+    cross = step[..., 0] * offset[..., 1] - step[..., 1] * offset[..., 0]
+    distance = np.take_along_axis(np.linalg.norm(miss, axis=-1), best, -1)[..., 0]
+    side = np.sign(np.take_along_axis(cross, best, -1)[..., 0])
+    s = np.take_along_axis(knots[: len(start)] + share * np.sqrt(length_2), best, -1)[..., 0]
+    return s, np.where(side < 0, -distance, distance)
+
+
+def total_turn(route: Array) -> float:
+    """How far the heading turns from the route's start to its end [rad], left positive, full turns counted."""
+    s = np.arange(0.0, arc_lengths(route)[-1], 0.25)
+    heading = np.unwrap(heading_at(route, s, window=2.0))
+    return float(heading[-1] - heading[0])
+
+
+def corridor_edges(route: Array, half_width: float) -> tuple[Array, Array]:
+    """Left and right edge of the corridor at the route's vertices, shapes (m, 3); heights are the route's."""
+    heading = heading_at(route, arc_lengths(route))
+    normal = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1) * half_width
+    return route + normal, route - normal
+
+
+def heading_error(wanted: Array | float, actual: Array | float) -> Array:
+    """wanted − actual, wrapped to ±π [rad]."""
+    return (np.asarray(wanted) - actual + np.pi) % (2 * np.pi) - np.pi
