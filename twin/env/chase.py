@@ -1,11 +1,12 @@
 """Pictures of a recorded drive: a chase camera behind the robot, and a map from above. No OpenGL and no display.
 
-`mujoco_warp`'s ray caster draws the scene twice: as it looks (ground, visual mesh, robot), and the convex collision parts
-alone with their identities. The parts are blended over the picture, half transparent and with outlines, wherever they are
-not hidden behind what is seen.
+`mujoco_warp`'s ray caster draws the scene twice: as it looks (ground, visual mesh, robot), and the convex collision
+parts alone with their identities. The parts are blended over the picture, half transparent and with outlines, wherever
+they are not hidden behind what is seen.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import cv2
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-_FOVY = 55.0  # [°]
-_BEHIND, _ABOVE, _AHEAD = 3.6, 2.0, 2.0  # [m] of the chase camera, and of the point it looks at
+_FOVY = 50.0  # [°]
+_BEHIND, _ABOVE, _AHEAD = 3.0, 1.6, 2.0  # [m] of the chase camera, and of the point it looks at
 _SMOOTHING = 0.15  # share of the way the camera turns after the robot per 0.1 s
 _LOOK_GROUPS = [0, 1, 2]
 _PART_GROUPS = [3]
@@ -89,13 +90,14 @@ class SceneCamera:
             getattr(device, name).assign(getattr(self.data, name)[None].astype(np.float32))
         for name in ("geom_xmat", "cam_xmat"):
             getattr(device, name).assign(getattr(self.data, name).reshape(1, -1, 3, 3).astype(np.float32))
-        rgb, depth, _ = self._draw(self._looks)
         if self._parts is None:
-            return rgb
-        part_rgb, part_depth, identity = self._draw(self._parts)
+            return self._draw(self._looks)[0]
+        # Warp's CPU kernels run on one thread each and release the GIL.
+        with ThreadPoolExecutor(2) as pool:
+            (rgb, depth, _), (part_rgb, part_depth, identity) = pool.map(self._draw, (self._looks, self._parts))
         return overlay(rgb, depth, part_rgb, part_depth, identity)
 
-    def _draw(self, context) -> tuple[Picture, Array, NDArray[np.int32]]:  # type: ignore[no-untyped-def]
+    def _draw(self, context) -> tuple[Picture, Array, NDArray[np.int32]]:
         self._mjw.refit_bvh(self._device_model, self._device_data, context)
         self._mjw.render(self._device_model, self._device_data, context)
         width, height = self.size

@@ -1,8 +1,8 @@
 """A scripted driver that follows a route from poses alone: the first proof that a scene can be driven.
 
-Pure pursuit (Coulter 1992): steer on the circle through a point of the route some way ahead. A skid-steered robot turns
-faster or slower than commanded, by a factor that depends on ground and load, so the driver also compares the yaw rate it
-asked for with what the poses show, and corrects its commands by the ratio.
+Pure pursuit (Coulter 1992): steer on the circle through a point of the route some way ahead. A skid-steered robot
+turns faster or slower than commanded, by a factor that depends on ground and load, so the driver also compares the yaw
+rate it asked for with what the poses show, and corrects its commands by the ratio.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """The Husky driven by commands: forward speed v [m/s] and yaw rate ω [rad/s], as its own controller takes them.
 
-One *control step* is 0.1 s, the period of the robot's wheel controller. Within it MuJoCo takes many small steps; contacts
-are looked at several times in between, so that a short graze is not missed. *Touched* means in contact with any part of
-the robot, the ground excepted.
+One *control step* is 0.1 s, the period of the robot's wheel controller. Within it MuJoCo takes many small steps;
+contacts are looked at several times in between, so that a short graze is not missed. *Touched* means in contact with
+any part of the robot, the ground excepted.
 """
 
 import mujoco

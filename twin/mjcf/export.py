@@ -139,7 +139,7 @@ def front_camera(cameras: Cameras) -> PixelCamera:
 
 
 def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
-    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane nearest the ground below them."""
+    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane that fits the ground below."""
     forward = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-forward[1], forward[0]])
     local = husky.wheel_centers()[:, :2]
@@ -270,8 +270,8 @@ def _add_robot(
     moved = float(np.linalg.norm(data.qpos[:2] - position[:2]))
     if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
         raise InputError(
-            f"the robot does not rest at the route's start: moved {moved:.2f} m, {data.qpos[2] - position[2]:+.2f} m up "
-            f"in {_SETTLE_TIME:g} s, expected < 0.05; is something solid there? look at 4_mesh or raise mesh.obstacle_height"
+            f"the robot does not rest at the route's start: moved {moved:.2f} m, {data.qpos[2] - position[2]:+.2f} m "
+            f"up in {_SETTLE_TIME:g} s, expected < 0.05; something solid is there: raise mesh.obstacle_height"
         )
     spec.add_key(name="spawn", qpos=data.qpos)
     x, y, z = data.qpos[:3]

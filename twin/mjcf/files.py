@@ -34,7 +34,7 @@ def write_obj(path: Path, vertices: NDArray, faces: NDArray, texcoords: NDArray 
         _write_lines(file, "f %d/%d %d/%d %d/%d\n", np.stack([faces + 1, corner], -1).reshape(-1, 6))
 
 
-def _write_lines(file, line: str, rows: NDArray) -> None:  # type: ignore[no-untyped-def]
+def _write_lines(file, line: str, rows: NDArray) -> None:
     for start in range(0, len(rows), _CHUNK):
         part = rows[start : start + _CHUNK]
         file.write(line * len(part) % tuple(part.ravel().tolist()))
@@ -50,8 +50,8 @@ def face_tiles(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64]]
         colors: Per face and corner, shape (f, 3, 3) uint8.
 
     Returns:
-        The texture, shape (h, w, 3), and texture coordinates per face and corner, shape (f, 3, 2), u from the left and v
-        from the top.
+        The texture, shape (h, w, 3), and texture coordinates per face and corner, shape (f, 3, 2), u from the left and
+        v from the top.
     """
     count = len(colors)
     across = max(1, int(np.ceil(np.sqrt(count))))

@@ -1,12 +1,12 @@
 """The Clearpath Husky A200 as a wheeled MuJoCo model.
 
 *Base* is the body with the free joint (Clearpath's `base_link`; x forward, y left, z up; its origin lies between the
-wheels, 0.132 m above flat ground). A *side* is the front and the rear wheel of the left or of the right, which one motor
-drives through a belt. The *track ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a car-like differential
-drive and larger for a skid-steered robot, whose tyres must scrub sideways.
+wheels, 0.132 m above flat ground). A *side* is the front and the rear wheel of the left or of the right, which one
+motor drives through a belt. The *track ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a differential
+drive whose wheels roll freely and larger for a skid-steered robot, whose tyres must scrub sideways.
 
-Figures: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml). Contact settings: measured,
-see `_WHEEL_SOLIMP`.
+Figures: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml). Contact settings:
+measured, see `_WHEEL_SOLIMP`.
 """
 
 from dataclasses import dataclass
@@ -45,8 +45,8 @@ _COLLISION_BOXES = (  # full size, centre in the base [m]
     ((0.9874, 0.5709, 0.12375), (0.0, 0.0, 0.061875)),
     ((0.78992, 0.5709, 0.10375), (0.0, 0.0, 0.175625)),
 )
-# With MuJoCo's default solimp (d0 = 0.9) scrubbing wheels hop: 12 to 17 m/s² at the body in a point turn, and the effective
-# track then depends on friction. An impedance that starts from zero over 3 mm has no jump at touchdown, hence no hop.
+# With MuJoCo's default solimp (d0 = 0.9) scrubbing wheels hop: 12 to 17 m/s² at the body in a point turn, and the
+# effective track then depends on friction. An impedance that starts from zero over 3 mm has no jump at touchdown.
 _WHEEL_SOLIMP = (0.0, 0.95, 0.003, 0.5, 2.0)
 _TORSIONAL = 1e-4  # [m] spin friction of the contact patch; next to nothing, the scrubbing of four wheels dominates
 
@@ -59,9 +59,10 @@ class HuskyParams:
     """What may differ from robot to robot, or be fitted to logs."""
 
     center_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.062)
-    """Of the chassis, in the base [m]. The published (−.00065, −.085, .062) would lie 8.5 cm to the right of a symmetric robot;
-    read as transposed it is rear-heavy (`REAR_HEAVY`) and turns with chi = 1.43. Centred it turns with 1.805, which is near
-    what Clearpath's controller assumes (1.82 to 1.875) and logs of a real one show (2.15 and more), so that is the default."""
+    """Of the chassis, in the base [m]. The published (−.00065, −.085, .062) would lie 8.5 cm to the right of a
+    symmetric robot; read as transposed it is rear-heavy (`REAR_HEAVY`) and turns with chi = 1.43. Centred it turns with
+    1.805, which is nearer to what Clearpath's controller assumes (1.82 to 1.875) and to what logs of a real one show
+    (2.15 and more); so centred is the default."""
     friction: float = 0.7
     """Sliding friction of a tyre, on whatever it touches."""
     rolling_resistance: float = 0.015
@@ -120,8 +121,8 @@ def add_husky(
 ) -> None:
     """Adds the robot to a world.
 
-    Names: body `husky`, free joint `husky`, bodies, joints, actuators `<front|rear>_<left|right>_wheel`, collision geoms
-    `husky_chassis_0`, `husky_chassis_1`, `<wheel>_tyre`, camera `front`.
+    Names: body `husky`, free joint `husky`, bodies, joints, actuators `<front|rear>_<left|right>_wheel`, collision
+    geoms `husky_chassis_0`, `husky_chassis_1`, `<wheel>_tyre`, camera `front`.
 
     Args:
         spec: The world; its options are not touched (see `set_options`).

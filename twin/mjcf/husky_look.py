@@ -135,7 +135,7 @@ def _hull() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 def _tyre(radius: float, width: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """A tyre with chevron lugs about the y axis: rings of vertices whose radius drops between the lugs."""
     steps = 4 * _LUGS
-    # Across the tyre: position [share of half width], radius at a lug and in a groove [share], lead of the chevron [lugs].
+    # Across the tyre: position [share of half width], radius at a lug and in a groove [share], chevron's lead [lugs].
     profile = (
         (-0.62, 0.50, 0.50, 0.0),
         (-0.98, 0.70, 0.70, 0.0),
@@ -159,7 +159,7 @@ def _tyre(radius: float, width: float) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def _lathe(rings: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A closed mesh from stacked closed rings of equal length, counter-clockwise about the stacking direction, with caps.
+    """A closed mesh from stacked rings of equal length, counter-clockwise about the stacking direction, with caps.
 
     Args:
         rings: Shape (levels, n, 3).

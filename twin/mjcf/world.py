@@ -1,8 +1,8 @@
 """The finished scene: a portable MJCF folder, and what a driver must know about it.
 
-*Route*: the filmed path on the ground, a polyline in driving order. *Arc length* s runs along it in the plane, from 0 at
-its start. *Cross-track error*: distance from the route in the plane, positive to its left. *Heading*: angle of the route
-from the x axis, positive towards y. *Corridor*: what lies within `half_width` of the route.
+*Route*: the filmed path on the ground, a polyline in driving order. *Arc length* s runs along it in the plane, from 0
+at its start. *Cross-track error*: distance from the route in the plane, positive to its left. *Heading*: angle of the
+route from the x axis, positive towards y. *Corridor*: what lies within `half_width` of the route.
 """
 
 from dataclasses import dataclass, field
