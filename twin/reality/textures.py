@@ -1,0 +1,324 @@
+"""Procedural textures: arrays of RGB in [0, 1], rows × columns × 3, that look like something at every scale.
+
+Nothing repeats along the road, because a repeating texture would give structure from motion false matches.
+Randomness comes from a generator per texture, so that one texture's change leaves the others as they are.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+
+
+def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, finest: float = 1.0, gain: float = 0.7):
+    """Fractal noise, zero mean, unit deviation: octaves of random values from `coarsest` to `finest` pixels."""
+    out = np.zeros(shape, np.float32)
+    size, weight = coarsest, 1.0
+    while size >= finest:
+        rows, columns = int(shape[0] / size) + 3, int(shape[1] / size) + 3
+        grid = rng.standard_normal((rows, columns)).astype(np.float32)
+        zoom = cv2.resize(grid, (int(columns * size), int(rows * size)), interpolation=cv2.INTER_CUBIC)
+        off_r, off_c = (int(rng.integers(0, max(1, z - n))) for z, n in zip(zoom.shape, shape, strict=True))
+        out += weight * zoom[off_r : off_r + shape[0], off_c : off_c + shape[1]]
+        size, weight = size / 2.0, weight * gain
+    return (out - out.mean()) / out.std()
+
+
+def blend(image: Image, colour: tuple[float, float, float] | Image, weight: NDArray) -> None:
+    """Paints over an image in place; `weight` in [0, 1], shape (rows, columns)."""
+    w = weight[..., None].astype(np.float32)
+    image += w * (np.asarray(colour, np.float32) - image)
+
+
+def _colour(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Image:
+    image = np.asarray(base, np.float32) * (1.0 + contrast * noise[..., None].astype(np.float32))
+    if tint is not None:
+        image = image * (1.0 + tint[..., None] * np.array([0.10, 0.02, -0.10], np.float32))
+    return image.astype(np.float32)
+
+
+def _speckle(rng: np.random.Generator, image: Image, count: int, sizes: tuple[int, int], colours: Image) -> None:
+    """Scatters small ellipses (chips, fallen leaves, stones) on an image, in place."""
+    rows, columns = image.shape[:2]
+    centres = np.stack([rng.uniform(0, columns, count), rng.uniform(0, rows, count)], -1)
+    axes = rng.uniform(*sizes, (count, 2))
+    angles = rng.uniform(0, 180, count)
+    picks = rng.integers(0, len(colours), count)
+    shade = rng.uniform(0.7, 1.3, count)
+    for centre, axis, angle, pick, light in zip(centres, axes, angles, picks, shade, strict=True):
+        colour = tuple(float(c * light) for c in colours[pick])
+        shift = 4  # fractional bits of the coordinates
+        cv2.ellipse(
+            image,
+            [int(c * 2**shift) for c in centre],
+            [max(1, int(a * 2**shift)) for a in axis],
+            float(angle),
+            0.0,
+            360.0,
+            colour,
+            -1,
+            cv2.LINE_AA if image.dtype == np.uint8 else cv2.LINE_8,
+            shift,
+        )
+
+
+def _crack(rng: np.random.Generator, mask: NDArray, start: NDArray, heading: float, length: float, width: float) -> None:
+    """A wandering, branching crack drawn into `mask`."""
+    point = start.astype(float)
+    step = 6.0
+    for _ in range(int(length / step)):
+        heading += rng.normal(0.0, 0.28)
+        ahead = point + step * np.array([np.cos(heading), np.sin(heading)])
+        cv2.line(mask, point.astype(int).tolist(), ahead.astype(int).tolist(), 1.0, max(1, round(width)))
+        point = ahead
+        if length > 60 and rng.random() < 0.05:
+            _crack(rng, mask, point, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.2), length * 0.35, width * 0.7)
+
+
+def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Image:
+    """Asphalt: rows across (row 0 at the left edge), columns along. Lengths [m], `pixel` [m].
+
+    Chips, stains, wheel tracks, patches with tarred seams, cracks, manholes, a worn centre line and edge lines.
+    """
+    rows, columns = round(2 * half_width / pixel), round(length / pixel)
+    shape = (rows, columns)
+    lateral = (half_width - (np.arange(rows) + 0.5) * pixel)[:, None]
+    image = _colour((0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, fbm(rng, shape, 6.0 / pixel, 40.0))
+    chips = np.array([[0.62, 0.61, 0.58], [0.2, 0.2, 0.2], [0.5, 0.45, 0.4], [0.14, 0.14, 0.15]], np.float32)
+    _speckle(rng, image, int(length * 260), (0.6, 1.9), chips)
+    for track in (-1.95, -0.75, 0.75, 1.95):  # polished by wheels
+        wander = track + 0.08 * fbm(rng, (1, columns), 8.0 / pixel, 200.0)
+        blend(image, (0.27, 0.27, 0.275), 0.33 * np.exp(-0.5 * ((lateral - wander) / 0.22) ** 2))
+    blend(image, (0.45, 0.41, 0.34), 0.5 * np.clip((np.abs(lateral) - 2.3) / 0.7, 0, 1) * (fbm(rng, shape, 80, 4) > 0.2))
+    for _ in range(int(length / 2.6)):  # repairs
+        along, across = rng.uniform(0.5, 3.4), rng.uniform(0.4, 1.9)
+        c0, r0 = int(rng.uniform(0, columns)), int(rng.uniform(0, rows))
+        c1, r1 = min(columns, c0 + int(along / pixel)), min(rows, r0 + int(across / pixel))
+        if c1 - c0 < 8 or r1 - r0 < 8:
+            continue
+        level = rng.uniform(0.19, 0.48)
+        part = _colour((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
+        _speckle(rng, part, int((c1 - c0) * (r1 - r0) * 0.02), (0.6, 1.6), chips)
+        image[r0:r1, c0:c1] = 0.15 * image[r0:r1, c0:c1] + 0.85 * part
+        cv2.rectangle(image, (c0, r0), (c1, r1), (0.10, 0.10, 0.11), int(rng.integers(2, 5)))
+    cracks = np.zeros(shape, np.float32)
+    for _ in range(int(length * 1.1)):
+        start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
+        across = rng.random() < 0.45
+        heading = (np.pi / 2 if across else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
+        _crack(rng, cracks, start, heading, rng.uniform(40, 330), rng.uniform(1.0, 3.0))
+    blend(image, (0.08, 0.08, 0.085), 0.85 * cv2.GaussianBlur(cracks, (3, 3), 0.6))
+    for _ in range(int(length / 1.8)):  # drips of oil, spilt water, chewing gum
+        centre = [int(rng.uniform(0, columns)), int(rng.uniform(0, rows))]
+        size = int(rng.uniform(3, 26))
+        r = slice(max(0, centre[1] - size), centre[1] + size)
+        c = slice(max(0, centre[0] - size), centre[0] + size)
+        rr, cc = np.mgrid[r.start : min(rows, r.stop), c.start : min(columns, c.stop)]
+        if rr.size == 0:
+            continue
+        blob = np.clip(1.6 - np.hypot(rr - centre[1], cc - centre[0]) / (0.6 * size), 0, 1)
+        blend(image[rr[0, 0] : rr[-1, 0] + 1, cc[0, 0] : cc[0, -1] + 1], (0.12, 0.12, 0.13), 0.6 * blob)
+    _markings(rng, image, lateral, pixel)
+    for station in np.arange(4.0, length, 11.0):  # manholes and gullies
+        station += rng.uniform(-3, 3)
+        _manhole(image, (int(station / pixel), int(rng.uniform(0.3, 0.7) * rows)), int(0.32 / pixel))
+        _gully(image, int((station + 4.0) / pixel), rng.random() < 0.5, pixel)
+    leaves = np.array([[0.55, 0.42, 0.16], [0.42, 0.28, 0.12], [0.38, 0.42, 0.18], [0.6, 0.5, 0.25]], np.float32)
+    _speckle(rng, image, int(length * 5), (1.5, 4.5), leaves)
+    return np.clip(image, 0.02, 1.0)
+
+
+def _markings(rng: np.random.Generator, image: Image, lateral: NDArray, pixel: float) -> None:
+    rows, columns = image.shape[:2]
+    along = (np.arange(columns) + 0.5)[None] * pixel
+    worn = np.clip(0.75 + 0.35 * fbm(rng, (rows, columns), 40, 1.5), 0.0, 1.0)
+    dashes = (np.abs(lateral) < 0.065) & ((along % 4.5) < 2.7)
+    edges = np.abs(np.abs(lateral) - 2.62) < 0.055
+    blend(image, (0.82, 0.81, 0.76), worn * (0.95 * dashes + 0.75 * edges))
+    for station, left in ((17.0, False), (39.0, True), (64.0, False)):  # arrows of the lanes
+        c = station / pixel
+        middle = (3.0 - (1.4 if left else -1.4)) / pixel
+        sign = -1.0 if left else 1.0
+        shaft = [(-1.6, -0.08), (0.4, -0.08), (0.4, -0.3), (1.3, 0.0), (0.4, 0.3), (0.4, 0.08), (-1.6, 0.08)]
+        outline = np.array([[c + sign * a / pixel, middle + b / pixel] for a, b in shaft], np.int32)
+        mask = np.zeros((rows, columns), np.float32)
+        cv2.fillPoly(mask, [outline], 1.0)
+        blend(image, (0.80, 0.80, 0.76), worn * mask)
+
+
+def _manhole(image: Image, centre: tuple[int, int], radius: int) -> None:
+    cv2.circle(image, centre, radius + 3, (0.14, 0.14, 0.14), -1)
+    cv2.circle(image, centre, radius, (0.36, 0.33, 0.30), -1)
+    for k in range(-radius + 4, radius - 2, 6):
+        half = int(np.sqrt(max(0, (radius - 3) ** 2 - k * k)))
+        cv2.line(image, (centre[0] - half, centre[1] + k), (centre[0] + half, centre[1] + k), (0.17, 0.16, 0.15), 2)
+    cv2.circle(image, centre, radius - 2, (0.22, 0.2, 0.19), 2)
+
+
+def _gully(image: Image, column: int, left: bool, pixel: float) -> None:
+    rows = image.shape[0]
+    across, along = int(0.34 / pixel), int(0.55 / pixel)
+    r0 = 2 if left else rows - 2 - across
+    image[r0 : r0 + across, column : column + along] = (0.25, 0.24, 0.23)
+    for k in range(3, along - 3, 7):
+        image[r0 + 3 : r0 + across - 3, column + k : column + k + 4] = (0.05, 0.05, 0.05)
+
+
+def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Image:
+    """Turf from above: patches, worn earth, blades, stones, fallen leaves. `pixel` [m]."""
+    image = _colour((0.29, 0.38, 0.15), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8), 0.17, fbm(rng, shape, 4.0 / pixel, 10))
+    blend(image, (0.44, 0.36, 0.22), np.clip(fbm(rng, shape, 1.8 / pixel, 3.0) - 1.1, 0, 0.8))
+    count = int(shape[0] * shape[1] * 0.02)
+    starts = np.stack([rng.uniform(0, shape[1], count), rng.uniform(0, shape[0], count)], -1)
+    ends = starts + rng.normal(0, 4.0, (count, 2))
+    tones = rng.uniform(0.55, 1.65, count)
+    for a, b, tone in zip(starts.astype(int).tolist(), ends.astype(int).tolist(), tones, strict=True):
+        cv2.line(image, a, b, (0.29 * tone, 0.37 * tone, 0.14 * tone), 1)
+    colours = np.array([[0.6, 0.45, 0.18], [0.45, 0.27, 0.1], [0.8, 0.8, 0.7], [0.5, 0.5, 0.47], [0.72, 0.66, 0.2]])
+    _speckle(rng, image, int(shape[0] * shape[1] * 0.0015), (1.0, 3.2), colours.astype(np.float32))
+    return np.clip(image, 0.02, 1.0)
+
+
+def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: tuple[float, float]) -> Image:
+    """Concrete paving: each slab of its own tone, joints with moss, gum, stains. `slab` is (across, along) [m]."""
+    rows, columns = shape
+    r, c = np.arange(rows) * pixel / slab[0], np.arange(columns) * pixel / slab[1]
+    tone = rng.uniform(0.8, 1.15, (int(r[-1]) + 1, int(c[-1]) + 2))
+    offset = 0.5 * (r.astype(int) % 2)[:, None]
+    cells = (c[None] + offset).astype(int)
+    image = _colour((0.53, 0.51, 0.47), fbm(rng, shape, 60, 1.5), 0.10) * tone[r.astype(int)[:, None], cells, None]
+    joint = ((r % 1.0) < 1.5 * pixel / slab[0])[:, None] | (((c[None] + offset) % 1.0) < 1.5 * pixel / slab[1])
+    blend(image, (0.19, 0.2, 0.14), 0.85 * joint)
+    spots = np.array([[0.2, 0.2, 0.2], [0.7, 0.68, 0.64], [0.4, 0.33, 0.22]], np.float32)
+    _speckle(rng, image, int(rows * columns * 0.004), (0.7, 2.6), spots)
+    return np.clip(image, 0.02, 1.0).astype(np.float32)
+
+
+def kerb(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Image:
+    """Kerb stones a metre long; rows across the profile, columns along."""
+    return slabs(rng, shape, pixel, (10.0, 0.9)) * np.float32(0.95)
+
+
+def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]) -> Image:
+    """Brickwork with single bricks off colour, weathering from top to bottom."""
+    image = slabs(rng, shape, pixel, (0.12, 0.36))
+    grey = image.mean(-1, keepdims=True) / 0.5
+    tint = np.asarray(base, np.float32) * grey
+    stains = fbm(rng, shape, 2.0 / pixel, 4.0)
+    streaks = fbm(rng, (1, shape[1]), 30, 2.0) * np.linspace(1.0, 0.2, shape[0])[:, None]
+    return np.clip(tint * (1.0 + 0.10 * stains[..., None] - 0.06 * streaks[..., None]), 0.02, 1.0).astype(np.float32)
+
+
+def plaster(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]) -> Image:
+    """Rendered wall: blotches, drip streaks, cracks, a darker plinth."""
+    image = _colour(base, fbm(rng, shape, 3.0 / pixel, 1.5), 0.06, 0.5 * fbm(rng, shape, 2.0 / pixel, 8))
+    streaks = np.clip(fbm(rng, (1, shape[1]), 24, 2.0), 0, 3) * np.linspace(1.0, 0.1, shape[0])[:, None]
+    image *= 1.0 - 0.07 * streaks[..., None]
+    cracks = np.zeros(shape, np.float32)
+    for _ in range(shape[1] // 60):
+        start = np.array([rng.uniform(0, shape[1]), rng.uniform(0, shape[0])])
+        _crack(rng, cracks, start, rng.uniform(0, 2 * np.pi), rng.uniform(30, 120), 1.0)
+    blend(image, (0.25, 0.23, 0.2), 0.55 * cracks)
+    plinth = round(0.7 / pixel)
+    image[-plinth:] *= 0.62
+    return np.clip(image, 0.02, 1.0)
+
+
+def window(rng: np.random.Generator, lit: bool) -> Image:
+    """One window, 96 × 72: frame, glazing bars, and sky, curtains or a lit room behind the glass."""
+    image = np.zeros((96, 72, 3), np.float32)
+    down = np.linspace(0, 1, 96)[:, None]
+    if lit:
+        image[:] = np.array([0.95, 0.78, 0.48]) * (0.95 - 0.3 * down[..., None]) * rng.uniform(0.8, 1.05)
+    else:
+        image[:] = np.array([0.20, 0.24, 0.30]) + (0.38 * (1 - down) ** 1.5)[..., None] * np.array([0.8, 0.95, 1.1])
+        image *= rng.uniform(0.65, 1.15)
+    image *= 1.0 + 0.10 * fbm(rng, (96, 72), 30, 3.0)[..., None]
+    for side in (0, 1):  # curtains, drawn unevenly
+        width = int(rng.uniform(2, 26))
+        folds = 0.75 + 0.25 * np.sin(np.arange(width) * rng.uniform(0.7, 1.6))
+        tone = rng.uniform(0.45, 0.9) * np.array([1.0, rng.uniform(0.8, 1.0), rng.uniform(0.6, 1.0)])
+        part = slice(4, 4 + width) if side == 0 else slice(68 - width, 68)
+        image[4:92, part] = 0.25 * image[4:92, part] + 0.75 * folds[None, :, None] * tone
+    if rng.random() < 0.6:  # something on the sill
+        x, w, h = int(rng.uniform(10, 50)), int(rng.uniform(5, 14)), int(rng.uniform(8, 24))
+        image[90 - h : 90, x : x + w] = rng.uniform(0.1, 0.6, 3)
+    if rng.random() < 0.35:  # a blind half down
+        drop = int(rng.uniform(12, 60))
+        image[4:drop] = (0.62 + 0.13 * (np.arange(4, drop) % 5 < 2))[:, None, None] * np.array([1.0, 0.97, 0.9])
+    frame = rng.choice(np.array([[0.86, 0.86, 0.84], [0.32, 0.22, 0.15], [0.25, 0.3, 0.27]]))
+    for part in (np.s_[:5], np.s_[-5:], np.s_[:, :5], np.s_[:, -5:], np.s_[:, 34:38], np.s_[30:33]):
+        image[part] = frame
+    return np.clip(image, 0.02, 1.0)
+
+
+def bark(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
+    """Bark: long vertical furrows, lichen."""
+    grain = fbm(rng, (shape[0] // 4, shape[1]), 24, 1.0, 0.85)
+    grain = cv2.resize(grain, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+    image = _colour((0.34, 0.27, 0.20), grain, 0.30)
+    blend(image, (0.52, 0.54, 0.42), np.clip(fbm(rng, shape, 40, 2.0) - 1.0, 0, 0.7))
+    return np.clip(image, 0.03, 1.0)
+
+
+def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Image:
+    """A field of leaf tones from which each leaf takes a window."""
+    image = _colour(base, fbm(rng, shape, 60, 1.0, 0.85), 0.24, 0.8 * fbm(rng, shape, 30, 6))
+    return np.clip(image, 0.03, 1.0)
+
+
+def wood(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
+    """Weathered planks, grain along the columns."""
+    grain = cv2.resize(fbm(rng, (shape[0], shape[1] // 8), 12, 1.0), shape[::-1], interpolation=cv2.INTER_LINEAR)
+    image = _colour((0.50, 0.37, 0.24), grain, 0.17)
+    image[:: max(2, shape[0] // 5)] *= 0.4
+    _speckle(rng, image, 30, (1.0, 3.0), np.array([[0.2, 0.13, 0.08]], np.float32))
+    return np.clip(image, 0.03, 1.0)
+
+
+def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Image:
+    """Painted or galvanised metal: scratches, rust, stickers."""
+    image = _colour(base, fbm(rng, shape, 40, 1.5), 0.11)
+    blend(image, (0.36, 0.2, 0.1), np.clip(fbm(rng, shape, 30, 1.5) - 1.5, 0, 0.8))
+    for _ in range(9):
+        a, b = rng.uniform(0, shape[1], 2).astype(int), rng.uniform(0, shape[0], 2).astype(int)
+        cv2.line(image, (int(a[0]), int(b[0])), (int(a[1]), int(b[1])), tuple(float(c) * 1.3 for c in base), 1)
+    for _ in range(3):
+        x, y = int(rng.uniform(0, shape[1] - 24)), int(rng.uniform(0, shape[0] - 16))
+        corner = (x + int(rng.integers(8, 22)), y + int(rng.integers(6, 14)))
+        cv2.rectangle(image, (x, y), corner, rng.uniform(0.2, 0.9, 3).tolist(), -1)
+    return np.clip(image, 0.03, 1.0)
+
+
+def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float, float, float], word: str) -> Image:
+    """A sign or poster: border, a word, lines of small print, a picture."""
+    rows, columns = shape
+    image = np.empty((rows, columns, 3), np.uint8)
+    image[:] = [round(255 * c) for c in ground]
+    ink = (242, 242, 242) if sum(ground) < 1.6 else (20, 20, 26)
+    cv2.rectangle(image, (5, 5), (columns - 6, rows - 6), ink, 4)
+    scale = 0.9 * columns / max(60, 21 * len(word))
+    cv2.putText(image, word, (14, int(rows * 0.38)), cv2.FONT_HERSHEY_DUPLEX, scale, ink, 3)
+    for k in range(4):
+        y = int(rows * (0.55 + 0.1 * k))
+        for x in range(16, columns - 60, 14):
+            if rng.random() < 0.75:
+                cv2.line(image, (x, y), (x + int(rng.integers(4, 12)), y), ink, 3)
+    for _ in range(4):
+        centre = (int(rng.uniform(columns * 0.72, columns - 20)), int(rng.uniform(rows * 0.5, rows - 24)))
+        cv2.circle(image, centre, int(rng.integers(5, 18)), rng.uniform(12, 242, 3).tolist(), -1)
+    return np.clip(image / np.float32(255.0) * (1.0 + 0.05 * fbm(rng, shape, 50, 2.0)[..., None]), 0.03, 1.0)
+
+
+def stripes(rng: np.random.Generator, shape: tuple[int, int], a: tuple[float, ...], b: tuple[float, ...], n: int) -> Image:
+    """Horizontal bands, dirty: cones and barriers."""
+    band = (np.arange(shape[0]) * n // shape[0]) % 2
+    image = np.where(band[:, None, None] == 0, np.asarray(a, np.float32), np.asarray(b, np.float32))
+    image = np.broadcast_to(image, (*shape, 3)).astype(np.float32)
+    return np.clip(image * (1.0 + 0.12 * fbm(rng, shape, 40, 1.5)[..., None]), 0.03, 1.0)
+
+
+def resized(image: Image, shape: tuple[int, int]) -> Image:
+    """Smoothly scaled to (rows, columns)."""
+    return cv2.resize(image, shape[::-1], interpolation=cv2.INTER_CUBIC)
