@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
 
 _HFIELD_BASE = 1.0  # [m] of solid below the lowest point, so that nothing tunnels through
+_GROUND_SKIN = 0.15  # [m] above the height field: visual mesh below this is left to the field's own texture
 _SETTLE_TIME = 2.0  # [s]
 _REST_STEPS = 200  # of the check after writing
 _REST_DRIFT = 0.005  # [m] a robot that "stays put" may creep in that check
@@ -93,7 +94,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     husky.set_options(spec)
     _add_surroundings(spec)
     _add_ground(spec, ground, assets)
-    faces = _add_visual(spec, mesh / "visual.npz", assets)
+    faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
 
     route = load_route(mesh / "route.npz") if config.mjcf.route else None
@@ -156,6 +157,23 @@ def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
     return np.array([*xy, height]) + z_axis * husky.BASE_HEIGHT, quaternion
 
 
+def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
+    """Which points (v, 3) the height field shows already: below it or hardly above, within its bounds.
+
+    Two surfaces within centimetres of each other would flicker, shade each other and swallow the robot's wheels.
+    """
+    rows, columns = ground.height.shape
+    cell = (vertices[:, :2] - ground.origin) / ground.cell
+    inside = ((cell >= 0) & (cell <= [columns - 1, rows - 1])).all(1)
+    return inside & (vertices[:, 2] - ground.at(vertices[:, :2]) < _GROUND_SKIN)
+
+
+def compacted(vertices: NDArray, colors: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Drops the vertices that no face uses."""
+    used, inverse = np.unique(faces, return_inverse=True)
+    return vertices[used], colors[used], inverse.reshape(faces.shape)
+
+
 def _add_surroundings(spec: mujoco.MjSpec) -> None:
     spec.add_texture(
         name="sky",
@@ -186,8 +204,10 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
 
 def _add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path) -> None:
     write_hfield(assets / "ground.bin", ground.height)
-    # The texture's first row is the far (+y) edge.
-    write_image(assets / "ground.png", ground.rgb[::-1])
+    # One texel per cell, the mean of its corners, as the texture spans the field edge to edge. First row: far (+y).
+    rgb = ground.rgb.astype(np.uint16)
+    cells = (rgb[1:, 1:] + rgb[1:, :-1] + rgb[:-1, 1:] + rgb[:-1, :-1] + 2) // 4
+    write_image(assets / "ground.png", cells[::-1].astype(np.uint8))
     rows, columns = ground.height.shape
     low, high = float(ground.height.min()), float(ground.height.max())
     half = np.array([columns - 1, rows - 1]) * ground.cell / 2
@@ -211,9 +231,11 @@ def _add_textured(spec: mujoco.MjSpec, name: str, emission: float) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 
-def _add_visual(spec: mujoco.MjSpec, path: Path, assets: Path) -> int:
+def _add_visual(spec: mujoco.MjSpec, ground: Ground, path: Path, assets: Path) -> int:
     with np.load(path, allow_pickle=False) as data:
         vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
+    faces = faces[~covered_by_ground(vertices, ground)[faces].all(1)]
+    vertices, colors, faces = compacted(vertices, colors, faces)
     if len(faces) == 0:
         return 0
     texture, texcoords = face_tiles(colors[faces])

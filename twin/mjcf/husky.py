@@ -71,6 +71,10 @@ class HuskyParams:
     """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
     servo_gain: float = 400.0
     """Torque per wheel speed error [N m s/rad]; stiff, as the motor controllers close the loop on encoder counts."""
+    motor_inertia: float = 0.15
+    """Inertia of rotors and gears as felt at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the gear
+    ratio of 79 squared, shared by two wheels. It also keeps stiffly driven wheels from stick-slip flutter: without it a
+    point turn at 1.8 rad/s on a friction of 1.0 hops (9 m/s² rms at the camera), from 0.1 up there is none at all."""
     wheel_torque: float = 35.0
     """Torque limit per wheel [N m]; half of what a side's motor gives at its peak."""
     separation_multiplier: float = 1.875
@@ -185,8 +189,9 @@ def _add_wheel(
 ) -> mujoco.MjsBody:
     wheel = base.add_body(name=name, pos=center)
     wheel.explicitinertial = True
-    wheel.mass, wheel.inertia = WHEEL_MASS, _WHEEL_INERTIA
-    wheel.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 1, 0))
+    # Left unsaid, MuJoCo takes the body's offset in its parent for the centre of mass.
+    wheel.mass, wheel.ipos, wheel.inertia = WHEEL_MASS, (0.0, 0.0, 0.0), _WHEEL_INERTIA
+    wheel.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 1, 0), armature=params.motor_inertia)
     shapes: dict[str, dict[str, Any]] = {
         "ellipsoid": {
             "type": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
