@@ -135,6 +135,10 @@ class NerfConfig:
     steps: int = 3000
     rays: int = 4096
     """Rays per step."""
+    samples: int = 16
+    """Samples per ray and step."""
+    sightings: float = 0.2
+    """Share of each step's rays that go through sparse points, whose distance is then learned, too."""
     max_width: int = 480
     """Images are trained at this longer side [px]."""
     learning_rate: float = 1e-2
@@ -190,6 +194,10 @@ class ReviewConfig:
     fps: int = 10
     width: int = 480
     """Width of one panel of the film [px]."""
+    render_width: int = 240
+    """Longer side the radiance field is rendered at for the film [px]; it is scaled up to the panel."""
+    renders: int = 150
+    """Pictures of the radiance field in the whole film: more make it smoother and the build longer."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import hashlib
 import io
 import re
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import matplotlib
@@ -62,10 +63,14 @@ _STYLE: dict[str, Any] = {
 }
 
 
+def _style() -> AbstractContextManager[None]:
+    return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
+
+
 def svg(figure: Figure) -> str:
     """The figure as an SVG element for a page, themed and without ids that another figure could share."""
     buffer = io.BytesIO()
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         FigureCanvasSVG(figure)
         figure.savefig(
             buffer,
@@ -86,11 +91,13 @@ def svg(figure: Figure) -> str:
     text = re.sub(r' id="([^"]+)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in referred else "", text)
     text = re.sub(r"#([\w.-]+)([\")])", lambda m: f"#{prefix}{m[1]}{m[2]}" if m[1] in referred else m[0], text)
     # The picture fills its column: width and height are the page's business.
-    return re.sub(r'<svg([^>]*?) width="[^"]*"', r"<svg\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1))
+    return re.sub(
+        r'<svg([^>]*?) width="[^"]*"', r"<svg\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    )
 
 
 def _figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         figure = Figure(figsize=(width, height), layout="constrained")
         return figure, figure.add_subplot()
 
@@ -105,7 +112,7 @@ def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
 
 
 def _legend(axes: Axes, columns: int) -> None:
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         axes.legend(
             loc="upper center",
             bbox_to_anchor=(0.5, -0.16 if axes.get_aspect() == "auto" else -0.12),
@@ -152,20 +159,21 @@ def place_map(
     """
     low, high = bounds_of(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
     figure, axes = _map_axes(low, high)
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         shown = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(1))
         if len(shown) > _MOST_POINTS:
             shown = shown[np.linspace(0, len(shown) - 1, _MOST_POINTS).astype(int)]
         # Dark points would vanish on a dark page and bright ones on a bright page: keep to the middle tones.
         colours = 0.25 + 0.5 * point_rgb[shown] / 255.0
-        axes.scatter(*points[shown, :2].T, s=0.8, c=colours, linewidths=0, rasterized=True)
+        axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colours, linewidths=0, rasterized=True)
         _draw_route(axes, route, half_width)
         _draw_parts(axes, parts)
         for i, source in enumerate(dict.fromkeys(sources)):
             mine = np.array([name == source for name in sources])
             colour = SERIES[i % len(SERIES)]
-            axes.scatter(*positions[mine & ~held_out, :2].T, s=9, c=colour, linewidths=0, label=source, zorder=4)
-            axes.scatter(*positions[mine & held_out, :2].T, s=12, facecolors="none", edgecolors=colour, lw=0.9, zorder=4)
+            seen, unseen = positions[mine & ~held_out], positions[mine & held_out]
+            axes.scatter(seen[:, 0], seen[:, 1], s=9, c=colour, linewidths=0, label=source, zorder=4)
+            axes.scatter(unseen[:, 0], unseen[:, 1], s=12, facecolors="none", edgecolors=colour, lw=0.9, zorder=4)
         axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
     _legend(axes, 3)
     return figure
@@ -181,7 +189,7 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
     figure, axes = _map_axes(low, high)
     heights = ground.height[seen] if seen.any() else ground.height
     lowest, highest = np.percentile(heights, [1, 99])
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         picture = axes.imshow(
             np.ma.masked_array(ground.height, ~ground.measured),
             origin="lower",
@@ -196,7 +204,7 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
         _draw_parts(axes, parts)
         beside = axes.inset_axes((1.03, 0.0, 0.035, 1.0))  # as tall as the map, whatever its proportions
         bar = figure.colorbar(picture, cax=beside, label="height of the ground [m]")
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
         bar.solids.set_rasterized(True)  # type: ignore[union-attr]
     if route is not None or len(parts):
         _legend(axes, 3)
@@ -229,7 +237,7 @@ def _draw_parts(axes: Axes, parts: Sequence[Array]) -> None:
 def training_curve(steps: Sequence[float], values: Sequence[float], label: str) -> Figure:
     """How training went: a value per step."""
     figure, axes = _figure(2.2)
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         axes.plot(steps, values, color=SERIES[0])
         axes.set(xlabel="training step", ylabel=label)
     return figure
@@ -239,7 +247,7 @@ def bars(values: dict[str, float], counts: dict[str, int], unit: str, label: str
     """A horizontal bar per name with its value and the number of samples behind it."""
     figure, axes = _figure(0.55 + 0.36 * max(1, len(values)))
     names = list(values)
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         axes.grid(False, axis="y")
         axes.barh(range(len(names)), [values[name] for name in names], color=SERIES[0], height=0.62)
         for i, name in enumerate(names):
@@ -256,7 +264,7 @@ def histogram(values: Array, label: str, highest: float | None = None) -> Figure
     figure, axes = _figure(1.9)
     values = np.asarray(values, np.float64)
     top = float(highest if highest is not None else np.percentile(values, 99.5))
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         axes.hist(np.minimum(values, top), bins=40, range=(0.0, max(top, 1e-9)), color=SERIES[0], rwidth=0.9)
         median = float(np.median(values))
         axes.axvline(median, color=SERIES[1], lw=1.2)
@@ -273,7 +281,7 @@ def along_the_path(
 ) -> Figure:
     """Curves over the distance driven or filmed [m]; `limit` is drawn as a dashed line."""
     figure, axes = _figure(2.2)
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         for i, (name, values) in enumerate(curves.items()):
             axes.plot(distance[: len(values)], values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)
         if limit is not None:
@@ -288,7 +296,7 @@ def along_the_path(
 def errors_by_group(errors: dict[str, Sequence[float]], label: str, limit: float | None = None) -> Figure:
     """Per-frame errors, one curve per group (a source), over the frame's place in its group."""
     figure, axes = _figure(2.2)
-    with matplotlib.rc_context(_STYLE):
+    with _style():
         for i, (name, values) in enumerate(errors.items()):
             place = np.linspace(0.0, 100.0, len(values)) if len(values) > 1 else np.zeros(len(values))
             axes.plot(place, values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)

@@ -56,14 +56,14 @@ def shorten(text: str, width: int, size: int, bold: bool = False) -> str:
     return text.rstrip() + "…"
 
 
-def wrap(text: str, width: int, size: int) -> list[str]:
+def wrap(text: str, width: int, size: int, bold: bool = False) -> list[str]:
     """Breaks text into lines no wider than `width` [px]; a single word that is wider is cut."""
     lines: list[str] = []
     for word in text.split():
-        if lines and text_width(f"{lines[-1]} {word}", size) <= width:
+        if lines and text_width(f"{lines[-1]} {word}", size, bold) <= width:
             lines[-1] += f" {word}"
         else:
-            lines.append(shorten(word, width, size))
+            lines.append(shorten(word, width, size, bold))
     return lines
 
 
@@ -204,7 +204,7 @@ class Layout:
         big, small = round(self.text * 2), round(self.text * 1.2)
         inset = round(0.08 * width)
         wrapped = [part for line in lines for part in wrap(line, width - 2 * inset, small)]
-        heads = wrap(title, width - 2 * inset, big)
+        heads = wrap(title, width - 2 * inset, big, bold=True)
         block = len(heads) * round(big * 1.4) + 18 + len(wrapped) * round(small * 1.6)
         y = max(10, (height - block) // 2)
         out[y : y + block, inset - 14 : inset - 10] = colour

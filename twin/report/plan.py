@@ -4,6 +4,7 @@ The plan is turned so that the path runs from left to right along its longest ex
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from twin.assets.ground import Ground
-from twin.report.panels import AMBER, GREEN, INK, RED, SUNKEN, Colour, Picture
+from twin.report.panels import ACCENT, AMBER, GREEN, INK, RED, SUNKEN, Colour, Picture
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ def footprints(
         reach: See `above` [m].
     """
     outlines = []
-    for start, end in zip(vertex_start[:-1], vertex_start[1:], strict=True):
+    for start, end in pairwise(vertex_start):
         part = np.asarray(vertices[start:end], np.float64)
         if above is not None and (part[:, 2] - above.at(part[:, :2])).min() > reach:
             continue
@@ -98,12 +99,21 @@ class Plan:
         return Plan(picture, to_pixel)
 
     def with_marker(
-        self, position: Array, heading: Array, trail: Array | None = None, colour: Colour = AMBER
+        self, position: Array, heading: Array, trail: Array | None = None, dots: Array | None = None
     ) -> Picture:
-        """A copy with an arrow at a position [m] along a heading (any length), and the way gone so far [m], (n, 2)."""
+        """A copy with an arrow at a position along a heading.
+
+        Args:
+            position: Shape (≥2,) [m].
+            heading: Any length, shape (≥2,).
+            trail: The way gone so far [m], shape (n, 2), drawn as a line.
+            dots: Other places [m], shape (n, 2), drawn as dots.
+        """
         out = self.picture.copy()
         if trail is not None and len(trail) > 1:
-            _line(out, _pixels(self.to_pixel, trail), colour, 2)
+            _line(out, _pixels(self.to_pixel, trail), AMBER, 2)
+        for centre in _pixels(self.to_pixel, dots).round().astype(int) if dots is not None else ():
+            cv2.circle(out, (int(centre[0]), int(centre[1])), 1, ACCENT, -1, cv2.LINE_AA)
         at = _pixels(self.to_pixel, position[None, :2])[0]
         ahead = self.to_pixel[:, :2] @ heading[:2]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
@@ -112,7 +122,7 @@ class Plan:
         arrow = np.array([at + ahead * length, at - ahead * length * 0.7 + side * length * 0.65,
                           at - ahead * length * 0.35, at - ahead * length * 0.7 - side * length * 0.65])  # fmt: skip
         corners = (arrow * 2**_SUPERSAMPLE).round().astype(np.int32)
-        cv2.fillPoly(out, [corners], colour, cv2.LINE_AA, _SUPERSAMPLE)
+        cv2.fillPoly(out, [corners], AMBER, cv2.LINE_AA, _SUPERSAMPLE)
         cv2.polylines(out, [corners], True, (0, 0, 0), 1, cv2.LINE_AA, _SUPERSAMPLE)
         return out
 

@@ -97,7 +97,7 @@ def read_frames(path: Path, every: int = 1) -> Iterator[NDArray[np.uint8]]:
     with av.open(str(path)) as container:
         for i, frame in enumerate(container.decode(video=0)):
             if i % every == 0:
-                yield frame.to_ndarray(format="rgb24")
+                yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
 
 
 def describe(path: Path) -> dict[str, str | int | float]:

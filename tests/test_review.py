@@ -1,0 +1,266 @@
+"""The review stage on a scene whose field is a few lines of arithmetic: what is filmed, counted and said."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.config import ReviewConfig, SceneConfig, SourceConfig
+from twin.geometry.cameras import Cameras, pixel_grid, unproject
+from twin.geometry.images import write_image
+from twin.geometry.poses import look_at
+from twin.nerf.rendering import FAR, Rendering
+from twin.report.ahead import Ahead
+from twin.report.drive import lighting_along
+from twin.report.overview import bird_pose
+from twin.report.panels import Layout, depth_colours, draw_text, fit, shorten, text_width, wrap
+from twin.report.plan import Plan, footprints, turn_of
+from twin.report.review import film
+from twin.report.studio import frames_to_compare, nearest_frame, side_by_side, spread
+from twin.report.video import describe, read_frames
+from twin.scene import SceneDir, read_json
+
+
+class ChequeredField:
+    """A radiance field of a chequered floor at z = 0 under a sky; a lighting is a brightness."""
+
+    def __init__(self, brightness: dict[str, float]):
+        self.brightness = brightness
+        self.asked: list[str] = []
+
+    @property
+    def lightings(self) -> tuple[str, ...]:
+        return tuple(self.brightness)
+
+    def render(
+        self, camera_to_world: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], lighting: str
+    ) -> Rendering:
+        self.asked.append(lighting)
+        a, b, share = lighting.split(":") if ":" in lighting else (lighting, lighting, "0")
+        level = (1 - float(share)) * self.brightness[a] + float(share) * self.brightness[b]
+        views = [self._view(pose, k, size, level) for pose, k in zip(camera_to_world, intrinsics, strict=True)]
+        return Rendering(*(np.stack(part).astype(np.float32) for part in zip(*views, strict=True)))
+
+    def _view(
+        self, pose: np.ndarray, k: np.ndarray, size: tuple[int, int], level: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rays = unproject(pixel_grid(*size), k) @ pose[:3, :3].T
+        down = rays[..., 2] < -1e-6
+        depth = np.where(down, -pose[2, 3] / np.where(down, rays[..., 2], -1.0), FAR)
+        floor = pose[:3, 3] + rays * depth[..., None]
+        odd = (np.floor(floor[..., 0]) + np.floor(floor[..., 1])) % 2
+        colour = np.stack([0.3 + 0.4 * odd, 0.35 + 0.3 * odd, 0.3 + 0.2 * odd], -1)
+        rgb = level * np.where(down[..., None], colour, [0.5, 0.7, 1.0])
+        return rgb, depth, down.astype(float)
+
+
+def make_cameras(folder: Path, field: ChequeredField, frames: int = 12, size: tuple[int, int] = (96, 54)) -> Cameras:
+    """Saved cameras on a straight path under each lighting, with images of the field; a metric stage's result."""
+    lightings = [name for name in field.lightings for _ in range(frames)]
+    x = np.tile(np.linspace(0.0, 22.0, frames), len(field.lightings))
+    poses = np.array([look_at(np.array([v, 0.0, 1.5]), np.array([v + 5.0, 0.0, 1.0])) for v in x])
+    k = np.tile([0.5 * size[0], 0.5 * size[0], size[0] / 2, size[1] / 2], (len(x), 1))
+    images = folder.parent / "2_cameras" / "images"
+    cameras = Cameras(
+        names=tuple(f"{name}/{i % frames:06d}" for i, name in enumerate(lightings)),
+        camera_to_world=poses,
+        intrinsics=k,
+        sizes=np.tile(np.array(size), (len(x), 1)),
+        lightings=tuple(lightings),
+        sources=tuple(lightings),
+        times=np.tile(np.arange(frames) * 0.5, len(field.lightings)),
+        held_out=np.arange(len(x)) % 4 == 2,
+        images=images,
+    )
+    for i, name in enumerate(lightings):
+        write_image(cameras.image_path(i), field.render(poses[i : i + 1], k[i : i + 1], size, name).rgb[0])
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras.save(folder)
+    return cameras
+
+
+def config(**review: float) -> SceneConfig:
+    small = {"width": 160, "render_width": 48, "renders": 20, "fps": 5} | review
+    return SceneConfig(name="chequers", source=(SourceConfig("a.mp4"),), review=ReviewConfig(**small))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneDir:
+    return SceneDir(tmp_path / "scene")
+
+
+def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path: Path) -> None:
+    field = ChequeredField({"day": 1.0, "night": 0.25})
+    make_cameras(scene.stage("metric"), field)
+    field.asked.clear()
+    out = tmp_path / "out"
+    out.mkdir()
+    metrics = film(scene, config(), out, field)
+    assert metrics["follower"] is None
+    assert "no route" in metrics["not_applicable"]
+    about = describe(out / "review.mp4")
+    assert (about["codec"], about["pixel_format"]) == ("h264", "yuv420p")
+    assert about["frames"] == metrics["frames"] == len(list(read_frames(out / "review.mp4")))
+    assert metrics["duration_s"] == metrics["frames"] / 5
+    assert metrics["renders"] == len(field.asked) <= 20
+    assert any(name.startswith("day:night:") for name in field.asked)
+    told = read_json(out / "review.json")
+    assert "render_seconds_per_frame" in metrics and "render_seconds_per_frame" not in told
+    for picture in told["pictures"]:
+        assert (out / picture["file"]).stat().st_size > 0
+    assert {picture["section"] for picture in told["pictures"]} == {"capture", "field"}
+
+
+def test_a_route_that_was_not_wanted_is_told_apart(scene: SceneDir, tmp_path: Path) -> None:
+    field = ChequeredField({"day": 1.0})
+    make_cameras(scene.stage("metric"), field)
+    out = tmp_path / "out"
+    out.mkdir()
+    base = config()
+    metrics = film(scene, dataclasses.replace(base, mjcf=dataclasses.replace(base.mjcf, route=False)), out, field)
+    assert "mjcf.route = false" in metrics["not_applicable"]
+    assert not any(":" in name for name in field.asked)  # one lighting turns into nothing
+
+
+def test_the_same_scene_makes_the_same_files(scene: SceneDir, tmp_path: Path) -> None:
+    field = ChequeredField({"day": 1.0, "night": 0.25})
+    make_cameras(scene.stage("metric"), field)
+    contents = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        film(scene, config(), tmp_path / name, field)
+        files = sorted(p for p in (tmp_path / name).rglob("*") if p.is_file())
+        contents.append([(p.relative_to(tmp_path / name), p.read_bytes()) for p in files])
+    assert contents[0] == contents[1]
+
+
+def test_frames_to_compare_show_both_kinds_in_order(tmp_path: Path) -> None:
+    cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField({"day": 1.0, "night": 0.3}))
+    chosen = frames_to_compare(cameras, "night", 6)
+    assert chosen == sorted(chosen) and len(chosen) == len(set(chosen)) == 6
+    assert {cameras.lightings[i] for i in chosen} == {"night"}
+    assert sum(cameras.held_out[i] for i in chosen) == 3
+    assert frames_to_compare(cameras, "dusk", 6) == []
+
+
+def test_the_nearest_frame_is_at_the_same_place(tmp_path: Path) -> None:
+    cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField({"day": 1.0, "night": 0.3}))
+    assert nearest_frame(cameras, 3, "night") == 12 + 3
+    assert nearest_frame(cameras, 3, "dusk") is None
+
+
+@pytest.mark.parametrize(("count", "expected"), [(0, []), (1, [5]), (2, [0, 9]), (3, [0, 4, 9]), (99, list(range(10)))])
+def test_spread(count: int, expected: list[int]) -> None:
+    assert spread(range(10), count) == expected
+
+
+def test_every_lighting_has_its_stretch_of_the_drive() -> None:
+    lightings = ("day", "dusk", "night")
+    assert lighting_along(lightings, 0.0) == ("day", "day")
+    assert lighting_along(lightings, 0.5) == ("dusk", "dusk")
+    assert lighting_along(lightings, 1.0) == ("night", "night")
+    code, words = lighting_along(lightings, 0.3)
+    assert code.startswith("day:dusk:0.6") and words == "day → dusk"
+    assert lighting_along(("day",), 0.99) == ("day", "day")
+
+
+def test_panels_do_not_overlap_and_fit_the_canvas() -> None:
+    for layout in (Layout.for_pictures(480, 9 / 16), Layout.for_pictures(161, 3.0), Layout.for_pictures(480, 0.2)):
+        width, height = layout.size
+        assert width % 2 == height % 2 == 0
+        covered = np.zeros((height, width), int)
+        for x, y, w, h in (layout.left, layout.right, *layout.strip(0.3, 0.42, 0.28)):
+            assert x >= 0 and y >= layout.header and x + w <= width and y + h <= height
+            covered[y : y + h, x : x + w] += 1
+        assert covered.max() == 1
+
+
+def test_text_is_cut_and_wrapped_to_its_width() -> None:
+    long = "a rather long name of a lighting that nobody would choose"
+    assert text_width(shorten(long, 120, 14), 14) <= 120
+    assert shorten("short", 120, 14) == "short"
+    lines = wrap(long, 120, 14)
+    assert " ".join(lines) == long
+    assert all(text_width(line, 14) <= 120 for line in lines)
+
+
+def test_text_beyond_the_edge_is_clipped() -> None:
+    canvas = np.zeros((20, 40, 3), np.uint8)
+    draw_text(canvas, "over the edge", 30, 10, 14)
+    draw_text(canvas, "outside", 100, 100, 14)
+    assert canvas[:, 30:].any()
+
+
+def test_fit_keeps_proportions() -> None:
+    white = np.full((100, 50, 3), 255, np.uint8)
+    out = fit(white, (90, 60))
+    assert out.shape == (60, 90, 3)
+    assert (out == 255).all(-1).sum() == 60 * 30
+
+
+def test_near_is_brighter_than_far_and_nothing_is_empty() -> None:
+    shades = depth_colours(np.array([[1.0, 5.0, 30.0, FAR]]), np.array([[1.0, 1.0, 1.0, 0.0]]))
+    brightness = shades.astype(int).sum(-1)[0]
+    assert brightness[0] > brightness[1] > brightness[2]
+    assert tuple(shades[0, 3]) == (28, 34, 43)
+
+
+def test_the_plan_runs_from_left_to_right() -> None:
+    path = np.stack([np.full(20, 3.0), np.linspace(0, -30, 20)], 1)  # southwards
+    plan = Plan.draw((200, 80), path)
+    start, end = path[[0, -1]] @ plan.to_pixel[:, :2].T + plan.to_pixel[:, 2]
+    assert start[0] < 40 and end[0] > 160
+    assert start[1] == pytest.approx(40, abs=1) and end[1] == pytest.approx(40, abs=1)
+    assert np.linalg.det(turn_of(path)) == pytest.approx(1.0)
+    # To the right of a southward path lies west, which is below it in the plan.
+    west = plan.to_pixel @ [0.0, -15.0, 1.0]
+    assert west[1] > 45
+
+
+def test_footprints_are_outlines_and_flat_parts_have_none() -> None:
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    wall = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]], float)
+    outlines = footprints(np.concatenate([cube, wall]), np.array([0, 8, 11]))
+    assert len(outlines) == 1
+    assert sorted(map(tuple, outlines[0])) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+
+
+def test_a_bird_looks_along_the_route() -> None:
+    route = np.stack([np.linspace(0, 40, 50), np.zeros(50), np.zeros(50)], 1)
+    for s in (0.0, 20.0, 40.0):
+        pose = bird_pose(route, s)
+        assert pose[0, 2] > 0.5 and pose[2, 2] < 0 and pose[2, 3] > 1.0
+
+
+def test_a_row_of_pictures_has_one_height() -> None:
+    row = side_by_side([np.zeros((50, 100, 3), np.uint8), np.zeros((200, 100, 3), np.uint8)], 40)
+    assert row.shape == (40, 80 + 6 + 20, 3)
+
+
+def test_work_ahead_keeps_order_and_hands_on_errors() -> None:
+    with Ahead(iter(range(20)), depth=3) as items:
+        assert list(items) == list(range(20))
+
+    def fails() -> Iterator[int]:
+        yield 1
+        raise ValueError("broken")
+
+    with Ahead(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
+        list(items)
+
+
+def test_work_ahead_stops_when_nobody_reads() -> None:
+    made = []
+
+    def endless() -> Iterator[int]:
+        while True:
+            made.append(len(made))
+            yield made[-1]
+
+    with Ahead(endless(), depth=2) as items:
+        assert next(iter(items)) == 0
+    count = len(made)
+    assert count <= 5
+    assert len(made) == count

@@ -1,0 +1,156 @@
+"""Stage 7: a film in which a person can judge the twin, the numbers of the drive in it, and pictures for the page.
+
+The film has up to three *chapters*: the field beside the real frames; the light turning, where there are two lightings
+or more; and the Husky driven along the route by a scripted follower, where there is a route.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.assets.ground import Ground
+from twin.config import SceneConfig
+from twin.env.chase import chase_frames
+from twin.env.follower import Drive, follow
+from twin.env.physics import HuskyPhysics
+from twin.geometry.cameras import Cameras
+from twin.mjcf.world import World, arc_lengths
+from twin.progress import bar
+from twin.report.ahead import Ahead
+from twin.report.chapters import (
+    COMPARISON_STRIP,
+    LIGHT_STRIP,
+    compare_with_the_film,
+    comparison_frames,
+    title_card,
+    turn_the_light,
+)
+from twin.report.drive import DRIVE_STRIP, drive_metrics, film_drive, stride, trace
+from twin.report.overview import keep_overviews
+from twin.report.panels import AMBER, GREEN, RED, Box, Layout, Picture
+from twin.report.plan import Plan, footprints
+from twin.report.sections import follower_verdict
+from twin.report.studio import Field, Studio, side_by_side, spread
+from twin.report.video import VideoWriter
+from twin.scene import SceneDir, write_json
+
+Array = NDArray[np.float64]
+
+_SHARES = (0.25, 0.2, 0.55)  # of `review.renders`, per chapter
+_CHASE_MEMORY = 64 * 2**20  # [bytes] of pictures from behind that wait to be shown
+_CRF = 24  # the demo's film stays near 5 MB
+_MOODS = {"good": GREEN, "mixed": AMBER, "bad": RED, "plain": AMBER}
+
+
+def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
+    """Drives the Husky along the route and films the twin.
+
+    Args:
+        scene: Reads the stages `metric`, `field`, `mesh` and `mjcf`.
+        config: `review`, and `mjcf.route`.
+        out: Gets `review.mp4`, `review.json` and `pictures/*.jpg`.
+
+    Returns:
+        Metrics for the report: `follower` (None where there is no route, and then `not_applicable` says why),
+        `frames`, `duration_s`, `renders`, `render_seconds_per_frame`.
+    """
+    from twin.nerf.field import RadianceField  # loads torch, which a reader of this module may not need
+
+    return film(scene, config, out, RadianceField.load(scene.stage("field")))
+
+
+def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[str, Any]:
+    """`run` with any field."""
+    cameras = Cameras.load(scene.stage("metric"))
+    world = World.load(scene.stage("mjcf")) if config.mjcf.route and scene.has_route else None
+    drive = follow(world, HuskyPhysics(world.model()), config.review.speed) if world else None
+    aspect = float(np.median(cameras.sizes[:, 1] / cameras.sizes[:, 0]))
+    layout = Layout.for_pictures(config.review.width, aspect)
+    path = world.route[:, :2] if world else _longest_path(cameras)
+    metrics: dict[str, Any] = {"follower": drive_metrics(drive) if drive else None}
+    if not drive:
+        metrics["not_applicable"] = no_drive_reason(config)
+    with VideoWriter(out / "review.mp4", layout.size, config.review.fps, _CRF) as writer:
+        studio = Studio(config.name, field, cameras, layout, writer, out, config.review.render_width, path)
+        _keep_captures(studio)
+        _film_chapters(studio, scene, config, world, drive)
+        verdict = follower_verdict(
+            {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
+        )
+        studio.writer.write(layout.card(verdict.text, [], _MOODS[verdict.mood]), 3 * studio.fps)
+    keep_overviews(studio, scene, world)
+    metrics |= {"frames": writer.frames, "duration_s": writer.frames / writer.fps, "renders": studio.renders}
+    metrics |= {"trace": trace(drive)} if drive else {}
+    # Times stay out of the file, so that the same build writes the same bytes.
+    write_json(out / "review.json", metrics | {"pictures": [asdict(picture) for picture in studio.kept]})
+    return metrics | {"render_seconds_per_frame": studio.render_seconds / max(1, studio.renders)}
+
+
+def no_drive_reason(config: SceneConfig) -> str:
+    """Why nothing was driven, in words."""
+    if not config.mjcf.route:
+        return "scene.toml says that this is no drive (mjcf.route = false)"
+    return "no route was found in the filmed path"
+
+
+def _film_chapters(
+    studio: Studio, scene: SceneDir, config: SceneConfig, world: World | None, drive: Drive | None
+) -> None:
+    renders = config.review.renders
+    chosen = comparison_frames(studio, int(_SHARES[0] * renders))
+    turns = int(_SHARES[1] * renders) if len(studio.field.lightings) > 1 else 0
+    drives = int(_SHARES[2] * renders) if drive else 0
+    ground, parts = _surroundings(scene)
+    half_width = world.half_width if world else 0.0
+
+    def plan(box: Box) -> Plan:
+        return Plan.draw(box[2:], studio.path, ground, parts, half_width)
+
+    strip, panel = studio.layout.strip, studio.layout.panel
+    chase: Iterator[Picture] = iter(())
+    if world and drive:
+        chase = chase_frames(world, drive, panel, stride(drive, studio.fps))
+    total = sum(map(len, chosen.values())) + turns + drives
+    # The chase camera needs no view of the field, so its pictures are made while those of the chapters before are.
+    with (
+        Ahead(chase, max(4, _CHASE_MEMORY // (3 * panel[0] * panel[1]))) as pictures,
+        bar("film", total, "view") as progress,
+    ):
+        compare_with_the_film(studio, plan(strip(*COMPARISON_STRIP)[1]), chosen, progress)
+        if turns:
+            turn_the_light(studio, plan(strip(*LIGHT_STRIP)[1]), turns, progress)
+        if world and drive:
+            film_drive(studio, plan(strip(*DRIVE_STRIP)[0]), world, drive, pictures, drives, progress)
+        else:
+            title_card(studio, "No drive", [f"Nothing is driven here: {no_drive_reason(config)}."])
+
+
+def _surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
+    """What the plan shows of the mesh stage: the ground, and the outlines of low parts."""
+    folder = scene.stage("mesh")
+    ground = Ground.load(folder) if (folder / "ground.npz").exists() else None
+    if not (folder / "parts.npz").exists():
+        return ground, []
+    with np.load(folder / "parts.npz", allow_pickle=False) as data:
+        return ground, footprints(data["vertices"], data["vertex_start"], ground)
+
+
+def _longest_path(cameras: Cameras) -> Array:
+    """Camera positions of the longest source from above [m], shape (n, 2)."""
+    longest = max(dict.fromkeys(cameras.sources), key=cameras.sources.count)
+    return cameras.positions[[name == longest for name in cameras.sources], :2]
+
+
+def _keep_captures(studio: Studio) -> None:
+    """Four frames of each lighting, for the page."""
+    cameras = studio.cameras
+    for number, lighting in enumerate(dict.fromkeys(cameras.lightings)):
+        mine = [i for i, name in enumerate(cameras.lightings) if name == lighting]
+        row = [studio.real(i) for i in spread(mine, 4)]
+        studio.keep(
+            f"capture_{number}", "capture", f"{lighting}: frames from its start to its end", side_by_side(row, 180)
+        )

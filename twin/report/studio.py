@@ -1,0 +1,161 @@
+"""What every section of the review film shares: the field, the cameras, the canvas, and the count of what was rendered.
+
+A *view* is one rendered picture with its depth. A *picture* with a caption is kept for the page beside the film.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from dataclasses import field as with_default
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.geometry.cameras import Cameras, scaled_intrinsics
+from twin.geometry.images import read_image
+from twin.nerf.rendering import Rendering
+from twin.report.panels import Layout, Picture
+from twin.report.video import VideoWriter, even
+
+Array = NDArray[np.float64]
+
+_PICTURE_WIDTH = 1000  # [px] at most, of a picture for the page
+_PICTURE_QUALITY = 82
+
+
+class Field(Protocol):
+    """The part of a radiance field that a film needs."""
+
+    @property
+    def lightings(self) -> tuple[str, ...]: ...
+
+    def render(self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str) -> Rendering: ...
+
+
+@dataclass(frozen=True)
+class KeptPicture:
+    """A picture for the page."""
+
+    file: str
+    """Within the stage folder."""
+    section: str
+    """The stage whose section shows it."""
+    caption: str
+
+
+@dataclass
+class Studio:
+    """Renders views and keeps the books."""
+
+    name: str
+    """Of the scene."""
+    field: Field
+    cameras: Cameras
+    layout: Layout
+    writer: VideoWriter
+    out: Path
+    render_width: int
+    path: Array
+    """What the plan shows: the route, or the cameras of the longest source [m], shape (n, 2)."""
+    kept: list[KeptPicture] = with_default(default_factory=list)
+    renders: int = 0
+    render_seconds: float = 0.0
+
+    @property
+    def fps(self) -> int:
+        return self.writer.fps
+
+    def view(self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str) -> Rendering:
+        """One view of the field, shapes (1, h, w, ...).
+
+        Args:
+            camera_to_world: Shape (4, 4).
+            intrinsics: fx, fy, cx, cy [px] at `size`.
+            size: Of the camera [px]; the view is rendered smaller, with the same proportions.
+            lighting: As the field takes it.
+        """
+        longer = max(size)
+        small = (even(round(size[0] * self.render_width / longer)), even(round(size[1] * self.render_width / longer)))
+        start = time.perf_counter()
+        rendering = self.field.render(
+            camera_to_world[None], scaled_intrinsics(intrinsics, size, small)[None], small, lighting
+        )
+        self.render_seconds += time.perf_counter() - start
+        self.renders += 1
+        return rendering
+
+    def frame_view(self, i: int, lighting: str | None = None) -> Rendering:
+        """The field seen from where frame i was taken, in its own lighting unless told otherwise."""
+        cameras = self.cameras
+        size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
+        return self.view(cameras.camera_to_world[i], cameras.intrinsics[i], size, lighting or cameras.lightings[i])
+
+    def real(self, i: int) -> Picture:
+        """Frame i as it was filmed (undistorted)."""
+        return read_image(self.cameras.image_path(i))
+
+    def keep(self, name: str, section: str, caption: str, picture: Picture) -> None:
+        """Stores a picture for the page as `pictures/<name>.jpg`."""
+        if picture.shape[1] > _PICTURE_WIDTH:
+            height = round(picture.shape[0] * _PICTURE_WIDTH / picture.shape[1])
+            picture = cv2.resize(picture, (_PICTURE_WIDTH, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _PICTURE_QUALITY])
+        if not ok:
+            raise OSError(f"could not encode picture {name}")
+        path = self.out / "pictures" / f"{name}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(data.tobytes())
+        self.kept.append(KeptPicture(f"pictures/{name}.jpg", section, caption))
+
+
+def spread(indices: Sequence[int] | NDArray, count: int) -> list[int]:
+    """At most `count` of the indices, evenly spread, the first and last included."""
+    if count >= len(indices):
+        return [int(i) for i in indices]
+    if count <= 1:
+        return [int(indices[len(indices) // 2])][:count]
+    return [int(indices[i]) for i in np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))]
+
+
+def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
+    """Frames of one lighting along its longest source, half of them held out where there are enough, in order."""
+    of_lighting = [i for i, name in enumerate(cameras.lightings) if name == lighting]
+    sources = [cameras.sources[i] for i in of_lighting]
+    if not sources:
+        return []
+    longest = max(dict.fromkeys(sources), key=sources.count)
+    mine = [i for i in of_lighting if cameras.sources[i] == longest]
+    held_out = [i for i in mine if cameras.held_out[i]]
+    trained = [i for i in mine if not cameras.held_out[i]]
+    unseen = spread(held_out, max(1, count // 2))
+    return sorted([*unseen, *spread(trained, count - len(unseen))])
+
+
+def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
+    """The frame of a lighting that was taken closest to frame i and looks the same way; None where none does."""
+    offset = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
+    forward = cameras.camera_to_world[:, :3, 2]
+    # Looking elsewhere counts as far away: 10 m for a right angle.
+    cost = offset + 10.0 * (1.0 - forward @ forward[i])
+    candidates = [k for k, name in enumerate(cameras.lightings) if name == lighting]
+    return min(candidates, key=lambda k: float(cost[k])) if candidates else None
+
+
+def side_by_side(pictures: Sequence[Picture], height: int) -> Picture:
+    """Pictures in a row, scaled to one height, with a thin gap."""
+    gap = np.full((height, 6, 3), 255, np.uint8)
+    row: list[Picture] = []
+    for picture in pictures:
+        width = max(1, round(picture.shape[1] * height / picture.shape[0]))
+        way = cv2.INTER_AREA if picture.shape[0] > height else cv2.INTER_CUBIC
+        row += [gap, cv2.resize(picture, (width, height), interpolation=way).astype(np.uint8)]
+    return np.concatenate(row[1:], 1)
+
+
+def as_picture(rgb: NDArray) -> Picture:
+    """Colour in [0, 1] as uint8."""
+    return (np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
