@@ -104,7 +104,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
     else:
         camera = front_camera(Cameras.load(scene.stage("metric")))
-        spawn = _add_robot(spec, ground, route, camera)
+        spawn, blocked = _add_robot(spec, ground, route, camera)
         _add_route(spec, route, config.mjcf.half_width)
         (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
         World(route, config.mjcf.half_width, spawn, np.array(camera.intrinsics), out).save()
@@ -114,7 +114,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
             "half_width_m": config.mjcf.half_width,
             "camera_intrinsics_px": [float(x) for x in camera.intrinsics],
         }
-    return metrics | check_portable(out, with_robot=route is not None)
+    metrics |= check_portable(out, with_robot=route is not None)
+    if route is not None:
+        metrics["spawn_touched"] = sorted(blocked | set(metrics["spawn_touched"]))
+    return metrics
 
 
 def load_route(path: Path) -> Array | None:
@@ -273,8 +276,13 @@ def _add_parts(spec: mujoco.MjSpec, parts: Parts, assets: Path) -> None:
 
 def _add_robot(
     spec: mujoco.MjSpec, ground: Ground, route: Array, camera: PixelCamera
-) -> tuple[float, float, float, float]:
-    """Puts the Husky at the route's start, lets it settle, and keeps that as keyframe `spawn`. Returns x, y, z, yaw."""
+) -> tuple[tuple[float, float, float, float], set[str]]:
+    """Puts the Husky at the route's start, lets it settle, and keeps that as keyframe `spawn`.
+
+    Returns:
+        x, y, z [m] and yaw [rad] at rest, and the names of what stood in its place besides the ground (and may have
+        pushed it aside).
+    """
     yaw = float(heading_at(route, 0.0))
     rows, columns = ground.height.shape
     edge = np.minimum(
@@ -288,6 +296,8 @@ def _add_robot(
     husky.add_husky(spec, position, quaternion, camera=camera)
     model = spec.compile()
     data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    blocked = touched_names(model, data)
     mujoco.mj_step(model, data, int(_SETTLE_TIME / husky.TIMESTEP))
     moved = float(np.linalg.norm(data.qpos[:2] - position[:2]))
     if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
@@ -298,7 +308,7 @@ def _add_robot(
     spec.add_key(name="spawn", qpos=data.qpos)
     x, y, z = data.qpos[:3]
     forward = data.body("husky").xmat.reshape(3, 3)[:, 0]
-    return float(x), float(y), float(z), float(np.arctan2(forward[1], forward[0]))
+    return (float(x), float(y), float(z), float(np.arctan2(forward[1], forward[0]))), blocked
 
 
 def _add_route(spec: mujoco.MjSpec, route: Array, half_width: float) -> None:

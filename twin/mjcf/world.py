@@ -131,8 +131,8 @@ def nearest(route: Array, xy: Array, around: tuple[float, float] | None = None) 
 
 def total_turn(route: Array) -> float:
     """How far the heading turns from the route's start to its end [rad], left positive, full turns counted."""
-    s = np.arange(0.0, arc_lengths(route)[-1], 0.25)
-    heading = np.unwrap(heading_at(route, s, window=2.0))
+    s = np.append(np.arange(0.0, arc_lengths(route)[-1], 0.25), np.inf)
+    heading = np.unwrap(heading_at(route, s))
     return float(heading[-1] - heading[0])
 
 

@@ -1,0 +1,276 @@
+"""The exported scene: heights, parts, colours and intrinsics survive the way into a folder that can be moved."""
+
+import re
+import zipfile
+
+import mujoco
+import numpy as np
+import pytest
+from tiny_world import box, tiny_config, tiny_ground, tiny_route, tiny_scene, tiny_world
+
+from twin.errors import InputError
+from twin.geometry.images import read_image
+from twin.mjcf.export import compacted, covered_by_ground, front_camera, rest_pose, run
+from twin.mjcf.files import face_tiles
+from twin.mjcf.husky import BASE_HEIGHT
+from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest, point_at, total_turn
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    scene = tiny_scene(tmp_path_factory.mktemp("scene"))
+    out = scene.stage("mjcf")
+    out.mkdir()
+    return out, run(scene, tiny_config(half_width=0.8), out)
+
+
+def ray_down(model, data, xy, groups=(1, 0, 0, 0, 0, 0)) -> float:
+    """Height of the topmost geom of the given groups at xy."""
+    hit = np.zeros(1, np.int32)
+    distance = mujoco.mj_ray(
+        model, data, np.array([*xy, 20.0]), np.array([0.0, 0.0, -1.0]), np.array(groups, np.uint8), 1, -1, hit
+    )
+    return 20.0 - distance
+
+
+def test_metrics(exported):
+    _, metrics = exported
+    assert metrics["parts"] == 2
+    assert metrics["route_length_m"] == pytest.approx(arc_lengths(tiny_route())[-1])
+    assert metrics["turn_deg"] == pytest.approx(-90, abs=3)
+    assert metrics["spawn_touched"] == []
+    # The nearest box's near edge is 1.9 m to the left, the robot's tyre 0.34 m.
+    assert 1.5 < metrics["spawn_clearance_m"] < 4.0
+    assert metrics["spawn_drift_m"] < 0.001
+
+
+def test_heights_are_right_to_a_millimetre(exported):
+    folder, _ = exported
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ground = tiny_ground()
+    rng = np.random.default_rng(1)
+    rows, columns = ground.height.shape
+    for row, column in zip(rng.integers(1, rows - 1, 40), rng.integers(1, columns - 1, 40), strict=True):
+        xy = ground.origin + ground.cell * np.array([column, row]) + 1e-4
+        assert ray_down(model, data, xy) == pytest.approx(ground.height[row, column], abs=1e-3)
+
+
+def test_level_ground_is_level(tmp_path):
+    """A height field without relief must not be divided by its range."""
+    scene = tiny_scene(tmp_path)
+    ground = tiny_ground()
+    flat = type(ground)(np.full_like(ground.height, 0.7), ground.origin, ground.cell, ground.measured, ground.rgb)
+    flat.save(scene.stage("mesh"))
+    out = scene.stage("mjcf")
+    out.mkdir()
+    run(scene, tiny_config(), out)
+    model = World.load(out).model()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert ray_down(model, data, (1.03, -0.52)) == pytest.approx(0.7, abs=1e-4)
+    assert World.load(out).spawn[2] == pytest.approx(0.7 + BASE_HEIGHT, abs=0.004)
+
+
+def test_parts_stand_where_they_stood(exported):
+    """MuJoCo moves a mesh to its own centre and axes; in the world its corners must be back in place."""
+    folder, _ = exported
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    geom = data.geom("part_0001")
+    mesh = model.mesh("part_0001")
+    vertices = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+    world = vertices @ geom.xmat.reshape(3, 3).T + geom.xpos
+    expected = box((4.0, -3.0, 0.8), (0.6, 0.6, 0.8))
+    gaps = np.linalg.norm(world[:, None] - expected[None], axis=-1)
+    assert gaps.min(0).max() < 1e-4 and gaps.min(1).max() < 1e-4
+    assert ray_down(model, data, (4.0, -3.0), groups=(0, 0, 0, 1, 0, 0)) == pytest.approx(1.2, abs=1e-4)
+
+
+def test_groups(exported):
+    folder, _ = exported
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    group = {model.geom(i).name: model.geom_group[i] for i in range(model.ngeom)}
+    assert group["ground"] == 0 and group["visual"] == 2 and group["part_0000"] == 3 and group["rear_left_tyre"] == 4
+    silent = np.isin(model.geom_group, [1, 2])
+    assert not model.geom_contype[silent].any() and not model.geom_conaffinity[silent].any()
+    assert {model.site(i).name for i in range(model.nsite)} >= {"goal", "route_000", "corridor_left_003"}
+    assert (model.site_group == 4).all()
+
+
+def test_loads_from_a_zip_unpacked_elsewhere(exported, tmp_path):
+    folder, _ = exported
+    archive = tmp_path / "scene.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        for path in folder.rglob("*"):
+            file.write(path, path.relative_to(folder))
+    with zipfile.ZipFile(archive) as file:
+        file.extractall(tmp_path / "there")
+    world = World.load(tmp_path / "there")
+    model = world.model()
+    assert model.nkey == 1 and model.nu == 4
+    text = (tmp_path / "there" / "scene.xml").read_text()
+    files = re.findall(r'file="([^"]*)"', text)
+    assert files and all("/" not in name and ".." not in name for name in files)
+    assert str(folder) not in text and str(folder) not in (folder / "world.json").read_text()
+
+
+def test_world_comes_back_as_saved(exported):
+    folder, _ = exported
+    world = World.load(folder)
+    np.testing.assert_allclose(world.route[:, :2], tiny_route())
+    np.testing.assert_allclose(world.goal, world.route[-1])
+    assert world.half_width == 0.8
+    assert world.spawn[3] == pytest.approx(0.0, abs=0.01)
+    np.testing.assert_allclose(world.intrinsics, [125.0, 127.5, 82.5, 42.5])
+
+
+def test_camera_is_the_first_training_frame_s(exported):
+    folder, _ = exported
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    pixel = model.cam_sensorsize[0] / model.cam_resolution[0]
+    np.testing.assert_allclose(model.cam_intrinsic[0, :2] / pixel, [125.0, 127.5], rtol=1e-5)
+    assert model.cam_resolution[0].tolist() == [160, 90]
+
+
+def test_camera_of_another_shape_keeps_square_pixels(exported):
+    from twin.geometry.cameras import Cameras
+    from twin.scene import SceneDir
+
+    cameras = Cameras.load(SceneDir(exported[0].parent.parent).stage("metric"))
+    tall = type(cameras)(**{**vars(cameras), "sizes": np.tile([640, 480], (3, 1))})
+    # 640 × 480 becomes 160 × 120, of which 15 rows go at the top and at the bottom.
+    np.testing.assert_allclose(front_camera(tall).intrinsics, [125.0, 127.5, 82.5, 42.5 - 15.0])
+
+
+def test_without_a_route_there_is_no_robot(tmp_path):
+    scene = tiny_scene(tmp_path, route=False)
+    out = scene.stage("mjcf")
+    out.mkdir()
+    metrics = run(scene, tiny_config(), out)
+    assert not metrics["has_route"] and "no route" in metrics["note"]
+    model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
+    assert model.nu == 0 and model.nq == 0 and model.geom("part_0001").id >= 0
+    assert not scene.has_route
+
+
+def test_a_route_that_starts_off_the_ground_is_refused(tmp_path):
+    scene = tiny_scene(tmp_path)
+    xy = tiny_route() - [2.5, 0.0]
+    np.savez(scene.stage("mesh") / "route.npz", xy=xy, z=tiny_ground().at(xy))
+    out = scene.stage("mjcf")
+    out.mkdir()
+    with pytest.raises(InputError, match=r"0\.50 m from the edge"):
+        run(scene, tiny_config(), out)
+
+
+def test_what_the_robot_touches_at_the_start_is_named(tmp_path):
+    scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tyres
+    out = scene.stage("mjcf")
+    out.mkdir()
+    assert run(scene, tiny_config(), out)["spawn_touched"] == ["part_0000"]
+
+
+def test_a_start_inside_something_solid_is_refused(tmp_path):
+    scene = tiny_scene(tmp_path, boxes=((0.4, 0.3, 0.5),))
+    out = scene.stage("mjcf")
+    out.mkdir()
+    with pytest.raises(InputError, match="does not rest"):
+        run(scene, tiny_config(), out)
+
+
+def test_rest_pose_follows_the_slope():
+    ground = tiny_ground()
+    grid_x, _ = np.meshgrid(*(np.arange(n) * ground.cell for n in ground.height.shape[::-1]))
+    ramp = type(ground)(0.1 * grid_x, np.zeros(2), ground.cell, ground.measured, ground.rgb)
+    position, quaternion = rest_pose(ramp, np.array([5.0, 5.0]), np.pi / 2)
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    up = np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0)
+    np.testing.assert_allclose(rotation.reshape(3, 3)[:, 2], up, atol=1e-9)
+    np.testing.assert_allclose(rotation.reshape(3, 3)[:, 0], [0.0, 1.0, 0.0], atol=1e-9)  # climbs to its right
+    np.testing.assert_allclose(position, np.array([5.0, 5.0, 0.5]) + BASE_HEIGHT * up, atol=1e-9)
+
+
+def test_tiles_interpolate_corner_colours_exactly():
+    """Bilinear lookup in the texture, by hand, against the linear interpolation of the corners."""
+    rng = np.random.default_rng(2)
+    colors = rng.integers(60, 120, (7, 3, 3)).astype(np.uint8)  # no clamping of the fourth texel
+    texture, texcoords = face_tiles(colors)
+    height, width, _ = texture.shape
+    for face in range(7):
+        weights = rng.dirichlet(np.ones(3))
+        u, v = weights @ texcoords[face] * [width, height] - 0.5
+        i, j = int(v), int(u)
+        a, b = v - i, u - j
+        patch = texture[i : i + 2, j : j + 2].astype(float)
+        value = (1 - a) * ((1 - b) * patch[0, 0] + b * patch[0, 1]) + a * ((1 - b) * patch[1, 0] + b * patch[1, 1])
+        np.testing.assert_allclose(value, weights @ colors[face], atol=1e-6)
+
+
+def test_texture_coordinates_survive_the_obj(exported):
+    """Colour looked up through the compiled model equals the mesh's own at a face's corner."""
+    folder, _ = exported
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    with np.load(folder.parent / "4_mesh" / "visual.npz") as data:
+        vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
+    vertices, colors, faces = compacted(
+        vertices, colors, faces[~covered_by_ground(vertices, tiny_ground())[faces].all(1)]
+    )
+    mesh = model.mesh("visual")
+    assert mesh.facenum[0] == len(faces)
+    texture = read_image(folder / "assets" / "visual.png")
+    height, width, _ = texture.shape
+    corner = model.mesh_facetexcoord[mesh.faceadr[0] : mesh.faceadr[0] + len(faces)]
+    uv = model.mesh_texcoord[mesh.texcoordadr[0] :][corner]  # MuJoCo flips OBJ's v, so that it counts from the top
+    column, row = (uv * [width, height]).astype(int).transpose(2, 0, 1)
+    np.testing.assert_array_equal(texture[row, column], colors[faces])
+
+
+def test_ground_covers_what_lies_on_it():
+    ground = tiny_ground()
+    points = np.array([[1.0, 1.0, 0.05], [1.0, 1.0, 0.5], [1.0, 1.0, -1.0], [50.0, 1.0, 0.0]])
+    points[:3, 2] += ground.at(points[:3, :2])
+    assert covered_by_ground(points, ground).tolist() == [True, False, True, False]
+
+
+def test_nearest_against_dense_samples():
+    route = tiny_route()
+    s_dense = np.linspace(0, arc_lengths(route)[-1], 20001)
+    dense = point_at(route, s_dense)
+    points = np.random.default_rng(3).uniform([-1, -5], [10, 2], (60, 2))
+    s, error = nearest(route, points)
+    gaps = np.linalg.norm(points[:, None] - dense[None], axis=-1)
+    np.testing.assert_allclose(np.abs(error), gaps.min(1), atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(point_at(route, s) - points, axis=1), np.abs(error), atol=1e-9)
+
+
+def test_left_of_the_route_is_positive():
+    route = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]])
+    s, error = nearest(route, np.array([[5.0, 1.0], [5.0, -1.0], [9.0, 5.0]]))
+    np.testing.assert_allclose(s, [5.0, 5.0, 15.0])
+    np.testing.assert_allclose(error, [1.0, -1.0, 1.0])
+    # A route that meets itself: only the wanted stretch is looked at.
+    loop = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.1]])
+    assert nearest(loop, np.array([0.02, 0.2]))[0] == pytest.approx(15.8)
+    assert nearest(loop, np.array([0.02, 0.2]), around=(0.0, 2.0))[0] == pytest.approx(0.02)
+
+
+def test_headings_and_turns():
+    route = tiny_route()
+    assert heading_at(route, 0.0) == pytest.approx(0.0)
+    assert heading_at(route, 100.0) == pytest.approx(-np.pi / 2, abs=0.05)
+    circle = np.stack([np.cos(np.linspace(0, 4 * np.pi, 400)), np.sin(np.linspace(0, 4 * np.pi, 400))], 1) * 5
+    assert total_turn(circle) == pytest.approx(4 * np.pi, rel=0.06)  # two full turns, less the averaging at the ends
+    left, right = corridor_edges(np.column_stack([route, np.zeros(len(route))]), 1.0)
+    np.testing.assert_allclose(left[3], [route[3, 0], 1.0, 0.0])
+    np.testing.assert_allclose(right[3], [route[3, 0], -1.0, 0.0])
+
+
+def test_tiny_world_is_drivable_model(tmp_path):
+    world = tiny_world(tmp_path)
+    data = mujoco.MjData(world.model())
+    mujoco.mj_resetDataKeyframe(world.model(), data, 0)
+    np.testing.assert_allclose(data.qpos[:3], world.spawn[:3], atol=1e-4)
