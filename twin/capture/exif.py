@@ -33,7 +33,7 @@ class PhotoFacts:
 
 def photo_facts(path: Path) -> PhotoFacts:
     """Reads a photo's header; whatever is absent or malformed is unknown, never an error."""
-    nothing = PhotoFacts(None, (math.nan,) * 3, None, 1)  # type: ignore[arg-type]
+    nothing = PhotoFacts(None, (math.nan, math.nan, math.nan), None, 1)
     try:
         with Image.open(path) as image:
             width, height = image.size

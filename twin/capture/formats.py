@@ -94,7 +94,8 @@ def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
     root = next((r for r in roots if any((r / name).exists() for name, _, _ in posed)), None)
     if root is None:
         raise InputError(
-            f"{model}: none of its {len(posed)} images (such as {posed[0][0]}) found in {roots[0]}; set images = in scene.toml"
+            f"{model}: none of its {len(posed)} images (such as {posed[0][0]}) found in {roots[0]}; "
+            "set images = in scene.toml"
         )
     found = [(root / name, lens, pose) for name, lens, pose in posed if (root / name).exists()]
     return ImageSet(
@@ -140,7 +141,8 @@ def read_transforms(path: Path, images: Path | None = None) -> ImageSet:
         entries.setdefault(file, (lens_from_transforms({**table, **frame}, file, where), world, mask_path))
     if not entries:
         raise InputError(
-            f"{path}: none of its {len(frames)} images (such as {frames[0]['file_path']}) found; set images = in scene.toml"
+            f"{path}: none of its {len(frames)} images (such as {frames[0]['file_path']}) found; "
+            "set images = in scene.toml"
         )
     files = sorted(entries, key=lambda file: natural_key(str(file)))
     masks = tuple(entries[file][2] for file in files)
@@ -201,9 +203,7 @@ def image_size(path: Path) -> tuple[int, int]:
         with Image.open(path) as image:
             return image.size
     except (OSError, SyntaxError, ValueError, UnidentifiedImageError):
-        raise InputError(
-            f"{path}: not a readable image ({path.stat().st_size} bytes); replace or remove it"
-        ) from None
+        raise InputError(f"{path}: not a readable image ({path.stat().st_size} bytes); replace or remove it") from None
 
 
 def _image_files(folder: Path) -> list[Path]:

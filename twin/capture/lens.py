@@ -13,8 +13,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from twin.capture.undistort import pinhole_of, undistortion_map
 from twin.errors import InputError
-from twin.geometry.cameras import pixel_grid, unproject
 
 _MODELS = tuple(name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR"))
 _MAX_ASPECT_ERROR = 0.01
@@ -32,15 +32,22 @@ class Lens:
     height: int
 
     @property
+    def camera(self) -> pycolmap.Camera:
+        """The same as COLMAP's own object."""
+        camera = pycolmap.Camera.create_from_model_name(0, self.model, 1.0, self.width, self.height)
+        camera.params = np.array(self.params)  # type: ignore[assignment]
+        return camera
+
+    @property
     def intrinsics(self) -> NDArray[np.float64]:
         """fx, fy, cx, cy [px], shape (4,)."""
-        matrix = self._camera().calibration_matrix()
+        matrix = self.camera.calibration_matrix()
         return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
 
     @property
     def distortion(self) -> tuple[float, ...]:
         """The parameters beyond focal length and principal point."""
-        return tuple(self.params[i] for i in self._camera().extra_params_idxs())
+        return tuple(self.params[i] for i in self.camera.extra_params_idxs())
 
     @property
     def is_distorted(self) -> bool:
@@ -49,10 +56,10 @@ class Lens:
         )
 
     def with_intrinsics(self, intrinsics: NDArray[np.float64]) -> "Lens":
-        """The same model and distortion with other fx, fy, cx, cy [px]; a model with one focal length takes the mean."""
-        camera, params = self._camera(), list(self.params)
-        focal, center = camera.focal_length_idxs(), camera.principal_point_idxs()
-        values = intrinsics[:2] if len(focal) == 2 else [intrinsics[:2].mean()]
+        """The same model and distortion with other fx, fy, cx, cy [px]; where there is one focal length, the mean."""
+        params = list(self.params)
+        focal, center = self.camera.focal_length_idxs(), self.camera.principal_point_idxs()
+        values = list(intrinsics[:2]) if len(focal) == 2 else [intrinsics[:2].mean()]
         for index, value in zip([*focal, *center], [*values, *intrinsics[2:]], strict=True):
             params[index] = float(value)
         return Lens(self.model, tuple(params), self.width, self.height)
@@ -61,18 +68,13 @@ class Lens:
         """The lens of the same picture resized to another size [px]."""
         if (width, height) == (self.width, self.height):
             return self
-        camera = self._camera()
+        camera = self.camera
         camera.rescale(width, height)
         return Lens(self.model, tuple(float(p) for p in camera.params), width, height)
 
     def fits(self, width: int, height: int) -> bool:
         """True where an image of this size is the lens's picture, scaled: the aspect agrees within 1 %."""
         return same_aspect((width, height), (self.width, self.height))
-
-    def _camera(self) -> pycolmap.Camera:
-        camera = pycolmap.Camera.create_from_model_name(0, self.model, 1.0, self.width, self.height)
-        camera.params = np.array(self.params)
-        return camera
 
 
 def checked_lens(model: str, params: tuple[float, ...], width: int, height: int, where: str) -> Lens:
@@ -100,7 +102,9 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
     if not (0.05 * longer < fx < 100 * longer and 0.05 * longer < fy < 100 * longer):
         raise InputError(f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}; expected pixels of that size")
     if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
-        raise InputError(f"{where}: principal point {cx:g}, {cy:g} px lies far outside {width}x{height}; check the order")
+        raise InputError(
+            f"{where}: principal point {cx:g}, {cy:g} px lies far outside {width}x{height}; check the order"
+        )
     return lens
 
 
@@ -110,17 +114,17 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
     return error <= max(_MAX_ASPECT_ERROR * a[0] * b[1], a[0], a[1], b[0], b[1])
 
 
-def undistort(image: Image, lens: Lens) -> tuple[Image, Image]:
-    """Resamples an image of a lens to the pinhole camera with the same intrinsics and size.
+def flattened(image: Image, lens: Lens, nearest: bool = False) -> tuple[Image, Lens]:
+    """An image of a distorted lens, and the pinhole lens of the same size it is resampled to.
 
-    Returns:
-        The image, and the mask of what the lens saw (0 = nothing there), shape (h, w).
+    Args:
+        image: Shape (h, w) or (h, w, 3), at the lens's size.
+        lens: The lens that took it.
+        nearest: True for masks, whose values must not be mixed.
     """
-    height, width = image.shape[:2]
-    rays = unproject(pixel_grid(width, height), lens.intrinsics).reshape(-1, 3)
-    seen = np.asarray(lens._camera().img_from_cam(rays)).reshape(height, width, 2)
-    # cv2 counts from the centre of the first pixel; outside the model's domain the projection is not finite.
-    maps = np.nan_to_num(seen - 0.5, nan=-1e6).astype(np.float32)
-    flat = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inside = ((maps >= 0.0) & (maps <= np.array([width - 1, height - 1]))).all(-1)
-    return flat.astype(np.uint8, copy=False), np.where(inside, 255, 0).astype(np.uint8)
+    pinhole = pinhole_of(lens.camera)
+    maps = undistortion_map(lens.camera, pinhole)
+    if maps is not None:
+        how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        image = np.asarray(cv2.remap(image, maps, None, how, borderMode=cv2.BORDER_REPLICATE), np.uint8)  # type: ignore[call-overload]
+    return image, Lens("PINHOLE", pinhole, lens.width, lens.height)

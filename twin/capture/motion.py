@@ -53,7 +53,12 @@ def median_motion(
 def stands_still(
     before: NDArray[np.uint8], after: NDArray[np.uint8], min_motion: float, mask: NDArray[np.uint8] | None = None
 ) -> bool:
-    """True where the picture moved less than `min_motion` [px]; without corners, where it did not change at all."""
+    """True where the picture moved less than `min_motion` [px]; without corners, where it did not change at all.
+
+    A `min_motion` of 0 keeps every frame.
+    """
+    if min_motion <= 0.0:
+        return False
     moved = median_motion(before, after, mask)
     if moved is not None:
         return moved < min_motion

@@ -5,6 +5,7 @@ that hardly moved from the last kept frame is a *duplicate* of a standing camera
 its place in the film, counted from 0 in order of presentation; its *time* runs from the first frame [s].
 """
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,8 @@ class FilmFacts:
 
     times: NDArray[np.float64]
     """Presentation times from the first frame on [s], sorted, shape (n,)."""
+    start: float
+    """Time stamp of the first frame in its stream [s]."""
     promised: int
     """Frames the container says it has; n where it does not say."""
 
@@ -70,6 +73,8 @@ class FilmFrame:
     time: float
     image: Image
     """RGB, shape (h, w, 3)."""
+    mask: Image | None
+    """0 = ignore, shape (h, w); None where nothing is masked."""
 
 
 def probe(path: Path) -> FilmFacts:
@@ -78,18 +83,15 @@ def probe(path: Path) -> FilmFacts:
     Raises:
         InputError: not a video, or so damaged that it has no readable packet.
     """
+    times: list[float] = []
     try:
         with av.open(str(path)) as container:
             stream = _video_stream(container, path)
-            times: list[float] = []
-            try:
-                times.extend(
-                    float((p.pts if p.pts is not None else p.dts) * p.time_base)
-                    for p in container.demux(stream)
-                    if (p.pts if p.pts is not None else p.dts) is not None and not p.is_discard
-                )
-            except av.error.FFmpegError:
-                pass  # cut off in the middle: what was read so far is used
+            with contextlib.suppress(av.error.FFmpegError):  # cut off in the middle: what was read so far is used
+                for packet in container.demux(stream):
+                    stamp = packet.pts if packet.pts is not None else packet.dts
+                    if stamp is not None and not packet.is_discard:
+                        times.append(float(stamp * packet.time_base))
             promised = stream.frames
             rate = float(stream.average_rate or 25)
     except (av.error.FFmpegError, ValueError, OSError) as error:
@@ -99,22 +101,19 @@ def probe(path: Path) -> FilmFacts:
     at = np.sort(np.array(times))
     if len(at) > 1 and at[-1] == at[0]:  # a raw stream without a clock
         at = np.arange(len(at)) / rate
-    return FilmFacts(at - at[0], promised or len(at))
+    return FilmFacts(at - at[0], float(at[0]), promised or len(at))
 
 
 def decode(path: Path, count: FilmCount) -> Iterator[tuple[float | None, av.VideoFrame]]:
-    """Decodes a film: each frame's time in the stream [s] (None where it has none) and the frame. Skips damaged ones."""
+    """Decodes a film front to back, skipping what is damaged.
+
+    Yields:
+        Each frame's time stamp in its stream [s] (None where it has none), and the frame.
+    """
     with av.open(str(path)) as container:
         stream = _video_stream(container, path)
         stream.thread_type = "AUTO"
-        packets = container.demux(stream)
-        while True:
-            try:
-                packet = next(packets, None)
-            except av.error.FFmpegError:
-                packet = None  # the file ends in the middle of a packet
-            if packet is None:
-                return
+        for packet in _packets(container, stream):
             try:
                 frames = packet.decode()
             except av.error.FFmpegError:
@@ -124,7 +123,34 @@ def decode(path: Path, count: FilmCount) -> Iterator[tuple[float | None, av.Vide
                 if frame.is_corrupt:
                     count.damaged += 1
                 else:
-                    yield frame.time, frame  # type: ignore[misc]
+                    yield frame.time, frame
+
+
+def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet]:
+    """A stream's packets, and an empty one at the end, upon which a decoder hands out what it held back.
+
+    A file that ends in the middle of a packet ends the stream like any other.
+    """
+    last: av.Packet | None = None
+    with contextlib.suppress(av.error.FFmpegError):
+        for last in container.demux(stream):
+            yield last
+    if last is None or last.size:
+        end = av.Packet()
+        end.stream = stream
+        if stream.time_base is not None:
+            end.time_base = stream.time_base
+        yield end
+
+
+def index_of(time: float | None, facts: FilmFacts, last: int) -> int:
+    """A decoded frame's index, by its time [s] among the film's, above `last` always; damaged frames leave gaps."""
+    if time is None:
+        return last + 1
+    right = min(int(np.searchsorted(facts.times, time)), len(facts.times) - 1)
+    left = max(right - 1, 0)
+    nearest = left if time - facts.times[left] < facts.times[right] - time else right
+    return max(nearest, last + 1)
 
 
 def slot_of(index: int, time: float, facts: FilmFacts, slots: int) -> int:
@@ -145,7 +171,7 @@ def slot_count(facts: FilmFacts, config: CaptureConfig) -> int:
 
 
 def read_film(
-    path: Path, config: CaptureConfig, count: FilmCount, mask_of: Callable[[int, Image], Image | None]
+    path: Path, config: CaptureConfig, count: FilmCount, mask_of: Callable[[int, int, int], Image | None]
 ) -> Iterator[FilmFrame]:
     """Yields a film's chosen frames in order: the sharpest of each slot, less the duplicates of a standing camera.
 
@@ -153,7 +179,7 @@ def read_film(
         path: The film.
         config: Slots, size and smallest motion.
         count: Filled with what became of the frames.
-        mask_of: From a frame's index and kept image to its mask (0 = ignore), or None.
+        mask_of: From a frame's index, kept width and kept height to its mask (0 = ignore), or None.
 
     Raises:
         InputError: nothing readable, fewer than two frames, or nothing but blank frames.
@@ -169,32 +195,32 @@ def read_film(
         whole = upright(candidate.frame)
         count.size = (whole.shape[1], whole.shape[0])
         image = fit(whole, config.max_size)
-        small = _grey_at(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), FLOW_WIDTH)  # type: ignore[arg-type]
-        mask = mask_of(candidate.index, image)
-        small_mask = None if mask is None else cv2.resize(mask, small.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        if kept_small is not None and stands_still(kept_small, small, config.min_motion, small_mask):  # type: ignore[arg-type]
+        small = _flow_picture(image)
+        mask = mask_of(candidate.index, image.shape[1], image.shape[0])
+        small_mask = None
+        if mask is not None:
+            small_mask = np.asarray(cv2.resize(mask, small.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+        if kept_small is not None and stands_still(kept_small, small, config.min_motion, small_mask):
             count.duplicates += 1
             return None
         kept_small, kept_any = small, True
         count.sharpness.append(candidate.sharpness)
-        return FilmFrame(candidate.index, candidate.time, image)
+        return FilmFrame(candidate.index, candidate.time, image, mask)
 
     best: _Candidate | None = None
-    start: float | None = None
+    index = -1
     size: tuple[int, int] | None = None
     for stamp, frame in decode(path, count):
-        index = count.decoded
         count.decoded += 1
-        if stamp is not None and start is None:
-            start = stamp
-        time = stamp - start if stamp is not None and start is not None else index * facts.interval
+        index = index_of(None if stamp is None else stamp - facts.start, facts, index)
+        time = float(facts.times[index]) if index < len(facts.times) else index * facts.interval
         if size is not None and size != (frame.width, frame.height):
             raise InputError(
-                f"{path}: the picture changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} at frame {index}; "
-                "cut the film there into two sources"
+                f"{path}: the picture changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} "
+                f"at frame {index}; cut the film there into two sources"
             )
         size = (frame.width, frame.height)
-        grey = _small_grey(frame)
+        grey = _sharpness_picture(frame)
         if float(grey[::2, ::2].std()) < _BLANK:
             count.blank += 1
             continue
@@ -224,7 +250,7 @@ def fit(image: Image, max_size: int) -> Image:
     """Scales an image down so that its longer side is at most `max_size` [px]."""
     height, width = image.shape[:2]
     new = fitted_size(width, height, max_size)
-    return image if new == (width, height) else resize(image, *new)
+    return image if new == (width, height) else np.asarray(resize(image, *new), np.uint8)
 
 
 def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
@@ -235,14 +261,14 @@ def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
 
 def upright(frame: av.VideoFrame) -> Image:
     """A frame as RGB, turned and mirrored as its display matrix says, to a multiple of 90°."""
-    image = frame.to_ndarray(format="rgb24")
+    image = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     matrix = display_matrix(frame)
     return image if matrix is None else oriented(image, matrix)
 
 
 def display_matrix(frame: av.VideoFrame) -> NDArray[np.float64] | None:
     """The 2×2 part of a frame's display matrix (pixel row vector × matrix = shown position), or None."""
-    side = frame.side_data.get(SideData.DISPLAYMATRIX)
+    side = frame.side_data.get(SideData.DISPLAYMATRIX)  # type: ignore[call-overload]
     if side is None:
         return None
     matrix = np.frombuffer(bytes(side), np.int32, 9).reshape(3, 3)[:2, :2] / 65536.0
@@ -270,14 +296,16 @@ class _Candidate:
     frame: av.VideoFrame
 
 
-def _small_grey(frame: av.VideoFrame) -> Image:
+def _sharpness_picture(frame: av.VideoFrame) -> Image:
     width = min(SHARPNESS_WIDTH, frame.width)
     height = max(1, round(frame.height * width / frame.width))
-    return frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray()
+    return np.asarray(frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray(), np.uint8)
 
 
-def _grey_at(grey: Image, width: int) -> Image:
-    return resize(grey, width, max(1, round(grey.shape[0] * width / grey.shape[1])))  # type: ignore[return-value]
+def _flow_picture(image: Image) -> Image:
+    height, width = image.shape[:2]
+    small = np.asarray(resize(image, FLOW_WIDTH, max(1, round(height * FLOW_WIDTH / width))), np.uint8)
+    return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
@@ -304,4 +332,3 @@ def _refuse_poor(path: Path, count: FilmCount, kept_any: bool) -> None:
         )
     if not kept_any:
         raise InputError(f"{path}: all {count.blank} frames are blank (one colour); film with light and without a cap")
-

@@ -1,0 +1,139 @@
+"""What every kind of source has in common: one source's inputs, its kept frames, and the files they are written to."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin import progress
+from twin.capture.lens import Lens, checked_lens
+from twin.capture.masks import Masks
+from twin.capture.types import SourceInfo
+from twin.config import CaptureConfig, SourceConfig
+from twin.errors import InputError
+from twin.geometry.images import write_image
+
+BLANK = 2.0
+"""A picture whose brightness varies less than this shows nothing [grey levels, standard deviation]."""
+
+_AHEAD = 4  # pictures decoded or encoded beside the one at hand; bounds the memory
+
+NO_GPS = (math.nan, math.nan, math.nan)
+
+Image = NDArray[np.uint8]
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One source to read."""
+
+    path: Path
+    name: str
+    lighting: str
+    kind: str
+    source: SourceConfig
+    config: CaptureConfig
+    masks: Masks | None
+    writer: "FrameWriter"
+
+    def given_lens(self, native: tuple[int, int]) -> Lens | None:
+        """The calibration of `scene.toml`, or None; `native` is the upright size of the input [px].
+
+        Raises:
+            InputError: an impossible calibration, or one for a picture of another shape.
+        """
+        camera = self.source.camera
+        if camera is None:
+            return None
+        where = f"{self.path.name}: camera"
+        width, height = (camera.width, camera.height) if camera.width or camera.height else native
+        lens = checked_lens(camera.model, camera.params, width, height, where)
+        if not lens.fits(*native):
+            raise InputError(
+                f"{where} is for {width}x{height}, but the upright picture is {native[0]}x{native[1]}; "
+                "give the calibration of the upright picture"
+            )
+        return lens
+
+    def info(self, size: tuple[int, int], lens: Lens | None, calibrated: bool) -> SourceInfo:
+        """The source as the next stage sees it; where no lens is known, a model that fits most cameras."""
+        model, params = (lens.model, lens.params) if lens else ("SIMPLE_RADIAL", ())
+        height = self.source.camera_height
+        return SourceInfo(self.name, self.lighting, self.kind, *size, model, params, calibrated, height)
+
+    def check_masked(self, unmasked: int, count: int) -> None:
+        """Says how many frames have no mask of their own; refuses a mask folder that fits none."""
+        if self.masks and unmasked == count:
+            raise InputError(
+                f"{self.masks.path}: no mask here is named like a frame; "
+                "call them 000012.png (frame of the film, from 0) or like the photo"
+            )
+        if self.masks and unmasked:
+            progress.say(f"  {self.masks.path.name}: {unmasked} of {count} frames have no mask and are used whole")
+
+
+@dataclass
+class Kept:
+    """The kept frames of one source, in order, and what is known of each."""
+
+    info: SourceInfo
+    index: list[int] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    gps: list[tuple[float, float, float]] = field(default_factory=list)
+    poses: list[NDArray[np.float64]] = field(default_factory=list)
+    """camera_to_world (4, 4) per frame; empty where the source brings none."""
+    intrinsics: list[NDArray[np.float64]] = field(default_factory=list)
+    """fx, fy, cx, cy [px] at the kept size, beside the poses."""
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+
+class FrameWriter:
+    """Encodes and writes a source's frames and masks in threads; a failure surfaces at the next frame or at the end."""
+
+    def __init__(self, out: Path, name: str) -> None:
+        self._images, self._masks = out / "images" / name, out / "masks" / name
+        self._waiting: list[Future[None]] = []
+        self.pool = ThreadPoolExecutor(2)
+
+    def put(self, index: int, image: Image, mask: Image | None) -> None:
+        """Queues one frame and its mask; blocks while the queue is full."""
+        while len(self._waiting) >= _AHEAD:
+            self._waiting.pop(0).result()
+        self._waiting.append(self.pool.submit(self._write, f"{index:06d}.png", image, mask))
+
+    def _write(self, file: str, image: Image, mask: Image | None) -> None:
+        grey = (image[..., 0] == image[..., 1]).all() and (image[..., 1] == image[..., 2]).all()
+        write_image(self._images / file, image[..., 0] if grey else image)
+        if mask is not None:
+            write_image(self._masks / file, mask)
+
+    def __enter__(self) -> "FrameWriter":
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self.pool.shutdown(wait=True, cancel_futures=error is not None)
+        if error is None:
+            for future in self._waiting:
+                future.result()
+
+
+def ahead(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Maps in threads, in order, never more than a few results ahead of the consumer."""
+    waiting: list[Future[R]] = []
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) >= _AHEAD:
+                yield waiting.pop(0).result()
+        while waiting:
+            yield waiting.pop(0).result()
+    finally:
+        for future in waiting:
+            future.cancel()

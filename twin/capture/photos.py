@@ -1,0 +1,198 @@
+"""Image sets, posed or not, as kept frames.
+
+A *posed* set brings a camera and a pose per image. A *stored* picture is as the file has it; *upright* is as its EXIF
+orientation wants it shown.
+"""
+
+import hashlib
+import itertools
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from twin import progress
+from twin.capture.exif import PhotoFacts, photo_facts
+from twin.capture.formats import ImageSet
+from twin.capture.keep import BLANK, Image, Kept, Task, ahead
+from twin.capture.lens import Lens, flattened, same_aspect
+from twin.capture.masks import read_mask
+from twin.capture.video import fitted_size
+from twin.errors import InputError
+from twin.geometry.images import resize
+
+_MAX_FOCAL_SPREAD = 0.05  # relative; photos of one source that differ more were zoomed
+
+
+def read_photos(task: Task, images: ImageSet) -> Kept:
+    """Reads, scales and writes the images of a set; exact duplicates and blank images are dropped.
+
+    Raises:
+        InputError: an unreadable image, images of different shapes, or none that shows anything.
+    """
+    if images.missing:
+        progress.say(f"  {task.path.name}: {images.missing} images are listed but do not exist; going on without them")
+    lenses = images.lenses
+    if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):
+        lenses = (given,) * len(lenses)
+    flatten = lenses is not None and _differ(lenses)
+    limit = min(task.config.frames or task.config.max_frames, task.config.max_frames)
+    chosen = [int(i) for i in regular_choice(len(images.paths), limit)]
+
+    def load(i: int) -> tuple[int, Image, PhotoFacts]:
+        return i, *load_photo(images.paths[i], lenses[i] if lenses else None)
+
+    kept = Kept(task.info((0, 0), None, False))
+    seen: set[bytes] = set()
+    duplicates = blank = unmasked = 0
+    clock: list[float | None] = []
+    focal: list[float] = []
+    kept_lenses: list[Lens] = []
+    native = size = (0, 0)
+    stream = ahead(task.writer.pool, load, chosen)
+    for i, image, facts in progress.track(stream, f"reading {task.name}", len(chosen), "image"):
+        shape = (image.shape[1], image.shape[0])
+        if size == (0, 0):
+            native, size = shape, fitted_size(*shape, task.config.max_size)
+        if not same_aspect(shape, native):
+            raise InputError(
+                f"{images.paths[i]}: {shape[0]}x{shape[1]}, but the images before it are {native[0]}x{native[1]}; "
+                "put images of another shape into a source of their own"
+            )
+        if shape != size:
+            image = np.asarray(resize(image, *size), np.uint8)
+        digest = hashlib.sha256(image.tobytes()).digest()
+        if digest in seen:
+            duplicates += 1
+            continue
+        seen.add(digest)
+        if float(image[::4, ::4].std()) < BLANK:
+            blank += 1
+            continue
+        mask = _mask(task, images, i, size)
+        unmasked += mask is None
+        if lenses and images.camera_to_world is not None:
+            lens = lenses[i].scaled(*size)
+            if flatten:
+                mask = None if mask is None else flattened(mask, lens, nearest=True)[0]
+                image, lens = flattened(image, lens)
+            kept_lenses.append(lens)
+            kept.poses.append(images.camera_to_world[i])
+            kept.intrinsics.append(lens.intrinsics)
+        task.writer.put(i, image, mask)
+        kept.index.append(i)
+        kept.gps.append(facts.gps)
+        clock.append(facts.time)
+        focal += [facts.focal] if facts.focal else []
+    if not kept.index:
+        raise InputError(f"{task.path}: all {len(chosen)} images are blank (one colour); give photos of the place")
+    task.check_masked(unmasked, len(kept.index))
+    kept.times = photo_times(clock, kept.index)
+    if kept_lenses:
+        middle = np.median([lens.intrinsics for lens in kept_lenses], axis=0)
+        kept.info = task.info(size, kept_lenses[0].with_intrinsics(middle), True)
+    elif known := task.given_lens(native):
+        kept.info = task.info(size, known.scaled(*size), True)
+    else:
+        kept.info = task.info(size, focal_prior(focal, size, task.name), False)
+    kept.metrics = {
+        "kind": task.kind,
+        "lighting": task.lighting,
+        "decoded": len(chosen),
+        "kept": len(kept.index),
+        "missing": images.missing,
+        "duplicates": duplicates,
+        "blank": blank,
+        "with_gps": sum(math.isfinite(latitude) for latitude, _, _ in kept.gps),
+        "focal_prior_px": None if kept.info.calibrated or not focal else round(kept.info.camera_params[0], 1),
+        "width": size[0],
+        "height": size[1],
+    }
+    return kept
+
+
+def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoFacts]:
+    """An image file as RGB, shape (h, w, 3), and what its header says.
+
+    A posed image's lens describes the picture as stored, so it is turned upright only where it then fits the lens.
+
+    Raises:
+        InputError: missing, empty, cut off or undecodable, or of another shape than its lens is for.
+    """
+    data = path.read_bytes() if path.exists() else b""
+    unreadable = InputError(f"{path}: not a readable image ({len(data)} bytes); replace or remove it")
+    if not data:
+        raise unreadable
+    facts = photo_facts(path)
+    stored = _stored_size(path, len(data))
+    as_stored = lens is not None and (facts.orientation < 5 or stored is None or lens.fits(*stored))
+    flags = cv2.IMREAD_COLOR | (cv2.IMREAD_IGNORE_ORIENTATION if as_stored else 0)
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if decoded is None:
+        raise unreadable
+    image = np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
+    if lens is not None and not lens.fits(image.shape[1], image.shape[0]):
+        raise InputError(
+            f"{path}: {image.shape[1]}x{image.shape[0]}, but its camera is for {lens.width}x{lens.height}; "
+            "give the images the poses were made with"
+        )
+    return image, facts
+
+
+def photo_times(clock: list[float | None], index: list[int]) -> list[float]:
+    """Times from the first photo on [s] where every photo has a clock and they rise strictly; else the index."""
+    known = [t for t in clock if t is not None]
+    if len(known) == len(clock) and len(known) > 1 and all(b > a for a, b in itertools.pairwise(known)):
+        return [t - known[0] for t in known]
+    return [float(i) for i in index]
+
+
+def regular_choice(count: int, limit: int) -> NDArray[np.int64]:
+    """Indices of at most `limit` of `count` things, evenly spaced, ends included."""
+    return np.arange(count) if count <= limit else np.round(np.linspace(0, count - 1, limit)).astype(np.int64)
+
+
+def focal_prior(focal: list[float], size: tuple[int, int], name: str) -> Lens | None:
+    """A lens with the photos' own focal length [longer sides], or None where they do not say."""
+    if not focal:
+        return None
+    middle = float(np.median(focal))
+    if max(focal) - min(focal) > _MAX_FOCAL_SPREAD * middle:
+        progress.say(f"  {name}: the photos' focal lengths differ (zoomed); give each zoom a source of its own")
+    return Lens("SIMPLE_RADIAL", (middle * max(size), 0.5 * size[0], 0.5 * size[1], 0.0), *size)
+
+
+def _differ(lenses: tuple[Lens, ...]) -> bool:
+    """True where one distortion cannot describe the source: then it is taken out here, image by image."""
+    several = len({(lens.model, lens.distortion) for lens in lenses}) > 1
+    return several and any(lens.is_distorted for lens in lenses)
+
+
+def _stored_size(path: Path, count: int) -> tuple[int, int] | None:
+    """Width and height as stored [px]; None where Pillow does not know the format.
+
+    OpenCV fills the rest of a JPEG that is cut off with grey and says nothing; Pillow reads to the end and objects.
+    """
+    try:
+        photo = PillowImage.open(path)
+    except (OSError, SyntaxError, ValueError):
+        return None
+    with photo:
+        stored = photo.size
+        if photo.format not in ("JPEG", "MPO"):
+            return stored
+        try:
+            photo.draft("L", (stored[0] // 8, stored[1] // 8))  # cheap, yet reads to the end
+            photo.load()
+        except (OSError, SyntaxError, ValueError):
+            raise InputError(f"{path}: the image is cut off ({count} bytes); copy it again or remove it") from None
+    return stored
+
+
+def _mask(task: Task, images: ImageSet, i: int, size: tuple[int, int]) -> Image | None:
+    path, own = images.paths[i], images.masks[i] if images.masks else None
+    found = task.masks.find((path.stem, path.name)) if task.masks else own
+    return read_mask(found, *size) if found else None
