@@ -16,7 +16,7 @@ from twin.capture.frames import held_out_frames, run, source_names
 from twin.capture.motion import median_motion, sharpness, stands_still
 from twin.capture.photos import photo_times, regular_choice
 from twin.capture.types import Capture
-from twin.capture.video import FilmFacts, index_of, oriented, probe, slot_of
+from twin.capture.video import FilmCount, FilmFacts, decode, index_of, oriented, probe, slot_of, upright
 from twin.config import CalibrationConfig, CaptureConfig, SceneConfig, SourceConfig, load_config
 from twin.errors import InputError
 from twin.geometry.images import read_image, write_image
@@ -39,10 +39,12 @@ def _drive(shifts: list[int]) -> list[np.ndarray]:
     return [np.ascontiguousarray(wall[40 : 40 + _H, s : s + _W]) for s in shifts]
 
 
-def _film(path: Path, frames: list[np.ndarray], times_ms: list[int] | None = None, **options: str) -> Path:
+def _film(
+    path: Path, frames: list[np.ndarray], times_ms: list[int] | None = None, gop: str = "250", **options: str
+) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w", options=options) as container:
-        stream = container.add_stream("libx264", rate=15, options={"crf": "12"})
+        stream = container.add_stream("libx264", rate=15, options={"crf": "12", "g": gop})
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         if times_ms is not None:
@@ -243,6 +245,33 @@ def test_a_film_cut_off_gives_the_frames_it_still_has(tmp_path: Path, capsys: py
     decoded = metrics["sources"]["a"]["decoded"]
     assert 2 <= len(capture.names) == decoded < 40
     assert f"{decoded} of 40 frames could be decoded" in capsys.readouterr().err
+
+
+def test_no_frame_predicted_from_a_damaged_one_is_used(tmp_path: Path) -> None:
+    path = _film(tmp_path / "a.mp4", _drive([7 * i for i in range(60)]), gop="12")
+
+    def decoded() -> tuple[dict[int, np.ndarray], FilmCount]:
+        facts, count, index, pictures = probe(path), FilmCount(), -1, {}
+        for stamp, frame in decode(path, count):
+            index = index_of(None if stamp is None else stamp - facts.start, facts, index)
+            pictures[index] = upright(frame)
+        return pictures, count
+
+    sound, count = decoded()
+    assert len(sound) == 60 and count.damaged == 0
+    with av.open(str(path)) as container:
+        places = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    data = path.read_bytes()
+    for spoil in ([20], [5, 31], [40, 41]):
+        spoilt = bytearray(data)
+        for number in spoil:
+            start, size = places[number]
+            spoilt[start + size // 4 : start + size] = bytes(size - size // 4)
+        path.write_bytes(spoilt)
+        found, count = decoded()
+        assert count.damaged >= len(spoil) and 60 - 25 * len(spoil) <= len(found) < 60
+        for index, picture in found.items():
+            np.testing.assert_array_equal(picture, sound[index])
 
 
 def test_one_frame_or_nothing_to_see_is_refused(tmp_path: Path) -> None:

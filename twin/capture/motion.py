@@ -15,7 +15,7 @@ FLOW_WIDTH = 320
 SHARPNESS_WIDTH = 640
 """Width at which sharpness is measured [px]; at full size the noise of the sensor would count as detail."""
 
-_CORNERS = 300
+_CORNERS = 200
 _MIN_TRACKED = 12  # fewer corners than this say nothing about the whole picture
 _MAX_RETURN_ERROR = 0.5  # [px], a corner tracked there and back must come home
 _STILL_DIFFERENCE = 1.5  # [grey levels of a picture stretched to 255], below it two texture-free frames are the same

@@ -15,6 +15,7 @@ import av.error
 import cv2
 import numpy as np
 from av.sidedata.sidedata import Type as SideData
+from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from twin.capture.motion import FLOW_WIDTH, SHARPNESS_WIDTH, sharpness, stands_still
@@ -23,6 +24,7 @@ from twin.errors import InputError
 from twin.geometry.images import resize
 
 _BLANK = 2.0  # [grey levels], a frame whose brightness varies less than this shows nothing
+_LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 _DAMAGED = 0.98  # share of the frames a container promises, below which the user is told
 
 Image = NDArray[np.uint8]
@@ -107,23 +109,35 @@ def probe(path: Path) -> FilmFacts:
 def decode(path: Path, count: FilmCount) -> Iterator[tuple[float | None, av.VideoFrame]]:
     """Decodes a film front to back, skipping what is damaged.
 
+    A decoder repairs a damaged frame by guessing and predicts the next frames from the guess, so nothing is taken from
+    the damage on to the next key frame, nor the B frames shown before it that lean on it.
+
     Yields:
         Each frame's time stamp in its stream [s] (None where it has none), and the frame.
     """
     with av.open(str(path)) as container:
         stream = _video_stream(container, path)
         stream.thread_type = "AUTO"
+        leaning: list[av.VideoFrame] = []  # B frames that wait for the frame after them to turn out sound
+        broken = False
         for packet in _packets(container, stream):
+            frames: list[av.VideoFrame | None] = []
             try:
-                frames = packet.decode()
+                frames.extend(packet.decode())
             except av.error.FFmpegError:
-                count.damaged += 1
-                continue
+                frames.append(None)
             for frame in frames:
-                if frame.is_corrupt:
-                    count.damaged += 1
-                else:
-                    yield frame.time, frame
+                if frame is None or frame.is_corrupt or (broken and not frame.key_frame):
+                    count.damaged += 1 + len(leaning)
+                    leaning.clear()
+                    broken = True
+                    continue
+                broken = False
+                leaning.append(frame)
+                if frame.pict_type != PictureType.B:
+                    yield from ((sound.time, sound) for sound in leaning)
+                    leaning.clear()
+        yield from ((sound.time, sound) for sound in leaning)
 
 
 def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet]:
@@ -299,6 +313,10 @@ class _Candidate:
 def _sharpness_picture(frame: av.VideoFrame) -> Image:
     width = min(SHARPNESS_WIDTH, frame.width)
     height = max(1, round(frame.height * width / frame.width))
+    if frame.format.name in _LUMA_FIRST:  # the brightness is there already: no conversion
+        plane = frame.planes[0]
+        luma = np.frombuffer(bytes(plane), np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+        return np.asarray(resize(luma, width, height), np.uint8)
     return np.asarray(frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray(), np.uint8)
 
 
