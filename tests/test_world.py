@@ -166,6 +166,16 @@ def test_a_route_that_starts_off_the_ground_is_refused(tmp_path):
         run(scene, tiny_config(), out)
 
 
+def test_a_film_that_went_nowhere_is_refused(tmp_path):
+    scene = tiny_scene(tmp_path)
+    xy = tiny_route()[:4]
+    np.savez(scene.stage("mesh") / "route.npz", xy=xy, z=tiny_ground().at(xy))
+    out = scene.stage("mjcf")
+    out.mkdir()
+    with pytest.raises(InputError, match=r"0\.75 m long"):
+        run(scene, tiny_config(), out)
+
+
 def test_what_the_robot_touches_at_the_start_is_named(tmp_path):
     scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tyres
     out = scene.stage("mjcf")

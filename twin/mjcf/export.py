@@ -42,6 +42,7 @@ GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
 _HFIELD_BASE = 1.0  # [m] of solid below the lowest point, so that nothing tunnels through
 _GROUND_SKIN = 0.15  # [m] above the height field: visual mesh below this is left to the field's own texture
 _SETTLE_TIME = 2.0  # [s]
+_MIN_ROUTE = 2.0  # [m]
 _REST_STEPS = 200  # of the check after writing
 _REST_DRIFT = 0.005  # [m] a robot that "stays put" may creep in that check
 _SITE_SPACING = 1.0  # [m] between the route's sites
@@ -79,7 +80,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         Metrics for the report.
 
     Raises:
-        InputError: the route's start lies off the ground, or the robot does not come to rest there.
+        InputError: the route is too short, starts off the ground, or the robot does not come to rest at its start.
     """
     mesh = scene.stage("mesh")
     ground = Ground.load(mesh)
@@ -283,6 +284,9 @@ def _add_robot(
         x, y, z [m] and yaw [rad] at rest, and the names of what stood in its place besides the ground (and may have
         pushed it aside).
     """
+    length = float(arc_lengths(route)[-1])
+    if length < _MIN_ROUTE:
+        raise InputError(f"the filmed route is {length:.2f} m long, expected {_MIN_ROUTE:g} m; set mjcf.route = false")
     yaw = float(heading_at(route, 0.0))
     rows, columns = ground.height.shape
     edge = np.minimum(
