@@ -13,8 +13,8 @@ from twin.mjcf.world import CAMERA_SIZE, World, arc_lengths
 from twin.report.chapters import title_card
 from twin.report.panels import ACCENT, AMBER, GREEN, INK, RED, Colour, Picture, facts, place, plate
 from twin.report.plan import Plan
-from twin.report.sections import listing
 from twin.report.studio import Studio, as_picture, side_by_side
+from twin.report.words import listing
 
 Array = NDArray[np.float64]
 

@@ -58,6 +58,7 @@ _STYLE: dict[str, Any] = {
     "legend.fontsize": 8,
     "lines.linewidth": 1.6,
     "svg.fonttype": "none",
+    "svg.hashsalt": "twin",  # ids from the content alone, so that the same numbers give the same figure
     # Names come from the user's files: a dollar sign is a dollar sign.
     "text.parse_math": False,
 }
@@ -82,7 +83,10 @@ def svg(figure: Figure) -> str:
         )
     text = buffer.getvalue().decode()
     text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # Its style would hold for the whole page, which has the same rule for its figures.
+    text = re.sub(r"<(metadata|style)\b.*?</\1>", "", text, flags=re.DOTALL)
+    # Within HTML the parser knows the namespaces; left out, nothing in the page looks like an address.
+    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, f"var({variable})")
     # Only what is referred to needs an id; those get a prefix of their own.
@@ -172,8 +176,10 @@ def place_map(
             mine = np.array([name == source for name in sources])
             colour = SERIES[i % len(SERIES)]
             seen, unseen = positions[mine & ~held_out], positions[mine & held_out]
-            axes.scatter(seen[:, 0], seen[:, 1], s=9, c=colour, linewidths=0, label=source, zorder=4)
-            axes.scatter(unseen[:, 0], unseen[:, 1], s=12, facecolors="none", edgecolors=colour, lw=0.9, zorder=4)
+            # Several films of one path lie on top of each other: the later ones are smaller, so that all show.
+            size = 16.0 / (1.0 + 0.8 * i)
+            axes.scatter(seen[:, 0], seen[:, 1], s=size, c=colour, linewidths=0, label=source, zorder=4)
+            axes.scatter(unseen[:, 0], unseen[:, 1], s=size, facecolors="none", edgecolors=colour, lw=0.8, zorder=4)
         axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
     _legend(axes, 3)
     return figure
@@ -259,7 +265,7 @@ def bars(values: dict[str, float], counts: dict[str, int], unit: str, label: str
     return figure
 
 
-def histogram(values: Array, label: str, highest: float | None = None) -> Figure:
+def histogram(values: NDArray, label: str, highest: float | None = None) -> Figure:
     """How often each value occurs, with its median; what is above `highest` is counted in the last bin."""
     figure, axes = _figure(1.9)
     values = np.asarray(values, np.float64)

@@ -33,9 +33,9 @@ from twin.report.drive import DRIVE_STRIP, drive_metrics, film_drive, stride, tr
 from twin.report.overview import keep_overviews
 from twin.report.panels import AMBER, GREEN, RED, Box, Layout, Picture
 from twin.report.plan import Plan, footprints
-from twin.report.sections import follower_verdict
 from twin.report.studio import Field, Studio, side_by_side, spread
 from twin.report.video import VideoWriter
+from twin.report.words import follower_verdict
 from twin.scene import SceneDir, write_json
 
 Array = NDArray[np.float64]

@@ -1,0 +1,137 @@
+"""Figures: they show the numbers they are given, follow the page's colours, and cannot break the page."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from twin.assets.ground import Ground
+from twin.report import figures
+
+
+class _Ids(HTMLParser):
+    """Collects ids and what refers to them, and checks that tags are closed in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.referred: set[str] = set()
+        self.open: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.open.append(tag)
+        self._look(attrs)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._look(attrs)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data.strip())
+
+    def _look(self, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name == "xlink:href" and (value or "").startswith("#"):
+                self.referred.add((value or "")[1:])
+            else:
+                self.referred |= set(re.findall(r"url\(#([^)]+)\)", value or ""))
+
+
+def parsed(svg: str) -> _Ids:
+    parser = _Ids()
+    parser.feed(svg)
+    assert not parser.open
+    return parser
+
+
+def every_figure() -> dict[str, figures.Figure]:
+    rng = np.random.default_rng(0)
+    route = np.stack([np.linspace(0, 20, 50), np.sin(np.linspace(0, 1, 50))], 1)
+    positions = np.column_stack([route[::5], np.full(10, 1.5)])
+    ground = Ground(
+        rng.normal(size=(60, 80)),
+        np.array([-5.0, -15.0]),
+        0.5,
+        np.ones((60, 80), bool),
+        np.zeros((60, 80, 3), np.uint8),
+    )
+    parts = [np.array([[1.0, 2.0], [2.0, 2.0], [2.0, 3.0]])]
+    points = rng.normal(size=(300, 3)) * 5
+    colours = rng.integers(0, 255, (300, 3)).astype(np.uint8)
+    half = np.arange(10) % 2 == 0
+    return {
+        "place": figures.place_map(positions, ["a"] * 5 + ["b"] * 5, half, points, colours, route, 1.0, parts),
+        "bare place": figures.place_map(positions, ["a"] * 10, half, points[:0], colours[:0]),
+        "ground": figures.ground_map(ground, route, route, 1.0, parts),
+        "bare ground": figures.ground_map(ground, route, None, 0.0, []),
+        "training": figures.training_curve([0, 10, 20], [10.0, 15.0, 17.0], "PSNR [dB]"),
+        "bars": figures.bars({"day": 23.44, "night": 17.0}, {"day": 7}, "dB", "PSNR [dB]"),
+        "histogram": figures.histogram(rng.gamma(2.0, 0.3, 500), "error [px]", 4.0),
+        "along": figures.along_the_path([0, 1, 2], {"x": [0.0, 0.1, 0.2], "y": [0.1, 0.1, 0.1]}, "off [m]", 1.0),
+        "groups": figures.errors_by_group({"day": [0.1, 0.2], "night": [0.3]}, "off [m]"),
+    }
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict[str, str]:
+    return {name: figures.svg(figure) for name, figure in every_figure().items()}
+
+
+def test_every_figure_is_well_formed_and_themed(drawn: dict[str, str]) -> None:
+    for svg in drawn.values():
+        assert svg.startswith("<svg") and svg.rstrip().endswith("</svg>")
+        parser = parsed(svg)
+        assert parser.referred <= set(parser.ids)  # nothing refers to an id that was dropped
+        assert "var(--" in svg
+        assert "#0a0b" not in svg  # every stand-in became a variable
+        assert "http" not in svg  # nothing to fetch
+        opening = svg[: svg.index(">")]
+        assert "viewBox" in opening and " width=" not in opening and " height=" not in opening
+
+
+def test_ids_are_unique_across_figures(drawn: dict[str, str]) -> None:
+    ids = [i for svg in drawn.values() for i in parsed(svg).ids]
+    assert len(ids) == len(set(ids)) > 0
+
+
+def test_the_same_numbers_give_the_same_figure(drawn: dict[str, str]) -> None:
+    again = {name: figures.svg(figure) for name, figure in every_figure().items()}
+    assert again == drawn
+
+
+def test_bars_say_their_values_and_counts(drawn: dict[str, str]) -> None:
+    text = parsed(drawn["bars"]).text
+    assert "23.4 dB (n = 7)" in text
+    assert "17.0 dB" in text  # no count is known, and none is invented
+
+
+def test_names_from_files_are_text() -> None:
+    svg = figures.svg(figures.bars({"<b>&$x_1$": 20.0}, {}, "dB", "PSNR"))
+    assert "<b>" not in svg
+    assert "<b>&$x_1$" in parsed(svg).text
+
+
+def test_the_histogram_shows_the_median() -> None:
+    svg = figures.svg(figures.histogram(np.array([1.0, 2.0, 2.5, 9.0, 100.0]), "px", 4.0))
+    assert "median 2.5" in parsed(svg).text
+
+
+def test_the_corridor_is_as_wide_as_it_says() -> None:
+    route = np.stack([np.linspace(0, 10, 11), np.zeros(11)], 1)
+    outline = figures.corridor_outline(route, 0.75)
+    assert outline.shape == (22, 2)
+    assert set(np.round(np.abs(outline[:, 1]), 9)) == {0.75}
+    x, y = outline.T
+    area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+    assert area == pytest.approx(10 * 1.5)
+
+
+def test_bounds_hold_the_path() -> None:
+    low, high = figures.bounds_of(np.array([[0.0, 5.0], [3.0, -2.0]]), 1.0)
+    assert low.tolist() == [-1.0, -3.0] and high.tolist() == [4.0, 6.0]

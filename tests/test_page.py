@@ -1,0 +1,281 @@
+"""The report page: what it says follows from the numbers, nothing is made up, and no name can break it."""
+
+import copy
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from twin.geometry.images import write_image
+from twin.report.markup import Html, element, table
+from twin.report.page import page, write_page
+from twin.report.sections import SECTIONS, truth_section
+from twin.report.words import NOT_MEASURED, duration, flat, follower_verdict, listing, number, pick, verdicts
+from twin.scene import STAGES, SceneDir, write_json
+
+REPORT: dict[str, Any] = {
+    "scene": "road",
+    "seed": 3,
+    "versions": {"twin": "0.1.0"},
+    "peak_memory_bytes": 3 * 2**30,
+    "seconds": 185.0,
+    "inputs": {"input/day.mp4": "ab" * 32},
+    "stages": {
+        name: {"seconds": 10.0 * k, "peak_memory_bytes": 2**30, "skipped": k == 0, "config": {"fps": 2.0}}
+        for k, name in enumerate(STAGES)
+    },
+    "capture": {"frames": 160, "train": 140, "held_out": 20, "sources": {"day": {"kept": 160, "damaged": 0}}},
+    "cameras": {"registered": 158, "total": 160, "reprojection_error_px": 0.61, "mean_track_length": 5.2},
+    "metric": {"scale_source": "camera_height", "scale_uncertainty": 0.012},
+    "field": {"psnr": {"day": 24.3}, "ssim": {"day": 0.7}, "n": {"day": 10}, "curve": [[0, 10.0], [100, 20.0]]},
+    "mesh": {"parts": 42},
+    "mjcf": {"route_length_m": 59.8, "turn_deg": -82.0, "half_width_m": 1.0},
+    "review": {
+        "follower": {
+            "reached_goal": True,
+            "touched": [],
+            "max_cross_track_m": 0.07,
+            "seconds": 61.0,
+            "distance_m": 59.1,
+            "turn_deg": -82.4,
+        },
+        "frames": 560,
+        "duration_s": 56.0,
+        "trace": {"progress_m": [0.0, 30.0, 59.0], "cross_track_m": [0.0, 0.07, 0.0], "speed_m_s": [0.0, 1.0, 1.0]},
+    },
+    "truth": None,
+}
+
+
+def changed(path: str, value: Any) -> dict[str, Any]:
+    report = copy.deepcopy(REPORT)
+    *folders, last = path.split(".")
+    inner = report
+    for key in folders:
+        inner = inner[key]
+    inner[last] = value
+    return report
+
+
+class _Text(HTMLParser):
+    """The text of a page, its links and its tags; fails on tags closed out of order."""
+
+    _VOID = frozenset({"img", "meta", "source", "br"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.parts: list[str] = []
+        self.links: list[str] = []
+        self.tags: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        if tag not in self._VOID:
+            self.open.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "poster", "xlink:href")]
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in self._VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.parts.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.parts))
+
+
+def read(html: str) -> _Text:
+    parser = _Text()
+    parser.feed(html)
+    assert not parser.open
+    return parser
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneDir:
+    scene = SceneDir(tmp_path / "road")
+    scene.stage("review").mkdir(parents=True)
+    return scene
+
+
+def test_the_page_says_what_happened(scene: SceneDir) -> None:
+    write_page(scene, REPORT)
+    text = read(scene.report_html.read_text(encoding="utf-8")).text
+    assert "The Husky followed the 59.8 m route from start to end and touched nothing but the ground." in text
+    assert "158 of 160" in text
+    assert "24.3 dB PSNR, 0.70 SSIM" in text
+    assert "3 min 05 s" in text and "3.0 GiB" in text
+    assert "Seed: 3" in text
+    assert [p.name for p in scene.build.iterdir() if p.is_file()] == ["report.html"]
+
+
+def test_an_empty_report_makes_a_page_that_makes_nothing_up(scene: SceneDir) -> None:
+    text = read(page(scene, {})).text
+    assert text.count("This stage has not run.") == len(SECTIONS)
+    assert NOT_MEASURED in text
+    assert not re.search(r"\d dB|\d m\b|\d %", text)
+
+
+@pytest.mark.parametrize("stage", list(SECTIONS))
+def test_a_stage_without_numbers_is_not_measured(stage: str) -> None:
+    for empty in ({}, {stage: {}}, {stage: None}):
+        facts = SECTIONS[stage](empty).facts
+        assert facts or stage == "review"
+        digits = [fact for fact in facts if re.search(r"\d", fact.value)]
+        assert digits == []
+
+
+def test_every_missing_key_is_tolerated(scene: SceneDir) -> None:
+    for stage in SECTIONS:
+        for key in REPORT[stage]:
+            report = copy.deepcopy(REPORT)
+            del report[stage][key]
+            SECTIONS[stage](report), verdicts(report)
+            report[stage][key] = None
+            SECTIONS[stage](report), verdicts(report)
+    for key in REPORT:
+        read(page(scene, {k: v for k, v in REPORT.items() if k != key}))
+
+
+def test_names_from_files_are_text(scene: SceneDir) -> None:
+    evil = '<script>alert("1")</script>&amp;'
+    report = changed("field.psnr", {evil: 20.0})
+    report["scene"] = evil
+    report["inputs"] = {evil: evil}
+    report["versions"] = {evil: evil}
+    report["capture"]["sources"] = {evil: {"kept": 3, "damaged": 1, "lighting": evil}}
+    report["metric"]["scale_source"] = evil
+    report["review"]["follower"] |= {"reached_goal": False, "touched": [evil]}
+    report["stages"][evil] = {"seconds": 1.0, "config": {evil: evil}}
+    write_image(scene.stage("review") / "pictures" / "a.jpg", np.zeros((4, 4, 3), np.uint8))
+    write_json(
+        scene.stage("review") / "review.json",
+        {"pictures": [{"file": "pictures/a.jpg", "section": "field", "caption": evil}]},
+    )
+    parser = read(page(scene, report))
+    assert "script" not in parser.tags
+    assert evil in parser.text
+
+
+def test_nothing_is_fetched_from_elsewhere(scene: SceneDir) -> None:
+    (scene.stage("review") / "review.mp4").write_bytes(b"film")
+    write_image(scene.stage("review") / "pictures" / "a.jpg", np.zeros((4, 4, 3), np.uint8))
+    told = [
+        {"file": f"pictures/{name}.jpg", "section": s, "caption": s} for name, s in (("a", "poster"), ("b", "field"))
+    ]
+    write_json(scene.stage("review") / "review.json", {"pictures": told})
+    html = page(scene, REPORT)
+    parser = read(html)
+    assert {link for link in parser.links if not link.startswith(("#", "data:"))} == {"review.mp4", "report.json"}
+    assert "http" not in html and "url(" not in html.replace("url(#", "")
+    assert "video" in parser.tags
+
+
+def test_without_a_film_none_is_offered(scene: SceneDir) -> None:
+    assert "video" not in read(page(scene, REPORT)).tags
+
+
+@pytest.mark.parametrize(
+    ("follower", "sentence", "mood"),
+    [
+        ({"reached_goal": True, "touched": []}, "from start to end and touched nothing but the ground.", "good"),
+        ({"reached_goal": True, "touched": ["tree"]}, "from start to end and touched tree.", "mixed"),
+        ({"reached_goal": True}, "and what it touched was not measured.", "mixed"),
+        (
+            {"reached_goal": False, "touched": ["a", "b"], "distance_m": 23.06},
+            "did not reach the end of the 59.8 m route: it came 23.1 m far and touched a and b.",
+            "bad",
+        ),
+    ],
+)
+def test_the_headline(follower: dict[str, Any], sentence: str, mood: str) -> None:
+    verdict = follower_verdict(changed("review.follower", follower))
+    assert verdict.text.endswith(sentence)
+    assert verdict.mood == mood
+
+
+def test_no_drive_says_why(scene: SceneDir) -> None:
+    report = changed("review.follower", None)
+    report["review"]["not_applicable"] = "this is no drive"
+    assert follower_verdict(report).text == "No robot was driven here: this is no drive."
+    assert "Does not apply here: this is no drive." in read(page(scene, report)).text
+
+
+@pytest.mark.parametrize(
+    ("stage", "key", "value", "what"),
+    [
+        ("cameras", "registered", 100, "60 of 160 frames could not be placed"),
+        ("cameras", "reprojection_error_px", 2.5, "2.50 px"),
+        ("cameras", "outliers", ["day/000001"], "day/000001"),
+        ("metric", "scale_uncertainty", 0.1, "10.0%"),
+        ("field", "psnr", {"day": 12.0}, "12.0 dB"),
+        ("field", "n", {"day": 1}, "Only 1 frame"),
+        ("mesh", "parts", 0, "Nothing solid"),
+        ("capture", "frames", 5, "Only 5 frames"),
+        ("capture", "sources", {"day": {"damaged": 4}}, "4 frame(s)"),
+    ],
+)
+def test_what_is_wrong_is_said_with_a_cure(stage: str, key: str, value: Any, what: str) -> None:
+    assert SECTIONS[stage](REPORT).cautions == []
+    cautions = SECTIONS[stage](changed(f"{stage}.{key}", value)).cautions
+    assert len(cautions) == 1
+    assert what in cautions[0].what and cautions[0].cure
+
+
+def test_a_failed_drive_says_what_to_try() -> None:
+    report = changed("review.follower", {"reached_goal": False, "touched": ["part_0001"]})
+    cautions = SECTIONS["review"](report).cautions
+    assert [bool(c.cure) for c in cautions] == [True, True]
+    assert "part_0001" in cautions[1].what
+
+
+def test_truth_is_told_where_it_is_known(scene: SceneDir) -> None:
+    assert "real place" in truth_section(REPORT).not_applicable
+    known = changed("truth", {"ate_m": 0.042, "ground_median_m": 0.09, "corridor_intrusions": 2, "scale_error": None})
+    section = truth_section(known)
+    values = {fact.name: fact.value for fact in section.facts}
+    assert values["camera positions"] == "0.042 m" and values["scale"] == NOT_MEASURED
+    assert len(section.cautions) == 2
+    assert any("4.2 cm" in verdict.text for verdict in verdicts(known))
+
+
+def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
+    text = read(page(scene, REPORT)).text
+    assert "24.3 dB (n = 10)" in text
+    assert "How training went" in text and "How far off the route it drove" in text
+    assert "Ground and solid parts" not in text  # no mesh stage on disk
+
+
+def test_elements_escape_all_but_html() -> None:
+    assert element("p", "a < b & c") == "<p>a &lt; b &amp; c</p>"
+    assert element("p", Html("<b>x</b>")) == "<p><b>x</b></p>"
+    assert element("a", "x", href='"><script>') == '<a href="&quot;&gt;&lt;script&gt;">x</a>'
+    assert element("video", controls=True, poster=None) == "<video controls></video>"
+    assert element("img", src="a") == '<img src="a">'
+    assert '<td class="n">1</td>' in table(["a"], [["1"]], (0,))
+
+
+def test_small_words() -> None:
+    assert number(None) == number(True) == number("x") == NOT_MEASURED
+    assert number(2, "{:.1f} m") == "2.0 m"
+    assert duration(8.24) == "8.2 s" and duration(59.96) == "1 min 00 s" and duration(None) == NOT_MEASURED
+    assert listing([]) == "none" and listing(["a"]) == "a" and listing("abc") == "a, b and c"
+    assert listing("abcdef") == "a, b, c and 3 more"
+    assert pick({"a": {"b": 1}}, "a.b") == 1 and pick({"a": 2}, "a.b") is None and pick(None, "a") is None
+    assert flat({"a": {"b": 1.5, "c": [1, 2]}, "d": list(range(99)), "e": None, "f": True}) == [
+        ("a.b", "1.5"),
+        ("a.c", "1, 2"),
+        ("d", "99 values"),
+        ("e", NOT_MEASURED),
+        ("f", "yes"),
+    ]

@@ -1,0 +1,193 @@
+"""`report.html`: one file that tells a newcomer what was built, how good it is, and what to do about what is not.
+
+Everything is inside the page but the film, which lies beside it; nothing is fetched. Pictures and figures come from the
+stage folders, words from `twin.report.sections`.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from twin.report.charts import Chart, charts
+from twin.report.markup import STYLE, Html, data_url, element, join, picture, table
+from twin.report.sections import SECTIONS, general_cautions, truth_section
+from twin.report.words import NOT_MEASURED, Caution, Section, duration, flat, number, pick, verdicts
+from twin.scene import SceneDir, read_json
+
+_STAGE_WORDS = {name: make({}).title for name, make in SECTIONS.items()}
+
+
+def write_page(scene: SceneDir, report: dict[str, Any]) -> None:
+    """Writes `build/report.html` from a report and what its build left on disk; half a page is never seen.
+
+    Args:
+        scene: Where pictures and figures come from; what is missing is left out.
+        report: As in `report.json`. Whatever it lacks is shown as not measured.
+    """
+    path = scene.report_html
+    aside = path.with_name(path.name + ".partial")
+    aside.write_text(page(scene, report), encoding="utf-8")
+    aside.replace(path)
+
+
+def page(scene: SceneDir, report: dict[str, Any]) -> str:
+    """The whole page."""
+    drawn, kept = charts(scene, report), _pictures(scene)
+    name = str(report.get("scene") or scene.root.name)
+    sections = [make(report) for make in SECTIONS.values()] + [truth_section(report)]
+    body = element(
+        "main",
+        _header(name, report),
+        _film(scene, kept),
+        element(
+            "nav", *(element("a", s.title, href=f"#{s.name}") for s in sections), element("a", "Costs", href="#costs")
+        ),
+        *(_section(k + 1, s, report, drawn, kept) for k, s in enumerate(sections)),
+        _costs(report),
+        element("footer", "Every number is in ", element("a", "report.json", href="report.json"), " beside this page."),
+    )
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("title", f"{name}: a twin's report"),
+        element("style", Html(STYLE)),
+    )
+    return "<!DOCTYPE html>\n" + element("html", head, element("body", body), lang="en") + "\n"
+
+
+def _header(name: str, report: dict[str, Any]) -> Html:
+    seconds = report.get("seconds")
+    if seconds is None:
+        each = [pick(stage, "seconds") for stage in (report.get("stages") or {}).values()]
+        seconds = sum(s for s in each if isinstance(s, int | float)) if each else None
+    cost = f"built in {duration(seconds)}"
+    memory = number(_gibibytes(report.get("peak_memory_bytes")), "{:.1f} GiB of memory at most")
+    sentences = [element("li", verdict.text, class_=verdict.mood) for verdict in verdicts(report)]
+    return element(
+        "header",
+        element("h1", name),
+        element("p", f"A filmed place as a MuJoCo twin: {cost}, {memory}.", class_="kicker"),
+        element("ul", *sentences, class_="verdicts"),
+        *map(_caution, general_cautions(report)),
+        class_="top",
+    )
+
+
+def _film(scene: SceneDir, kept: list[tuple[str, Path, str]]) -> Html:
+    """The film, which lies beside the page, and its poster, which is in it."""
+    if not (scene.stage("review") / "review.mp4").exists() and not scene.review_mp4.exists():
+        return Html("")
+    poster = next((data_url(path) for section, path, _ in kept if section == "poster"), None)
+    return element(
+        "section",
+        element("video", src="review.mp4", poster=poster, controls=True, preload="none", playsinline=True),
+        element(
+            "p",
+            "The film shows the real frames beside the twin’s, the light turning, and the drive. "
+            "It lies beside this page: ",
+            element("a", "review.mp4", href="review.mp4"),
+            class_="meaning",
+        ),
+        id="film",
+    )
+
+
+def _pictures(scene: SceneDir) -> list[tuple[str, Path, str]]:
+    """Section, file and caption of every picture the review kept."""
+    folder = scene.stage("review")
+    if not (folder / "review.json").exists():
+        return []
+    told = read_json(folder / "review.json").get("pictures", [])
+    rows = [(str(row["section"]), folder / str(row["file"]), str(row["caption"])) for row in told]
+    return [row for row in rows if row[1].is_file()]
+
+
+def _section(
+    position: int, section: Section, report: dict[str, Any], drawn: list[Chart], kept: list[tuple[str, Path, str]]
+) -> Html:
+    title = element("h2", element("small", str(position)) if section.name != "truth" else "", section.title)
+    ran = section.name in report or section.name in (report.get("stages") or {})
+    if not ran and section.name != "truth":
+        return element("section", title, element("p", "This stage has not run.", class_="na"), id=section.name)
+    if section.not_applicable and not section.done:
+        return element("section", title, _not_applicable(section), id=section.name)
+    facts = [
+        element(
+            "div",
+            element("dt", fact.name),
+            element(
+                "dd",
+                element("b", fact.value),
+                element("span", fact.meaning, class_="meaning"),
+                class_="none" if fact.value == NOT_MEASURED else None,
+            ),
+        )
+        for fact in section.facts
+    ]
+    figures = [element("div", element("h3", c.title), Html(c.svg)) for c in drawn if c.section == section.name]
+    rows = flat(report.get(section.name))
+    return element(
+        "section",
+        title,
+        element("p", section.done, class_="done"),
+        _not_applicable(section) if section.not_applicable else "",
+        *map(_caution, section.cautions),
+        element("dl", *facts),
+        *(picture(path, caption) for name, path, caption in kept if name == section.name),
+        element("div", *figures, class_="charts") if figures else "",
+        element(
+            "details",
+            element("summary", "All numbers of this stage"),
+            table(["key", "value"], [[*row] for row in rows]),
+        ),
+        id=section.name,
+    )
+
+
+def _not_applicable(section: Section) -> Html:
+    return element("p", f"Does not apply here: {section.not_applicable}.", class_="na")
+
+
+def _caution(caution: Caution) -> Html:
+    return element("div", element("b", caution.what), f"What helps: {caution.cure}", class_="caution", role="note")
+
+
+def _gibibytes(size: Any) -> float | None:
+    return size / 2**30 if isinstance(size, int | float) else None
+
+
+def _costs(report: dict[str, Any]) -> Html:
+    stages: dict[str, Any] = report.get("stages") or {}
+    seconds = {name: pick(stage, "seconds") for name, stage in stages.items()}
+    longest = max([s for s in seconds.values() if isinstance(s, int | float)], default=0.0)
+    rows = []
+    for name, stage in stages.items():
+        spent = seconds[name]
+        share = 100.0 * spent / longest if isinstance(spent, int | float) and longest > 0 else 0.0
+        rows.append(
+            [
+                _STAGE_WORDS.get(name, name) + (" (up to date)" if pick(stage, "skipped") else ""),
+                duration(spent),
+                element("span", class_="bar", style=f"width:{share:.1f}%"),
+                number(_gibibytes(pick(stage, "peak_memory_bytes")), "{:.2f} GiB"),
+            ]
+        )
+    settings = [row for name, stage in stages.items() for row in flat(pick(stage, "config") or {}, name)]
+    inputs = [[str(name), element("code", str(digest)[:16])] for name, digest in (report.get("inputs") or {}).items()]
+    versions = [[str(name), str(version)] for name, version in (report.get("versions") or {}).items()]
+    seed = report.get("seed")
+    return element(
+        "section",
+        element("h2", "Costs and origins"),
+        element("p", "Where the time went, and everything needed to build the same twin again.", class_="done"),
+        table(["stage", "time", "", "peak memory"], rows, (1, 3)),
+        element("p", f"Seed: {NOT_MEASURED if seed is None else seed}"),
+        _fold("Versions", table(["package", "version"], versions)),
+        _fold("Input files", table(["file", "SHA-256 (start)"], inputs)),
+        _fold("Settings", table(["setting", "value"], [[*row] for row in settings])),
+        id="costs",
+    )
+
+
+def _fold(title: str, content: Html) -> Html:
+    return element("details", element("summary", title), join(content))
