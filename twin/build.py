@@ -100,10 +100,10 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
             path = scene.root / name
             if not path.exists():
                 raise InputError(f"{scene.config_file}: {name!r} does not exist; put it there or correct the path")
-            files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-            # A transforms.json names images beside it, which are input as well.
-            if path.suffix == ".json":
-                files += sorted(p for p in path.parent.rglob("*") if p.is_file())
+            # A transforms.json or a COLMAP model names images elsewhere below input/, which are input as well.
+            posed = path.suffix == ".json" or any(path.glob("cameras.*"))
+            folder = scene.root / Path(name).parts[0] if posed and not Path(name).is_absolute() else path
+            files = sorted(p for p in folder.rglob("*") if p.is_file()) if folder.is_dir() else [path]
             digests |= {os.path.relpath(file, scene.root): digest_file(file) for file in files}
     return digests
 
