@@ -27,9 +27,7 @@ def film(plan: Plan, out: Path) -> Truth:
     for lighting in plan.lightings:
         times, poses = shoot(lighting, place, plan, out / "input" / f"{lighting}.mp4")
         films[lighting] = Film(times, poses, *depths(lighting, place, plan, poses))
-    truth = Truth(
-        place.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (plan.width, plan.height), films
-    )
+    truth = Truth(place.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (plan.width, plan.height), films)
     truth.save(out / "truth")
     (out / "scene.toml").write_text(scene_toml(plan, out.resolve().name), encoding="utf-8")
     return truth

@@ -18,8 +18,8 @@ from twin.geometry.cameras import opencv_to_mujoco
 from twin.progress import track
 from twin.reality import world
 from twin.reality.lighting import LIGHTINGS, Lighting
-from twin.reality.place import SEED, Place
 from twin.reality.route import Route, ground_height
+from twin.reality.things import SEED, Place
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,6 @@ class Renderer:
     """Renders the place under one lighting; the camera goes anywhere."""
 
     def __init__(self, lighting: str, place: Place, plan: Plan) -> None:
-        wp.config.quiet = True
         spec = world.spec(lighting, place)
         camera = spec.camera("film")
         camera.fovy = float(np.rad2deg(2 * np.arctan(plan.height / 2 / plan.intrinsics[1])))

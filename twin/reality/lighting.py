@@ -136,7 +136,9 @@ def sky(lighting: Lighting, seed: int, width: int = 512) -> NDArray[np.uint8]:
     plane = world[..., :2] / np.maximum(world[..., 2:], 0.06)
     field = fbm(rng, (1024, 1024), 220, 2.0, 0.62)
     grid = (plane * 55.0 + 512.0).astype(np.float32) % 1024
-    noise = np.stack([cv2.remap(field, g[..., 0], g[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for g in grid])
+    noise = np.stack(
+        [cv2.remap(field, g[..., 0], g[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for g in grid]
+    )
     threshold = np.quantile(field, 1.0 - lighting.clouds)
     cover = np.clip((noise - threshold) / 0.9, 0.0, 1.0) * np.clip((elevation - 0.02) / 0.25, 0.0, 1.0)
     shade = 1.0 - 0.13 * np.clip(noise, -1.0, 2.0)

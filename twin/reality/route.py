@@ -8,13 +8,16 @@ straight on. Heights are metres above the datum z = 0.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
 ROAD_HALF_WIDTH = 3.0  # [m] asphalt, centre line to kerb face
 KERB_HEIGHT = 0.11  # [m] above the asphalt beside it
 KERB_WIDTH = 0.16  # [m]
+VERGE_WIDTH = 5.6  # [m] grass beyond the kerb that the road's own mesh covers
+PAVEMENT_WIDTH = 1.7  # [m] slabs along the left kerb
+START, END = -6.0, 88.0  # [m] stations between which the road is paved
 VERGE_SLOPE = 0.025  # rise of the verges away from the road
 _CROWN = 0.018  # fall of the road from its crown to either side
 _CROWN_ROUNDING = 0.35  # [m] half width over which the crown is rounded off
@@ -45,11 +48,11 @@ class Route:
         """Length of the turn [m]."""
         return self.radius * self.turn
 
-    def heading(self, station: Array) -> Array:
+    def heading(self, station: ArrayLike) -> Array:
         """Direction of travel, counterclockwise from +x [rad]; shape as `station`."""
         return -np.clip((np.asarray(station) - self.straight) / self.radius, 0.0, self.turn)
 
-    def at(self, station: Array, lateral: Array | float = 0.0) -> Array:
+    def at(self, station: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
         """Points (x, y) [m], shape (..., 2). Before 0 and beyond the end the line goes straight on."""
         s, lateral = np.broadcast_arrays(np.asarray(station, float), np.asarray(lateral, float))
         heading = self.heading(s)
@@ -58,12 +61,12 @@ class Route:
         y = self.radius * (np.cos(heading) - 1.0) - after * np.sin(self.turn)
         return np.stack([x - lateral * np.sin(heading), y + lateral * np.cos(heading)], -1)
 
-    def project(self, xy: Array) -> tuple[Array, Array]:
+    def project(self, xy: ArrayLike) -> tuple[Array, Array]:
         """Station and lateral of the nearest point of the centre line; shapes (..., 2) → (...), (...)."""
         xy = np.asarray(xy, float)
         x, y = xy[..., 0], xy[..., 1]
         out = np.array([np.cos(self.turn), -np.sin(self.turn)])  # direction after the turn
-        end = self.at(np.float64(self.straight + self.arc))
+        end = self.at(self.straight + self.arc)
         along = (xy - end) @ out
         across = (xy - end) @ np.array([-out[1], out[0]])
         angle = np.arctan2(x - self.straight, y + self.radius)  # clockwise, from the start of the arc
@@ -75,13 +78,13 @@ class Route:
         return np.take_along_axis(stations, best, 0)[0], np.take_along_axis(laterals, best, 0)[0]
 
 
-def undulation(xy: Array) -> Array:
+def undulation(xy: ArrayLike) -> Array:
     """The rolling of the land [m], shape (..., 2) → (...)."""
     xy = np.asarray(xy, float)
     return sum((a * np.sin(xy @ np.array(k) + phase) for a, k, phase in _WAVES), np.zeros(xy.shape[:-1]))
 
 
-def cross_profile(lateral: Array) -> Array:
+def cross_profile(lateral: ArrayLike) -> Array:
     """Height across the road above the undulation [m]: crowned asphalt, a kerb, a verge that rises outwards."""
     away = np.abs(np.asarray(lateral, float))
     crown = -_CROWN * (np.sqrt(away**2 + _CROWN_ROUNDING**2) - _CROWN_ROUNDING)
@@ -90,6 +93,6 @@ def cross_profile(lateral: Array) -> Array:
     return np.where(away <= ROAD_HALF_WIDTH, crown, verge)
 
 
-def ground_height(route: Route, xy: Array) -> Array:
+def ground_height(route: Route, xy: ArrayLike) -> Array:
     """True height of the ground [m], shape (..., 2) → (...)."""
     return undulation(xy) + cross_profile(route.project(xy)[1])

@@ -82,11 +82,15 @@ def walls(width: float, depth: float, low: float, high: float) -> Part:
     for k in range(4):
         (ax, ay), (bx, by) = ring[k], ring[k + 1]
         part = quad(np.array([[ax, ay, high], [ax, ay, low], [bx, by, low], [bx, by, high]]))
-        parts.append(replace(part, uv=np.stack([np.where(part.uv[:, 0] > 0, along[k + 1], along[k]), part.uv[:, 1]], 1)))
+        parts.append(
+            replace(part, uv=np.stack([np.where(part.uv[:, 0] > 0, along[k + 1], along[k]), part.uv[:, 1]], 1))
+        )
     return join(parts)
 
 
-def tube(bottom: Array, top: Array, radius_bottom: float, radius_top: float, sides: int = 10, capped: bool = True) -> Part:
+def tube(
+    bottom: Array, top: Array, radius_bottom: float, radius_top: float, sides: int = 10, capped: bool = True
+) -> Part:
     """A truncated cone between two points [m]; the texture wraps once around it."""
     axis = np.asarray(top, float) - bottom
     length = np.linalg.norm(axis)
@@ -111,10 +115,13 @@ def tube(bottom: Array, top: Array, radius_bottom: float, radius_top: float, sid
     return join([side, *lids])
 
 
-def leaves(rng: np.random.Generator, centres: Array, size: tuple[float, float], uv_size: float = 0.08) -> Part:
+def leaves(
+    rng: np.random.Generator, centres: Array, size: tuple[float, float], light: Array, uv_size: float = 0.08
+) -> Part:
     """Small bent rhombi around given centres, shape (n, 3): foliage with gaps that light passes through.
 
-    Each leaf shows its own window of the texture, `uv_size` wide.
+    Each leaf shows its own window of the texture, `uv_size` wide: from its left where `light` is 0, to its right where
+    it is 1, shape (n,).
     """
     n = len(centres)
     long, short = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
@@ -126,7 +133,9 @@ def leaves(rng: np.random.Generator, centres: Array, size: tuple[float, float], 
     droop = np.cross(long, short) * half * 0.25
     tips = [centres - half * long, centres + 0.55 * half * short + droop, centres + half * long]
     tips.append(centres - 0.55 * half * short + droop)
-    window = rng.uniform(0.0, 1.0 - uv_size, (n, 1, 2)) + uv_size * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    corner = rng.uniform(0.0, 1.0 - uv_size, (n, 1, 2))
+    corner[:, 0, 0] = np.clip(light + rng.normal(0.0, 0.1, n), 0.0, 1.0) * (1.0 - uv_size)
+    window = corner + uv_size * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     base = 4 * np.arange(n)[:, None]
-    faces = np.concatenate([base + [0, 1, 2], base + [0, 2, 3]]).astype(np.int32)
+    faces = (base[:, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3).astype(np.int32)
     return Part(np.stack(tips, 1).reshape(-1, 3), faces, window.reshape(-1, 2))

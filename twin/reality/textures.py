@@ -25,7 +25,7 @@ def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, fines
     return (out - out.mean()) / out.std()
 
 
-def blend(image: Image, colour: tuple[float, float, float] | Image, weight: NDArray) -> None:
+def blend(image: NDArray, colour: tuple[float, float, float], weight: NDArray) -> None:
     """Paints over an image in place; `weight` in [0, 1], shape (rows, columns)."""
     w = weight[..., None].astype(np.float32)
     image += w * (np.asarray(colour, np.float32) - image)
@@ -38,7 +38,9 @@ def _colour(base: tuple[float, float, float], noise: NDArray, contrast: float, t
     return image.astype(np.float32)
 
 
-def _speckle(rng: np.random.Generator, image: Image, count: int, sizes: tuple[int, int], colours: Image) -> None:
+def _speckle(
+    rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[float, float], colours: NDArray
+) -> None:
     """Scatters small ellipses (chips, fallen leaves, stones) on an image, in place."""
     rows, columns = image.shape[:2]
     centres = np.stack([rng.uniform(0, columns, count), rng.uniform(0, rows, count)], -1)
@@ -63,7 +65,16 @@ def _speckle(rng: np.random.Generator, image: Image, count: int, sizes: tuple[in
         )
 
 
-def _crack(rng: np.random.Generator, mask: NDArray, start: NDArray, heading: float, length: float, width: float) -> None:
+def _grains(rng: np.random.Generator, image: Image, share: float, colours: NDArray) -> None:
+    """Colours single texels, `share` of them: the stones of an asphalt, in place."""
+    hit = rng.random(image.shape[:2]) < share
+    shade = rng.uniform(0.75, 1.15, (int(hit.sum()), 1))
+    image[hit] = 0.35 * image[hit] + 0.65 * colours[rng.integers(0, len(colours), int(hit.sum()))] * shade
+
+
+def _crack(
+    rng: np.random.Generator, mask: NDArray, start: NDArray, heading: float, length: float, width: float
+) -> None:
     """A wandering, branching crack drawn into `mask`."""
     point = start.astype(float)
     step = 6.0
@@ -85,12 +96,15 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
     shape = (rows, columns)
     lateral = (half_width - (np.arange(rows) + 0.5) * pixel)[:, None]
     image = _colour((0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, fbm(rng, shape, 6.0 / pixel, 40.0))
-    chips = np.array([[0.62, 0.61, 0.58], [0.2, 0.2, 0.2], [0.5, 0.45, 0.4], [0.14, 0.14, 0.15]], np.float32)
-    _speckle(rng, image, int(length * 260), (0.6, 1.9), chips)
+    chips = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
+    _grains(rng, image, 0.16, chips)
+    _speckle(rng, image, int(length * 45), (0.5, 1.6), chips)
     for track in (-1.95, -0.75, 0.75, 1.95):  # polished by wheels
         wander = track + 0.08 * fbm(rng, (1, columns), 8.0 / pixel, 200.0)
         blend(image, (0.27, 0.27, 0.275), 0.33 * np.exp(-0.5 * ((lateral - wander) / 0.22) ** 2))
-    blend(image, (0.45, 0.41, 0.34), 0.5 * np.clip((np.abs(lateral) - 2.3) / 0.7, 0, 1) * (fbm(rng, shape, 80, 4) > 0.2))
+    blend(
+        image, (0.45, 0.41, 0.34), 0.5 * np.clip((np.abs(lateral) - 2.3) / 0.7, 0, 1) * (fbm(rng, shape, 80, 4) > 0.2)
+    )
     for _ in range(int(length / 2.6)):  # repairs
         along, across = rng.uniform(0.5, 3.4), rng.uniform(0.4, 1.9)
         c0, r0 = int(rng.uniform(0, columns)), int(rng.uniform(0, rows))
@@ -99,9 +113,12 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
             continue
         level = rng.uniform(0.19, 0.48)
         part = _colour((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
-        _speckle(rng, part, int((c1 - c0) * (r1 - r0) * 0.02), (0.6, 1.6), chips)
-        image[r0:r1, c0:c1] = 0.15 * image[r0:r1, c0:c1] + 0.85 * part
-        cv2.rectangle(image, (c0, r0), (c1, r1), (0.10, 0.10, 0.11), int(rng.integers(2, 5)))
+        _grains(rng, part, rng.uniform(0.05, 0.2), chips)
+        image[r0:r1, c0:c1] = 0.25 * image[r0:r1, c0:c1] + 0.75 * part
+        seam = np.zeros((r1 - r0, c1 - c0), np.float32)
+        cv2.rectangle(seam, (1, 1), (c1 - c0 - 2, r1 - r0 - 2), 1.0, int(rng.integers(2, 4)))
+        worn = np.clip(0.6 + 0.4 * fbm(rng, seam.shape, 40, 3.0), 0.0, 0.9)
+        blend(image[r0:r1, c0:c1], (0.12, 0.12, 0.125), seam * worn)
     cracks = np.zeros(shape, np.float32)
     for _ in range(int(length * 1.1)):
         start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
@@ -225,6 +242,13 @@ def plaster(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base
     return np.clip(image, 0.02, 1.0)
 
 
+def weathered(image: Image, pixel: float) -> Image:
+    """A wall that is darker towards its foot and under its eaves, where less of the sky reaches it."""
+    up = (image.shape[0] - np.arange(image.shape[0]))[:, None, None] * pixel
+    down = image.shape[0] * pixel - up
+    return (image * (1.0 - 0.35 * np.exp(-up / 0.6) - 0.30 * np.exp(-down / 0.5))).astype(np.float32)
+
+
 def window(rng: np.random.Generator, lit: bool) -> Image:
     """One window, 96 × 72: frame, glazing bars, and sky, curtains or a lit room behind the glass."""
     image = np.zeros((96, 72, 3), np.float32)
@@ -248,8 +272,8 @@ def window(rng: np.random.Generator, lit: bool) -> Image:
         drop = int(rng.uniform(12, 60))
         image[4:drop] = (0.62 + 0.13 * (np.arange(4, drop) % 5 < 2))[:, None, None] * np.array([1.0, 0.97, 0.9])
     frame = rng.choice(np.array([[0.86, 0.86, 0.84], [0.32, 0.22, 0.15], [0.25, 0.3, 0.27]]))
-    for part in (np.s_[:5], np.s_[-5:], np.s_[:, :5], np.s_[:, -5:], np.s_[:, 34:38], np.s_[30:33]):
-        image[part] = frame
+    for bar in (np.s_[:5], np.s_[-5:], np.s_[:, :5], np.s_[:, -5:], np.s_[:, 34:38], np.s_[30:33]):
+        image[bar] = frame
     return np.clip(image, 0.02, 1.0)
 
 
@@ -263,8 +287,9 @@ def bark(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
 
 
 def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Image:
-    """A field of leaf tones from which each leaf takes a window."""
-    image = _colour(base, fbm(rng, shape, 60, 1.0, 0.85), 0.24, 0.8 * fbm(rng, shape, 30, 6))
+    """A field of leaf tones, from shade (left) to light (right), from which each leaf takes a window."""
+    image = _colour(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
+    image *= np.linspace(0.35, 1.35, shape[1], dtype=np.float32)[None, :, None]
     return np.clip(image, 0.03, 1.0)
 
 
@@ -311,7 +336,9 @@ def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float
     return np.clip(image / np.float32(255.0) * (1.0 + 0.05 * fbm(rng, shape, 50, 2.0)[..., None]), 0.03, 1.0)
 
 
-def stripes(rng: np.random.Generator, shape: tuple[int, int], a: tuple[float, ...], b: tuple[float, ...], n: int) -> Image:
+def stripes(
+    rng: np.random.Generator, shape: tuple[int, int], a: tuple[float, ...], b: tuple[float, ...], n: int
+) -> Image:
     """Horizontal bands, dirty: cones and barriers."""
     band = (np.arange(shape[0]) * n // shape[0]) % 2
     image = np.where(band[:, None, None] == 0, np.asarray(a, np.float32), np.asarray(b, np.float32))
@@ -319,6 +346,7 @@ def stripes(rng: np.random.Generator, shape: tuple[int, int], a: tuple[float, ..
     return np.clip(image * (1.0 + 0.12 * fbm(rng, shape, 40, 1.5)[..., None]), 0.03, 1.0)
 
 
-def resized(image: Image, shape: tuple[int, int]) -> Image:
-    """Smoothly scaled to (rows, columns)."""
-    return cv2.resize(image, shape[::-1], interpolation=cv2.INTER_CUBIC)
+def resized(image: Image, shape: tuple[int, int], smooth: bool = True) -> Image:
+    """Scaled to (rows, columns), by cubic or linear interpolation."""
+    how = cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR
+    return cv2.resize(image, shape[::-1], interpolation=how).astype(np.float32)

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.reality import place as places
 from twin.reality import route as roads
-from twin.reality.place import Place
+from twin.reality import shapes
 from twin.reality.route import Route
+from twin.reality.things import SEED, Place
 from twin.scene import read_json, write_json
 
 Array = NDArray[np.float64]
@@ -61,14 +62,14 @@ class Truth:
         arrays = {f"{key}_{name}": value for name, film in self.films.items() for key, value in vars(film).items()}
         np.savez_compressed(folder / "truth.npz", intrinsics=self.intrinsics, **arrays)
         head = {"route": asdict(self.route), "start": self.start, "length": self.length, "half_width": self.half_width}
-        head |= {"size": list(self.size), "films": list(self.films), "seed": places.SEED}
+        head |= {"size": list(self.size), "films": list(self.films), "seed": SEED}
         write_json(folder / "truth.json", head)
 
     @staticmethod
     def load(folder: Path) -> "Truth":
         head = read_json(folder / "truth.json")
-        if head["seed"] != places.SEED:
-            raise ValueError(f"{folder}: filmed in the place of seed {head['seed']}, this is {places.SEED}; film again")
+        if head["seed"] != SEED:
+            raise ValueError(f"{folder}: filmed in the place of seed {head['seed']}, this is {SEED}; film again")
         with np.load(folder / "truth.npz", allow_pickle=False) as data:
             keys = ("times", "camera_to_world", "depth_frames", "depth")
             films = {name: Film(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]}
@@ -94,7 +95,8 @@ class Truth:
         """The surface of everything solid that stands on the ground (and of leaves, if asked for)."""
         kinds = ("obstacle", "foliage") if foliage else ("obstacle",)
         parts = [thing.part for thing in self.place.things if thing.kind in kinds]
-        return trimesh.util.concatenate([trimesh.Trimesh(p.vertices, p.faces, process=False) for p in parts])
+        whole = shapes.join(parts)
+        return trimesh.Trimesh(whole.vertices, whole.faces, process=False)
 
     def poses(self, source: str, times: Array) -> Array:
         """camera_to_world of one source at times [s] within its film, interpolated; shapes (n,) → (n, 4, 4)."""

@@ -1,5 +1,6 @@
 """The known-truth world as a MuJoCo model: what is filmed (geom groups 0 and 1), and what is driven in (group 3)."""
 
+from collections.abc import Callable
 from functools import cache
 
 import mujoco
@@ -7,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.reality import lighting as lightings
+from twin.reality import occlusion, textures
 from twin.reality import place as places
-from twin.reality import textures
+from twin.reality.buildings import BUILDINGS
 from twin.reality.lighting import Lighting
-from twin.reality.place import CELLS, SEED, Place
-from twin.reality.route import ROAD_HALF_WIDTH, ground_height
+from twin.reality.route import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, VERGE_WIDTH, ground_height
+from twin.reality.things import ATLAS_CELL, ATLAS_SIDE, CELLS, SEED, Place
 
 ROAD_PIXEL = 0.0125  # [m] texel of the road
 VERGE_PIXEL = 0.022
 WALL_PIXEL = 0.03
-_CELL = 256  # [px] side of an atlas cell
 _HFIELD_CELL = 0.2  # [m] of the ground one drives on
 COLLISION_GROUP = 3
 
@@ -45,30 +46,31 @@ def painted() -> dict[str, NDArray[np.uint8]]:
     def rng(*key: int) -> np.random.Generator:
         return np.random.default_rng([SEED, 5, *key])
 
-    length = places.ROAD_END - places.ROAD_START
+    length = END - START
     out = {"road": _bytes(textures.road(rng(0), length, ROAD_HALF_WIDTH, ROAD_PIXEL))}
-    shape = (round(places.VERGE_WIDTH / VERGE_PIXEL), round(length / VERGE_PIXEL))
+    shape = (round(VERGE_WIDTH / VERGE_PIXEL), round(length / VERGE_PIXEL))
     out["verge_right"] = _bytes(textures.grass(rng(1), shape, VERGE_PIXEL))
     left = textures.grass(rng(2), shape, VERGE_PIXEL)
-    paved = round(places.PAVEMENT_WIDTH / VERGE_PIXEL)
+    paved = round(PAVEMENT_WIDTH / VERGE_PIXEL)
     left[-paved:] = textures.slabs(rng(3), (paved, shape[1]), VERGE_PIXEL, (0.57, 0.75))
     out["verge_left"] = _bytes(left)
     out["kerb"] = _bytes(textures.kerb(rng(4), (16, round(length / 0.02)), 0.02))
     out["land"] = _bytes(textures.grass(rng(5), (2292, 2172), 1 / 12))
     for k, (name, (kind, colour)) in enumerate(WALLS.items()):
-        (_, size, _) = places.BUILDINGS[name]
+        (_, size, _) = BUILDINGS[name]
         wall = (round(size[2] / WALL_PIXEL), round(2 * (size[0] + size[1]) / WALL_PIXEL))
         paint = textures.bricks if kind == "bricks" else textures.plaster
-        out[name] = _bytes(paint(rng(6, k), wall, WALL_PIXEL, colour))
+        out[name] = _bytes(textures.weathered(paint(rng(6, k), wall, WALL_PIXEL, colour), WALL_PIXEL))
     out["atlas"] = _bytes(_atlas(rng))
     return out
 
 
-def _atlas(rng) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
-    square = (_CELL, _CELL)
+def _atlas(rng: Callable[..., np.random.Generator]) -> NDArray[np.float32]:
+    square = (ATLAS_CELL, ATLAS_CELL)
     tones = {
         "zinc": (0.55, 0.57, 0.58), "dark": (0.16, 0.17, 0.18), "green": (0.12, 0.30, 0.18), "red": (0.58, 0.12, 0.10),
-        "blue": (0.13, 0.24, 0.46), "white": (0.78, 0.78, 0.76), "rubber": (0.09, 0.09, 0.09), "tank": (0.34, 0.33, 0.33),
+        "blue": (0.13, 0.24, 0.46), "white": (0.78, 0.78, 0.76), "rubber": (0.09, 0.09, 0.09),
+        "tank": (0.34, 0.33, 0.33),
     }  # fmt: skip
     signs = [
         ((0.10, 0.22, 0.55), "LIBRARY"), ((0.85, 0.85, 0.82), "SLOW"), ((0.9, 0.75, 0.1), "WORKS"),
@@ -76,7 +78,7 @@ def _atlas(rng) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
         ((0.95, 0.95, 0.9), "KA 214"), ((0.93, 0.8, 0.2), "RX 730"),
     ]  # fmt: skip
     greens = [(0.26, 0.37, 0.12), (0.33, 0.42, 0.13), (0.40, 0.40, 0.14), (0.22, 0.33, 0.14)]
-    image = np.zeros((8 * _CELL, 8 * _CELL, 3), np.float32)
+    image = np.zeros((ATLAS_SIDE * ATLAS_CELL, ATLAS_SIDE * ATLAS_CELL, 3), np.float32)
     for k, name in enumerate(CELLS):
         g = rng(7, k)
         if name.startswith("bark"):
@@ -103,8 +105,8 @@ def _atlas(rng) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
             tile = textures.notice(g, square, *signs[int(name[-1])])
         else:
             tile = textures.resized(textures.window(g, name.startswith("lit")), square)
-        row, column = divmod(k, 8)
-        image[row * _CELL : (row + 1) * _CELL, column * _CELL : (column + 1) * _CELL] = tile
+        row, column = divmod(k, ATLAS_SIDE)
+        image[row * ATLAS_CELL : (row + 1) * ATLAS_CELL, column * ATLAS_CELL : (column + 1) * ATLAS_CELL] = tile
     return image
 
 
@@ -120,12 +122,19 @@ def spec(lighting: Lighting | str, place: Place | None = None) -> mujoco.MjSpec:
     model.modelname = f"reality_{light.name}"
     model.visual.map.znear, model.visual.map.zfar = 0.001, 10.0
     model.stat.extent, model.stat.center = 60.0, [20.0, -5.0, 0.0]
+    visibility = occlusion.ground_visibility(place) if light.occlusion > 0.0 else {}
     for name, image in painted().items():
+        if name in visibility:
+            image = _shaded(image, 1.0 - light.occlusion * (1.0 - visibility[name]))
         _add_texture(model, name, image)
     sky = lightings.sky(light, SEED)
     box = model.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     box.width, box.height, box.nchannel, box.data = sky.shape[1], sky.shape[0], 3, sky.tobytes()
-    for name, emission in (("lamp_glass", light.glow), ("windows_by_night", 0.75 * light.glow), ("windows_by_day", 0.0)):
+    for name, emission in (
+        ("lamp_glass", light.glow),
+        ("windows_by_night", 0.75 * light.glow),
+        ("windows_by_day", 0.0),
+    ):
         _add_material(model, name, "atlas", emission)
     after_dark = light.glow > 0.0
     for thing in place.things:
@@ -150,6 +159,12 @@ def spec(lighting: Lighting | str, place: Place | None = None) -> mujoco.MjSpec:
     lightings.add_lights(model, light, np.array(place.lamp_heads))
     model.worldbody.add_camera(name="film", pos=[0, 0, 1.2])
     return model
+
+
+def _shaded(image: NDArray[np.uint8], factor: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """A texture darkened by a coarse map of factors."""
+    fine = textures.resized(factor.astype(np.float32), image.shape[:2], smooth=False)
+    return (image * np.clip(fine, 0.0, 1.0)[..., None]).astype(np.uint8)
 
 
 def _add_texture(model: mujoco.MjSpec, name: str, image: NDArray[np.uint8]) -> None:
