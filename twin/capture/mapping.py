@@ -1,0 +1,306 @@
+"""From matches to poses and points; the body of the worker process.
+
+A *model* is a COLMAP reconstruction. Global mapping (Pan et al. 2024) comes first: the incremental mapper gets stuck on
+forward motion. Frames off their neighbours' path are taken out and registered once more against all others; those that
+end up beside the path again are dropped.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from twin.capture import pairs as pairing
+from twin.capture.features import Matcher, open_database
+from twin.capture.outliers import path_outliers
+from twin.capture.types import Capture
+from twin.capture.worker import tell
+from twin.errors import InputError
+from twin.geometry.poses import Array, inverse_pose
+from twin.scene import write_json
+
+_MIN_FRAMES = 3
+_PROBE_INLIERS = 25
+_NEAR_STEPS = 3.0
+"""Cameras this near [median steps] that were never matched are matched in the second round."""
+_NEAR_PAIRS = 4
+_POSED_PAIRS = 10
+_WORTH_REMAPPING = 0.05
+"""Newly verified pairs [share of all] from which the second round solves again."""
+
+
+def solve(job: dict[str, Any]) -> None:
+    """Runs a whole job (see `sfm.run` for its keys) and leaves `result.npz` and `result.json` in its work folder.
+
+    Raises:
+        InputError: too few frames, no texture, or no model found.
+    """
+    stage, work = Path(job["capture"]), Path(job["work"])
+    capture = Capture.load(stage)
+    pycolmap.set_random_seed(job["seed"])
+    matcher = open_database(capture, stage, work, job["free_focal"], job["threads"], job["seed"])
+    matcher.extract(job["features"], job["max_feature_size"])
+    facts: dict[str, Any] = {}
+    if capture.camera_to_world is not None:
+        model = _triangulated(matcher, capture, work)
+        facts["mapper"] = "given poses"
+        facts["outliers"] = []
+    else:
+        model = _mapped(matcher, job, work, facts)
+    facts["pairs"] = len(matcher.tried)
+    facts["verified_pairs"] = len(matcher.verified())
+    _save(model, matcher, facts, work)
+
+
+def _mapped(matcher: Matcher, job: dict[str, Any], work: Path, facts: dict[str, Any]) -> pycolmap.Reconstruction:
+    capture = matcher.capture
+    if len(capture.names) < _MIN_FRAMES:
+        raise InputError(
+            f"{len(capture.names)} frames (need {_MIN_FRAMES} that share a view); raise capture.fps or film longer"
+        )
+    _match(matcher, np.random.default_rng(job["seed"]))
+    if len(matcher.verified()) < 2:
+        raise InputError(
+            "no two frames show the same place; film slower with texture in view, or raise capture.fps for more overlap"
+        )
+    fixed = [s for s, source in enumerate(capture.sources) if source.calibrated and not job["free_focal"]]
+    if not all(source.camera_params for source in capture.sources) or job["free_focal"]:
+        pycolmap.calibrate_view_graph(matcher.database)
+    mapper = _Mapper(matcher, job, work, fixed)
+    model = mapper.best(facts)
+    before = matcher.verified()
+    frames, poses = _poses(model, matcher)
+    step = _median_step(poses, frames, capture)
+    near = pairing.near_pairs(poses, frames, matcher.tried, _NEAR_STEPS * step, _NEAR_PAIRS)
+    facts["near_pairs"] = len(near)
+    if near:
+        matcher.match(near, "near pairs")
+        fresh = len(matcher.verified()) - len(before)
+        if fresh > _WORTH_REMAPPING * len(before):
+            tell(say=f"  {fresh} more pairs hold: mapping again")
+            again = mapper.best(facts)
+            model = again if again.num_reg_images() >= model.num_reg_images() else model
+    return mapper.without_outliers(model, job["max_outlier"], facts)
+
+
+def _match(matcher: Matcher, rng: np.random.Generator) -> None:
+    source_index = matcher.capture.source_index
+    sequence = pairing.sequence_pairs(source_index)
+    signatures = pairing.frame_signatures(matcher.descriptors(), source_index, rng)
+    probes = pairing.probe_pairs(source_index, signatures) - sequence
+    matcher.match(sequence | probes, "matches in sequence")
+    more = pairing.expanded_pairs(source_index, probes, matcher.verified(), _PROBE_INLIERS) - matcher.tried
+    if more:
+        matcher.match(more, "matches across")
+
+
+class _Mapper:
+    """COLMAP's mappers on one database, with the known cameras held fixed."""
+
+    def __init__(self, matcher: Matcher, job: dict[str, Any], work: Path, fixed: list[int]) -> None:
+        self._matcher, self._work, self._seed, self._threads = matcher, work, job["seed"], job["threads"]
+        self._kind, self._min_registered = job["mapper"], job["min_registered"]
+        with pycolmap.Database.open(matcher.database) as database:
+            self._cameras = {c.camera_id: c for c in database.read_all_cameras()}
+            image_camera = {i.image_id: i.camera_id for i in database.read_all_images()}
+        of_source = {
+            int(s): image_camera[int(matcher.image_ids[i])] for i, s in enumerate(matcher.capture.source_index)
+        }
+        self._fixed = {of_source[s] for s in fixed}
+
+    def best(self, facts: dict[str, Any]) -> pycolmap.Reconstruction:
+        """The largest model by the configured mapper. Raises InputError if there is none."""
+        total = len(self._matcher.capture.names)
+        model = None
+        if self._kind in ("auto", "global"):
+            model, facts["mapper"] = self._global(), "global"
+        if self._kind == "incremental" or (
+            self._kind == "auto" and (model is None or model.num_reg_images() < self._min_registered * total)
+        ):
+            other = self._incremental()
+            if other is not None and (model is None or other.num_reg_images() > model.num_reg_images()):
+                model, facts["mapper"] = other, "incremental"
+        if model is None:
+            raise InputError(
+                f"registered 0 of {total} frames; film slower, sideways rather than only forward, with texture in view"
+            )
+        return model
+
+    def _global(self) -> pycolmap.Reconstruction | None:
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads, options.random_seed = self._threads, self._seed
+        bundle = options.mapper.bundle_adjustment
+        bundle.ceres.use_gpu = False
+        options.mapper.global_positioning.use_gpu = False
+        if self._fixed == set(self._cameras):
+            bundle.refine_focal_length = bundle.refine_extra_params = False
+        tell(bar="mapping", total=0)
+        models = pycolmap.global_mapping(
+            self._matcher.database, self._matcher.images, self._fresh_folder("global"), options
+        )
+        model = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+        if model is not None and self._fixed and self._fixed != set(self._cameras):
+            self._refine(model)
+        return model
+
+    def _incremental(self) -> pycolmap.Reconstruction | None:
+        options = self._incremental_options()
+        options.min_model_size = _MIN_FRAMES
+        total = len(self._matcher.capture.names)
+        tell(bar="incremental mapping", total=total)
+        models = pycolmap.incremental_mapping(
+            self._matcher.database,
+            self._matcher.images,
+            self._fresh_folder("incremental"),
+            options,
+            next_image_callback=lambda: tell(step=1),
+        )
+        return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+
+    def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads, options.random_seed = self._threads, self._seed
+        options.constant_cameras = self._fixed
+        options.mapper.constant_cameras = self._fixed
+        return options
+
+    def _refine(self, model: pycolmap.Reconstruction, iterations: int = 50) -> None:
+        """Bundle adjustment with the known cameras put back to what was given and held there."""
+        for camera_id in self._fixed:
+            model.cameras[camera_id].params = self._cameras[camera_id].params
+        config = pycolmap.BundleAdjustmentConfig()
+        for image in model.images.values():
+            if image.has_pose:
+                config.add_image(image.image_id)
+        for camera_id in self._fixed:
+            config.set_constant_cam_intrinsics(camera_id)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.ceres.solver_options.max_num_iterations = iterations
+        options.ceres.solver_options.num_threads = self._threads
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        model.update_point_3d_errors()
+
+    def without_outliers(
+        self, model: pycolmap.Reconstruction, limit: float, facts: dict[str, Any]
+    ) -> pycolmap.Reconstruction:
+        """Frames off the path registered anew against the rest; those off it again are dropped. Missing ones, too."""
+        matcher = self._matcher
+        names = matcher.capture.names
+        off = _off_path(model, matcher, limit)
+        facts["outliers"] = []
+        missing = len(names) - model.num_reg_images()
+        if not off and not missing:
+            return model
+        _deregister(model, matcher, off)
+        model = self._registered_anew(model)
+        still = _off_path(model, matcher, limit)
+        _deregister(model, matcher, still)
+        self._refine(model)
+        gone = set(off) - set(_poses(model, matcher)[0].tolist()) | set(still)
+        facts["outliers"] = sorted(names[i] for i in gone)
+        facts["registered_anew"] = sorted(names[i] for i in set(off) - gone)
+        return model
+
+    def _registered_anew(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        source, target = self._fresh_folder("kept"), self._fresh_folder("anew")
+        model.write(source)
+        options = self._incremental_options()
+        options.fix_existing_frames = True
+        options.mapper.fix_existing_frames = True
+        options.multiple_models = False
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        models = pycolmap.incremental_mapping(self._matcher.database, self._matcher.images, target, options, source)
+        return max(models.values(), key=lambda m: m.num_reg_images(), default=model)
+
+    def _fresh_folder(self, name: str) -> Path:
+        folder = self._work / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        return folder
+
+
+def _off_path(model: pycolmap.Reconstruction, matcher: Matcher, limit: float) -> list[int]:
+    frames, poses = _poses(model, matcher)
+    source = matcher.capture.source_index[frames]
+    off: list[int] = []
+    for s in np.unique(source):
+        off += frames[source == s][path_outliers(poses[source == s], limit)].tolist()
+    return off
+
+
+def _deregister(model: pycolmap.Reconstruction, matcher: Matcher, frames: list[int]) -> None:
+    for i in frames:
+        model.deregister_frame(model.images[int(matcher.image_ids[i])].frame_id)
+
+
+def _poses(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], Array]:
+    """Frame indices of the registered frames in order, and their camera_to_world."""
+    frame_of = matcher.frame_of()
+    poses = {}
+    for image in model.images.values():
+        if image.has_pose:
+            camera_from_world = np.eye(4)
+            camera_from_world[:3] = image.cam_from_world().matrix()
+            poses[frame_of[image.image_id]] = inverse_pose(camera_from_world)
+    frames = np.array(sorted(poses), np.int64)
+    return frames, np.array([poses[i] for i in frames]).reshape(-1, 4, 4)
+
+
+def _median_step(poses: Array, frames: NDArray[np.int64], capture: Capture) -> float:
+    source = capture.source_index[frames]
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[np.diff(source) == 0]
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def _triangulated(matcher: Matcher, capture: Capture, work: Path) -> pycolmap.Reconstruction:
+    """Points under the given poses, which stay as they are."""
+    assert capture.camera_to_world is not None
+    every = np.arange(len(capture.names))
+    matcher.match(
+        pairing.sequence_pairs(capture.source_index)
+        | pairing.near_pairs(capture.camera_to_world, every, set(), np.inf, _POSED_PAIRS),
+        "matches",
+    )
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(matcher.database) as database:
+        for camera in database.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for i, image_id in enumerate(matcher.image_ids):
+            image = database.read_image(int(image_id))
+            fresh = pycolmap.Image(image.name, pycolmap.Point2DList(), image.camera_id, image.image_id)
+            pose = pycolmap.Rigid3d(inverse_pose(capture.camera_to_world[i])[:3])
+            model.add_image_with_trivial_frame(fresh, pose)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = matcher.threads, matcher.seed
+    folder = work / "posed"
+    folder.mkdir(exist_ok=True)
+    return pycolmap.triangulate_points(model, matcher.database, matcher.images, folder, True, options, False)
+
+
+def _save(model: pycolmap.Reconstruction, matcher: Matcher, facts: dict[str, Any], work: Path) -> None:
+    frames, poses = _poses(model, matcher)
+    frame_of = matcher.frame_of()
+    points = list(model.points3D.values())
+    seen = [(k, frame_of[element.image_id]) for k, point in enumerate(points) for element in point.track.elements]
+    observations = np.array(seen, np.int64).reshape(-1, 2)
+    np.savez(
+        work / "result.npz",
+        frames=frames,
+        camera_to_world=poses,
+        xyz=np.array([point.xyz for point in points]).reshape(-1, 3),
+        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        error=np.array([point.error for point in points], np.float64),
+        point=observations[:, 0],
+        frame=observations[:, 1],
+    )
+    cameras = [model.cameras[model.images[int(matcher.image_ids[i])].camera_id] for i in frames]
+    facts["cameras"] = [
+        {"model": c.model.name, "params": [float(p) for p in c.params], "width": c.width, "height": c.height}
+        for c in cameras
+    ]
+    write_json(work / "result.json", facts)

@@ -1,0 +1,302 @@
+"""How many metres one unit of the reconstruction is, from one of five kinds of evidence.
+
+Each function returns a `Scale`: metres per unit, its relative standard deviation, and notes for the report. *Relative*
+always means divided by the scale itself.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.capture.gravity import MIN_ROAD_POINTS, Road, heights_above_road
+from twin.config import DistanceConfig, MetricConfig
+from twin.errors import InputError
+from twin.geometry.cameras import Cameras, unproject
+from twin.geometry.poses import Array
+
+_WAYS = (
+    "metric.camera_height = 0.5 (lens above the ground [m]), [metric.distance] (two marked image points and the metres "
+    "between them), metric.gps = true (EXIF positions), [metric.marker] (a printed ArUco or AprilTag marker), or "
+    "metric.poses_are_metric = true"
+)
+_PIXEL_ERROR = 1.0  # [px] a hand marks a point about this well
+_EARTH_A, _EARTH_E2 = 6378137.0, 6.69437999014e-3  # WGS 84: semi-major axis [m], squared eccentricity
+_GPS_TRIALS = 400
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Metres per unit of the reconstruction."""
+
+    value: float
+    uncertainty: float
+    """One standard deviation, relative; 0 where the scale is taken on trust."""
+    notes: dict[str, Any] = field(default_factory=dict)
+
+
+def chosen_way(metric: MetricConfig, source_heights: dict[str, float]) -> str:
+    """Which of the five ways the configuration gives.
+
+    Args:
+        metric: The configuration.
+        source_heights: Camera height per source where it has one of its own [m]; 0 = none.
+
+    Raises:
+        InputError: none given, or more than one; a value that cannot be.
+    """
+    given = []
+    if metric.camera_height < 0 or any(h < 0 for h in source_heights.values()):
+        raise InputError(
+            f"metric.camera_height = {metric.camera_height}; expected metres above the ground, such as 0.5"
+        )
+    if metric.camera_height > 0 or any(h > 0 for h in source_heights.values()):
+        given.append("camera_height")
+    given += ["distance"] * (metric.distance is not None)
+    given += ["gps"] * metric.gps
+    given += ["marker"] * (metric.marker is not None)
+    given += ["poses_are_metric"] * metric.poses_are_metric
+    if not given:
+        raise InputError(f"no scale given; give one of: {_WAYS}")
+    if len(given) > 1:
+        raise InputError(f"{len(given)} scales given ({', '.join('metric.' + g for g in given)}); keep exactly one")
+    return given[0]
+
+
+def scale_from_height(
+    cameras: Cameras, up: Array, points: Array, road: Road | None, default: float, own: dict[str, float]
+) -> Scale:
+    """Scale from how high the lens was carried over the road.
+
+    Args:
+        cameras: In the reconstruction's unit.
+        up: Unit vector.
+        points: All sparse points, shape (m, 3).
+        road: Which of them lie on the road.
+        default: Height of every source without one of its own [m]; 0 = none.
+        own: Height of a source's lens [m]; 0 = none.
+
+    Raises:
+        InputError: no point lies below the path.
+    """
+    if road is None:
+        raise InputError(
+            "metric.camera_height: no reconstructed point lies below the path; film with the ground in view, or give the "
+            "scale as metric.distance, metric.marker or metric.gps"
+        )
+    on_road = points[road.points]
+    sources = np.array(cameras.sources)
+    scales, weights, sigmas, spreads = [], [], [], []
+    for name in dict.fromkeys(cameras.sources):
+        metres = own.get(name, 0.0) or default
+        if metres <= 0:
+            continue
+        centres = cameras.positions[sources == name]
+        local = heights_above_road(on_road, centres, up, road.drop)
+        measured = local[np.isfinite(local)]
+        if len(measured) >= max(3, 0.2 * len(centres)):
+            height = float(np.median(measured))
+            spread = 1.4826 * float(np.median(np.abs(measured - height)))
+            count = len(measured)
+        else:  # too few points under this path: the road as a whole
+            height, spread, count = road.drop, road.spread, 1
+        scales.append(metres / height)
+        weights.append(count)
+        spreads.append(spread * metres / height)
+        # A road undulates smoothly: heights along it are worth a handful of independent ones.
+        sigmas.append(spread / height / np.sqrt(min(count, 6)))
+    value = float(np.average(scales, weights=weights))
+    layer = road.spread / road.drop / np.sqrt(len(road.points))
+    between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
+    few = 0.05 if len(road.points) < MIN_ROAD_POINTS else 0.0
+    sigma = float(np.sqrt(np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2))
+    return Scale(
+        value,
+        sigma,
+        {
+            "road_points": len(road.points),
+            "road_reliable": bool(road.reliable),
+            "scale_per_source_relative": [round(s / value, 4) for s in scales],
+            "local_height_spread_m": float(np.average(spreads, weights=weights)),
+        },
+    )
+
+
+def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distance: DistanceConfig) -> Scale:
+    """Scale from two marked image points; both triangulated from two frames, or both on the ground.
+
+    Args:
+        cameras: In the reconstruction's unit.
+        up: Unit vector.
+        ground_level: Height of the ground along `up`, in the reconstruction's unit.
+        distance: The marked points, in pixels of the pinhole images, and the metres between them.
+
+    Raises:
+        InputError: unknown frame, a point outside its image, no metres, or rays that do not meet.
+    """
+    if not distance.metres > 0:
+        raise InputError(f"metric.distance.metres = {distance.metres}; expected the metres between the points a and b")
+    marks = [_mark(cameras, "a", distance.frame_a, distance.a), _mark(cameras, "b", distance.frame_a, distance.b)]
+    if distance.frame_b:
+        marks.append(_mark(cameras, "a2", distance.frame_b, distance.a2))
+        marks.append(_mark(cameras, "b2", distance.frame_b, distance.b2))
+        if distance.frame_a == distance.frame_b:
+            raise InputError(f"metric.distance: frame_a and frame_b are both {distance.frame_a!r}; mark two frames")
+    frames = [frame for frame, _ in marks]
+    pixels = np.array([pixel for _, pixel in marks])
+
+    def length(offset: Array) -> float:
+        rays = [_ray(cameras, f, p) for f, p in zip(frames, pixels + offset, strict=True)]
+        if len(rays) == 2:
+            ends = [_on_ground(origin, direction, up, ground_level) for origin, direction in rays]
+        else:
+            ends = [_meeting_point(rays[0], rays[2]), _meeting_point(rays[1], rays[3])]
+        return float(np.linalg.norm(ends[0] - ends[1]))
+
+    measured = length(np.zeros_like(pixels))
+    if not np.isfinite(measured) or measured < 1e-9:
+        raise InputError(
+            "metric.distance: the points a and b coincide or do not lie before the camera; mark them again"
+        )
+    shifts = np.concatenate([np.eye(pixels.size), -np.eye(pixels.size)]) * _PIXEL_ERROR
+    lengths = np.array([length(shift.reshape(pixels.shape)) for shift in shifts])
+    # Both signs of each coordinate: half the sum of squares is the first-order variance.
+    sigma = float(np.sqrt(0.5 * np.sum((lengths - measured) ** 2)) / measured)
+    if not np.isfinite(sigma) or sigma > 0.5:
+        raise InputError(
+            "metric.distance: one pixel changes it by half; mark points further apart, or in frames further apart"
+        )
+    return Scale(distance.metres / measured, sigma, {"distance_units": measured})
+
+
+def _mark(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ...]) -> tuple[int, Array]:
+    if frame not in cameras.names:
+        raise InputError(
+            f"metric.distance: no registered frame {frame!r}; expected a name such as {cameras.names[0]!r} "
+            "(build/2_cameras/images)"
+        )
+    index = cameras.names.index(frame)
+    width, height = (int(v) for v in cameras.sizes[index])
+    if len(pixel) != 2 or not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
+        raise InputError(f"metric.distance.{key} = {list(pixel)}; expected [u, v] within {width}×{height} px")
+    return index, np.array(pixel, np.float64)
+
+
+def _ray(cameras: Cameras, frame: int, pixel: Array) -> tuple[Array, Array]:
+    pose = cameras.camera_to_world[frame]
+    direction = pose[:3, :3] @ unproject(pixel, cameras.intrinsics[frame])
+    return pose[:3, 3], direction / np.linalg.norm(direction)
+
+
+def _on_ground(origin: Array, direction: Array, up: Array, level: float) -> Array:
+    descent = float(direction @ up)
+    if descent > -1e-3:
+        raise InputError("metric.distance: a marked point lies above the horizon, not on the ground; give frame_b")
+    return origin + direction * (level - origin @ up) / descent
+
+
+def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
+    """The point nearest to two rays; NaN where they are parallel or it lies behind a camera."""
+    (o1, d1), (o2, d2) = first, second
+    matrix = np.stack([d1, -d2], 1)
+    along, _, rank, _ = np.linalg.lstsq(matrix, o2 - o1, rcond=1e-9)
+    if rank < 2 or np.any(along <= 0):
+        return np.full(3, np.nan)
+    return 0.5 * (o1 + along[0] * d1 + o2 + along[1] * d2)
+
+
+def local_east_north_up(gps: Array) -> Array:
+    """Latitude [°], longitude [°], altitude [m] (WGS 84) as east, north, up [m] about the first row, shape (n, 3)."""
+    lat, lon = np.radians(gps[:, 0]), np.radians(gps[:, 1])
+    normal = _EARTH_A / np.sqrt(1.0 - _EARTH_E2 * np.sin(lat) ** 2)
+    ecef = np.stack(
+        [
+            (normal + gps[:, 2]) * np.cos(lat) * np.cos(lon),
+            (normal + gps[:, 2]) * np.cos(lat) * np.sin(lon),
+            (normal * (1.0 - _EARTH_E2) + gps[:, 2]) * np.sin(lat),
+        ],
+        1,
+    )
+    a, b = lat[0], lon[0]
+    rows = [
+        [-np.sin(b), np.cos(b), 0.0],
+        [-np.sin(a) * np.cos(b), -np.sin(a) * np.sin(b), np.cos(a)],
+        [np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)],
+    ]
+    return (ecef - ecef[0]) @ np.array(rows).T
+
+
+def scale_from_gps(
+    centres: Array, up: Array, gps: Array, rng: np.random.Generator
+) -> tuple[Scale, tuple[Array, NDArray[np.bool_]]]:
+    """Scale and heading from GPS positions, by a similarity in the horizontal plane.
+
+    Heights are left out: a receiver's altitude is several times worse than its position, and up is known already.
+
+    Args:
+        centres: Camera centres in the reconstruction's unit, shape (n, 3).
+        up: Unit vector.
+        gps: Latitude, longitude, altitude per frame; NaN where unknown, shape (n, 3).
+        rng: Draws the samples of the robust fit.
+
+    Returns:
+        The scale; and the horizontal east axis in the reconstruction, shape (3,), with which frames fit, shape (n,).
+
+    Raises:
+        InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
+    """
+    known = np.all(np.isfinite(gps[:, :2]), axis=1)
+    if known.sum() < 3:
+        raise InputError(
+            f"metric.gps: {known.sum()} registered frames have a position (need 3); give the scale another way"
+        )
+    filled = np.where(np.isfinite(gps[known]), gps[known], 0.0)
+    target = local_east_north_up(filled)[:, :2] @ np.array([1.0, 1.0j])
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    source = centres[known] @ first + 1j * (centres[known] @ second)
+    # A similarity of the plane is a complex factor and an offset: target = factor · source + offset.
+    best = np.inf
+    n = len(source)
+    for _ in range(_GPS_TRIALS):
+        i, j = rng.choice(n, 2, replace=False)
+        if abs(source[j] - source[i]) < 1e-9 * np.ptp(np.abs(source - source[0])):
+            continue
+        factor = (target[j] - target[i]) / (source[j] - source[i])
+        misfit = float(np.median(np.abs(target - target[i] - factor * (source - source[i]))))
+        if misfit < best:
+            best, fit, offset = misfit, factor, target[i] - factor * source[i]
+    if not np.isfinite(best):
+        raise InputError("metric.gps: the camera never moved; give the scale another way")
+    inliers = np.abs(target - offset - fit * source) <= max(3.0 * 1.4826 * best, 1e-6)
+    for _ in range(10):
+        a, b = source[inliers], target[inliers]
+        fit = np.vdot(a - a.mean(), b - b.mean()) / np.vdot(a - a.mean(), a - a.mean())
+        offset = b.mean() - fit * a.mean()
+        residual = np.abs(target - offset - fit * source)
+        again = residual <= max(3.0 * 1.4826 * float(np.median(residual)), 1e-6)
+        if np.array_equal(again, inliers) or again.sum() < 3:
+            break
+        inliers = again
+    residual = np.abs(target - offset - fit * source)[inliers]
+    extent = float(np.std(source[inliers]) * abs(fit))
+    # Errors of a receiver drift, so neighbours share them: about three frames make one independent position.
+    sigma = float(np.sqrt(np.mean(residual**2) / 2) / (extent * np.sqrt(max(inliers.sum() / 3.0, 1.0))))
+    if not np.isfinite(sigma) or sigma > 0.3:
+        raise InputError(
+            f"metric.gps: positions fit within {np.median(residual):.1f} m but spread over {extent:.1f} m only; film "
+            "a longer way, or give the scale another way"
+        )
+    turn = fit / abs(fit)
+    # `turn` takes the plane's first axis to a direction in east-north; east in the plane is its conjugate.
+    east = first * turn.real - second * turn.imag
+    used = np.zeros(len(gps), bool)
+    used[np.flatnonzero(known)[inliers]] = True
+    notes = {
+        "gps_frames": int(known.sum()),
+        "gps_inliers": int(inliers.sum()),
+        "gps_residual_median_m": float(np.median(residual)),
+    }
+    return Scale(float(abs(fit)), sigma, notes), (east, used)

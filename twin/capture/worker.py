@@ -1,0 +1,176 @@
+"""Runs structure from motion in a process of its own.
+
+Some failures inside COLMAP abort the whole process instead of raising. The *parent* (the stage) starts a *worker*
+(`python -m twin.capture.worker JOB`), reads its news line by line and turns an abort into an error that names a cure.
+
+A line of news on the worker's standard output is JSON: {"bar": name, "total": n} starts a bar, {"step": n} moves it,
+{"say": text} speaks, {"error": text} is bad input. COLMAP's own log comes on standard error and goes to a file.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import IO, Any
+
+from twin import progress
+from twin.errors import InputError
+
+_LOG = "colmap.log"
+_BAD_INPUT = 2
+_MAPPING_STEPS = (
+    "Rotation averaging done",
+    "Track establishment done",
+    "Global positioning done",
+    "iteration 1 / ",
+    "iteration 2 / ",
+    "iteration 3 / ",
+    "Iterative bundle adjustment done",
+    "refinement done",
+)
+"""Parts of COLMAP's log lines after which the mapping bar moves."""
+
+
+def tell(**news: Any) -> None:
+    """The worker's news to its parent."""
+    print(json.dumps(news), flush=True)
+
+
+def run_worker(job: dict[str, Any], folder: Path) -> None:
+    """Runs one job to its end under progress bars. The worker leaves its result in `folder`.
+
+    Raises:
+        InputError: the worker found the input bad, or died of a signal inside COLMAP.
+        RuntimeError: the worker failed for any other reason (a bug).
+    """
+    job_file = folder / "job.json"
+    job_file.write_text(json.dumps(job), encoding="utf-8")
+    log_file = folder / _LOG
+    process = subprocess.Popen(
+        [sys.executable, "-m", "twin.capture.worker", str(job_file)],
+        stdin=subprocess.PIPE,  # closed by our death, however it comes; the worker then ends, too
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+    )
+    assert process.stdout and process.stderr
+    bars = _Bars()
+    reader = threading.Thread(target=_keep_log, args=(process.stderr, log_file, bars), daemon=True)
+    reader.start()
+    error: str | None = None
+    try:
+        for line in process.stdout:
+            news = bars.show(line)
+            error = news.get("error", error)
+        code = process.wait()
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        reader.join(timeout=5.0)
+        bars.close()
+    if code == 0:
+        return
+    tail = " | ".join(log_file.read_text(encoding="utf-8", errors="replace").split("\n")[-30:])[-1500:]
+    if code == _BAD_INPUT and error:
+        raise InputError(error)
+    if code < 0:
+        name = signal.Signals(-code).name
+        cure = (
+            "too little memory: lower cameras.features or capture.max_frames"
+            if name == "SIGKILL"
+            else "film slower and with more texture in view, check the calibration, or set cameras.mapper = "
+            '"incremental"'
+        )
+        last = next((part for part in reversed(tail.split(" | ")) if part.strip()), "no log")[-160:]
+        raise InputError(f"structure from motion died ({name}; {last}); {cure}")
+    raise RuntimeError(f"structure from motion failed with exit status {code}: {tail}")
+
+
+class _Bars:
+    """One bar at a time, moved by the worker's news and by COLMAP's log; two threads use it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._bar: Any = None
+        self._mapping = False
+
+    def show(self, line: str) -> dict[str, Any]:
+        try:
+            news = json.loads(line)
+        except json.JSONDecodeError:
+            return {}
+        if not isinstance(news, dict):
+            return {}
+        with self._lock:
+            if "bar" in news:
+                self._end()
+                self._mapping = news["bar"] == "mapping"
+                self._bar = progress.bar(news["bar"], news["total"] or len(_MAPPING_STEPS))
+            if "step" in news and self._bar is not None:
+                self._bar.update(news["step"])
+            if "say" in news:
+                progress.say(news["say"])
+        return news
+
+    def log(self, line: str) -> None:
+        with self._lock:
+            finished = self._mapping and "fixed-rotation" not in line and any(part in line for part in _MAPPING_STEPS)
+            if finished and self._bar is not None and self._bar.n < self._bar.total:
+                self._bar.update(1)
+
+    def close(self) -> None:
+        with self._lock:
+            self._end()
+
+    def _end(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+def _keep_log(stream: IO[str], path: Path, bars: _Bars) -> None:
+    with path.open("w", encoding="utf-8") as log:
+        for line in stream:
+            log.write(line)
+            log.flush()
+            bars.log(line)
+
+
+def _end_with_parent() -> None:
+    """Ends this process when its standard input closes, which the parent's death does, even by kill -9."""
+    with contextlib.suppress(OSError, ValueError):
+        while os.read(0, 1024):
+            pass
+    os._exit(1)
+
+
+def main(argv: list[str]) -> int:
+    """The worker. Exit status: 0 done, 2 bad input (said in the news), 1 anything else."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Loaded here only: the parent needs no COLMAP to start a worker.
+    from twin.capture import mapping
+
+    job = json.loads(Path(argv[0]).read_text(encoding="utf-8"))
+    try:
+        mapping.solve(job)
+    except InputError as error:
+        tell(error=str(error))
+        return _BAD_INPUT
+    except Exception:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    code = main(sys.argv[1:])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # past COLMAP's destructors: all results are on disk already
