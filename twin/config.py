@@ -194,9 +194,9 @@ class ReviewConfig:
     fps: int = 10
     width: int = 480
     """Width of one panel of the film [px]."""
-    render_width: int = 240
+    render_width: int = 224
     """Longer side the radiance field is rendered at for the film [px]; it is scaled up to the panel."""
-    renders: int = 150
+    renders: int = 120
     """Pictures of the radiance field in the whole film: more make it smoother and the build longer."""
 
 
