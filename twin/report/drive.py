@@ -1,5 +1,6 @@
 """The chapter of the review film with the robot in it, and what its drive comes to in numbers."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -68,10 +69,11 @@ def lighting_along(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
     return f"{a}:{b}:{mixed:.6g}", f"{a} → {b}"
 
 
-def stride(drive: Drive, fps: int) -> int:
-    """Control steps between two frames of the film, so that the drive takes `_LONGEST` at most."""
-    speedup = max(1.0, drive.times[-1] / _LONGEST)
-    return max(1, round(speedup * _CONTROL_RATE / fps))
+def stride(drive: Drive, fps: int) -> tuple[int, int]:
+    """Control steps between two pictures of the drive, and film frames each is shown for; `_LONGEST` [s] in all."""
+    speedup = max(1.0, float(drive.times[-1]) / _LONGEST)
+    every = max(1, math.ceil(speedup * _CONTROL_RATE / fps - 1e-9))
+    return every, max(1, int(fps * every / (_CONTROL_RATE * speedup) + 1e-9))
 
 
 def film_drive(
@@ -95,9 +97,9 @@ def film_drive(
         progress: Counts them.
     """
     layout = studio.layout
-    every = stride(drive, studio.fps)
+    every, hold = stride(drive, studio.fps)
     instants = frame_indices(len(drive.times), every)
-    shown_speed = every * studio.fps / _CONTROL_RATE
+    shown_speed = every * studio.fps / (_CONTROL_RATE * hold)
     title_card(
         studio,
         "3  The Husky drives",
@@ -105,7 +107,7 @@ def film_drive(
             f"A scripted driver follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo. It sees nothing: "
             "it shows that the place can be driven.",
             "Left: what the radiance field shows to its camera. Right: the physics, with the solid parts drawn over. "
-            f"Shown {shown_speed:.3g} times as fast.",
+            + (f"Shown {shown_speed:.3g} times as fast." if shown_speed > 1.01 else ""),
         ],
     )
     rendered = set(instants[:: max(1, -(-len(instants) // max(1, budget)))])
@@ -132,7 +134,7 @@ def film_drive(
         facts(canvas, right, _captions(world, drive, i, speed[i], driven[i]), layout.text)
         if i == instants[-1]:
             _ending(canvas, studio, drive)
-        studio.writer.write(canvas, round(1.5 * studio.fps) if i == instants[-1] else 1)
+        studio.writer.write(canvas, round(1.5 * studio.fps) if i == instants[-1] else hold)
         if i in moments:
             seen.append(rgb)
             behind.append(from_behind)

@@ -113,7 +113,7 @@ def _film_chapters(
     strip, panel = studio.layout.strip, studio.layout.panel
     chase: Iterator[Picture] = iter(())
     if world and drive:
-        chase = chase_frames(world, drive, panel, stride(drive, studio.fps))
+        chase = chase_frames(world, drive, panel, stride(drive, studio.fps)[0])
     total = sum(map(len, chosen.values())) + turns + drives
     # The chase camera needs no view of the field, so its pictures are made while those of the chapters before are.
     with (

@@ -26,6 +26,7 @@ from twin.report.words import (
 _LARGE_REPROJECTION = 1.5  # [px]
 _FEW_HELD_OUT = 3  # frames per lighting
 _FEW_FRAMES = 20
+_LARGE_TILT = 1.5  # [°]
 _LARGE_MEMORY = 4.0  # [GiB]
 _LARGE_SCALE_ERROR = 0.02  # relative
 _LARGE_GROUND_ERROR = 0.04  # [m]
@@ -154,11 +155,31 @@ def metric_section(report: dict[str, Any]) -> Section:
                 "constant while filming.",
             )
         )
+    tilt = metric.get("gravity_uncertainty_deg")
+    if isinstance(tilt, int | float) and tilt > _LARGE_TILT:
+        cautions.append(
+            Caution(
+                f"Which way is up is uncertain by {tilt:.1f}°.",
+                "film with the road in view and the horizon level; give the camera’s calibration.",
+            )
+        )
+    if metric.get("road_reliable") is False:
+        cautions.append(
+            Caution(
+                "Too few points lie on the road to find its plane.",
+                "film nearer to the ground or in higher resolution, or put something with texture on the road.",
+            )
+        )
     source = metric.get("scale_source")
     facts = [
         Fact("metres from", source_words(source) if source else NOT_MEASURED, "what scene.toml gave"),
         Fact("scale uncertainty", number(uncertainty, "{:.1%}"), "one standard deviation, relative"),
-        Fact("up from", str(metric.get("gravity") or metric.get("up") or NOT_MEASURED), "what decided where up is"),
+        Fact("up from", str(_first(metric, "gravity_source", "gravity") or NOT_MEASURED), "what decided where up is"),
+        Fact("tilt uncertainty", number(metric.get("gravity_uncertainty_deg"), "{:.2f}°"), "one standard deviation"),
+        Fact("filmed path", number(metric.get("path_length_m"), "{:.1f} m"), "of the longest film"),
+        Fact(
+            "camera height", number(metric.get("camera_height_median_m"), "{:.2f} m"), "median, above the floor found"
+        ),
     ]
     return Section(
         "metric",
