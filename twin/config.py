@@ -79,14 +79,14 @@ class CamerasConfig:
     min_registered: float = 0.6
     """Share of frames that must register, else the stage refuses."""
     max_outlier: float = 0.3
-    """A frame further than this from its smoothed path [share of the median step × 10] is dropped as an outlier."""
+    """A frame further than this off the path its neighbours draw is an outlier [median steps between frames]."""
     free_focal: bool = False
     """Ignore the given calibrations and self-calibrate (to compare; a calibrated camera is better)."""
 
 
 @dataclass(frozen=True)
 class DistanceConfig:
-    """Two points marked in images and the metres between them. Pixels of the kept (undistorted or raw) frame."""
+    """Two points marked in images and the metres between them. Pixels of `build/2_cameras/images/<frame>.png`."""
 
     metres: float = 0.0
     frame_a: str = ""
@@ -141,7 +141,7 @@ class NerfConfig:
     """Share of each step's rays that go through sparse points, whose distance is then learned, too."""
     max_width: int = 480
     """Images are trained at this longer side [px]."""
-    learning_rate: float = 1e-2
+    learning_rate: float = 3e-2
     appearance_dim: int = 32
     levels: int = 8
     log2_table: int = 17

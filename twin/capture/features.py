@@ -1,8 +1,8 @@
 """Features and matches of a capture in COLMAP's database.
 
-One database camera per source (posed input may bring one per image). A *known* camera is a given calibration, held fixed
-for good; a *prior* one has a focal length to start from; an *unknown* one has neither. A pair is *verified* when enough
-of its matches obey one two-view geometry.
+One database camera per source (posed input may bring one per image). A *known* camera is a given calibration, held
+fixed for good; a *prior* one has a focal length to start from; an *unknown* one has neither. A pair is *verified* when
+enough of its matches obey one two-view geometry.
 """
 
 import shutil

@@ -5,8 +5,8 @@ cameras (level in an upright camera, however it is pitched), the *path* (paralle
 constant height) and the *road* (points of the layer the path runs above). A straight path says nothing about the roll
 around itself, a turning one settles both angles; the road's own camber makes its testimony no better than a degree.
 
-The *drop* of a point is how far it lies below the nearest camera of the path, its *offset* how far beside it. All lengths
-are in the unit of the poses; nothing here needs the metric scale.
+The *drop* of a point is how far it lies below the nearest camera of the path, its *offset* how far beside it. All
+lengths are in the unit of the poses; nothing here needs the metric scale.
 """
 
 from dataclasses import dataclass

@@ -170,7 +170,7 @@ class _Mapper:
     def _refine(self, model: pycolmap.Reconstruction, iterations: int = 50) -> None:
         """Bundle adjustment with the known cameras put back to what was given and held there."""
         for camera_id in self._fixed:
-            model.cameras[camera_id].params = self._cameras[camera_id].params
+            model.cameras[camera_id].params = self._cameras[camera_id].params.tolist()
         config = pycolmap.BundleAdjustmentConfig()
         for image in model.images.values():
             if image.has_pose:

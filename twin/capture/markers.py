@@ -42,8 +42,8 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
             corners.append(np.asarray(found[hits[0]], np.float64).reshape(4, 2) + 0.5)
     if len(frames) < 2:
         raise InputError(
-            f"metric.marker: {marker.family} number {marker.id} was found in {len(frames)} frames (need 2); film it nearer "
-            "and from more than one place"
+            f"metric.marker: {marker.family} number {marker.id} was found in {len(frames)} frames (need 2); film it "
+            "nearer and from more than one place"
         )
     poses, intrinsics = cameras.camera_to_world[frames], cameras.intrinsics[frames]
     square = np.array([_triangulate(np.array(corners)[:, k], poses, intrinsics) for k in range(4)])

@@ -1,8 +1,8 @@
 """Which frames are worth matching.
 
-A *pair* is (i, j) with i < j, indices into the capture's frames. Frames of one source are ordered by time. Pairs come from
-four places: *sequence* (neighbours in time), *probes* (a few far frames that look alike, or lie equally far along two
-sources), *expansion* (what lies around a probe that held), and *nearness* (cameras found close to each other).
+A *pair* is (i, j) with i < j, indices into the capture's frames. Frames of one source are ordered by time. Pairs come
+from four places: *sequence* (neighbours in time), *probes* (a few far frames that look alike, or lie equally far along
+two sources), *expansion* (what lies around a probe that held), and *nearness* (cameras found close to each other).
 """
 
 import numpy as np

@@ -82,8 +82,8 @@ def scale_from_height(
     """
     if road is None:
         raise InputError(
-            "metric.camera_height: no reconstructed point lies below the path; film with the ground in view, or give the "
-            "scale as metric.distance, metric.marker or metric.gps"
+            "metric.camera_height: no reconstructed point lies below the path; film with the ground in view, or give "
+            "the scale as metric.distance, metric.marker or metric.gps"
         )
     on_road = points[road.points]
     sources = np.array(cameras.sources)

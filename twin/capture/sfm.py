@@ -1,8 +1,8 @@
 """Stage `cameras`: where every frame was taken from, by structure from motion, and the frames without lens distortion.
 
-The *frame of reference* of what this stage writes is the reconstruction's own: turned, placed and scaled at will, unless
-the input brought poses. The work itself happens in a worker process (`worker.py`, `mapping.py`); this module starts it,
-judges what came back and writes `Cameras`, `SparsePoints` and the pinhole images.
+The *frame of reference* of what this stage writes is the reconstruction's own: turned, placed and scaled at will,
+unless the input brought poses. The work itself happens in a worker process (`worker.py`, `mapping.py`); this module
+starts it, judges what came back and writes `Cameras`, `SparsePoints` and the pinhole images.
 """
 
 import os
@@ -97,14 +97,14 @@ def _refuse(capture: Capture, frames: NDArray[np.int64], settings: CamerasConfig
     total = len(capture.names)
     if len(frames) < settings.min_registered * total or not len(frames):
         raise InputError(
-            f"registered {len(frames)} of {total} frames (need {settings.min_registered:.0%}); film slower and with more "
-            "overlap and texture, raise capture.fps, give the camera's calibration, or lower cameras.min_registered"
+            f"registered {len(frames)} of {total} frames (need {settings.min_registered:.0%}); film slower and with "
+            "more overlap and texture, raise capture.fps, give the calibration, or lower cameras.min_registered"
         )
     for s, source in enumerate(capture.sources):
         if not np.any(capture.source_index[frames] == s):
             raise InputError(
-                f"source {source.name!r}: none of its {np.sum(capture.source_index == s)} frames connects to the others; "
-                "film the same road along the same path, in light that shows the same texture, or leave it out"
+                f"source {source.name!r}: none of its {np.sum(capture.source_index == s)} frames connects to the "
+                "others; film the same road along the same path, in light that shows the same texture, or leave it out"
             )
 
 

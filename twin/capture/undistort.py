@@ -1,7 +1,7 @@
 """From a lens with distortion to a pinhole of the same size.
 
-The *raw* image has the lens's distortion; the *pinhole* image is what a perfect pinhole at the same place would see. Its
-focal length is raised just enough that no pixel of it lies outside the raw image, so nothing has to be filled in.
+The *raw* image has the lens's distortion; the *pinhole* image is what a perfect pinhole at the same place would see.
+Its focal length is raised just enough that no pixel of it lies outside the raw image, so nothing has to be filled in.
 """
 
 import os
@@ -75,9 +75,8 @@ def write_pinhole_image(raw: Path, target: Path, mapping: NDArray[np.float32] | 
     image = cv2.imread(str(raw), cv2.IMREAD_GRAYSCALE if mask else cv2.IMREAD_ANYCOLOR)
     if image is None:
         raise InputError(f"{raw}: not a readable image; delete the build folder and build again")
-    flat = cv2.remap(
-        image, mapping, None, cv2.INTER_NEAREST if mask else cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-    )
+    method = cv2.INTER_NEAREST if mask else cv2.INTER_CUBIC
+    flat = cv2.remap(image, mapping[..., 0], mapping[..., 1], method, borderMode=cv2.BORDER_REPLICATE)
     write_image(target, flat if flat.ndim == 2 else cv2.cvtColor(flat, cv2.COLOR_BGR2RGB))
 
 
@@ -90,7 +89,8 @@ def _raw(camera: pycolmap.Camera, pixels: Array, pinhole: tuple[float, float, fl
 def _border(width: int, height: int) -> Array:
     u, v = np.linspace(0.5, width - 0.5, 65), np.linspace(0.5, height - 0.5, 65)
     top, left = np.stack([u, 0 * u + 0.5], 1), np.stack([0 * v + 0.5, v], 1)
-    return np.concatenate([top, top + [0, height - 1.0], left, left + [width - 1.0, 0]])
+    down, right = np.array([0.0, height - 1.0]), np.array([width - 1.0, 0.0])
+    return np.concatenate([top, top + down, left, left + right])
 
 
 def _inside(camera: pycolmap.Camera, border: Array, pinhole: tuple[float, float, float, float]) -> bool:
