@@ -36,7 +36,8 @@ def film(plan: Plan, out: Path) -> Truth:
 def scene_toml(plan: Plan, name: str) -> str:
     """The scene's description, as a user would write it."""
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
-    lines = [f'name = "{name}"', "seed = 0", "", "[metric]", f"camera_height = {CAMERA_HEIGHT}  # metres", ""]
+    lines = ["# A drive through the known-truth world, filmed by python -m twin.reality film --out THIS_FOLDER"]
+    lines += [f'name = "{name}"', "seed = 0", "", "[metric]", f"camera_height = {CAMERA_HEIGHT}  # metres", ""]
     for lighting in plan.lightings:
         lines += ["[[source]]", f'path = "input/{lighting}.mp4"', f'lighting = "{lighting}"']
         lines += ["[source.camera]", 'model = "PINHOLE"', f"params = [{fx}, {fy}, {cx}, {cy}]"]

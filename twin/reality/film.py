@@ -39,12 +39,12 @@ class Plan:
     """[m] along the centre line."""
     speed: float = 2.0
     """Mean speed [m/s]."""
-    fps: int = 8
+    fps: int = 4
     width: int = 640
     height: int = 360
-    samples: int = 3
+    samples: int = 2
     """Rays per pixel and axis."""
-    crf: int = 21
+    crf: int = 28
     """Quality of the H.264 film; lower is better."""
 
     @property
@@ -165,7 +165,7 @@ def shoot(lighting: str, place: Place, plan: Plan, path: Path) -> tuple[Array, A
     render = Renderer(lighting, place, plan)
     with av.open(str(path), "w") as container:
         # One thread, so that the encoder's decisions do not depend on the machine.
-        options = {"crf": str(plan.crf), "preset": "slow", "threads": "1", "tune": "grain"}
+        options = {"crf": str(plan.crf), "preset": "slower", "threads": "1"}
         stream = container.add_stream("libx264", rate=plan.fps, options=options)
         stream.width, stream.height, stream.pix_fmt = plan.width, plan.height, "yuv420p"
         for pose, gain in track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame"):

@@ -41,7 +41,7 @@ class Lighting:
     exposure: float = 1.0
     drift: float = 0.10
     """Standard deviation of the exposure's logarithm within the film."""
-    noise: float = 0.006
+    noise: float = 0.004
     """Sensor noise at mid grey [share of full scale]."""
     gain: Colour = (1.0, 1.0, 1.0)
     """White balance."""
@@ -54,8 +54,8 @@ LIGHTINGS: dict[str, Lighting] = {
     for lighting in (
         Lighting(
             "sun",
-            ambient=(0.40, 0.45, 0.56),
-            suns=(((-0.45, 0.62, -0.72), (0.95, 0.88, 0.74), True), ((0.5, -0.3, -0.4), (0.10, 0.12, 0.16), False)),
+            ambient=(0.46, 0.50, 0.58),
+            suns=(((-0.40, 0.45, -0.85), (0.98, 0.91, 0.78), True), ((0.5, -0.3, -0.4), (0.10, 0.12, 0.16), False)),
             zenith=(0.22, 0.42, 0.78),
             horizon=(0.70, 0.82, 0.94),
             clouds=0.30,
@@ -63,8 +63,9 @@ LIGHTINGS: dict[str, Lighting] = {
             skyline=(0.33, 0.42, 0.38),
             occlusion=0.45,
             glow_sun=(0.5, 0.42, 0.3),
-            exposure=1.08,
-            noise=0.005,
+            exposure=1.2,
+            drift=0.08,
+            noise=0.003,
         ),
         Lighting(
             "overcast",
@@ -76,8 +77,8 @@ LIGHTINGS: dict[str, Lighting] = {
             cloud=(0.75, 0.77, 0.80),
             skyline=(0.42, 0.46, 0.46),
             occlusion=1.0,
-            exposure=1.25,
-            noise=0.007,
+            exposure=1.2,
+            noise=0.004,
             gain=(0.98, 1.0, 1.03),
         ),
         Lighting(
@@ -93,7 +94,7 @@ LIGHTINGS: dict[str, Lighting] = {
             lamps=(0.30, 0.22, 0.12),
             glow=0.75,
             exposure=1.2,
-            noise=0.012,
+            noise=0.006,
             gain=(1.03, 1.0, 0.97),
         ),
         Lighting(
@@ -108,9 +109,9 @@ LIGHTINGS: dict[str, Lighting] = {
             occlusion=0.7,
             lamps=(1.0, 0.80, 0.50),
             glow=1.0,
-            exposure=1.6,
+            exposure=1.7,
             drift=0.07,
-            noise=0.014,
+            noise=0.007,
         ),
     )
 }

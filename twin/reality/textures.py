@@ -95,7 +95,9 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
     rows, columns = round(2 * half_width / pixel), round(length / pixel)
     shape = (rows, columns)
     lateral = (half_width - (np.arange(rows) + 0.5) * pixel)[:, None]
-    image = _colour((0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, fbm(rng, shape, 6.0 / pixel, 40.0))
+    image = _colour(
+        (0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, 0.5 * fbm(rng, shape, 6.0 / pixel, 40.0)
+    )
     chips = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
     _grains(rng, image, 0.16, chips)
     _speckle(rng, image, int(length * 45), (0.5, 1.6), chips)

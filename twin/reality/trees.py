@@ -58,9 +58,9 @@ def _tree(place: Place, k: int, station: float, lateral: float, height: float, c
     clusters.append(fork + up(0.5 * height))
     centres = []
     for tip in clusters:
-        ball = rng.normal(size=(230, 3))
+        ball = rng.normal(size=(330, 3))
         ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-        radius = crown * 0.55 * rng.uniform(0.25, 1.0, (230, 1)) ** 0.5
+        radius = crown * 0.55 * rng.uniform(0.25, 1.0, (330, 1)) ** 0.5
         centres.append(tip + ball * radius * [1.0, 1.0, 0.75])
     crown_leaves = np.concatenate(centres)
     crown_leaves = crown_leaves[crown_leaves[:, 2] > foot[2] + 0.3 * height]
@@ -70,7 +70,7 @@ def _tree(place: Place, k: int, station: float, lateral: float, height: float, c
     middle = crown_leaves.mean(0)
     outward = np.linalg.norm((crown_leaves - middle) / [crown, crown, 0.8 * crown], axis=1)
     light = 0.15 + 0.6 * np.clip(outward, 0, 1) ** 1.5 + 0.18 * (crown_leaves[:, 2] - middle[2]) / crown
-    foliage = cell(f"leaf{k % 4}", shapes.leaves(rng, crown_leaves, (0.14, 0.28), light))
+    foliage = cell(f"leaf{k % 4}", shapes.leaves(rng, crown_leaves, (0.09, 0.21), light))
     place.things.append(Thing(f"tree_{k}_leaves", "foliage", foliage))
 
 
@@ -108,7 +108,7 @@ def _tufts(place: Place) -> None:
     angle = rng.uniform(0, np.pi, n)
     across = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], 1) * width[:, None]
     tip = foot + np.stack([rng.normal(0, 0.04, n), rng.normal(0, 0.04, n), height], 1)
-    window = rng.uniform(0.3, 0.9, (n, 1, 2)) + 0.08 * np.array([[0, 1], [1, 1], [0.5, 0]])
+    window = rng.uniform(0.5, 0.9, (n, 1, 2)) + 0.08 * np.array([[0, 1], [1, 1], [0.5, 0]])
     points = np.stack([foot - across - up(0.02), foot + across - up(0.02), tip], 1)
     blades = Part(points.reshape(-1, 3), np.arange(3 * n, dtype=np.int32).reshape(-1, 3), window.reshape(-1, 2))
     place.things.append(Thing("tufts", "detail", cell("leaf2", blades)))
