@@ -110,7 +110,7 @@ def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path
     assert "render_seconds_per_frame" in metrics and "render_seconds_per_frame" not in told
     for picture in told["pictures"]:
         assert (out / picture["file"]).stat().st_size > 0
-    assert {picture["section"] for picture in told["pictures"]} == {"capture", "field"}
+    assert {picture["section"] for picture in told["pictures"]} == {"capture", "field", "poster"}
 
 
 def test_a_route_that_was_not_wanted_is_told_apart(scene: SceneDir, tmp_path: Path) -> None:

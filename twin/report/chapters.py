@@ -65,6 +65,8 @@ def compare_with_the_film(studio: Studio, plan: Plan, chosen: dict[str, list[int
             depth = depth_colours(view.depth[0], view.opacity[0])
             canvas = _comparison(studio, plan, i, lighting, (real, rgb, depth))
             studio.writer.write(canvas, max(1, round(_COMPARISON_SECONDS * studio.fps)))
+            if i == best and number == 0:
+                studio.keep("poster_compare", "poster", "the film and its twin", canvas)
             if i == best:
                 caption = f"{lighting}: filmed, rendered from the same place, and its depth; never trained on"
                 row = side_by_side((real, rgb, depth), _ROW_HEIGHT)

@@ -139,7 +139,7 @@ def film_drive(
             seen.append(rgb)
             behind.append(from_behind)
         if i == instants[len(instants) // 2]:
-            studio.keep("poster", "poster", "the Husky in the twin", canvas)
+            studio.keep("poster_drive", "poster", "the Husky in the twin", canvas)
     studio.keep("drive_camera", "review", "what its camera shows along the route", side_by_side(seen, 200))
     studio.keep("drive_chase", "review", "the same moments in the physics", side_by_side(behind, 200))
 

@@ -77,7 +77,9 @@ def _film(scene: SceneDir, kept: list[tuple[str, Path, str]]) -> Html:
     """The film, which lies beside the page, and its poster, which is in it."""
     if not (scene.stage("review") / "review.mp4").exists() and not scene.review_mp4.exists():
         return Html("")
-    poster = next((data_url(path) for section, path, _ in kept if section == "poster"), None)
+    posters = [path for section, path, _ in kept if section == "poster"]
+    # The last one is of the drive, where there is one.
+    poster = data_url(posters[-1]) if posters else None
     return element(
         "section",
         element("video", src="review.mp4", poster=poster, controls=True, preload="none", playsinline=True),
