@@ -171,6 +171,10 @@ class MeshConfig:
     """No convex part may stick out of its mesh by more than this [m]."""
     margin: float = 20.0
     """What is further than this from the route is not meshed for collision [m]."""
+    views: int = 100
+    """Filmed poses at most that surface and ground are rendered from."""
+    view_width: int = 200
+    """Width of those renderings [px]."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,150 @@
+"""Honest figures on frames the field never saw.
+
+A held-out frame starts from the embedding of its lighting. Its own residual (exposure, say) is fitted on one half of
+the picture, left or right, and scored on the other; both ways, and the mean counts. Nothing else is fitted.
+*Unfitted* scores use the lighting's embedding as it is; *wrong* scores use that of the other lightings, unfitted.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from twin.geometry.cameras import Cameras
+from twin.geometry.images import psnr, ssim
+from twin.nerf.compute import single_threaded_torch
+from twin.nerf.dataset import load_frame
+from twin.nerf.field import CameraArrays, RadianceField
+from twin.progress import track
+
+_FIT_STEPS = 60
+_FIT_RATE = 0.05
+_FIT_PRIOR = 1e-3  # pull towards the lighting's embedding, as residuals are in training
+_MAX_FRAMES = 24  # held-out frames scored per lighting, spread evenly
+
+
+def fit_embedding(
+    field: RadianceField,
+    features: torch.Tensor,
+    harmonics: torch.Tensor,
+    colours: torch.Tensor,
+    start: NDArray[np.float32],
+    steps: int = _FIT_STEPS,
+) -> NDArray[np.float32]:
+    """The embedding under which traced rays (see `RadianceField.trace`) look like `colours`, field frozen.
+
+    Args:
+        features: Shape (n, CHANNELS − 1).
+        harmonics: Shape (n, 16).
+        colours: In [0, 1], shape (n, 3).
+        start: Embedding to start from and stay near to, shape (dim,).
+    """
+    origin = torch.as_tensor(start, device=features.device)
+    embedding = origin.clone().requires_grad_(True)
+    optimiser = torch.optim.Adam([embedding], lr=_FIT_RATE)
+    for step in range(steps):
+        for group in optimiser.param_groups:
+            group["lr"] = _FIT_RATE * (1.0 - step / steps)
+        rgb = field.colour(features, harmonics, embedding)
+        loss = ((rgb - colours) ** 2).mean() + _FIT_PRIOR * ((embedding - origin) ** 2).mean()
+        (embedding.grad,) = torch.autograd.grad(loss, [embedding])
+        optimiser.step()
+    return embedding.detach().cpu().numpy()
+
+
+def fit_embedding_to_image(
+    field: RadianceField,
+    image: NDArray,
+    camera_to_world: NDArray,
+    intrinsics: NDArray,
+    lighting: str,
+    mask: NDArray[np.bool_] | None = None,
+    max_rays: int = 20_000,
+) -> NDArray[np.float32]:
+    """The embedding of one picture of the place, shape (dim,).
+
+    Args:
+        image: RGB in [0, 1], shape (h, w, 3).
+        camera_to_world: OpenCV axes, shape (4, 4).
+        intrinsics: fx, fy, cx, cy [px] at the image's size, shape (4,).
+        lighting: Name of the lighting to start from.
+        mask: True = use, shape (h, w).
+        max_rays: Pixels used at most, spread evenly.
+    """
+    height, width = image.shape[:2]
+    use = np.flatnonzero(np.ones((height, width), bool) if mask is None else mask)
+    use = use[:: max(1, len(use) // max_rays)]
+    row, column = np.divmod(use, width)
+    pixel = np.stack([column + 0.5, row + 0.5], -1)
+    cameras = CameraArrays(np.asarray(camera_to_world)[None], np.asarray(intrinsics)[None], field.where)
+    features, harmonics, _, _ = field.trace(cameras, np.zeros(len(use), int), pixel)
+    colours = torch.as_tensor(image.reshape(-1, 3)[use].astype(np.float32), device=field.where)
+    return fit_embedding(field, features, harmonics, colours, field.embedding(lighting))
+
+
+def score_frame(field: RadianceField, cameras: Cameras, i: int, max_width: int) -> dict[str, float]:
+    """PSNR [dB] and SSIM of one held-out frame: `psnr`, `ssim`, `unfitted`, and `wrong` (nan with one lighting)."""
+    bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
+    image = bytes_.astype(np.float32) / 255.0
+    height, width = mask.shape
+    v, u = np.mgrid[:height, :width] + 0.5
+    arrays = CameraArrays(cameras.camera_to_world[i : i + 1], intrinsics[None], field.where)
+    pixel = np.stack([u.ravel(), v.ravel()], -1)
+    features, harmonics, _, _ = field.trace(arrays, np.zeros(len(pixel), int), pixel)
+    colours = torch.as_tensor(image.reshape(-1, 3), device=field.where)
+    start = field.embedding(cameras.lightings[i])
+
+    def picture(embedding: NDArray[np.float32]) -> NDArray[np.float32]:
+        with torch.no_grad():
+            vector = torch.as_tensor(embedding, device=field.where)
+            return field.colour(features, harmonics, vector).cpu().numpy().reshape(height, width, 3)
+
+    left = np.zeros((height, width), bool)
+    left[:, : width // 2] = True
+    psnrs, ssims = [], []
+    for half in (left, ~left):
+        fit_on, score_on = np.flatnonzero(half & mask), ~half & mask
+        if not len(fit_on) or not score_on.any():
+            continue
+        some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // 10_000)], device=field.where)
+        shown = picture(fit_embedding(field, features[some], harmonics[some], colours[some], start))
+        psnrs.append(psnr(shown, image, score_on))
+        # Masked pixels are made equal: they neither help nor harm beyond their windows.
+        shown[~mask] = image[~mask]
+        side = slice(width // 2, None) if half is left else slice(None, width // 2)
+        ssims.append(ssim(shown[:, side], image[:, side]))
+    others = [name for name in field.lightings if name != cameras.lightings[i]]
+    wrong = [psnr(picture(field.embedding(name)), image, mask) for name in others]
+    return {
+        "psnr": float(np.mean(psnrs)) if psnrs else float("nan"),
+        "ssim": float(np.mean(ssims)) if ssims else float("nan"),
+        "unfitted": psnr(picture(start), image, mask),
+        "wrong": float(np.mean(wrong)) if wrong else float("nan"),
+    }
+
+
+def evaluate(field: RadianceField, cameras: Cameras, max_width: int, max_frames: int = _MAX_FRAMES) -> dict[str, Any]:
+    """Held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted` and `psnr_wrong_lighting` (None where
+    there is no other lighting). Lightings without held-out frames have n = 0 and are left out of the rest."""
+    result: dict[str, Any] = {key: {} for key in ("psnr", "ssim", "n", "psnr_unfitted", "psnr_wrong_lighting")}
+    frames = []
+    for name in field.lightings:
+        mine = [i for i in np.flatnonzero(cameras.held_out) if cameras.lightings[i] == name]
+        if len(mine) > max_frames:
+            mine = [mine[k] for k in np.linspace(0, len(mine) - 1, max_frames).round().astype(int)]
+        frames += [(name, int(i)) for i in mine]
+    scores: dict[str, list[dict[str, float]]] = {name: [] for name in field.lightings}
+    with single_threaded_torch():
+        for name, i in track(frames, "held-out frames", unit="frame"):
+            scores[name].append(score_frame(field, cameras, i, max_width))
+    for name, rows in scores.items():
+        result["n"][name] = len(rows)
+        for key, column in (("psnr", "psnr"), ("ssim", "ssim"), ("psnr_unfitted", "unfitted")):
+            values = [row[column] for row in rows if np.isfinite(row[column])]
+            if values:
+                result[key][name] = round(float(np.mean(values)), 4)
+        wrong = [row["wrong"] for row in rows if np.isfinite(row["wrong"])]
+        if rows:
+            result["psnr_wrong_lighting"][name] = round(float(np.mean(wrong)), 4) if wrong else None
+    return result

@@ -1,0 +1,396 @@
+"""The radiance field: density and colour of a place, under every lighting it was filmed in.
+
+Hash grid → trunk → density and features per sample; features are composited along the ray; the head turns them into
+colour (see `network.py`). A `Workspace` holds the arrays of a batch of rays, so that nothing is allocated per batch.
+Points and distances are in metres, in the world of the cameras; for other vocabulary see `kernels/space.py`.
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+
+from twin.errors import InputError
+from twin.nerf import network
+from twin.nerf.appearance import Appearance
+from twin.nerf.compute import device, load_kernels, parallel, single_threaded_torch, view
+from twin.nerf.kernels import composite as volume
+from twin.nerf.kernels import hashgrid, sampler, space
+from twin.nerf.rendering import FAR, Rendering
+from twin.nerf.sampling import Space, grid_shape, level_cells, level_shapes
+from twin.scene import read_json, write_json
+
+_FORMAT = 1
+_RENDER_RAYS = 4096  # per batch
+_RENDER_SAMPLES = 24
+_RENDER_FLOOR = 0.02  # weight of unlikely places when rendering
+_QUERY_POINTS = 65536  # per batch of density queries
+_START_DENSITY = 0.5  # optical depth of the untrained field across the near box's longest half side
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Everything about a field that is no learned number."""
+
+    centre: tuple[float, float, float]
+    """Of the near box [m]."""
+    half: tuple[float, float, float]
+    """Half sides of the near box [m]."""
+    near_plane: float
+    """Rays begin here [m]."""
+    levels: int
+    growth: float
+    log2_table: int
+    hidden: int
+    appearance_dim: int
+
+    @property
+    def space(self) -> Space:
+        return Space(self.centre, self.half)
+
+    @property
+    def density_unit(self) -> float:
+        """Density at raw output 0 [1/m]."""
+        return _START_DENSITY / self.space.scale
+
+
+class Workspace:
+    """Arrays of a batch of `rays` rays with `samples` samples each, and `extra` single points after them."""
+
+    def __init__(self, layout: Layout, rays: int, samples: int, where: str, extra: int = 0, training: bool = False):
+        self.rays, self.samples, self.where = rays, samples, where
+        rows, channels = rays * samples + extra, volume.CHANNELS
+        width = layout.levels * hashgrid.FEATURES
+
+        def new(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, device=where)
+
+        self.camera = torch.zeros(rays, dtype=torch.int32, device=where)
+        self.pixel, self.targets, self.cosines = new(rays, 2), new(rays), new(rays)
+        self.origins, self.directions = new(rays, 3), new(rays, 3)
+        self.edges, self.distances = new(rays, samples + 1), new(rays, samples)
+        self.positions, self.features = new(rows, 3), new(rows, width)
+        self.hidden, self.outputs = new(rows, layout.hidden), new(rows, channels)
+        self.weights, self.composited = new(rays, samples), new(rays, channels)
+        self.inverse_distance, self.median_distance = new(rays), new(rays)
+
+        on_rays = rays * samples
+        self.w_camera = view(self.camera, wp.int32)
+        self.w_pixel = view(self.pixel, wp.vec2f)
+        self.w_targets, self.w_cosines = view(self.targets, wp.float32), view(self.cosines, wp.float32)
+        self.w_origins, self.w_directions = view(self.origins, wp.vec3f), view(self.directions, wp.vec3f)
+        self.w_edges, self.w_distances = view(self.edges, wp.float32), view(self.distances, wp.float32)
+        self.w_positions = view(self.positions, wp.vec3f)
+        self.w_ray_positions = view(self.positions[:on_rays].view(rays, samples, 3), wp.vec3f)
+        self.w_features = view(self.features.view(rows, layout.levels, hashgrid.FEATURES), hashgrid.Feature)
+        self.w_outputs = view(self.outputs, volume.Channels)
+        self.w_ray_outputs = view(self.outputs[:on_rays].view(rays, samples, channels), volume.Channels)
+        self.w_weights = view(self.weights, wp.float32)
+        self.w_composited = view(self.composited, volume.Channels)
+        self.w_inverse = view(self.inverse_distance, wp.float32)
+        self.w_median = view(self.median_distance, wp.float32)
+        if training:
+            self.densities = new(rows)
+            self.outputs_grad, self.hidden_grad = new(rows, channels), new(rows, layout.hidden)
+            self.features_grad = new(rows, width)
+            self.composited_grad, self.inverse_grad = new(rays, channels), new(rays)
+            self.w_densities = view(self.densities, wp.float32)
+            self.w_ray_outputs_grad = view(self.outputs_grad[:on_rays].view(rays, samples, channels), volume.Channels)
+            self.w_features_grad = view(
+                self.features_grad.view(rows, layout.levels, hashgrid.FEATURES), hashgrid.Feature
+            )
+            self.w_composited_grad = view(self.composited_grad, volume.Channels)
+            self.w_inverse_grad = view(self.inverse_grad, wp.float32)
+
+
+class CameraArrays:
+    """Cameras as the ray kernel wants them."""
+
+    def __init__(self, camera_to_world: NDArray, intrinsics: NDArray, where: str):
+        pose = np.asarray(camera_to_world, np.float64)
+        self.rotation = wp.array(pose[:, :3, :3].astype(np.float32), dtype=wp.mat33f, device=where)
+        self.position = wp.array(pose[:, :3, 3].astype(np.float32), dtype=wp.vec3f, device=where)
+        self.intrinsics = wp.array(np.asarray(intrinsics, np.float32), dtype=wp.vec4f, device=where)
+
+
+class RadianceField:
+    """A trained (or training) field on one device."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        appearance: Appearance,
+        table: torch.Tensor,
+        parameters: dict[str, torch.Tensor],
+        grid: torch.Tensor,
+        about: dict[str, Any] | None = None,
+    ):
+        """
+        Args:
+            layout: Sizes and bounds.
+            appearance: The embeddings, on the same device as the rest.
+            table: Hash tables, shape (levels, 2**log2_table, FEATURES).
+            parameters: Weights, see `network.initial_parameters`.
+            grid: Density grid [1/m] over the contracted cube.
+            about: Whatever else is to be kept beside the numbers, JSON-able.
+        """
+        self.layout, self.appearance, self.about = layout, appearance, about or {}
+        self.table, self.parameters, self.grid = table, parameters, grid
+        self.where = "cpu" if table.device.type == "cpu" else "cuda"
+        load_kernels(self.where)
+        self.w_table = view(table, hashgrid.Feature)
+        self.w_grid = view(grid, wp.float32)
+        cells = level_cells(layout.space, layout.levels, layout.growth)
+        self.w_cells = wp.array(cells, dtype=wp.vec3f, device=self.where)
+        self.w_shapes = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.where)
+        self.mask = wp.uint32(2**layout.log2_table - 1)
+        self.centre = wp.vec3f(*layout.centre)
+        self.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
+        self.grid_cell = grid_shape(layout.space)[1]
+        self._spare: list[Workspace] = []
+
+    @property
+    def lightings(self) -> tuple[str, ...]:
+        return self.appearance.lightings
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the near box [m], shape (2, 3)."""
+        return self.layout.space.bounds
+
+    def embedding(self, lighting: str) -> NDArray[np.float32]:
+        """See `Appearance.embedding`."""
+        return self.appearance.embedding(lighting)
+
+    def frame_embedding(self, name: str) -> NDArray[np.float32]:
+        """The embedding of a training frame, shape (dim,). Raises InputError where it was not trained on."""
+        if name not in self.appearance.frames:
+            raise InputError(f"frame {name!r}: not among the {len(self.appearance.frames)} frames trained on")
+        return self.appearance.embedding(name)
+
+    # ---- the passes of a batch; each works on rays [start, start + count) of a workspace
+
+    def cast(self, ws: Workspace, cameras: CameraArrays, start: int, count: int) -> None:
+        """Pixels → rays."""
+        wp.launch(
+            space.pixel_rays,
+            count,
+            [ws.w_camera, ws.w_pixel, cameras.rotation, cameras.position, cameras.intrinsics, start],
+            [ws.w_origins, ws.w_directions, ws.w_cosines],
+            device=self.where,
+        )
+
+    def sample(
+        self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int = -1
+    ) -> None:
+        """Rays → samples. See `kernels/sampler.py`."""
+        wp.launch(
+            sampler.sample_rays,
+            count,
+            [ws.w_origins, ws.w_directions, ws.w_targets, self.centre, self.inverse_half, self.w_grid, self.grid_cell]
+            + [self.layout.near_plane, floor, target_mass, seed, start],
+            [ws.w_edges, ws.w_distances, ws.w_ray_positions],
+            device=self.where,
+        )
+
+    def query(self, ws: Workspace, start: int, count: int) -> None:
+        """Grid positions → network outputs, for rows (not rays) [start, start + count)."""
+        wp.launch(
+            hashgrid.encode,
+            count,
+            [ws.w_positions, self.w_table, self.w_cells, self.w_shapes, self.mask, start],
+            [ws.w_features],
+            device=self.where,
+        )
+        rows = slice(start, start + count)
+        network.trunk(self.parameters, ws.features[rows], ws.hidden[rows], ws.outputs[rows])
+
+    def composite(self, ws: Workspace, start: int, count: int) -> None:
+        """Network outputs → opacity and features per ray."""
+        wp.launch(
+            volume.composite,
+            count,
+            [ws.w_ray_outputs, ws.w_edges, ws.w_distances, self.layout.density_unit, start],
+            [ws.w_weights, ws.w_composited, ws.w_inverse, ws.w_median],
+            device=self.where,
+        )
+
+    # ---- what others ask of it
+
+    def density(self, points: NDArray) -> NDArray[np.float32]:
+        """Density [1/m] at points [m], shape (k, 3) → (k,)."""
+        points = np.ascontiguousarray(points, np.float32)
+        result = np.empty(len(points), np.float32)
+        batch = _QUERY_POINTS
+
+        def one(start: int) -> None:
+            ws = self._borrow(0, 1, batch)
+            n = min(batch, len(points) - start)
+            metres = torch.as_tensor(points[start : start + n], device=self.where)
+            wp.launch(
+                space.contract_points,
+                n,
+                [view(metres, wp.vec3f), self.centre, self.inverse_half, 0],
+                [ws.w_positions],
+                device=self.where,
+            )
+            self.query(ws, 0, n)
+            raw = ws.outputs[:n, 0].clamp(max=volume.RAW_LIMIT)
+            result[start : start + n] = (torch.exp(raw) * self.layout.density_unit).cpu().numpy()
+            self._spare.append(ws)
+
+        with single_threaded_torch(), torch.no_grad():
+            parallel(one, range(0, len(points), batch), self.where)
+        return result
+
+    def trace(
+        self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int = _RENDER_SAMPLES
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What does not depend on the lighting, of n rays given by camera index (n,) and pixel (n, 2) [px].
+
+        Returns:
+            Features (n, CHANNELS − 1), spherical harmonics of the directions (n, 16), z-depth [m] (n,), opacity (n,).
+        """
+        n, batch = len(camera), _RENDER_RAYS
+        features = torch.empty(n, volume.CHANNELS - 1, device=self.where)
+        harmonics = torch.empty(n, 16, device=self.where)
+        depth, opacity = torch.empty(n, device=self.where), torch.empty(n, device=self.where)
+
+        def one(start: int) -> None:
+            ws = self._borrow(batch, samples, 0)
+            stop = min(start + batch, n)
+            k = stop - start
+            ws.camera[:k] = torch.as_tensor(camera[start:stop].astype(np.int32), device=self.where)
+            ws.pixel[:k] = torch.as_tensor(pixel[start:stop].astype(np.float32), device=self.where)
+            self.cast(ws, cameras, 0, k)
+            self.sample(ws, 0, k, _RENDER_FLOOR)
+            self.query(ws, 0, k * samples)
+            self.composite(ws, 0, k)
+            rows = slice(start, stop)
+            harmonics[rows] = network.spherical_harmonics(ws.directions[:k])
+            features[rows] = network.ray_features(self.parameters, ws.composited[:k], harmonics[rows])
+            median = ws.median_distance[:k]
+            depth[rows] = torch.where(median > 0.0, median * ws.cosines[:k], FAR).clamp(max=FAR)
+            opacity[rows] = ws.composited[:k, 0]
+            self._spare.append(ws)
+
+        with single_threaded_torch(), torch.no_grad():
+            parallel(one, range(0, n, batch), self.where)
+        return features, harmonics, depth, opacity
+
+    def colour(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: torch.Tensor) -> torch.Tensor:
+        """Colour of traced rays under embeddings (n, dim) or (dim,), shape (n, 3)."""
+        return network.head(self.parameters, features, harmonics, embedding)
+
+    def render(
+        self, camera_to_world: NDArray, intrinsics: NDArray, size: tuple[int, int], lighting: str | NDArray
+    ) -> Rendering:
+        """Views of n cameras under one lighting.
+
+        Args:
+            camera_to_world: OpenCV axes, shape (n, 4, 4).
+            intrinsics: fx, fy, cx, cy [px] at `size`, shape (n, 4).
+            size: Width, height [px].
+            lighting: A name, see `Appearance.embedding`, or an embedding (dim,).
+
+        Raises:
+            InputError: unknown lighting.
+        """
+        vector = self.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
+        width, height = size
+        n = len(camera_to_world)
+        cameras = CameraArrays(camera_to_world, intrinsics, self.where)
+        v, u = np.mgrid[:height, :width] + 0.5
+        pixel = np.tile(np.stack([u.ravel(), v.ravel()], -1), (n, 1))
+        features, harmonics, depth, opacity = self.trace(cameras, np.repeat(np.arange(n), width * height), pixel)
+        with torch.no_grad():
+            rgb = self.colour(features, harmonics, torch.as_tensor(vector, device=self.where))
+        return Rendering(
+            rgb.cpu().numpy().reshape(n, height, width, 3),
+            depth.cpu().numpy().reshape(n, height, width),
+            opacity.cpu().numpy().reshape(n, height, width),
+        )
+
+    def _borrow(self, rays: int, samples: int, extra: int) -> Workspace:
+        """A workspace of this size from those at hand, or a new one; list operations are atomic between threads."""
+        for ws in self._spare:
+            if (ws.rays, ws.samples) == (rays, samples):
+                try:
+                    self._spare.remove(ws)
+                    return ws
+                except ValueError:  # another thread took it
+                    continue
+        return Workspace(self.layout, rays, samples, self.where, extra)
+
+    # ---- files
+
+    def save(self, folder: Path) -> None:
+        """Writes `field.safetensors` and `field.json`."""
+        tensors = {"table": self.table, "grid": self.grid}
+        tensors |= {"appearance.vectors": self.appearance.vectors, "appearance.residuals": self.appearance.residuals}
+        tensors |= {f"network.{name}": value for name, value in self.parameters.items()}
+        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, str(folder / "field.safetensors"))
+        write_json(
+            folder / "field.json",
+            {
+                "format": _FORMAT,
+                "layout": asdict(self.layout),
+                "lightings": self.appearance.lightings,
+                "frames": self.appearance.frames,
+                "frame_lighting": self.appearance.frame_lighting.tolist(),
+                "about": self.about,
+            },
+        )
+
+    @staticmethod
+    def load(folder: Path, where: str | None = None) -> "RadianceField":
+        """Reads a field on to a device (by default `compute.device()`).
+
+        Raises:
+            InputError: no field there, or one of another format.
+        """
+        where = where or device()
+        if not (folder / "field.json").exists():
+            raise InputError(f"{folder}: holds no field.json; build the scene's field first")
+        head = read_json(folder / "field.json")
+        if head.get("format") != _FORMAT:
+            raise InputError(f"{folder}/field.json: format {head.get('format')}, expected {_FORMAT}; build it anew")
+        tensors = load_file(str(folder / "field.safetensors"), device=where)
+        layout = head["layout"] | {key: tuple(head["layout"][key]) for key in ("centre", "half")}
+        appearance = Appearance(
+            tuple(head["lightings"]),
+            tuple(head["frames"]),
+            np.array(head["frame_lighting"], np.int64),
+            tensors["appearance.vectors"],
+            tensors["appearance.residuals"],
+        )
+        parameters = {k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")}
+        return RadianceField(
+            Layout(**layout), appearance, tensors["table"], parameters, tensors["grid"], head["about"]
+        )
+
+
+def untrained(layout: Layout, appearance: Appearance, seed: int, where: str) -> RadianceField:
+    """A field before its first step: nearly transparent everywhere."""
+    generator = torch.Generator().manual_seed(seed)
+    table = (torch.rand(layout.levels, 2**layout.log2_table, hashgrid.FEATURES, generator=generator) - 0.5) * 2e-2
+    parameters = network.initial_parameters(
+        layout.levels * hashgrid.FEATURES, layout.hidden, layout.appearance_dim, seed
+    )
+    shape, _ = grid_shape(layout.space)
+    grid = torch.full(shape, layout.density_unit)
+    moved = Appearance(
+        appearance.lightings,
+        appearance.frames,
+        appearance.frame_lighting,
+        appearance.vectors.to(where),
+        appearance.residuals.to(where),
+    )
+    return RadianceField(
+        layout, moved, table.to(where), {k: v.to(where) for k, v in parameters.items()}, grid.to(where)
+    )

@@ -1,0 +1,142 @@
+"""Volume rendering of features along rays, with its hand-written backward pass and the per-sample regularisers.
+
+Per ray there are K strata between K + 1 edges [m]. Each sample's network output holds the raw density in slot 0 and
+features in the others. Weight wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)) (Max 1995). The composited output holds the *opacity* Σwᵢ in
+slot 0 and Σwᵢ·featureᵢ in the others.
+"""
+
+import warp as wp
+
+CHANNELS = 16
+"""Network outputs per sample: raw density and 15 features."""
+
+Channels = wp.types.vector(length=CHANNELS, dtype=wp.float32)
+
+RAW_LIMIT = 14.0
+"""Raw outputs above this count as this: opaque at any sampling distance."""
+
+_RAW_LIMIT = wp.constant(RAW_LIMIT)
+
+
+@wp.func
+def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
+    """Density [1/m] of the network's raw output; `unit` is the density at 0."""
+    return unit * wp.exp(wp.min(raw, _RAW_LIMIT))
+
+
+@wp.kernel(enable_backward=False)
+def densities_of(
+    outputs: wp.array(dtype=Channels),  # type: ignore[valid-type]
+    unit: wp.float32,
+    start: wp.int32,
+    densities: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+):
+    """Densities [1/m] of samples."""
+    i = start + wp.tid()
+    densities[i] = density_of(outputs[i][0], unit)
+
+
+@wp.kernel(enable_backward=False)
+def composite(
+    outputs: wp.array2d(dtype=Channels),  # type: ignore[valid-type]
+    edges: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    distances: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    unit: wp.float32,
+    start: wp.int32,
+    weights: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    composited: wp.array(dtype=Channels),  # type: ignore[valid-type]
+    inverse_distance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    median_distance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+):
+    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and the distance at which half the light is stopped [m] (−1: nowhere)."""
+    i = start + wp.tid()
+    transmittance = float(1.0)
+    total = Channels()
+    inverse = float(0.0)
+    median = float(-1.0)
+    for k in range(distances.shape[1]):
+        out = outputs[i, k]
+        sigma = density_of(out[0], unit)
+        delta = edges[i, k + 1] - edges[i, k]
+        through = wp.exp(-sigma * delta)
+        w = transmittance * (1.0 - through)
+        weights[i, k] = w
+        total += out * w
+        inverse += w / distances[i, k]
+        if median < 0.0 and transmittance * through < 0.5:
+            median = edges[i, k] + wp.log(transmittance / 0.5) / sigma
+        transmittance *= through
+    total[0] = 1.0 - transmittance
+    composited[i] = total
+    inverse_distance[i] = inverse
+    median_distance[i] = median
+
+
+@wp.kernel(enable_backward=False)
+def composite_backward(
+    outputs: wp.array2d(dtype=Channels),  # type: ignore[valid-type]
+    edges: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    distances: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    weights: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    targets: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    composited_grad: wp.array(dtype=Channels),  # type: ignore[valid-type]
+    inverse_distance_grad: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    unit: wp.float32,
+    distortion: wp.float32,
+    depth: wp.float32,
+    depth_reach: wp.float32,
+    log_offset: wp.float32,
+    start: wp.int32,
+    outputs_grad: wp.array2d(dtype=Channels),  # type: ignore[valid-type]
+):
+    """Gradient of the network outputs, given that of the composited output and of Σwᵢ/tᵢ.
+
+    Adds the gradient of two regularisers of the weights:
+        distortion · (Σᵢⱼ wᵢwⱼ|sᵢ − sⱼ| + ⅓ Σ wᵢ²Δsᵢ), s = log(t + log_offset)      (Barron et al. 2022, eq. 15)
+        depth · (Σᵢ wᵢ·min(|tᵢ/target − 1|, reach) + (1 − Σwᵢ)·reach), where a target distance is known: the cost of
+        moving all weight to it, capped so that a wrong target does not tear.
+    """
+    i = start + wp.tid()
+    count = distances.shape[1]
+    target = targets[i]
+    gradient = composited_grad[i]
+    opacity_gradient = gradient[0]
+    inverse_gradient = inverse_distance_grad[i]
+
+    # Σⱼ wⱼ|sᵢ − sⱼ| = sᵢ(2Wᵢ − W) − (2Sᵢ − S) with prefix sums W of w and S of w·s, as the samples are sorted.
+    all_w = float(0.0)
+    all_ws = float(0.0)
+    for k in range(count):
+        w = weights[i, k]
+        all_w += w
+        all_ws += w * wp.log(distances[i, k] + log_offset)
+    sum_w = all_w
+    sum_ws = all_ws
+
+    behind = float(0.0)  # Σ_{j>i} wⱼ·∂L/∂wⱼ
+    left = 1.0 - all_w
+    for reverse in range(count):
+        k = count - 1 - reverse
+        out = outputs[i, k]
+        w = weights[i, k]
+        t = distances[i, k]
+        s = wp.log(t + log_offset)
+        sum_w -= w
+        sum_ws -= w * s
+        spread = s * (2.0 * sum_w + w - all_w) - (2.0 * sum_ws + w * s - all_ws)
+        width = wp.log((edges[i, k + 1] + log_offset) / (edges[i, k] + log_offset))
+        gw = opacity_gradient + inverse_gradient / t + distortion * (2.0 * spread + 0.6666667 * w * width)
+        if target > 0.0:
+            gw += depth * (wp.min(wp.abs(t / target - 1.0), depth_reach) - depth_reach)
+        grad = gradient * w
+        gw += wp.dot(gradient, out) - opacity_gradient * out[0]
+        # ∂wᵢ/∂σᵢ = δᵢ·T_{i+1}, ∂wⱼ/∂σᵢ = −δᵢ·wⱼ behind it.
+        sigma = density_of(out[0], unit)
+        left += w  # Tᵢ
+        slope = gw * (left - w) - behind
+        behind += gw * w
+        if out[0] < _RAW_LIMIT:
+            grad[0] = slope * sigma * (edges[i, k + 1] - edges[i, k])
+        else:
+            grad[0] = 0.0
+        outputs_grad[i, k] = grad

@@ -1,0 +1,67 @@
+"""Unbounded space in a box: contraction, and the rays of pinhole cameras.
+
+*Near box*: an axis-aligned box [m] that is mapped without distortion. *Unit position* u: metres from its centre over its
+half extent, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, and outside
+(2 − 1/|u|)·u/|u| in the maximum norm (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so that all of
+space lies in (−2, 2)³. *Grid position*: the contracted position scaled to [0, 1]³.
+"""
+
+import warp as wp
+
+_TOP = wp.constant(1.0 - 1.0e-6)
+
+
+@wp.func
+def max_norm(u: wp.vec3f) -> wp.float32:
+    return wp.max(wp.max(wp.abs(u[0]), wp.abs(u[1])), wp.abs(u[2]))
+
+
+@wp.func
+def grid_position(u: wp.vec3f) -> wp.vec3f:
+    """Unit position → grid position in [0, 1)."""
+    m = max_norm(u)
+    c = u
+    if m > 1.0:
+        c = u * ((2.0 - 1.0 / m) / m)
+    g = c * 0.25 + wp.vec3f(0.5, 0.5, 0.5)
+    return wp.vec3f(wp.clamp(g[0], 0.0, _TOP), wp.clamp(g[1], 0.0, _TOP), wp.clamp(g[2], 0.0, _TOP))
+
+
+@wp.kernel(enable_backward=False)
+def contract_points(
+    points: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
+    centre: wp.vec3f,
+    inverse_half: wp.vec3f,
+    start: wp.int32,
+    positions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
+):
+    """Grid positions of points [m]."""
+    i = start + wp.tid()
+    positions[i] = grid_position(wp.cw_mul(points[i] - centre, inverse_half))
+
+
+@wp.kernel(enable_backward=False)
+def pixel_rays(
+    camera: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    pixel: wp.array(dtype=wp.vec2f),  # type: ignore[valid-type]
+    rotation: wp.array(dtype=wp.mat33f),  # type: ignore[valid-type]
+    position: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
+    intrinsics: wp.array(dtype=wp.vec4f),  # type: ignore[valid-type]
+    start: wp.int32,
+    origins: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
+    directions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
+    cosines: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+):
+    """Rays through pixels (u, v) [px]: origin [m], unit direction, and cosine to the optical axis.
+
+    `rotation`, `position` and `intrinsics` (fx, fy, cx, cy) are per camera; z-depth = distance × cosine.
+    """
+    i = start + wp.tid()
+    c = camera[i]
+    k = intrinsics[c]
+    p = pixel[i]
+    local = wp.vec3f((p[0] - k[2]) / k[0], (p[1] - k[3]) / k[1], 1.0)
+    length = wp.length(local)
+    origins[i] = position[c]
+    directions[i] = rotation[c] * (local / length)
+    cosines[i] = 1.0 / length
