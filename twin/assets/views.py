@@ -1,0 +1,160 @@
+"""What the radiance field shows from where the films were taken: the rays that surface and ground are made from.
+
+A *view* is one rendered pose. Its *inverse depth* is linear in the image wherever the surface is a plane, so that edges
+are told from slopes by second differences. *Slant* is |n · r| for the surface normal n and the ray r with unit z-depth:
+a step of 1 m of z-depth through the surface is a step of `slant` metres away from it.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin import progress
+from twin.geometry.cameras import Cameras, pixel_grid, scaled_intrinsics, unproject
+
+Array = NDArray[np.float64]
+
+_BATCH = 8
+_TURN = 3.0  # [m per rad] how far apart two views are that differ by direction only
+_FLYING = 0.06  # share of inverse depth: between two surfaces further apart than this a pixel belongs to neither
+_MIN_OPACITY = 0.5
+_MIN_SLANT = 0.12  # below this, normals from depth say little
+NEAR = 0.3  # [m] nothing nearer to a lens than this is believed
+
+
+class Rendered(Protocol):
+    """Shapes (n, h, w, 3), (n, h, w) z-depth [m], (n, h, w)."""
+
+    @property
+    def rgb(self) -> NDArray[np.float32]: ...
+    @property
+    def depth(self) -> NDArray[np.float32]: ...
+    @property
+    def opacity(self) -> NDArray[np.float32]: ...
+
+
+class Field(Protocol):
+    """What is needed of a `RadianceField` here."""
+
+    @property
+    def lightings(self) -> tuple[str, ...]: ...
+    @property
+    def bounds(self) -> Array: ...
+    def render(
+        self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str
+    ) -> Rendered: ...
+
+
+@dataclass(frozen=True)
+class Views:
+    """n renderings of one size."""
+
+    camera_to_world: Array
+    """Shape (n, 4, 4)."""
+    intrinsics: Array
+    """fx, fy, cx, cy [px] at the rendered size, shape (n, 4)."""
+    rgb: NDArray[np.uint8]
+    """Shape (n, h, w, 3)."""
+    depth: NDArray[np.float32]
+    """z-depth [m], shape (n, h, w); the background is further than any surface; 0 where it is not to be believed."""
+    slant: NDArray[np.float32]
+    """Shape (n, h, w), in [0.12, √(1 + r²)]."""
+    upward: NDArray[np.float32]
+    """z of the surface normal, turned to the lens, shape (n, h, w)."""
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+    def points(self, i: int) -> Array:
+        """World points of view i's pixels, shape (h, w, 3) [m]."""
+        height, width = self.depth.shape[1:]
+        rays = unproject(pixel_grid(width, height), self.intrinsics[i])
+        local = rays * self.depth[i, ..., None]
+        return local @ self.camera_to_world[i, :3, :3].T + self.camera_to_world[i, :3, 3]
+
+
+def render_views(field: Field, cameras: Cameras, count: int, width: int, far: float) -> Views:
+    """Renders the field from `count` spread-out training frames, under its first lighting.
+
+    Args:
+        field: The radiance field.
+        cameras: Metric cameras.
+        count: Views at most.
+        width: Width of a view [px]; the height follows the first camera's shape.
+        far: Depth beyond which a pixel counts as background [m].
+    """
+    chosen = cameras.select(spread_frames(cameras, count))
+    size = (width, max(2, round(width * float(cameras.sizes[0, 1] / cameras.sizes[0, 0]))))
+    old = [(int(w), int(h)) for w, h in chosen.sizes]
+    intrinsics = np.stack([scaled_intrinsics(k, s, size) for k, s in zip(chosen.intrinsics, old, strict=True)])
+    rgb, depth = [], []
+    with progress.bar("rendering depth", len(chosen), "view") as bar:
+        for start in range(0, len(chosen), _BATCH):
+            part = slice(start, start + _BATCH)
+            image = field.render(chosen.camera_to_world[part], intrinsics[part], size, field.lightings[0])
+            rgb.append((np.clip(image.rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
+            depth.append(believed_depth(np.asarray(image.depth), np.asarray(image.opacity), far))
+            bar.update(len(image.depth))
+    all_depth = np.concatenate(depth)
+    slant, upward = surface_slant(all_depth, intrinsics, chosen.camera_to_world)
+    return Views(chosen.camera_to_world, intrinsics, np.concatenate(rgb), all_depth, slant, upward)
+
+
+def spread_frames(cameras: Cameras, count: int) -> NDArray[np.int64]:
+    """Indices of `count` training frames, far apart in position and direction (farthest-point order), sorted."""
+    candidates = np.flatnonzero(~cameras.held_out)
+    if len(candidates) == 0:
+        candidates = np.arange(len(cameras))
+    where = np.concatenate([cameras.positions, _TURN * cameras.camera_to_world[:, :3, 2]], 1)[candidates]
+    chosen, gap = [0], np.linalg.norm(where - where[0], axis=1)
+    while len(chosen) < min(count, len(candidates)):
+        chosen.append(int(np.argmax(gap)))
+        gap = np.minimum(gap, np.linalg.norm(where - where[chosen[-1]], axis=1))
+    return np.sort(candidates[np.unique(chosen)])
+
+
+def believed_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.float32]:
+    """Depth (n, h, w) with 0 where a pixel is too near, half transparent, or hangs between two surfaces.
+
+    What is beyond `far`, or all but transparent, becomes background at 10 · far.
+    """
+    out = np.where((depth > far) | (opacity < 0.1) | ~np.isfinite(depth), 10.0 * far, depth).astype(np.float32)
+    bad = (out < NEAR) | ((opacity < _MIN_OPACITY) & (out < far))
+    inverse = 1.0 / np.maximum(out, 1e-3)
+    for axis in (1, 2):
+        ahead = np.diff(inverse, axis=axis)
+        first, second = (ahead[:, :-1], ahead[:, 1:]) if axis == 1 else (ahead[..., :-1], ahead[..., 1:])
+        middle = inverse[:, 1:-1] if axis == 1 else inverse[..., 1:-1]
+        # Between its neighbours, far from both, and not on the line between them only by being a slope.
+        steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING * middle
+        bent = np.abs(first - second) > 0.3 * np.abs(first + second)
+        flying = steep & bent & (first * second > 0)
+        if axis == 1:
+            bad[:, 1:-1] |= flying
+        else:
+            bad[..., 1:-1] |= flying
+    out[bad] = 0.0
+    return out
+
+
+def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> tuple[NDArray, NDArray]:
+    """Slant and the upward part of the normal from depth maps (n, h, w): central differences of inverse depth.
+
+    A plane n · x = c seen along r = (x, y, 1) has inverse depth (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ) of q = 1/z.
+    """
+    n, height, width = depth.shape
+    slant = np.ones(depth.shape, np.float32)
+    upward = np.zeros(depth.shape, np.float32)
+    for i in range(n):
+        inverse = 1.0 / np.where(depth[i] > 0, depth[i], np.nan)
+        rays = unproject(pixel_grid(width, height), intrinsics[i])
+        dv, du = np.gradient(inverse)
+        gx, gy = du * intrinsics[i, 0], dv * intrinsics[i, 1]
+        normal = np.stack([gx, gy, inverse - rays[..., 0] * gx - rays[..., 1] * gy], -1)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
+        # n · r has the sign of the inverse depth, so the normal points away from the lens: the one towards it is −n.
+        slant[i] = np.nan_to_num(np.maximum((normal * rays).sum(-1), _MIN_SLANT), nan=_MIN_SLANT)
+        upward[i] = np.nan_to_num(-(normal @ camera_to_world[i, :3, :3].T)[..., 2], nan=0.0)
+    return slant, upward
