@@ -104,7 +104,7 @@ def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path
     assert (about["codec"], about["pixel_format"]) == ("h264", "yuv420p")
     assert about["frames"] == metrics["frames"] == len(list(read_frames(out / "review.mp4")))
     assert metrics["duration_s"] == metrics["frames"] / 5
-    assert metrics["renders"] == len(field.asked) <= 20
+    assert metrics["renders"] == len(field.asked) - 1 <= 20  # the first one only warms up
     assert any(name.startswith("day:night:") for name in field.asked)
     told = read_json(out / "review.json")
     assert "render_seconds_per_frame" in metrics and "render_seconds_per_frame" not in told

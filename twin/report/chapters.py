@@ -115,6 +115,11 @@ def plan_with(plan: Plan, pose: NDArray[np.float64], dots: NDArray[np.float64] |
     return picture
 
 
+def light_steps(lightings: int, budget: int) -> int:
+    """Views from one lighting to the next, so that all of them and the last one keep within the budget."""
+    return max(2, (budget - 1) // max(1, lightings - 1))
+
+
 def turn_the_light(studio: Studio, plan: Plan, budget: int, progress: tqdm) -> None:
     """Chapter 2: one place, while the appearance goes from lighting to lighting."""
     lightings, cameras, layout = studio.field.lightings, studio.cameras, studio.layout
@@ -133,7 +138,7 @@ def turn_the_light(studio: Studio, plan: Plan, budget: int, progress: tqdm) -> N
     )
     nearest = {name: nearest_frame(cameras, i, name) for name in lightings}
     reals = {name: studio.real(k) for name, k in nearest.items() if k is not None}
-    steps = max(2, budget // (len(lightings) - 1))
+    steps = light_steps(len(lightings), budget)
     shown = max(1, round(studio.fps / 6))  # video frames per rendered step
     kept = []
     for number, (a, b) in enumerate(pairwise(lightings)):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,10 @@ from twin.report.studio import Studio, as_picture, side_by_side
 from twin.report.words import listing
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 DRIVE_STRIP = (0.62, 0.38)  # shares of the strip below: plan, facts
-_LONGEST = 16.0  # [s] the drive may take in the film; a longer one is shown faster
+_LONGEST = 14.0  # [s] the drive may take in the film; a longer one is shown faster
 _CROSSFADE = 0.25  # share of a lighting's stretch of the route in which it turns into the next
 _TRACE_SAMPLES = 200  # of a drive, for the page
 _CONTROL_RATE = 10  # instants per second in a Drive
@@ -76,6 +77,11 @@ def stride(drive: Drive, fps: int) -> tuple[int, int]:
     return every, max(1, int(fps * every / (_CONTROL_RATE * speedup) + 1e-9))
 
 
+def rendered_instants(instants: list[T], budget: int) -> list[T]:
+    """Those instants of the film that get a view of the field of their own; in between the last one stays."""
+    return instants[:: max(1, -(-len(instants) // max(1, budget)))]
+
+
 def film_drive(
     studio: Studio,
     plan: Plan,
@@ -110,7 +116,7 @@ def film_drive(
             + (f"Shown {shown_speed:.3g} times as fast." if shown_speed > 1.01 else ""),
         ],
     )
-    rendered = set(instants[:: max(1, -(-len(instants) // max(1, budget)))])
+    rendered = set(rendered_instants(instants, budget))
     moments = {instants[int(share * (len(instants) - 1))] for share in (0.08, 0.4, 0.65, 0.95)}
     speed, driven = speeds(drive), arc_lengths(drive.base_to_world[:, :2, 3])
     rgb, told = None, ""

@@ -4,6 +4,10 @@ import base64
 import html
 from pathlib import Path
 
+from PIL import Image
+
+_STRIP = 2.4  # width over height from which on a picture is a strip
+
 
 class Html(str):
     """Text that is HTML, and is not escaped again."""
@@ -47,11 +51,14 @@ def table(head: list[str], rows: list[list[str]], numeric: tuple[int, ...] = ())
 
 
 def picture(path: Path, caption: str) -> Html:
-    """A JPEG or PNG within the page, under its caption."""
+    """A JPEG or PNG within the page, over its caption; a long strip takes the whole width."""
+    with Image.open(path) as image:
+        width, height = image.size
     return element(
         "figure",
         element("img", src=data_url(path), alt=caption, loading="lazy"),
         element("figcaption", caption),
+        class_="strip" if width > _STRIP * height else None,
     )
 
 
@@ -98,6 +105,8 @@ dd .meaning { font-size:.82rem; display:block; line-height:1.35 } dd.none b { co
   margin:0 0 12px } .caution b { display:block } .na { color:var(--muted); font-style:italic; margin:0 0 16px }
 figure { margin:0 0 16px; min-width:0 } figcaption { font-size:.86rem; line-height:1.4; margin-top:5px }
 img, video { display:block; width:100%; height:auto; border-radius:8px; background:#000 }
+.pictures { display:grid; grid-template-columns:repeat(auto-fit, minmax(min(100%, 400px), 1fr)); gap:0 16px }
+.pictures .strip { grid-column:1 / -1 }
 .charts { display:grid; grid-template-columns:repeat(auto-fit, minmax(min(100%, 400px), 1fr)); gap:8px 24px;
   align-items:start } .charts svg { display:block; width:100%; max-width:560px; height:auto }
 .charts svg * { stroke-linejoin:round; stroke-linecap:butt }

@@ -1,19 +1,26 @@
-"""Pictures of the built scene for the page: what MuJoCo loads, from a bird's eye, with the solid parts drawn over."""
+"""Pictures of what MuJoCo loads: a bird's eye view of the place, and the drive from behind.
+
+A *shot* is the robot's configuration (MuJoCo's qpos) and the pose of the camera that sees it.
+"""
+
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.chase import SceneCamera
+from twin.env.chase import SceneCamera, chase_poses, frame_indices
+from twin.env.follower import Drive
+from twin.geometry.cameras import Cameras
 from twin.geometry.poses import look_at
-from twin.mjcf.world import SCENE_XML, World, arc_lengths, point_at
-from twin.report.studio import Studio
-from twin.scene import SceneDir
+from twin.mjcf.world import World, arc_lengths, point_at
+from twin.report.panels import Picture
 
 Array = NDArray[np.float64]
+Shot = tuple[Array | None, Array]
 
-_SIZE = (800, 450)  # [px]
 _BACK, _UP, _AHEAD = 9.0, 7.0, 10.0  # [m] behind and above the place looked from, and ahead of it where we look
+_STATIONS = (0.0, 0.45)  # shares of the route where the bird is
 
 
 def bird_pose(route: Array, s: float) -> Array:
@@ -26,27 +33,31 @@ def bird_pose(route: Array, s: float) -> Array:
     return look_at(here - _BACK * along + [0.0, 0.0, _UP], here + _AHEAD * along)
 
 
-def keep_overviews(studio: Studio, scene: SceneDir, world: World | None) -> None:
-    """Keeps one picture of the scene from its start and one from halfway; without a route one of the whole."""
-    folder = scene.stage("mjcf")
-    if not (folder / SCENE_XML).exists():
+def route_shots(route: Array) -> list[Shot]:
+    """The place from above its start and from further along, the robot where the scene puts it."""
+    length = float(arc_lengths(route)[-1])
+    return [(None, bird_pose(route, share * length)) for share in _STATIONS]
+
+
+def camera_shots(cameras: Cameras) -> list[Shot]:
+    """The place as two of the cameras saw it, for a scene without a route."""
+    n = len(cameras)
+    return [(None, cameras.camera_to_world[i]) for i in dict.fromkeys((n // 4, 3 * n // 4))]
+
+
+def chase_shots(drive: Drive, every: int) -> list[Shot]:
+    """The drive from behind, every few control steps and at its last instant."""
+    poses = chase_poses(drive.base_to_world)
+    return [(drive.qpos[i], poses[i]) for i in frame_indices(len(drive.times), every)]
+
+
+def pictures_of(world: World, shots: list[Shot], size: tuple[int, int]) -> Iterator[Picture]:
+    """Draws shots in order, solid parts over what is seen. One camera serves all: building it takes seconds."""
+    if not shots:
         return
-    if world is None:
-        # Only its model is drawn; there is no route to know.
-        world = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), np.ones(4), folder)
-        middle = studio.cameras.positions.mean(0)
-        poses = {
-            "the scene that MuJoCo loads": look_at(studio.cameras.positions[0] + [0.0, 0.0, 1.0], middle * [1, 1, 0])
-        }
-    else:
-        length = float(arc_lengths(world.route)[-1])
-        poses = {
-            "the scene that MuJoCo loads, from above its start; solid parts drawn over": bird_pose(world.route, 0.0),
-            "further along the route": bird_pose(world.route, 0.45 * length),
-        }
-    camera = SceneCamera(world, _SIZE)
+    camera = SceneCamera(world, size)
     data = mujoco.MjData(camera.model)
     if camera.model.nkey:
         mujoco.mj_resetDataKeyframe(camera.model, data, 0)
-    for number, (caption, pose) in enumerate(poses.items()):
-        studio.keep(f"scene_{number}", "mjcf", caption, camera.render(data.qpos, pose))
+    for qpos, pose in shots:
+        yield camera.render(data.qpos if qpos is None else qpos, pose)

@@ -126,6 +126,7 @@ def _section(
         )
         for fact in section.facts
     ]
+    pictures = [picture(path, caption) for name, path, caption in kept if name == section.name]
     figures = [element("div", element("h3", c.title), Html(c.svg)) for c in drawn if c.section == section.name]
     rows = flat(report.get(section.name))
     return element(
@@ -135,7 +136,7 @@ def _section(
         _not_applicable(section) if section.not_applicable else "",
         *map(_caution, section.cautions),
         element("dl", *facts),
-        *(picture(path, caption) for name, path, caption in kept if name == section.name),
+        element("div", *pictures, class_="pictures") if pictures else "",
         element("div", *figures, class_="charts") if figures else "",
         element(
             "details",

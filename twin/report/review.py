@@ -4,8 +4,8 @@ The film has up to three *chapters*: the field beside the real frames; the light
 or more; and the Husky driven along the route by a scripted follower, where there is a route.
 """
 
-from collections.abc import Iterator
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from twin.assets.ground import Ground
 from twin.config import SceneConfig
-from twin.env.chase import chase_frames
 from twin.env.follower import Drive, follow
 from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import Cameras
@@ -26,12 +25,13 @@ from twin.report.chapters import (
     LIGHT_STRIP,
     compare_with_the_film,
     comparison_frames,
+    light_steps,
     title_card,
     turn_the_light,
 )
-from twin.report.drive import DRIVE_STRIP, drive_metrics, film_drive, stride, trace
-from twin.report.overview import keep_overviews
-from twin.report.panels import AMBER, GREEN, RED, Box, Layout, Picture
+from twin.report.drive import DRIVE_STRIP, drive_metrics, film_drive, rendered_instants, stride, trace
+from twin.report.overview import Shot, camera_shots, chase_shots, pictures_of, route_shots
+from twin.report.panels import AMBER, GREEN, RED, Box, Layout
 from twin.report.plan import Plan, footprints
 from twin.report.studio import Field, Studio, side_by_side, spread
 from twin.report.video import VideoWriter
@@ -41,7 +41,7 @@ from twin.scene import SceneDir, write_json
 Array = NDArray[np.float64]
 
 _SHARES = (0.25, 0.2, 0.55)  # of `review.renders`, per chapter
-_CHASE_MEMORY = 64 * 2**20  # [bytes] of pictures from behind that wait to be shown
+_WAITING = 64 * 2**20  # [bytes] of MuJoCo's pictures that wait to be shown
 _CRF = 24  # the demo's film stays near 5 MB
 _MOODS = {"good": GREEN, "mixed": AMBER, "bad": RED, "plain": AMBER}
 
@@ -82,7 +82,6 @@ def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[
             {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
         )
         studio.writer.write(layout.card(verdict.text, [], _MOODS[verdict.mood]), 3 * studio.fps)
-    keep_overviews(studio, scene, world)
     metrics |= {"frames": writer.frames, "duration_s": writer.frames / writer.fps, "renders": studio.renders}
     metrics |= {"trace": trace(drive)} if drive else {}
     # Times stay out of the file, so that the same build writes the same bytes.
@@ -100,9 +99,9 @@ def no_drive_reason(config: SceneConfig) -> str:
 def _film_chapters(
     studio: Studio, scene: SceneDir, config: SceneConfig, world: World | None, drive: Drive | None
 ) -> None:
-    renders = config.review.renders
+    renders, field, cameras = config.review.renders, studio.field, studio.cameras
     chosen = comparison_frames(studio, int(_SHARES[0] * renders))
-    turns = int(_SHARES[1] * renders) if len(studio.field.lightings) > 1 else 0
+    turns = int(_SHARES[1] * renders) if len(field.lightings) > 1 else 0
     drives = int(_SHARES[2] * renders) if drive else 0
     ground, parts = _surroundings(scene)
     half_width = world.half_width if world else 0.0
@@ -111,22 +110,38 @@ def _film_chapters(
         return Plan.draw(box[2:], studio.path, ground, parts, half_width)
 
     strip, panel = studio.layout.strip, studio.layout.panel
-    chase: Iterator[Picture] = iter(())
-    if world and drive:
-        chase = chase_frames(world, drive, panel, stride(drive, studio.fps)[0])
-    total = sum(map(len, chosen.values())) + turns + drives
-    # The chase camera needs no view of the field, so its pictures are made while those of the chapters before are.
+    views, model = _views(studio, scene, world)
+    behind = chase_shots(drive, stride(drive, studio.fps)[0]) if drive else []
+    # Warp compiles kernels when they are first used; the field's are, before a second thread compiles the scene's.
+    field.render(cameras.camera_to_world[:1], cameras.intrinsics[:1], (16, 8), field.lightings[0])
+    total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
+    total += light_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
+    # MuJoCo's pictures need no view of the field, so they are made while those of the first chapters are.
     with (
-        Ahead(chase, max(4, _CHASE_MEMORY // (3 * panel[0] * panel[1]))) as pictures,
+        Ahead(pictures_of(model, views + behind, panel), max(4, _WAITING // (3 * panel[0] * panel[1]))) as ahead,
         bar("film", total, "view") as progress,
     ):
         compare_with_the_film(studio, plan(strip(*COMPARISON_STRIP)[1]), chosen, progress)
         if turns:
             turn_the_light(studio, plan(strip(*LIGHT_STRIP)[1]), turns, progress)
+        pictures = iter(ahead)
+        for number, picture in enumerate(islice(pictures, len(views))):
+            caption = ("the scene that MuJoCo loads, solid parts drawn over", "further along")[number]
+            studio.keep(f"scene_{number}", "mjcf", caption, picture)
         if world and drive:
             film_drive(studio, plan(strip(*DRIVE_STRIP)[0]), world, drive, pictures, drives, progress)
         else:
             title_card(studio, "No drive", [f"Nothing is driven here: {no_drive_reason(config)}."])
+
+
+def _views(studio: Studio, scene: SceneDir, world: World | None) -> tuple[list[Shot], World]:
+    """What is shown of the scene itself, and the world to show it in."""
+    folder = scene.stage("mjcf")
+    if world:
+        return route_shots(world.route), world
+    # Only its model is drawn; there is no route to know.
+    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), np.ones(4), folder)
+    return (camera_shots(studio.cameras) if model.model_path.exists() else []), model
 
 
 def _surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:

@@ -64,7 +64,7 @@ def number(value: Any, form: str = "{:.3g}") -> str:
     """A number in a format such as "{:.1f} m", or "not measured"."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return NOT_MEASURED
-    return form.format(value)
+    return form.format(value).replace("-", "−") if value < 0 else form.format(value)
 
 
 def duration(seconds: Any) -> str:
