@@ -18,6 +18,7 @@ from twin.capture.pairs import Pair, ordered
 from twin.capture.types import Capture, SourceInfo
 from twin.capture.worker import tell
 from twin.errors import InputError
+from twin.geometry.images import write_image
 
 _CHUNK_FRAMES = 16
 _CHUNK_PAIRS = 100
@@ -173,13 +174,16 @@ def _camera(source: SourceInfo, camera_id: int, forget: bool, intrinsics: NDArra
 
 def _mask_folder(capture: Capture, stage: Path, work: Path) -> Path | None:
     """The masks under the names COLMAP looks for: `a.png` has the mask `a.png.png`. None where nothing is masked."""
+    masked = {name for name in capture.names if (stage / "masks" / f"{name}.png").exists()}
+    if not masked:
+        return None
     folder = work / "masks"
-    found = False
-    for name in capture.names:
-        mask = stage / "masks" / f"{name}.png"
-        if mask.exists():
-            target = folder / f"{name}.png.png"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(mask, target)
-            found = True
-    return folder if found else None
+    for name, s in zip(capture.names, capture.source_index, strict=True):
+        target = folder / f"{name}.png.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name in masked:
+            shutil.copyfile(stage / "masks" / f"{name}.png", target)
+        else:  # COLMAP finds nothing in an image whose mask is missing
+            source = capture.sources[int(s)]
+            write_image(target, np.full((source.height, source.width), 255, np.uint8))
+    return folder

@@ -31,6 +31,8 @@ _MAX_TILT = np.radians(25.0)
 """The road's normal lies within this of the camera-based one [rad]."""
 MIN_ROAD_POINTS = 20
 """From this many points on the road counts as measured."""
+_REACHES = (1.0, 2.0, 4.0, 8.0)
+"""Offsets [drops] within which the road's layer is looked for, one after the other."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,12 @@ class Road:
     """Height of the cameras above it, median."""
     spread: float
     """Robust standard deviation of the drops of its points."""
+    reach: float
+    """Largest offset of its points [drops]. At 1 they lie under the path; far beyond, on verges rather than the road."""
 
     @property
     def reliable(self) -> bool:
-        return len(self.points) >= MIN_ROAD_POINTS
+        return len(self.points) >= MIN_ROAD_POINTS and self.reach <= _REACHES[0]
 
 
 @dataclass(frozen=True)
@@ -105,28 +109,39 @@ def find_road(points: Array, centres: Array, up: Array) -> Road | None:
 
     A layer at drop h counts the points within ±6 % of h whose offset is below h: near the path the road is below 45°,
     whatever the scale. Among layers with at least half of the best support the lowest is the road, since nothing
-    solid lies below a road.
+    solid lies below a road. A road without texture has no points; then the layer is looked for ever further beside the
+    path, where its verges are, and the best supported of these is taken if none has enough points.
     """
     if not len(points):
         return None
     _, drop, offset = below_path(points, centres, up)
-    below = np.flatnonzero((drop > 0) & (offset < 2.0 * drop))
+    best: Road | None = None
+    for reach in _REACHES:
+        road = _layer(drop, offset, reach)
+        if road is not None and len(road.points) >= MIN_ROAD_POINTS:
+            return road
+        if road is not None and (best is None or len(road.points) > 2 * len(best.points)):
+            best = road
+    return best
+
+
+def _layer(drop: Array, offset: Array, reach: float) -> Road | None:
+    below = np.flatnonzero((drop > 0) & (offset < 2.0 * reach * drop))
     if not len(below):
         return None
     drops, offsets = drop[below], offset[below]
     layers = np.geomspace(np.quantile(drops, 0.01), drops.max(), 400)
-    in_layer = (np.abs(drops[None] - layers[:, None]) < _LAYER * layers[:, None]) & (offsets[None] < layers[:, None])
-    support = in_layer.sum(1)
-    best = int(np.flatnonzero(support >= 0.5 * support.max())[-1])
-    height = float(layers[best])
+    inside = (np.abs(drops - layers[:, None]) < _LAYER * layers[:, None]) & (offsets < reach * layers[:, None])
+    support = inside.sum(1)
+    height = float(layers[np.flatnonzero(support >= 0.5 * support.max())[-1]])
     for _ in range(5):  # centre the layer on its median
-        chosen = (np.abs(drops - height) < _LAYER * height) & (offsets < height)
+        chosen = (np.abs(drops - height) < _LAYER * height) & (offsets < reach * height)
         if not chosen.any():
             return None
         height = float(np.median(drops[chosen]))
-    chosen = (np.abs(drops - height) < _LAYER * height) & (offsets < height)
+    chosen = (np.abs(drops - height) < _LAYER * height) & (offsets < reach * height)
     spread = 1.4826 * float(np.median(np.abs(drops[chosen] - height)))
-    return Road(below[chosen], height, spread)
+    return Road(below[chosen], height, spread, reach)
 
 
 def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Up, Road | None]:

@@ -15,6 +15,8 @@ from twin.geometry.poses import Array, rotation_angle
 _MIN_FRAMES = 6
 _MAX_SHARE = 0.25
 """If more than this share of a source looks wrong, it is not a smooth path, and nothing can be said."""
+_ROUGH = 0.3
+"""A path whose median residual is more than this share of its median step is photos in no order, not a film."""
 _SPREADS = 8.0
 """A residual counts only beyond this many robust standard deviations of all residuals."""
 _MAX_TURN = np.radians(5.0)  # [rad] off the neighbours, at least, before a direction counts as wrong
@@ -79,6 +81,8 @@ def path_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
         return out
     step = float(np.median(np.linalg.norm(np.diff(camera_to_world[:, :3, 3], axis=0), axis=1)))
     position, turn = path_residuals(camera_to_world)
+    if np.median(position) > _ROUGH * step:
+        return out
     max_offset = max(limit * step, _SPREADS * _spread(position), 1e-12)
     max_turn = max(_MAX_TURN, _SPREADS * _spread(turn))
     while True:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.capture.gravity import MIN_ROAD_POINTS, Road, heights_above_road
+from twin.capture.gravity import Road, heights_above_road
 from twin.config import DistanceConfig, MetricConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, unproject
@@ -109,7 +109,8 @@ def scale_from_height(
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
-    few = 0.05 if len(road.points) < MIN_ROAD_POINTS else 0.0
+    # Few points, or points of the verge only (a kerb is a tenth of the usual height): no better than 5 %.
+    few = 0.0 if road.reliable else 0.05
     sigma = float(np.sqrt(np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2))
     return Scale(
         value,
