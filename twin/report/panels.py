@@ -126,7 +126,7 @@ def depth_colours(depth: NDArray, opacity: NDArray | None = None) -> Picture:
     """
     log_range = np.log(FARTHEST_DEPTH / NEAREST_DEPTH)
     far = np.log(np.clip(np.nan_to_num(depth, nan=1e9), NEAREST_DEPTH, FARTHEST_DEPTH) / NEAREST_DEPTH) / log_range
-    colours = (colormaps["inferno"](1.0 - 0.95 * far)[..., :3] * 255 + 0.5).astype(np.uint8)
+    colours = (colormaps["inferno"](1.0 - 0.86 * far)[..., :3] * 255 + 0.5).astype(np.uint8)
     if opacity is not None:
         colours[np.asarray(opacity) < 0.5] = SUNKEN
     return colours

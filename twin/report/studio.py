@@ -88,10 +88,11 @@ class Studio:
         return rendering
 
     def frame_view(self, i: int, lighting: str | None = None) -> Rendering:
-        """The field seen from where frame i was taken, in its own lighting unless told otherwise."""
+        """The field seen from where frame i was taken, in that frame's light unless told otherwise."""
         cameras = self.cameras
         size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
-        return self.view(cameras.camera_to_world[i], cameras.intrinsics[i], size, lighting or cameras.lightings[i])
+        light = lighting or light_of_frame(cameras, i)
+        return self.view(cameras.camera_to_world[i], cameras.intrinsics[i], size, light)
 
     def real(self, i: int) -> Picture:
         """Frame i as it was filmed (undistorted)."""
@@ -133,6 +134,26 @@ def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
     trained = [i for i in mine if not cameras.held_out[i]]
     unseen = spread(held_out, max(1, count // 2))
     return sorted([*unseen, *spread(trained, count - len(unseen))])
+
+
+def light_of_frame(cameras: Cameras, i: int) -> str:
+    """What to ask the field for, to see the light of frame i.
+
+    A trained frame has an appearance of its own. A held-out one was never looked at, so it gets what lies between the
+    trained frames before and after it in its film: light and exposure drift, and they are not what is judged.
+    """
+    if not cameras.held_out[i]:
+        return cameras.names[i]
+    mine = [k for k, name in enumerate(cameras.sources) if name == cameras.sources[i] and not cameras.held_out[k]]
+    before = max(
+        (k for k in mine if cameras.times[k] <= cameras.times[i]), key=lambda k: cameras.times[k], default=None
+    )
+    after = min((k for k in mine if cameras.times[k] > cameras.times[i]), key=lambda k: cameras.times[k], default=None)
+    if before is None or after is None:
+        only = before if before is not None else after
+        return cameras.lightings[i] if only is None else cameras.names[only]
+    span = cameras.times[after] - cameras.times[before]
+    return f"{cameras.names[before]}:{cameras.names[after]}:{(cameras.times[i] - cameras.times[before]) / span:.6g}"
 
 
 def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
