@@ -25,6 +25,10 @@ _PATH_SAMPLES = 3.0
 """Independent heights along a path: its undulation is smooth, so frames count far less than their number."""
 _CONDITION = 10.0
 """The path must extend this many times (in variance) further than it undulates before it says anything."""
+_WIDTH = 0.05
+"""... and at least this share of its length: a straight path undulates as much up and down as to the sides."""
+_UNDULATION = 0.003
+"""A path undulates by no less than this share of its length, however flat it looks."""
 _LAYER = 0.06
 """Half thickness of the road layer [share of the drop]: undulation, camber and noise."""
 _MAX_TILT = np.radians(25.0)
@@ -81,9 +85,10 @@ def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
     evidence = right.T @ right / len(right) / _SIGMA_RIGHT**2
     centres = camera_to_world[:, :3, 3] - camera_to_world[:, :3, 3].mean(0)
     variances, axes = np.linalg.eigh(centres.T @ centres / len(centres))
+    undulation = max(variances[0], _UNDULATION**2 * variances[2])
     for variance, axis in zip(variances[1:], axes.T[1:], strict=True):
-        if variance > _CONDITION * max(variances[0], 1e-18):
-            sigma2 = variances[0] / (_PATH_SAMPLES * variance) + _SIGMA_PATH**2
+        if variance > max(_CONDITION * variances[0], _WIDTH**2 * variances[2]):
+            sigma2 = undulation / (_PATH_SAMPLES * variance) + _SIGMA_PATH**2
             evidence += np.outer(axis, axis) / sigma2
     return _solve(evidence, camera_up(camera_to_world))[0], evidence
 

@@ -1,0 +1,382 @@
+"""Stage `metric`: from a reconstruction turned, scaled and placed at will back to the level, metric world of before."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from twin.capture import metric
+from twin.capture.gravity import find_road, up_from_ground
+from twin.capture.scale import local_east_north_up
+from twin.capture.types import Capture, SourceInfo
+from twin.config import DistanceConfig, MarkerConfig, MetricConfig, SceneConfig
+from twin.errors import InputError
+from twin.geometry.cameras import Cameras, pixel_grid, project, unproject
+from twin.geometry.images import write_image
+from twin.geometry.points import SparsePoints
+from twin.geometry.poses import Similarity, inverse_pose, look_at, umeyama
+from twin.scene import SceneDir, read_json
+
+SIZE = (320, 240)
+INTRINSICS = np.array([260.0, 260.0, 160.0, 120.0])
+HEIGHT = 1.3
+"""Lens above the road [m]."""
+
+
+def _similarity(seed: int) -> Similarity:
+    rng = np.random.default_rng(seed)
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return Similarity(float(np.exp(rng.normal())), q * np.sign(np.linalg.det(q)), rng.normal(size=3) * 5)
+
+
+def _path(turn: bool = True, count: int = 60, height: float = HEIGHT, pitch: float = 0.2) -> np.ndarray:
+    """A drive along x, then (with `turn`) to the right; cameras pitched down. World: metres, z up, road z = 0."""
+    s = np.linspace(0.0, 40.0, count)
+    angle = np.clip((s - 20.0) / 6.0, 0.0, np.pi / 2) if turn else 0 * s
+    past = np.maximum(s - 20.0 - 3.0 * np.pi, 0.0) if turn else 0 * s
+    x = np.minimum(s, 20.0) + 6.0 * np.sin(angle) if turn else s
+    eyes = np.stack([x, -6.0 * (1 - np.cos(angle)) - past, height + 0.01 * np.sin(2 * s)], 1)
+    ahead = np.stack([np.cos(angle), -np.sin(angle), 0 * s - np.tan(pitch)], 1)
+    return np.array([look_at(e, e + a) for e, a in zip(eyes, ahead, strict=True)])
+
+
+def _points(poses: np.ndarray, rng: np.random.Generator, on_road: int = 300) -> np.ndarray:
+    """Few points on the road near the path, many above and beside it, a few mismatches below it."""
+    centres = poses[:, :3, 3]
+    road = centres[rng.integers(0, len(poses), on_road)] + rng.normal(0, 0.7, (on_road, 3))
+    road[:, 2] = rng.normal(0, 0.01, on_road)
+    clutter = centres[rng.integers(0, len(poses), 2000)] + rng.uniform(-15, 15, (2000, 3))
+    clutter[:, 2] = rng.uniform(0.3, 12.0, 2000)
+    wrong = centres[rng.integers(0, len(poses), 20)] + rng.uniform(-3, 3, (20, 3))
+    wrong[:, 2] = rng.uniform(-6.0, -0.5, 20)
+    return np.concatenate([road, clutter, wrong])
+
+
+@dataclasses.dataclass
+class World:
+    """A scene whose `cameras` stage is written; `truth` are its level, metric poses."""
+
+    scene: SceneDir
+    truth: np.ndarray
+
+    def run(self, out: Path, **changes: object) -> dict:
+        out.mkdir(exist_ok=True)
+        return metric.run(self.scene, SceneConfig(metric=MetricConfig(**changes)), out)  # type: ignore[arg-type]
+
+
+def _world(
+    root: Path,
+    films: list[np.ndarray],
+    points: np.ndarray,
+    moved: Similarity,
+    gps: np.ndarray | None = None,
+    heights: tuple[float, ...] = (),
+    posed: bool = False,
+) -> World:
+    poses = np.concatenate(films)
+    source = np.repeat(np.arange(len(films)), [len(f) for f in films])
+    names = tuple(f"film{s}/{i:06d}" for s, film in enumerate(films) for i in range(len(film)))
+    n = len(names)
+    times = np.concatenate([np.arange(len(f)) * 0.5 for f in films])
+    infos = tuple(
+        SourceInfo(
+            f"film{s}", f"light{s}", "video", *SIZE, "PINHOLE", tuple(INTRINSICS), True, (heights or (0.0,) * 9)[s]
+        )
+        for s in range(len(films))
+    )
+    scene = SceneDir(root)
+    for stage in ("capture", "cameras"):
+        scene.stage(stage).mkdir(parents=True)
+    nowhere = np.full((n, 3), np.nan)
+    given = (moved.poses(poses), np.tile(INTRINSICS, (n, 1))) if posed else (None, None)
+    Capture(infos, names, source, times, np.zeros(n, bool), nowhere if gps is None else gps, *given).save(
+        scene.stage("capture")
+    )
+    Cameras(
+        names,
+        moved.poses(poses),
+        np.tile(INTRINSICS, (n, 1)),
+        np.tile(np.array(SIZE), (n, 1)),
+        tuple(f"light{s}" for s in source),
+        tuple(f"film{s}" for s in source),
+        times,
+        np.zeros(n, bool),
+        scene.stage("cameras") / "images",
+    ).save(scene.stage("cameras"))
+    m = len(points)
+    seen = np.arange(m)
+    SparsePoints(moved.points(points), np.zeros((m, 3), np.uint8), np.ones(m), seen, np.zeros(m, np.int64)).save(
+        scene.stage("cameras")
+    )
+    return World(scene, poses)
+
+
+def _check_level(world: World, out: Path, tilt_deg: float, scale: float, floor: float) -> None:
+    """The result equals the truth up to a turn about z and a shift along the ground."""
+    cameras, points = Cameras.load(out), SparsePoints.load(out)
+    fit = umeyama(cameras.positions, world.truth[:, :3, 3])
+    assert fit.scale == pytest.approx(1.0, abs=scale)
+    turned = world.truth[0, :3, :3] @ cameras.camera_to_world[0, :3, :3].T
+    assert np.degrees(np.arccos(turned[2, 2])) < tilt_deg
+    assert cameras.positions[:, 2].mean() == pytest.approx(world.truth[:, 2, 3].mean(), abs=floor)
+    assert np.abs(cameras.positions[0, :2]).max() < 1e-9  # the origin is under the first camera
+    way = cameras.positions[3] - cameras.positions[0]
+    assert way[0] > 0 and abs(way[1]) < 0.05 * way[0]  # x is the way driven first
+    assert len(points) and cameras.images == world.scene.stage("cameras") / "images"
+
+
+# --- camera height ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("turn", [True, False])
+def test_camera_height_gives_metres_and_up(tmp_path: Path, seed: int, turn: bool) -> None:
+    rng = np.random.default_rng(seed)
+    film = _path(turn)
+    world = _world(tmp_path / "s", [film], _points(film, rng), _similarity(seed))
+    metrics = world.run(tmp_path / "out", camera_height=HEIGHT)
+    _check_level(world, tmp_path / "out", tilt_deg=0.7, scale=0.01, floor=0.02)
+    assert metrics == read_json(tmp_path / "out" / "metric.json")
+    assert metrics["scale_source"] == "camera_height" and metrics["road_reliable"]
+    assert metrics["scale_uncertainty"] < 0.02
+    assert metrics["camera_height_median_m"] == pytest.approx(HEIGHT, abs=0.01)
+    assert metrics["path_length_m"] == pytest.approx(40.0, rel=0.02)
+    back = np.array(metrics["similarity"]["rotation"])
+    np.testing.assert_allclose(back @ back.T, np.eye(3), atol=1e-9)
+
+
+def test_sources_carried_at_different_heights_agree(tmp_path: Path) -> None:
+    low, high = _path(height=0.6), _path(height=1.5)
+    points = _points(high, np.random.default_rng(0), on_road=800)
+    world = _world(tmp_path / "s", [low, high], points, _similarity(1), heights=(0.6, 1.5))
+    metrics = world.run(tmp_path / "out")
+    _check_level(world, tmp_path / "out", tilt_deg=0.5, scale=0.01, floor=0.02)
+    assert metrics["scale_per_source_relative"] == pytest.approx([1.0, 1.0], abs=0.02)
+
+
+def test_few_road_points_are_reported(tmp_path: Path) -> None:
+    film = _path()
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0), on_road=8)[:8], _similarity(0))
+    metrics = world.run(tmp_path / "out", camera_height=HEIGHT)
+    assert not metrics["road_reliable"] and metrics["road_points"] <= 8
+    assert metrics["scale_uncertainty"] >= 0.05
+
+
+def test_no_point_below_the_path_is_an_error(tmp_path: Path) -> None:
+    film = _path()
+    world = _world(tmp_path / "s", [film], film[:, :3, 3] + [0, 0, 2.0], _similarity(0))
+    with pytest.raises(InputError, match="no reconstructed point lies below the path"):
+        world.run(tmp_path / "out", camera_height=HEIGHT)
+
+
+# --- gravity ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_pitched_camera_does_not_tilt_the_world() -> None:
+    film = _path(turn=False, pitch=0.35)
+    up, road = up_from_ground(film, np.zeros((0, 3)))
+    assert road is None
+    assert np.degrees(np.arccos(up.direction[2])) < 0.1  # the path gives the pitch, the level right axes the roll
+    assert up.uncertainty < np.radians(2.0)
+
+
+def test_up_is_signed_by_the_cameras() -> None:
+    film = _path()
+    mirrored = np.array(film)
+    flip = np.diag([1.0, -1.0, -1.0])
+    mirrored[:, :3, :3] = flip @ film[:, :3, :3]
+    mirrored[:, :3, 3] = film[:, :3, 3] @ flip
+    up, _ = up_from_ground(mirrored, np.zeros((0, 3)))
+    assert up.direction[2] < -0.99
+
+
+def test_the_road_is_found_below_kerbs_and_above_mismatches() -> None:
+    rng = np.random.default_rng(5)
+    film = _path()
+    centres = film[:, :3, 3]
+    kerb = centres[rng.integers(0, 60, 200)] + rng.normal(0, 0.8, (200, 3))
+    kerb[:, 2] = 0.35
+    points = np.concatenate([_points(film, rng, on_road=150), kerb])
+    road = find_road(points, centres, np.array([0.0, 0.0, 1.0]))
+    assert road is not None and road.reliable
+    assert road.drop == pytest.approx(HEIGHT, abs=0.02)
+    assert np.mean(np.abs(points[road.points, 2]) < 0.1) > 0.95
+
+
+def test_a_road_without_texture_is_found_beside_the_path() -> None:
+    rng = np.random.default_rng(2)
+    film = _path(turn=False)
+    verge = film[rng.integers(0, 60, 200), :3, 3] + np.stack(
+        [rng.normal(0, 1, 200), rng.choice([-1, 1], 200) * rng.uniform(3, 5, 200), 0 * rng.random(200)], 1
+    )
+    verge[:, 2] = rng.normal(0.05, 0.02, 200)
+    road = find_road(verge, film[:, :3, 3], np.array([0.0, 0.0, 1.0]))
+    assert road is not None and not road.reliable and road.reach > 1.0
+    assert road.drop == pytest.approx(HEIGHT, abs=0.1)
+
+
+# --- the other scales -------------------------------------------------------------------------------------------------
+
+
+def _to_gps(enu: np.ndarray) -> np.ndarray:
+    """East, north, up [m] near Lund as latitude, longitude, altitude; good to millimetres over 100 m."""
+    lat0, lon0, eps = 55.7, 13.2, 1e-4
+    origin = np.array([[lat0, lon0, 50.0]])
+    north = local_east_north_up(np.concatenate([origin, origin + np.array([[eps, 0, 0]])]))[1, 1] / eps
+    east = local_east_north_up(np.concatenate([origin, origin + np.array([[0, eps, 0]])]))[1, 0] / eps
+    return np.stack([lat0 + enu[:, 1] / north, lon0 + enu[:, 0] / east, 50.0 + enu[:, 2]], 1)
+
+
+def test_east_north_up_of_a_known_place() -> None:
+    # One minute of latitude is a nautical mile (1852 m by definition; 1855.8 m at 55.7° on WGS 84).
+    enu = local_east_north_up(np.array([[55.7, 13.2, 10.0], [55.7 + 1 / 60, 13.2, 10.0], [55.7, 13.2, 17.0]]))
+    np.testing.assert_allclose(enu[1, :2], [0.0, 1855.8], atol=0.6)
+    np.testing.assert_allclose(enu[2], [0.0, 0.0, 7.0], atol=1e-6)
+
+
+def test_gps_gives_metres_and_east(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    film = _path(count=40)
+    gps = _to_gps(film[:, :3, 3] + rng.normal(0, 0.3, (40, 3)) * [1, 1, 5])
+    gps[5] += [0.001, 0, 0]  # a hundred metres off
+    gps[9] = np.nan
+    world = _world(tmp_path / "s", [film], _points(film, rng), _similarity(7), gps=gps)
+    metrics = world.run(tmp_path / "out", gps=True)
+    cameras = Cameras.load(tmp_path / "out")
+    shift = cameras.positions - film[:, :3, 3]
+    assert np.abs(shift - shift.mean(0)).max() < 0.8  # not turned: x is east
+    assert metrics["gps_inliers"] <= metrics["gps_frames"] - 1 == 38
+    fit = umeyama(cameras.positions, film[:, :3, 3])
+    assert abs(fit.scale - 1) < 0.02 and abs(fit.scale - 1) < 4 * metrics["scale_uncertainty"]
+
+
+def test_gps_that_does_not_spread_is_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    film = _path(count=20)
+    world = _world(tmp_path / "s", [film], _points(film, rng), _similarity(2), gps=_to_gps(rng.normal(0, 5, (20, 3))))
+    with pytest.raises(InputError, match=r"metric.gps: positions fit within"):
+        world.run(tmp_path / "out", gps=True)
+    none = _world(tmp_path / "n", [film], _points(film, rng), _similarity(2))
+    with pytest.raises(InputError, match=r"0 registered frames have a position \(need 3\)"):
+        none.run(tmp_path / "out", gps=True)
+
+
+@pytest.mark.parametrize("on_ground", [True, False])
+def test_distance_between_marked_points(tmp_path: Path, on_ground: bool) -> None:
+    film = _path(turn=False, pitch=0.3)
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(3))
+    ends = np.array([[4.0, 1.0, 0.0], [4.5, -1.2, 0.0]]) if on_ground else np.array([[9.0, 1.5, 0.4], [9.5, -1.2, 1.9]])
+    (a, b), _ = project(ends, film[0], INTRINSICS)
+    (a2, b2), _ = project(ends, film[4], INTRINSICS)
+    distance = DistanceConfig(float(np.linalg.norm(ends[0] - ends[1])), "film0/000000", tuple(a), tuple(b))
+    if not on_ground:
+        distance = dataclasses.replace(distance, frame_b="film0/000004", a2=tuple(a2), b2=tuple(b2))
+    metrics = world.run(tmp_path / "out", distance=distance)
+    _check_level(world, tmp_path / "out", tilt_deg=0.7, scale=0.02, floor=0.03)
+    assert 0 < metrics["scale_uncertainty"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"metres": 0.0}, "metric.distance.metres = 0.0; expected"),
+        ({"frame_a": "film0/999999"}, "no registered frame 'film0/999999'"),
+        ({"a": (400.0, 10.0)}, r"metric.distance.a = \[400.0, 10.0\]; expected .* 320×240"),
+        ({"b": (100.0, 200.0)}, "coincide"),
+        ({"a": (100.0, 5.0)}, "above the horizon"),
+    ],
+)
+def test_wrong_distances_are_refused(tmp_path: Path, changes: dict, text: str) -> None:
+    film = _path(turn=False)
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(3))
+    right = DistanceConfig(2.0, "film0/000000", (100.0, 200.0), (220.0, 200.0))
+    with pytest.raises(InputError, match=text):
+        world.run(tmp_path / "out", distance=dataclasses.replace(right, **changes))
+
+
+def _paint_marker(pose: np.ndarray, corner: np.ndarray, side: float, pattern: np.ndarray) -> np.ndarray:
+    """A marker that faces −x with its top-left corner at `corner`, on white, seen from `pose`; supersampled twice."""
+    grid = pixel_grid(2 * SIZE[0], 2 * SIZE[1]) / 2
+    rays = unproject(grid, INTRINSICS) @ pose[:3, :3].T
+    along = (corner[0] - pose[0, 3]) / rays[..., 0]
+    hit = pose[:3, 3] + along[..., None] * rays
+    u, v = -(hit[..., 1] - corner[1]) / side, -(hit[..., 2] - corner[2]) / side
+    cell = len(pattern)
+    inside = (u >= 0) & (u < 1) & (v >= 0) & (v < 1) & (along > 0)
+    at = np.clip((np.stack([v, u]) * cell).astype(int), 0, cell - 1)
+    image = np.where(inside, pattern[at[0], at[1]], 220).astype(np.uint8)
+    return cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
+
+
+def test_a_marker_gives_metres(tmp_path: Path) -> None:
+    side = 0.4
+    film = _path(turn=False, count=12, pitch=0.05)
+    film[:, 0, 3] *= 0.05  # twelve frames within two metres
+    film[:, 1, 3] += np.linspace(-0.5, 0.5, 12)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    pattern = cv2.aruco.generateImageMarker(dictionary, 7, 48)
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(4))
+    for i, pose in enumerate(film):
+        image = _paint_marker(pose, np.array([4.0, 0.3, 1.4]), side, pattern)
+        write_image(world.scene.stage("cameras") / "images" / f"film0/{i:06d}.png", image)
+    metrics = world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 7, side))
+    fit = umeyama(Cameras.load(tmp_path / "out").positions, film[:, :3, 3])
+    assert fit.scale == pytest.approx(1.0, abs=0.01)
+    assert metrics["marker_frames"] >= 10
+    with pytest.raises(InputError, match="number 8 was found in 0 frames"):
+        world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 8, side))
+    with pytest.raises(InputError, match=r"family = 'DICT_4X5'; expected one of .*DICT_4X4_50"):
+        world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X5", 7, side))
+    with pytest.raises(InputError, match=r"marker.size = 0.0"):
+        world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 7, 0.0))
+
+
+def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:
+    film = _path()
+    shift = Similarity(1.0, np.eye(3), np.array([10.0, -4.0, 2.0]))
+    points = _points(film, np.random.default_rng(0))
+    world = _world(tmp_path / "s", [film], points, shift, posed=True)
+    metrics = world.run(tmp_path / "out", poses_are_metric=True, up="poses")
+    placed = Cameras.load(tmp_path / "out").positions
+    # Turned and shifted along the ground not at all; the floor is at 0.
+    np.testing.assert_allclose(placed[:, :2], film[:, :2, 3] + [10.0, -4.0], atol=1e-9)
+    np.testing.assert_allclose(placed[:, 2], film[:, 2, 3], atol=0.02)
+    assert metrics["scale"] == 1.0 and metrics["gravity_source"] == "poses"
+
+
+def test_up_from_cameras(tmp_path: Path) -> None:
+    film = _path(pitch=0.0)
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(6))
+    metrics = world.run(tmp_path / "out", camera_height=HEIGHT, up="cameras")
+    _check_level(world, tmp_path / "out", tilt_deg=1.0, scale=0.02, floor=0.05)
+    assert metrics["gravity_source"] == "cameras"
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_wrong_choices_are_one_line_with_a_cure(tmp_path: Path) -> None:
+    film = _path(count=10)
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(0))
+    cases: list[tuple[dict, str]] = [
+        ({}, "no scale given; give one of: metric.camera_height .*distance.*gps.*marker.*poses_are_metric"),
+        ({"camera_height": 1.0, "gps": True}, r"2 scales given \(metric.camera_height, metric.gps\); keep exactly one"),
+        ({"camera_height": -1.0}, "metric.camera_height = -1.0; expected metres"),
+        ({"poses_are_metric": True}, "the input brought no poses"),
+        ({"camera_height": 1.0, "up": "poses"}, "the input brought no poses"),
+        ({"camera_height": 1.0, "up": "north"}, "metric.up = 'north'; expected ground, cameras or poses"),
+    ]
+    for changes, text in cases:
+        with pytest.raises(InputError, match=text) as error:
+            world.run(tmp_path / "out", **changes)
+        assert "\n" not in str(error.value)
+
+
+def test_poses_stay_rigid(tmp_path: Path) -> None:
+    film = _path()
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(9))
+    world.run(tmp_path / "out", camera_height=HEIGHT)
+    poses = Cameras.load(tmp_path / "out").camera_to_world
+    np.testing.assert_allclose(poses @ inverse_pose(poses), np.broadcast_to(np.eye(4), poses.shape), atol=1e-9)
