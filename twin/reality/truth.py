@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from twin.errors import InputError
 from twin.reality import place as places
 from twin.reality import route as roads
 from twin.reality import shapes
@@ -63,19 +64,27 @@ class Truth:
         np.savez_compressed(folder / "truth.npz", intrinsics=self.intrinsics, **arrays)
         head = {"route": asdict(self.route), "start": self.start, "length": self.length, "half_width": self.half_width}
         head |= {"size": list(self.size), "films": list(self.films), "seed": SEED}
-        write_json(folder / "truth.json", head)
+        write_json(folder / "truth.json", head | {"fingerprint": fingerprint(self.place)})
 
     @staticmethod
     def load(folder: Path) -> "Truth":
+        """Reads a truth and builds its place anew.
+
+        Raises:
+            InputError: the films were made of another place than this version of the code builds.
+        """
         head = read_json(folder / "truth.json")
-        if head["seed"] != SEED:
-            raise ValueError(f"{folder}: filmed in the place of seed {head['seed']}, this is {SEED}; film again")
         with np.load(folder / "truth.npz", allow_pickle=False) as data:
             keys = ("times", "camera_to_world", "depth_frames", "depth")
             films = {name: Film(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]}
             route = Route(**head["route"])
             size = (int(head["size"][0]), int(head["size"][1]))
-            return Truth(route, head["start"], head["length"], head["half_width"], data["intrinsics"], size, films)
+            truth = Truth(route, head["start"], head["length"], head["half_width"], data["intrinsics"], size, films)
+        if not np.allclose(head["fingerprint"], fingerprint(truth.place), atol=1e-4):
+            raise InputError(
+                f"{folder}: filmed in another version of the place; film again: python -m twin.reality film"
+            )
+        return truth
 
     @cached_property
     def place(self) -> Place:
@@ -107,3 +116,9 @@ class Truth:
         for axis in range(3):
             out[:, axis, 3] = np.interp(at, film.times, film.camera_to_world[:, axis, 3])
         return out
+
+
+def fingerprint(place: Place) -> list[float]:
+    """What tells one version of the place from another: counts of things and vertices, and the vertices' moments."""
+    vertices = np.concatenate([thing.part.vertices for thing in place.things])
+    return [len(place.things), len(vertices), *vertices.mean(0).tolist(), *vertices.std(0).tolist()]

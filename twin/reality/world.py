@@ -110,6 +110,37 @@ def _atlas(rng: Callable[..., np.random.Generator]) -> NDArray[np.float32]:
     return image
 
 
+def solids(place: Place | None = None) -> mujoco.MjSpec:
+    """Only what one can touch, in group 3: the height field `ground`, boxes and cylinders. Quick to compile."""
+    place = place or places.build()
+    model = mujoco.MjSpec()
+    low, high = np.array([-8.0, -58.0]), np.array([60.0, 22.0])
+    columns, rows = (np.round((high - low) / _HFIELD_CELL).astype(int) + 1).tolist()
+    x, y = np.meshgrid(np.linspace(low[0], high[0], columns), np.linspace(low[1], high[1], rows))
+    z = ground_height(place.route, np.stack([x, y], -1))
+    field = model.add_hfield(name="ground", nrow=rows, ncol=columns)
+    field.size = [*((high - low) / 2), float(np.ptp(z)), 0.5]
+    field.userdata = ((z - z.min()) / np.ptp(z)).astype(np.float32).ravel()
+    model.worldbody.add_geom(
+        name="ground",
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname="ground",
+        pos=[*((low + high) / 2), float(z.min())],
+        group=COLLISION_GROUP,
+    )
+    for thing in place.things:
+        for k, solid in enumerate(thing.solids):
+            model.worldbody.add_geom(
+                name=f"{thing.name}_solid_{k}",
+                type=mujoco.mjtGeom.mjGEOM_BOX if solid.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER,
+                pos=solid.centre,
+                size=list(solid.half),
+                quat=[np.cos(solid.yaw / 2), 0, 0, np.sin(solid.yaw / 2)],
+                group=COLLISION_GROUP,
+            )
+    return model
+
+
 def spec(lighting: Lighting | str, place: Place | None = None) -> mujoco.MjSpec:
     """The world under one lighting, with a camera named `film`, textures, lights and collision geoms.
 
@@ -118,7 +149,7 @@ def spec(lighting: Lighting | str, place: Place | None = None) -> mujoco.MjSpec:
     """
     light = lightings.LIGHTINGS[lighting] if isinstance(lighting, str) else lighting
     place = place or places.build()
-    model = mujoco.MjSpec()
+    model = solids(place)
     model.modelname = f"reality_{light.name}"
     model.visual.map.znear, model.visual.map.zfar = 0.001, 10.0
     model.stat.extent, model.stat.center = 60.0, [20.0, -5.0, 0.0]
@@ -155,7 +186,6 @@ def spec(lighting: Lighting | str, place: Place | None = None) -> mujoco.MjSpec:
             conaffinity=0,
             group=0 if thing.kind == "ground" else 1,
         )
-    _add_collision(model, place)
     lightings.add_lights(model, light, np.array(place.lamp_heads))
     model.worldbody.add_camera(name="film", pos=[0, 0, 1.2])
     return model
@@ -177,30 +207,3 @@ def _add_texture(model: mujoco.MjSpec, name: str, image: NDArray[np.uint8]) -> N
 def _add_material(model: mujoco.MjSpec, name: str, texture: str, emission: float) -> None:
     material = model.add_material(name=name, rgba=[1, 1, 1, 1], emission=emission, specular=0.0, shininess=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture
-
-
-def _add_collision(model: mujoco.MjSpec, place: Place) -> None:
-    low, high = np.array([-8.0, -58.0]), np.array([60.0, 22.0])
-    columns, rows = (np.round((high - low) / _HFIELD_CELL).astype(int) + 1).tolist()
-    x, y = np.meshgrid(np.linspace(low[0], high[0], columns), np.linspace(low[1], high[1], rows))
-    z = ground_height(place.route, np.stack([x, y], -1))
-    field = model.add_hfield(name="ground", nrow=rows, ncol=columns)
-    field.size = [*((high - low) / 2), float(np.ptp(z)), 0.5]
-    field.userdata = ((z - z.min()) / np.ptp(z)).astype(np.float32).ravel()
-    model.worldbody.add_geom(
-        name="ground",
-        type=mujoco.mjtGeom.mjGEOM_HFIELD,
-        hfieldname="ground",
-        pos=[*((low + high) / 2), float(z.min())],
-        group=COLLISION_GROUP,
-    )
-    for thing in place.things:
-        for k, solid in enumerate(thing.solids):
-            model.worldbody.add_geom(
-                name=f"{thing.name}_solid_{k}",
-                type=mujoco.mjtGeom.mjGEOM_BOX if solid.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER,
-                pos=solid.centre,
-                size=list(solid.half),
-                quat=[np.cos(solid.yaw / 2), 0, 0, np.sin(solid.yaw / 2)],
-                group=COLLISION_GROUP,
-            )

@@ -1,0 +1,280 @@
+"""The known-truth world: its road, its place, its films, and the comparison of a build with it."""
+
+from pathlib import Path
+
+import cv2
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from twin.assets.ground import Ground
+from twin.geometry.cameras import Cameras, pixel_grid, unproject
+from twin.geometry.poses import Similarity, umeyama
+from twin.reality import film, place, route, world
+from twin.reality.lighting import LIGHTINGS, sky
+from twin.reality.route import Route
+from twin.reality.truth import HALF_WIDTH, Film, Truth
+from twin.report.truth import align_rigid, camera_errors, compare, intrudes
+from twin.scene import SceneDir
+
+DEMO = Path(__file__).parent.parent / "scenes" / "demo"
+
+
+@pytest.fixture(scope="module")
+def campus():
+    return place.build()
+
+
+@pytest.fixture(scope="module")
+def truth(campus):
+    plan = film.Plan(lightings=("sun", "night"))
+    films = {}
+    for name in plan.lightings:
+        times, poses = film.trajectory(plan, campus.route, name)
+        films[name] = Film(times, poses, np.zeros(0, np.int64), np.zeros((0, 90, 160), np.float16))
+    return Truth(campus.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (640, 360), films)
+
+
+def test_route_projects_back():
+    road = Route()
+    rng = np.random.default_rng(0)
+    station, lateral = rng.uniform(-5.0, 80.0, 2000), rng.uniform(-3.0, 3.0, 2000)
+    back_station, back_lateral = road.project(road.at(station, lateral))
+    assert np.allclose(back_station, station, atol=1e-9)
+    assert np.allclose(back_lateral, lateral, atol=1e-9)
+
+
+def test_route_runs_straight_then_right_at_unit_speed():
+    road = Route()
+    station = np.linspace(0.0, 60.0, 6001)
+    xy = road.at(station)
+    steps = np.diff(xy, axis=0)
+    assert np.allclose(np.linalg.norm(steps, axis=1), 0.01, rtol=1e-5)
+    assert np.allclose(np.arctan2(steps[:, 1], steps[:, 0]), road.heading(station[:-1] + 0.005), atol=1e-3)
+    assert np.allclose(xy[3000], [30.0, 0.0])
+    assert road.heading(60.0) == pytest.approx(-np.pi / 2)
+
+
+def test_ground_is_gentle_but_not_flat():
+    road = Route()
+    station = np.linspace(0.0, 60.0, 601)
+    middle = route.ground_height(road, road.at(station))
+    assert 0.06 < np.ptp(middle) < 0.3
+    assert np.abs(np.gradient(middle, station)).max() < 0.05
+    across = route.cross_profile(np.linspace(-2.9, 2.9, 59))
+    assert across.max() - across.min() > 0.03  # crowned
+    assert np.abs(np.diff(across)).max() < 0.005
+
+
+def test_nothing_solid_in_the_corridor(campus):
+    for thing in campus.things:
+        if thing.kind not in ("obstacle", "foliage"):
+            continue
+        mesh = trimesh.Trimesh(thing.part.vertices, thing.part.faces, process=False)
+        points = np.concatenate([mesh.vertices, mesh.triangles_center])
+        station, lateral = campus.route.project(points[:, :2])
+        low = points[:, 2] - route.ground_height(campus.route, points[:, :2]) < 2.2
+        inside = low & (np.abs(lateral) < 1.6) & (station > -2.0) & (station < 65.0)
+        assert not inside.any(), thing.name
+
+
+def test_what_blocks_is_solid(campus):
+    """Each obstacle of a size that stops a robot brings a collision shape around where it is."""
+    for thing in campus.things:
+        if thing.kind != "obstacle" or thing.name.endswith(("_trim", "_glass", "_day", "_lit")):
+            continue
+        assert thing.solids, thing.name
+        centre = np.mean([s.centre for s in thing.solids], 0)
+        assert np.linalg.norm(centre[:2] - thing.part.vertices[:, :2].mean(0)) < 1.6, thing.name
+
+
+def test_trajectories_are_what_a_cart_does():
+    plan, road = film.Plan(), Route()
+    paths = {}
+    for name in LIGHTINGS:
+        times, poses = film.trajectory(plan, road, name)
+        again = film.trajectory(plan, road, name)
+        assert np.array_equal(poses, again[1])
+        paths[name] = poses[:, :3, 3]
+        xy = poses[:, :2, 3]
+        height = poses[:, 2, 3] - route.ground_height(road, xy)
+        assert abs(height.mean() - film.CAMERA_HEIGHT) < 0.005
+        assert np.abs(height - film.CAMERA_HEIGHT).max() < 0.02
+        assert np.abs(road.project(xy)[1]).max() <= 0.3 + 1e-9
+        assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
+        down = np.rad2deg(np.arcsin(-poses[:, 2, 2]))
+        assert abs(down.mean() - 8.0) < 0.5
+        assert np.allclose(np.diff(times), 1.0 / plan.fps)
+    shortest = min(len(p) for p in paths.values())
+    assert np.abs(paths["sun"][:shortest] - paths["night"][:shortest]).max() > 0.05
+
+
+def test_sky_is_seamless_and_brighter_by_day():
+    day, night = (sky(LIGHTINGS[name], 1, 64).reshape(6, 64, 64, 3).astype(float) for name in ("sun", "night"))
+    assert day.mean() > 2 * night.mean()
+    # +X and −Z share an edge of the cube map (columns), up to one texel's difference.
+    assert np.abs(day[0][:, -1] - day[5][:, 0]).mean() < 12.0
+
+
+def test_one_drives_on_the_true_ground(campus):
+    """A ball dropped on the road comes to rest on the height field, which is the true ground."""
+    spec = world.solids(campus)
+    xy = campus.route.at(np.array([12.3, 36.4, 55.1]), np.array([0.2, -0.9, 1.1]))
+    for k, point in enumerate(xy):
+        body = spec.worldbody.add_body(name=f"ball_{k}", pos=[*point, route.ground_height(campus.route, point) + 0.12])
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], damping=4.0)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], mass=1.0)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 600)
+    for k, point in enumerate(xy):
+        rest = data.body(f"ball_{k}").xpos[2] - 0.1
+        assert rest == pytest.approx(route.ground_height(campus.route, point), abs=0.006)
+
+
+def test_truth_survives_saving(truth, tmp_path):
+    truth.save(tmp_path)
+    back = Truth.load(tmp_path)
+    assert np.array_equal(back.films["sun"].camera_to_world, truth.films["sun"].camera_to_world)
+    assert np.allclose(back.poses("night", truth.films["night"].times), truth.films["night"].camera_to_world)
+    between = back.poses("sun", np.array([0.125]))
+    assert np.allclose(between[0, :3, 3], truth.films["sun"].camera_to_world[:2, :3, 3].mean(0))
+
+
+def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) -> SceneDir:
+    """A build that is the truth, moved by `warp`, its ground raised by `lift`; its parts are the true solids."""
+    scene = SceneDir(root)
+    truth.save(scene.truth)
+    for stage in ("metric", "mesh"):
+        scene.stage(stage).mkdir(parents=True)
+    poses = np.concatenate([f.camera_to_world for f in truth.films.values()])
+    names = [name for name, f in truth.films.items() for _ in f.times]
+    n = len(poses)
+    cameras = Cameras(
+        names=tuple(f"{name}/{k:06d}" for k, name in enumerate(names)),
+        camera_to_world=warp.poses(poses),
+        intrinsics=np.tile(truth.intrinsics, (n, 1)),
+        sizes=np.tile(truth.size, (n, 1)),
+        lightings=tuple(names),
+        sources=tuple(names),
+        times=np.concatenate([f.times for f in truth.films.values()]),
+        held_out=np.zeros(n, bool),
+        images=scene.build / "images",
+    )
+    cameras.save(scene.stage("metric"))
+    x, y = np.meshgrid(np.arange(-5.0, 50.0, 0.1), np.arange(-40.0, 8.0, 0.1))
+    height = truth.ground_height(np.stack([x, y], -1)) + lift
+    Ground(height, np.array([-5.0, -40.0]), 0.1, np.ones(x.shape, bool), np.zeros((*x.shape, 3), np.uint8)).save(
+        scene.stage("mesh")
+    )
+    hulls = []
+    for thing in truth.place.things:
+        for solid in thing.solids:
+            if solid.kind == "box":
+                hull = trimesh.creation.box(2 * np.array(solid.half))
+            else:
+                hull = trimesh.creation.cylinder(solid.half[0], 2 * solid.half[1], sections=16)
+            hull.apply_transform(trimesh.transformations.rotation_matrix(solid.yaw, [0, 0, 1]))
+            hulls.append((warp.points(hull.vertices + solid.centre), hull.faces))
+    np.savez(
+        scene.stage("mesh") / "parts.npz",
+        vertices=np.concatenate([v for v, _ in hulls]).astype(np.float32),
+        faces=np.concatenate([f for _, f in hulls]).astype(np.int32),
+        vertex_start=np.cumsum([0] + [len(v) for v, _ in hulls]),
+        face_start=np.cumsum([0] + [len(f) for _, f in hulls]),
+    )
+    return scene
+
+
+def test_a_perfect_build_has_no_error(truth, tmp_path):
+    found = compare(fake_build(truth, tmp_path, Similarity.identity()))
+    assert found["ate_m"] < 1e-9
+    assert abs(found["scale_error"]) < 1e-9
+    assert found["tilt_deg"] < 1e-5
+    assert found["ground_median_m"] < 0.002
+    assert found["obstacle_median_m"] < 0.05  # the solids stand for the things to within that
+    assert found["corridor_intrusions"] == 0
+    assert found["depth_median_m"] is None
+
+
+def test_errors_are_measured(truth, tmp_path):
+    found = compare(fake_build(truth, tmp_path / "lift", Similarity.identity(), lift=0.07))
+    assert found["ground_median_m"] == pytest.approx(0.07, abs=0.002)
+    assert found["ground_bias_m"] == pytest.approx(0.07, abs=0.002)
+    tilt = np.deg2rad(2.0)
+    rotation = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    poses = np.concatenate([f.camera_to_world for f in truth.films.values()])
+    moved = Similarity(1.03, rotation, np.array([3.0, -2.0, 0.5])).poses(poses)
+    errors = camera_errors(moved, poses)
+    assert errors["scale_error"] == pytest.approx(0.03)
+    assert errors["tilt_deg"] == pytest.approx(2.0, abs=0.01)
+    assert errors["ate_m"] < 1e-9
+    assert errors["ate_rigid_m"] > 0.2
+
+
+def test_a_scene_without_truth_is_not_compared(tmp_path):
+    assert compare(SceneDir(tmp_path)) is None
+
+
+def test_rigid_alignment_holds_on_a_straight_drive(truth):
+    """Centres on one line leave the roll open; the cameras' axes settle it."""
+    poses = truth.films["sun"].camera_to_world[:30]
+    line = poses.copy()
+    line[:, 1:3, 3] = 0.0
+    found = align_rigid(line, line)
+    assert np.allclose(found.rotation, np.eye(3), atol=1e-9)
+    assert np.linalg.matrix_rank(line[:, :3, 3] - line[:, :3, 3].mean(0), tol=1e-6) == 1
+    assert umeyama(poses[:, :3, 3], poses[:, :3, 3]).scale == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("lateral", "height", "expected"), [(0.0, 0.3, True), (2.2, 0.3, False), (1.6, 0.3, True)])
+def test_intrusion(truth, lateral, height, expected):
+    centre = truth.route.at(20.0, lateral)
+    block = trimesh.creation.box([0.3, 0.3, height])
+    base = float(truth.ground_height(centre))
+    vertices = np.asarray(block.vertices) + np.append(centre, base + height / 2)
+    assert intrudes(vertices, np.asarray(block.faces, np.int32), truth) is expected
+    assert not intrudes(vertices - [0.0, 0.0, height - 0.03], np.asarray(block.faces, np.int32), truth)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lighting", sorted(LIGHTINGS))
+def test_frames_are_true_and_rich(campus, lighting):
+    """Depth of the road is that of the true ground; SIFT finds the whole picture and the road, under every lighting."""
+    plan = film.Plan()
+    render = film.Renderer(lighting, campus, plan)
+    times, poses = film.trajectory(plan, campus.route, lighting)
+    frame = len(times) // 5
+    light, depth = render(poses[frame])
+    # The first of the 2 × 2 samples of a pixel lies a quarter of a pixel right of and below its corner.
+    rays = unproject(pixel_grid(640, 360) - 0.25, plan.intrinsics)
+    points = (rays * depth[..., None]) @ poses[frame][:3, :3].T + poses[frame][:3, 3]
+    road = np.abs(campus.route.project(points[..., :2])[1]) < 1.5
+    road &= (depth > 0) & (depth < 15)
+    error = points[road][:, 2] - route.ground_height(campus.route, points[road][:, :2])
+    assert road.sum() > 20_000
+    assert np.quantile(np.abs(error), 0.99) < 0.004
+    image = film.develop(np.random.default_rng(0), light, LIGHTINGS[lighting], 1.0)
+    keypoints = cv2.SIFT_create(contrastThreshold=0.02).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    at = np.array([k.pt for k in keypoints]).astype(int)
+    on_road = road[at[:, 1].clip(0, 359), at[:, 0].clip(0, 639)].sum()
+    assert len(keypoints) > 600
+    assert on_road > 60
+
+
+@pytest.mark.slow
+def test_the_demo_is_this_world(campus):
+    """The shipped films show what the generator renders now."""
+    av = pytest.importorskip("av")
+    truth = Truth.load(DEMO / "truth")
+    for name in truth.films:
+        with av.open(str(DEMO / "input" / f"{name}.mp4")) as container:
+            shipped = next(container.decode(video=0)).to_ndarray(format="rgb24").astype(float)
+        plan = film.Plan()
+        times, poses = film.trajectory(plan, campus.route, name)
+        assert np.allclose(poses, truth.films[name].camera_to_world, atol=1e-9)
+        light, _ = film.Renderer(name, campus, plan)(poses[0])
+        frame = film.develop(np.random.default_rng(0), light, LIGHTINGS[name], film.exposures(name, times)[0])
+        error = cv2.GaussianBlur(frame.astype(float) - shipped, (0, 0), 2.0)
+        assert np.sqrt((error**2).mean()) < 4.0
