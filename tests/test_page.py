@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from twin.geometry.images import write_image
+from twin.report.against_truth import truth_section
 from twin.report.markup import Html, element, table
 from twin.report.page import page, write_page
-from twin.report.sections import SECTIONS, truth_section
+from twin.report.sections import SECTIONS
 from twin.report.words import NOT_MEASURED, duration, flat, follower_verdict, listing, number, pick, verdicts
 from twin.scene import STAGES, SceneDir, write_json
 
@@ -221,6 +222,12 @@ def test_no_drive_says_why(scene: SceneDir) -> None:
         ("field", "psnr", {"day": 12.0}, "12.0 dB"),
         ("field", "n", {"day": 1}, "Only 1 frame"),
         ("mesh", "parts", 0, "Nothing solid"),
+        ("mesh", "parts_beyond_bound", 2, "2 solid part(s) stick out"),
+        ("mesh", "ground", {"corridor_coverage": 0.2}, "Only 20%"),
+        ("mesh", "coacd_failed", 1, "1 piece(s)"),
+        ("mjcf", "spawn_touched", ["part_0003"], "part_0003"),
+        ("metric", "gravity_uncertainty_deg", 3.0, "3.0°"),
+        ("metric", "road_reliable", False, "Too few points"),
         ("capture", "frames", 5, "Only 5 frames"),
         ("capture", "sources", {"day": {"damaged": 4}}, "4 frame(s)"),
     ],

@@ -51,7 +51,7 @@ def compare_with_the_film(studio: Studio, plan: Plan, chosen: dict[str, list[int
         studio,
         "1  The film and its twin",
         [
-            "Left: what the camera filmed. Right: what the radiance field renders from the same place in the same light.",
+            "Left: what the camera filmed. Right: what the radiance field renders there, in the same light.",
             "Frames marked “never trained on” were kept from it: there it shows what it has understood, "
             "not what it has memorised.",
         ],

@@ -7,9 +7,10 @@ stage folders, words from `twin.report.sections`.
 from pathlib import Path
 from typing import Any
 
+from twin.report.against_truth import truth_section
 from twin.report.charts import Chart, charts
 from twin.report.markup import STYLE, Html, data_url, element, join, picture, table
-from twin.report.sections import SECTIONS, general_cautions, truth_section
+from twin.report.sections import SECTIONS, general_cautions
 from twin.report.words import NOT_MEASURED, Caution, Section, duration, flat, number, pick, verdicts
 from twin.scene import SceneDir, read_json
 

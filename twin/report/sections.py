@@ -5,7 +5,6 @@ from typing import Any
 
 from twin.report.words import (
     ENOUGH_REGISTERED,
-    LARGE_PATH_ERROR,
     LARGE_SCALE_UNCERTAINTY,
     LOW_PSNR,
     NOT_MEASURED,
@@ -27,10 +26,8 @@ _LARGE_REPROJECTION = 1.5  # [px]
 _FEW_HELD_OUT = 3  # frames per lighting
 _FEW_FRAMES = 20
 _LARGE_TILT = 1.5  # [°]
+_LOW_COVERAGE = 0.5  # share of the ground along the route
 _LARGE_MEMORY = 4.0  # [GiB]
-_LARGE_SCALE_ERROR = 0.02  # relative
-_LARGE_GROUND_ERROR = 0.04  # [m]
-_LARGE_SURFACE_ERROR = 0.1  # [m]
 
 
 def capture_section(report: dict[str, Any]) -> Section:
@@ -242,10 +239,39 @@ def mesh_section(report: dict[str, Any], limit: int | None = None) -> Section:
         cautions.append(
             Caution(f"All {parts} allowed solid parts were used up.", "raise mesh.max_parts, or mesh.voxel for fewer.")
         )
+    beyond, failed = mesh.get("parts_beyond_bound"), mesh.get("coacd_failed")
+    if isinstance(beyond, int) and beyond > 0:
+        cautions.append(
+            Caution(
+                f"{beyond} solid part(s) stick out of their surface by more than mesh.max_protrusion.",
+                "raise mesh.max_parts, so that each may be smaller, or lower mesh.voxel.",
+            )
+        )
+    if isinstance(failed, int) and failed > 0:
+        cautions.append(
+            Caution(
+                f"{failed} piece(s) could not be split into convex parts and are coarser than the rest.",
+                "look at them in the picture of the MuJoCo scene; a smaller mesh.voxel usually helps.",
+            )
+        )
+    covered = pick(mesh, "ground.corridor_coverage")
+    if isinstance(covered, int | float) and covered < _LOW_COVERAGE:
+        cautions.append(
+            Caution(
+                f"Only {covered:.0%} of the ground along the route was measured; the rest is filled in.",
+                "film with more of the road in view, or carry the camera at constant height.",
+            )
+        )
     facts = [
         Fact("solid parts", number(parts, "{}"), "convex bodies the robot can bump into"),
         Fact("surface", number(mesh.get("faces"), "{:,} triangles"), "what is seen; it touches nothing"),
-        Fact("ground measured", number(mesh.get("ground_measured"), "{:.0%}"), "the rest of its area was filled in"),
+        Fact("ground measured", number(pick(mesh, "ground.coverage"), "{:.0%}"), "the rest of its area was filled in"),
+        Fact("along the route", number(covered, "{:.0%}"), "of the ground was measured"),
+        Fact(
+            "road’s slope", number(pick(mesh, "ground.route_slope_rms"), "{:.1%}"), "root mean square, along the route"
+        ),
+        Fact("parts stick out", number(mesh.get("max_protrusion_m"), "{:.2f} m"), "of the surface, at most"),
+        Fact("left out", number(mesh.get("parts_left_out"), "{}"), "parts beyond what mesh.max_parts allows"),
     ]
     return Section(
         "mesh",
@@ -259,20 +285,34 @@ def mesh_section(report: dict[str, Any], limit: int | None = None) -> Section:
 
 def mjcf_section(report: dict[str, Any]) -> Section:
     mjcf = pick(report, "mjcf") or {}
+    routeless = mjcf.get("has_route") is False
+    done = "Ground, parts, lights and a Husky at the start of the route, as a folder that plain MuJoCo opens: "
+    if routeless:
+        done = (
+            "Ground, parts and lights as a folder that plain MuJoCo opens, without a robot, since there is no route: "
+        )
+    size = mjcf.get("assets_bytes")
+    megabytes = size / 1e6 if isinstance(size, int | float) else None
     facts = [
-        Fact("route", number(mjcf.get("route_length_m"), "{:.1f} m"), "the filmed path on the ground"),
+        Fact("route", "none" if routeless else number(mjcf.get("route_length_m"), "{:.1f} m"), "the filmed path"),
         Fact("turn", number(mjcf.get("turn_deg"), "{:+.0f}°"), "from the first heading to the last; right is negative"),
         Fact("corridor", number(mjcf.get("half_width_m"), "± {:.2f} m"), "kept free of solid parts"),
-        Fact("geoms", number(mjcf.get("geoms"), "{:,}"), "bodies in the scene"),
+        Fact("free at the start", number(mjcf.get("spawn_clearance_m"), "{:.2f} m"), "from the robot to the next part"),
+        Fact("geoms", number(mjcf.get("geoms"), "{:,}"), "shapes in the scene"),
+        Fact("folder", number(megabytes, "{:.1f} MB"), "may be moved or zipped"),
     ]
-    return Section(
-        "mjcf",
-        "MuJoCo scene",
-        "Ground, parts, lights and a Husky at the start of the route, as a folder that plain MuJoCo opens: "
-        "build/5_mjcf/scene.xml.",
-        facts,
-        not_applicable=str(mjcf.get("not_applicable") or ""),
-    )
+    if routeless:
+        facts = [fact for fact in facts if fact.name not in ("turn", "corridor", "free at the start")]
+    touched = mjcf.get("spawn_touched")
+    cautions = []
+    if isinstance(touched, list) and touched:
+        cautions.append(
+            Caution(
+                f"The robot touches {listing(touched)} where it starts.",
+                "raise mjcf.corridor_margin or mesh.obstacle_height, or start the film further along.",
+            )
+        )
+    return Section("mjcf", "MuJoCo scene", f"{done}build/5_mjcf/scene.xml.", facts, cautions)
 
 
 def review_section(report: dict[str, Any]) -> Section:
@@ -328,56 +368,6 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], Section]] = {
     "review": review_section,
 }
 """Stage name → its section, in the order of the page."""
-
-
-def truth_section(report: dict[str, Any]) -> Section:
-    """How far the twin is from the known truth; not a stage, and not there for a real place."""
-    truth = pick(report, "truth")
-    title, name = "Against the truth", "truth"
-    if not isinstance(truth, dict):
-        return Section(name, title, "", not_applicable="this is a real place: its truth is not known")
-    rows = (
-        ("ate_m", "camera positions", "{:.3f} m", "root mean square, after the best fit of path to path"),
-        ("ate_max_m", "worst camera", "{:.3f} m", "the frame that is furthest off"),
-        ("ate_rigid_m", "camera positions, in the twin’s metres", "{:.3f} m", "with its scale as it is"),
-        ("rotation_median_deg", "camera directions", "{:.2f}°", "median"),
-        ("scale_error", "scale", "{:+.2%}", "the twin’s metre against the true one"),
-        ("tilt_deg", "gravity", "{:.2f}°", "between the twin’s vertical and the true one"),
-        ("ground_median_m", "ground height", "{:.3f} m", "median error inside the corridor"),
-        ("ground_p95_m", "ground height, worst places", "{:.3f} m", "95 of 100 places are better"),
-        ("obstacle_accuracy_m", "solid parts to true surface", "{:.3f} m", "median: is there something where it says?"),
-        ("obstacle_completeness_m", "true surface to solid parts", "{:.3f} m", "median: is everything there?"),
-        ("visual_median_m", "visible mesh", "{:.3f} m", "median distance to the true surface"),
-        ("corridor_intrusions", "parts inside the true corridor", "{}", "nothing solid may stand there"),
-        ("route_median_m", "route", "{:.3f} m", "median distance to the true centre line"),
-        ("depth_median_m", "depth of the field", "{:.3f} m", "median error, up to 20 m"),
-    )
-    facts = [Fact(label, number(truth.get(key), form), meaning) for key, label, form, meaning in rows]
-    cautions = [
-        Caution(f"{what} is {number(truth[key], form)} off, more than {number(limit, form)}.", cure)
-        for key, limit, what, form, cure in (
-            ("ate_m", LARGE_PATH_ERROR, "The camera path", "{:.3f} m", "give the camera’s calibration."),
-            ("scale_error", _LARGE_SCALE_ERROR, "The scale", "{:.1%}", "check what the metres come from."),
-            ("ground_median_m", _LARGE_GROUND_ERROR, "The ground", "{:.3f} m", "check the camera’s height."),
-            ("obstacle_median_m", _LARGE_SURFACE_ERROR, "Solid parts", "{:.3f} m", "raise nerf.steps."),
-        )
-        if isinstance(truth.get(key), int | float) and abs(truth[key]) > limit
-    ]
-    if isinstance(truth.get("corridor_intrusions"), int) and truth["corridor_intrusions"] > 0:
-        cautions.append(
-            Caution(
-                f"{truth['corridor_intrusions']} solid part(s) reach into the true corridor.",
-                "raise nerf.steps, or mjcf.corridor_margin.",
-            )
-        )
-    return Section(
-        name,
-        title,
-        "This place was generated, so what is really there is known. The build never saw that; only this comparison "
-        "does.",
-        facts,
-        cautions,
-    )
 
 
 def general_cautions(report: dict[str, Any]) -> list[Caution]:
