@@ -109,14 +109,15 @@ img, video { display:block; width:100%; height:auto; border-radius:8px; backgrou
 .pictures .strip { grid-column:1 / -1 }
 .charts { display:grid; grid-template-columns:repeat(auto-fit, minmax(min(100%, 400px), 1fr)); gap:8px 24px;
   align-items:start } .charts svg { display:block; width:100%; max-width:560px; height:auto }
+.charts > :only-child { max-width:720px } .charts > :only-child svg { max-width:none }
 .charts svg * { stroke-linejoin:round; stroke-linecap:butt }
 .charts svg text { font-family:system-ui, sans-serif !important } .charts h3 { font-size:.95rem; margin:0 0 4px }
 .scroll { overflow-x:auto; margin:0 0 12px } table { border-collapse:collapse; width:100%; font-size:.92rem }
 th, td { text-align:left; padding:5px 10px 5px 0; border-bottom:1px solid var(--line); vertical-align:top }
 th { color:var(--muted); font-weight:500 }
 .n { text-align:right; font-variant-numeric:tabular-nums; white-space:nowrap }
-.bar { display:block; height:9px; border-radius:3px; background:var(--c1); min-width:2px }
-td.wide { width:35% } details { margin:8px 0 0 } summary { cursor:pointer; color:var(--link); font-size:.92rem }
+.bar { display:block; margin-top:.5em; height:9px; border-radius:3px; background:var(--c1); min-width:2px }
+#costs > .scroll td:nth-child(3) { width:45%; min-width:90px } details { margin:8px 0 0 } summary { cursor:pointer; color:var(--link); font-size:.92rem }
 code { font:.88em ui-monospace, monospace } footer { color:var(--muted); font-size:.88rem }
 @media (max-width:520px) { main { padding:12px 8px 40px } section, header.top { padding:14px 12px; border-radius:10px }
   dl { grid-template-columns:1fr 1fr; gap:8px } dl div { padding:8px 9px } }
