@@ -18,7 +18,8 @@ from twin.nerf.dataset import load_frame
 from twin.nerf.field import CameraArrays, RadianceField
 from twin.progress import track
 
-_FIT_STEPS = 60
+_FIT_STEPS = 40
+_FIT_RAYS = 4000  # of a half picture, spread evenly
 _FIT_RATE = 0.05
 _FIT_PRIOR = 1e-3  # pull towards the lighting's embedding, as residuals are in training
 _MAX_FRAMES = 24  # held-out frames scored per lighting, spread evenly
@@ -107,7 +108,7 @@ def score_frame(field: RadianceField, cameras: Cameras, i: int, max_width: int) 
         fit_on, score_on = np.flatnonzero(half & mask), ~half & mask
         if not len(fit_on) or not score_on.any():
             continue
-        some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // 10_000)], device=field.where)
+        some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // _FIT_RAYS)], device=field.where)
         shown = picture(fit_embedding(field, features[some], harmonics[some], colours[some], start))
         psnrs.append(psnr(shown, image, score_on))
         # Masked pixels are made equal: they neither help nor harm beyond their windows.

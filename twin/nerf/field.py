@@ -30,7 +30,7 @@ _RENDER_RAYS = 4096  # per batch
 _RENDER_SAMPLES = 24
 _RENDER_FLOOR = 0.02  # weight of unlikely places when rendering
 _QUERY_POINTS = 65536  # per batch of density queries
-_START_DENSITY = 0.5  # optical depth of the untrained field across the near box's longest half side
+_START_DENSITY = 2.0  # optical depth of the untrained field across the near box's longest half side
 
 
 @dataclass(frozen=True)

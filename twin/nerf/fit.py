@@ -29,15 +29,19 @@ from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
 from twin.nerf.sampling import COARSEST, Space, space_of_cameras
 from twin.progress import bar
-from twin.scene import SceneDir
+from twin.scene import SceneDir, read_json
 
 _SHARDS = 4
 _CELL_PIXELS = 2.0  # side of the finest cell [px of a training frame, at the near end of what was seen]
 _GROWTH_RANGE = (1.3, 2.2)
 _HIDDEN = 64
+_TRIPLES = 0.3  # share of the rays that come in threes, to see whether surfaces are plane
 _FREE_POINTS = 256  # per shard and step
 _NETWORK_RATE = 1e-2  # learning rate of the networks and embeddings at the start
 _FINAL_RATE = 0.03  # learning rates end at this share
+_EDGE = 10.0  # a contrast of 1/10 makes bending count e times less
+_MOST_BEND = 0.5  # beyond this it is an edge of depth, whatever the colours say
+_HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 _WARM_UP = 20  # steps of rising learning rate
 _EXPLORE = 0.15  # share of the steps over which sampling narrows down
 
@@ -47,8 +51,9 @@ class Weights:
     """How much each part of the loss counts."""
 
     distortion: float = 0.005
-    depth: float = 0.02
-    depth_reach: float = 0.3
+    depth: float = 0.5
+    depth_reach: float = 0.5
+    plane: float = 0.01
     free: float = 1e-3
     residual: float = 1e-3
 
@@ -64,10 +69,11 @@ class Trainer:
         seed: int,
         where: str,
         weights: Weights | None = None,
+        camera_height: float = 0.0,
     ):
         self.config, self.seed, self.where = config, seed, where
         self.weights = weights or Weights()
-        self.pixels = TrainingPixels(cameras, points, config.max_width)
+        self.pixels = TrainingPixels(cameras, points, config.max_width, camera_height)
         train = self.pixels.cameras
         self.lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([self.lightings.index(name) for name in train.lightings])
@@ -105,7 +111,7 @@ class Trainer:
 
     def _growth(self, space: Space) -> float:
         """Ratio of one level's cells to the next finer one's, such that the finest suits the frames."""
-        seen = self.pixels.sighting_distance
+        seen = self.pixels.points.distance
         distance = float(np.quantile(seen, 0.05)) if len(seen) else 0.25 * space.scale
         cell = _CELL_PIXELS * distance / float(np.median(self.pixels.intrinsics[:, 0]))
         ratio = 4.0 * space.scale / cell / COARSEST
@@ -123,19 +129,19 @@ class Trainer:
     def step(self) -> float:
         """One step; returns the mean squared error of its colours."""
         ws, where = self.ws, self.where
-        share = int(self.rays * self.config.sightings)
-        batch = self.pixels.batch(self.rng, self.rays, share)
-        # Every shard gets its part of the sightings.
-        order = np.arange(self.rays).reshape(-1, _SHARDS).T.ravel()
-        ws.camera.copy_(torch.from_numpy(batch.frame[order]))
-        ws.pixel.copy_(torch.from_numpy(batch.pixel[order]))
-        ws.targets.copy_(torch.from_numpy(batch.distance[order]))
-        colour = torch.from_numpy(batch.colour[order]).to(where)
+        per_shard = self.rays // _SHARDS
+        sightings = int(per_shard * self.config.sightings)
+        triples = int(per_shard * _TRIPLES) // 3
+        batch = self.pixels.batch(self.rng, _SHARDS, triples, per_shard - sightings - 3 * triples, sightings)
+        ws.camera.copy_(torch.from_numpy(batch.frame))
+        ws.pixel.copy_(torch.from_numpy(batch.pixel))
+        ws.targets.copy_(torch.from_numpy(batch.distance))
+        colour = torch.from_numpy(batch.colour).to(where)
         free = self._free_points(_SHARDS * _FREE_POINTS)
         if free is not None:
             ws.positions[self.rays * ws.samples :].copy_(free)
 
-        results = parallel(lambda shard: self._shard(shard, colour, free is not None), range(_SHARDS), where)
+        results = parallel(lambda shard: self._shard(shard, colour, triples, free is not None), range(_SHARDS), where)
         rate = self.rate()
         parallel(lambda task: self._update(task, rate), range(self.config.levels + 2), where)
         for tensor, *gradients in zip(self.small.values(), *(r[1] for r in results), strict=True):
@@ -146,7 +152,7 @@ class Trainer:
         self.steps_done += 1
         return sum(r[0] for r in results) / _SHARDS
 
-    def _shard(self, shard: int, colour: torch.Tensor, free: bool) -> tuple[float, list[torch.Tensor]]:
+    def _shard(self, shard: int, colour: torch.Tensor, triples: int, free: bool) -> tuple[float, list[torch.Tensor]]:
         """Forward and back through one shard: its error, and the gradients of the small tensors in their order."""
         f, ws, w = self.field, self.ws, self.weights
         count = self.rays // _SHARDS
@@ -171,10 +177,15 @@ class Trainer:
         # The shards' losses add up to a mean over the batch.
         loss = torch.nn.functional.smooth_l1_loss(rgb, colour[rays], beta=0.1) / _SHARDS
         loss = loss + w.residual * (residuals[frame] ** 2).mean() / _SHARDS
+        inverse_depth = (ws.inverse_distance[rays] / ws.cosines[rays]).requires_grad_(True)
+        if triples and w.plane > 0.0:
+            loss = loss + w.plane / _SHARDS * bending(inverse_depth[: 3 * triples], colour[rays][: 3 * triples])
         learned = [t for n, t in self.small.items() if not n.startswith("trunk")]
-        gradients = torch.autograd.grad(loss, [composited, *learned])
+        gradients = torch.autograd.grad(loss, [composited, inverse_depth, *learned], allow_unused=True)
         with torch.no_grad():
             ws.composited_grad[rays] = gradients[0]
+            if gradients[1] is not None:
+                ws.inverse_grad[rays] = gradients[1] / ws.cosines[rays]
             wp.launch(
                 volume.composite_backward,
                 count,
@@ -195,7 +206,7 @@ class Trainer:
                 [ws.w_densities],
                 device=self.where,
             )
-            return float((error**2).mean()), [first, second, *gradients[1:]]
+            return float((error**2).mean()), [first, second, *gradients[2:]]
 
     def _trunk_backward(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         ws = self.ws
@@ -263,6 +274,23 @@ class Trainer:
         return self.field
 
 
+def bending(inverse_depth: torch.Tensor, colour: torch.Tensor) -> torch.Tensor:
+    """How far triples of rays are from seeing a plane, where their colours give no reason for an edge.
+
+    The inverse z-depth of a plane is affine in the pixel, so its second difference vanishes on any plane; relative to
+    the inverse depth itself it has no unit. The road has little texture, so this is what spreads the few known depths.
+
+    Args:
+        inverse_depth: Expected inverse z-depth [1/m], shape (3k,), triple after triple.
+        colour: Shape (3k, 3).
+    """
+    d = inverse_depth.view(-1, 3)
+    c = colour.view(-1, 3, 3)
+    contrast = (c[:, 0] - c[:, 1]).abs().sum(-1) + (c[:, 2] - c[:, 1]).abs().sum(-1)
+    bend = (d[:, 0] + d[:, 2] - 2.0 * d[:, 1]).abs() / (d.detach().mean(1) + 1e-3)
+    return (torch.exp(-_EDGE * contrast) * bend.clamp(max=_MOST_BEND)).mean()
+
+
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
     """Straight pieces of the filmed path, shape (k, 2, 3) [m]: around them (within the near plane) nothing is.
 
@@ -278,10 +306,15 @@ def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
     return np.concatenate(pieces) if pieces else np.zeros((0, 2, 3))
 
 
-def fit(cameras: Cameras, points: SparsePoints, config: NerfConfig, seed: int = 0) -> tuple[RadianceField, dict[str, Any]]:
-    """Trains a field and returns it with what there is to say of the training."""
+def fit(
+    cameras: Cameras, points: SparsePoints, config: NerfConfig, seed: int = 0, camera_height: float = 0.0
+) -> tuple[RadianceField, dict[str, Any]]:
+    """Trains a field and returns it with what there is to say of the training.
+
+    `camera_height` [m] is that of a camera carried at constant height over the ground, 0 where it was not.
+    """
     where = device()
-    trainer = Trainer(cameras, points, config, seed, where)
+    trainer = Trainer(cameras, points, config, seed, where, camera_height=camera_height)
     curve: list[list[float]] = []
     began = time.perf_counter()
     mean = 0.0
@@ -304,9 +337,17 @@ def fit(cameras: Cameras, points: SparsePoints, config: NerfConfig, seed: int = 
         "rays_per_second": round(config.steps * trainer.rays / seconds, 1),
         "train_psnr": curve[-1][1],
         "parameters": int(field.table.numel() + small),
-        "sightings": len(trainer.pixels.sighting_frame),
+        "sightings_points": len(trainer.pixels.points.frame),
+        "sightings_path": len(trainer.pixels.path.frame),
         "curve": curve,
     }
+
+
+def constant_height(metric: dict[str, Any]) -> float:
+    """The camera's height above the ground [m], if the metric stage found it to be known and constant; else 0."""
+    height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
+    known = height and (metric.get("road_reliable") or metric.get("scale_source") == "camera_height")
+    return float(height) if known and (spread is None or spread < _HEIGHT_SPREAD * height) else 0.0
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
@@ -319,7 +360,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
-    field, metrics = fit(cameras, points, config.nerf, config.seed)
+    height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
+    field, metrics = fit(cameras, points, config.nerf, config.seed, height)
     metrics |= evaluate(field, cameras, config.nerf.max_width)
     field.about = {"scene": config.name, "seed": config.seed, "metrics": metrics}
     field.save(out)

@@ -11,6 +11,7 @@ from twin.nerf.kernels.space import grid_position, max_norm
 
 BINS = wp.constant(256)
 _FAR = wp.constant(100.0)  # unit positions beyond this are one with the horizon
+_BEYOND = wp.constant(3)  # bins behind an opaque one
 _WIDENING = wp.constant(0.02)  # least bin length as a share of the distance
 
 
@@ -59,6 +60,7 @@ def sample_rays(
     t = near
     transmittance = float(1.0)
     n = int(0)
+    beyond = int(0)
     bounds[0] = t
     while n < BINS:
         m = max_norm(wp.cw_mul(o + d * t - centre, inverse_half))
@@ -73,22 +75,29 @@ def sample_rays(
         t += step
         n += 1
         bounds[n] = t
-        # A target behind what the grid believes to be solid must still be reached.
+        # The surface may lie a cell behind where the grid believes it; a target further back must be reached, too.
         if transmittance < 1.0e-3 and t > target:
-            break
+            beyond += 1
+            if beyond > _BEYOND:
+                break
 
     # Neighbours share weight: a surface need not lie in the bin whose cell first saw it.
     total = float(0.0)
     before = float(0.0)
+    before2 = float(0.0)
     uniform = floor / wp.float32(n)
     for b in range(n):
         here = weights[b]
         after = float(0.0)
+        after2 = float(0.0)
         if b + 1 < n:
             after = weights[b + 1]
-        p = 0.5 * here + 0.25 * (before + after) + uniform
+        if b + 2 < n:
+            after2 = weights[b + 2]
+        p = 0.4 * here + 0.2 * (before + after) + 0.1 * (before2 + after2) + uniform
         if target > bounds[b] and target <= bounds[b + 1]:
             p += target_mass
+        before2 = before
         before = here
         weights[b] = p
         total += p
