@@ -18,7 +18,7 @@ from twin.report.overview import bird_pose
 from twin.report.panels import Layout, depth_colours, draw_text, fit, shorten, text_width, wrap
 from twin.report.plan import Plan, footprints, turn_of
 from twin.report.review import film
-from twin.report.studio import frames_to_compare, light_of_frame, nearest_frame, side_by_side, spread
+from twin.report.studio import frames_to_compare, greyed, light_of_frame, nearest_frame, side_by_side, spread
 from twin.report.video import describe, read_frames
 from twin.scene import SceneDir, read_json
 
@@ -242,6 +242,15 @@ def test_a_bird_looks_along_the_route() -> None:
     for s in (0.0, 20.0, 40.0):
         pose = bird_pose(route, s)
         assert pose[0, 2] > 0.5 and pose[2, 2] < 0 and pose[2, 3] > 1.0
+
+
+def test_what_is_masked_is_grey_and_the_rest_untouched() -> None:
+    image = np.random.default_rng(0).integers(0, 255, (40, 60, 3)).astype(np.uint8)
+    ignored = np.zeros((40, 60), bool)
+    ignored[:, :20] = True
+    out = greyed(image, ignored)
+    assert (out[:, 20:] == image[:, 20:]).all()
+    assert (out[:, :20] == out[:, :20, :1]).all()
 
 
 def test_a_row_of_pictures_has_one_height() -> None:

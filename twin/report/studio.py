@@ -95,8 +95,10 @@ class Studio:
         return self.view(cameras.camera_to_world[i], cameras.intrinsics[i], size, light)
 
     def real(self, i: int) -> Picture:
-        """Frame i as it was filmed (undistorted)."""
-        return read_image(self.cameras.image_path(i))
+        """Frame i as it was filmed (undistorted), with what its mask ignores greyed out."""
+        image = read_image(self.cameras.image_path(i))
+        mask = self.cameras.mask_path(i)
+        return image if mask is None else greyed(image, read_image(mask)[..., 0] == 0)
 
     def keep(self, name: str, section: str, caption: str, picture: Picture) -> None:
         """Stores a picture for the page as `pictures/<name>.jpg`."""
@@ -111,6 +113,15 @@ class Studio:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(data.tobytes())
         self.kept.append(KeptPicture(f"pictures/{name}.jpg", section, caption))
+
+
+def greyed(image: Picture, ignored: NDArray[np.bool_]) -> Picture:
+    """The image with its ignored part, shape (h, w), grey and striped: it was filmed, but not learnt."""
+    v, u = np.indices(ignored.shape)
+    width = max(4, len(ignored) // 40)
+    stripes = np.where((u + v) // width % 2 == 0, 0.55, 0.4)[..., None]
+    grey = image.mean(-1, keepdims=True) * stripes + 30.0
+    return np.where(ignored[..., None], grey, image).astype(np.uint8)
 
 
 def spread(indices: Sequence[int] | NDArray, count: int) -> list[int]:
