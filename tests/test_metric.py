@@ -205,6 +205,14 @@ def test_the_road_is_found_below_kerbs_and_above_mismatches() -> None:
     assert np.mean(np.abs(points[road.points, 2]) < 0.1) > 0.95
 
 
+def test_a_camera_led_around_an_object_has_no_road() -> None:
+    rng = np.random.default_rng(3)
+    angle = np.linspace(0, 5, 50)
+    eyes = np.stack([3 * np.cos(angle), 3 * np.sin(angle), 2.0 + 1.5 * np.sin(3 * angle)], 1)
+    points = rng.normal(0, 2, (3000, 3))
+    assert find_road(points, eyes, np.array([0.0, 0.0, 1.0])) is None
+
+
 def test_a_road_without_texture_is_found_beside_the_path() -> None:
     rng = np.random.default_rng(2)
     film = _path(turn=False)

@@ -39,6 +39,13 @@ _REACHES = (1.0, 2.0, 4.0, 8.0)
 """Offsets [drops] within which the road's layer is looked for, one after the other."""
 
 
+_MIN_SHARE = 0.2
+"""Share of the cameras that must have road points below them before their own heights are used."""
+_DEEPER = 1.25
+_MAX_DEEPER = 0.1
+"""Solid ground hides what is below it: more than this share of points deeper than 1.25 drops, and it is no ground."""
+
+
 @dataclass(frozen=True)
 class Road:
     """The layer of points that a path runs above."""
@@ -50,7 +57,7 @@ class Road:
     spread: float
     """Robust standard deviation of the drops of its points."""
     reach: float
-    """Largest offset of its points [drops]. At 1 they lie under the path; far beyond, on verges rather than the road."""
+    """Largest offset of its points [drops]. At 1 they lie under the path, far beyond on verges."""
 
     @property
     def reliable(self) -> bool:
@@ -114,8 +121,9 @@ def find_road(points: Array, centres: Array, up: Array) -> Road | None:
 
     A layer at drop h counts the points within ±6 % of h whose offset is below h: near the path the road is below 45°,
     whatever the scale. Among layers with at least half of the best support the lowest is the road, since nothing
-    solid lies below a road. A road without texture has no points; then the layer is looked for ever further beside the
-    path, where its verges are, and the best supported of these is taken if none has enough points.
+    solid lies below a road; with many points below it there is none (a camera led around an object). A road without
+    texture has no points; then the layer is looked for ever further beside the path, where its verges are, and the
+    best supported of these is taken if none has enough points.
     """
     if not len(points):
         return None
@@ -145,6 +153,9 @@ def _layer(drop: Array, offset: Array, reach: float) -> Road | None:
             return None
         height = float(np.median(drops[chosen]))
     chosen = (np.abs(drops - height) < _LAYER * height) & (offsets < reach * height)
+    deeper = np.count_nonzero((drops > _DEEPER * height) & (offsets < reach * height))
+    if deeper > _MAX_DEEPER * chosen.sum():
+        return None
     spread = 1.4826 * float(np.median(np.abs(drops[chosen] - height)))
     return Road(below[chosen], height, spread, reach)
 
@@ -187,8 +198,9 @@ def _road_normal(road: Array, centres: Array, up: Array) -> Array | None:
     return normal if normal @ up > 0 else -normal
 
 
-def heights_above_road(points: Array, centres: Array, up: Array, drop: float, least: int = 6) -> Array:
-    """Height of each camera over the road points around its own foot; NaN where fewer than `least` lie there.
+def heights_above_road(points: Array, centres: Array, up: Array, drop: float, least: int = 6) -> Array | None:
+    """Height of each camera over the road points around its own foot; NaN where fewer than `least` lie there, None
+    where that leaves fewer than a fifth of the cameras.
 
     Args:
         points: Road points, shape (k, 3).
@@ -203,4 +215,4 @@ def heights_above_road(points: Array, centres: Array, up: Array, drop: float, le
     for i, near in enumerate(tree.query_ball_point(centres @ flat, drop)):
         if len(near) >= least:
             heights[i] = float(np.median((centres[i] - points[near]) @ up))
-    return heights
+    return heights if np.isfinite(heights).sum() >= max(3, _MIN_SHARE * len(centres)) else None

@@ -149,7 +149,7 @@ def _metrics(
     if road is not None and road.reliable:
         z_up = np.array([0.0, 0.0, 1.0])
         local = heights_above_road(points.xyz[road.points], cameras.positions, z_up, road.drop * scale.value)
-        if np.isfinite(local).sum() >= 3:
+        if local is not None:
             heights = local[np.isfinite(local)]
             spread = 1.4826 * float(np.median(np.abs(heights - np.median(heights))))
     sources = np.array(cameras.sources)

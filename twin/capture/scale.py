@@ -94,8 +94,8 @@ def scale_from_height(
             continue
         centres = cameras.positions[sources == name]
         local = heights_above_road(on_road, centres, up, road.drop)
-        measured = local[np.isfinite(local)]
-        if len(measured) >= max(3, 0.2 * len(centres)):
+        if local is not None:
+            measured = local[np.isfinite(local)]
             height = float(np.median(measured))
             spread = 1.4826 * float(np.median(np.abs(measured - height)))
             count = len(measured)
