@@ -164,6 +164,31 @@ def test_given_poses_are_kept(tmp_path: Path) -> None:
     assert np.median(np.abs(points.xyz[points.xyz[:, 2] < 0.3, 2])) < 0.05
 
 
+def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) -> None:
+    from twin.capture import mapping
+    from twin.capture.features import open_database
+
+    stage = street.scene.stage("capture")
+    matcher = open_database(Capture.load(stage), stage, tmp_path, False, 2, 0)
+    matcher.extract(1500, 1280)
+    mapping._match(matcher, np.random.default_rng(0))
+    job = {"seed": 0, "threads": 2, "mapper": "global", "min_registered": 0.6}
+    mapper = mapping._Mapper(matcher, job, tmp_path, fixed=[0, 1])
+    model = mapper.best({})
+    frames, poses = mapping._poses(model, matcher)
+    step = mapping._median_step(poses, frames, matcher.capture)
+    image = model.images[int(matcher.image_ids[5])]
+    moved = np.linalg.inv(poses[5] @ np.block([[np.eye(3), np.full((3, 1), 2 * step)], [np.zeros((1, 3)), 1.0]]))
+    model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(moved[:3]))
+    facts: dict = {}
+    repaired = mapper.without_outliers(model, 0.3, facts)
+    assert facts == {"outliers": [], "registered_anew": [matcher.capture.names[5]]}
+    frames, poses = mapping._poses(repaired, matcher)
+    true = np.array([street.truth[matcher.capture.names[i]] for i in frames])
+    fit = umeyama(poses[:, :3, 3], true[:, :3, 3])
+    assert np.linalg.norm(fit.points(poses[5, :3, 3]) - true[5, :3, 3]) < 0.03
+
+
 def _capture_of(root: Path, images: list[np.ndarray]) -> Street:
     stage = SceneDir(root).stage("capture")
     names = tuple(f"film/{i:06d}" for i in range(len(images)))

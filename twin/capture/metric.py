@@ -99,7 +99,8 @@ def _ground_level(cameras: Cameras, points: Array, up: Array, road: Road | None)
     if road is not None and road.reliable:
         return float(np.median(points[road.points] @ up)), "road points under the path"
     if road is not None:
-        return float(np.median(cameras.positions @ up)) - road.drop, f"{len(road.points)} points within {road.reach:g} camera heights of the path"
+        where = f"{len(road.points)} points within {road.reach:g} camera heights of the path"
+        return float(np.median(cameras.positions @ up)) - road.drop, where
     heights = points @ up
     if len(heights):
         return float(np.quantile(heights, _UNKNOWN_FLOOR)), "lowest points"
