@@ -1,9 +1,15 @@
 """Stage `cameras`: pairs, outliers and undistortion as laws; the whole stage on a small rendered street."""
 
+import contextlib
 import dataclasses
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pycolmap
 import pytest
 
@@ -236,6 +242,48 @@ def test_a_dying_worker_is_an_error_with_a_cure(
     with pytest.raises(InputError, match=rf"died \(SIG{signal}; Check failed: something\); {cure}") as error:
         worker.run_worker({}, tmp_path)
     assert "\n" not in str(error.value)
+
+
+def test_a_full_disk_in_the_worker_is_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = tmp_path / "python"
+    fake.write_text("#!/bin/sh\necho 'SQLite error: database or disk is full' >&2\nexit 1\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(worker.sys, "executable", str(fake))
+    with pytest.raises(OSError, match="No space left"):
+        worker.run_worker({}, tmp_path)
+
+
+def test_the_worker_ends_with_its_parent(street: Street, tmp_path: Path) -> None:
+    script = (
+        "import sys; from pathlib import Path; from twin.capture import sfm; from twin.config import SceneConfig;"
+        "from twin.scene import SceneDir; sfm.run(SceneDir(Path(sys.argv[1])), SceneConfig(), Path(sys.argv[2]))"
+    )
+    out = tmp_path / "out"
+    out.mkdir()
+    parent = subprocess.Popen(
+        [sys.executable, "-c", script, str(street.scene.root), str(out)], stderr=subprocess.DEVNULL
+    )
+    log = out / "work" / "job.json"
+
+    def workers() -> list[psutil.Process]:
+        found = []
+        for process in psutil.process_iter():
+            with contextlib.suppress(psutil.Error):
+                if str(log) in process.cmdline() and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
+        return found
+
+    _wait_for(lambda: bool(workers()))
+    parent.kill()
+    parent.wait()
+    _wait_for(lambda: not workers())
+
+
+def _wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
 
 
 # --- pairs ------------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ A line of news on the worker's standard output is JSON: {"bar": name, "total": n
 """
 
 import contextlib
+import errno
 import json
 import os
 import signal
@@ -23,6 +24,7 @@ from twin.errors import InputError
 
 _LOG = "colmap.log"
 _BAD_INPUT = 2
+_DISK_FULL = ("no space left on device", "disk is full", "sqlite_full")
 _MAPPING_STEPS = (
     "Rotation averaging done",
     "Track establishment done",
@@ -46,6 +48,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
 
     Raises:
         InputError: the worker found the input bad, or died of a signal inside COLMAP.
+        OSError: the disk is full.
         RuntimeError: the worker failed for any other reason (a bug).
     """
     job_file = folder / "job.json"
@@ -80,6 +83,8 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     tail = " | ".join(log_file.read_text(encoding="utf-8", errors="replace").split("\n")[-30:])[-1500:]
     if code == _BAD_INPUT and error:
         raise InputError(error)
+    if any(words in tail.lower() for words in _DISK_FULL):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     if code < 0:
         name = signal.Signals(-code).name
         cure = (
