@@ -222,10 +222,11 @@ def summary(report: dict[str, Any]) -> str:
     psnr = pick("field", "psnr") or {}
     follower = pick("review", "follower") or {}
     figures = {
-        "capture": f"{number(pick('capture', 'kept'), '{} frames kept')}",
+        "capture": number(pick("capture", "frames"), "{} frames kept"),
         "cameras": f"{pick('cameras', 'registered')} of {pick('cameras', 'total')} frames registered, "
         + number(pick("cameras", "reprojection_error_px"), "{:.2f} px"),
-        "metric": f"scale from {pick('metric', 'scale_source')}",
+        "metric": f"scale from {pick('metric', 'scale_source')}"
+        + number(pick("metric", "scale_uncertainty"), " ± {:.1%}"),
         "field": "held-out PSNR " + ", ".join(f"{name} {value:.1f} dB" for name, value in psnr.items()),
         "mesh": number(pick("mesh", "parts"), "{} convex parts"),
         "mjcf": number(pick("mjcf", "route_length_m"), "route {:.1f} m"),
