@@ -34,7 +34,7 @@ def truth_section(report: dict[str, Any]) -> Section:
     )
     facts = [Fact(label, number(truth.get(key), form), meaning) for key, label, form, meaning in rows]
     cautions = [
-        Caution(f"{what} is {number(truth[key], form)} off, more than {number(limit, form)}.", cure)
+        Caution(f"{what}: {number(abs(truth[key]), form)} off, more than {number(limit, form)}.", cure)
         for key, limit, what, form, cure in (
             ("ate_m", LARGE_PATH_ERROR, "The camera path", "{:.3f} m", "give the camera’s calibration."),
             ("scale_error", _LARGE_SCALE_ERROR, "The scale", "{:.1%}", "check what the metres come from."),

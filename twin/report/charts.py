@@ -81,7 +81,7 @@ def _points(scene: SceneDir) -> list[Chart]:
     if not len(points):
         return []
     error = figures.histogram(points.error, "reprojection error of a point [px]", _WORST_REPROJECTION)
-    tracks = figures.histogram(points.track_length, "frames that saw a point", _LONGEST_TRACK)
+    tracks = figures.histogram(points.track_length, "frames that saw a point", _LONGEST_TRACK, whole=True)
     return [
         Chart("cameras", "How far points are from where they were seen", figures.svg(error)),
         Chart("cameras", "How often points were seen again", figures.svg(tracks)),
@@ -112,7 +112,7 @@ def _drive(report: dict[str, Any]) -> list[Chart]:
     off = figures.along_the_path(
         trace["progress_m"], {"cross-track": trace["cross_track_m"]}, "off the route [m], left is positive", limit
     )
-    speed = figures.along_the_path(trace["progress_m"], {"speed": trace["speed_m_s"]}, "speed [m/s]")
+    speed = figures.along_the_path(trace["progress_m"], {"speed": trace["speed_m_s"]}, "speed [m/s]", lowest=0.0)
     title = "How far off the route it drove" + ("" if limit is None else "; dashed: the corridor")
     return [Chart("review", title, figures.svg(off)), Chart("review", "How fast it drove", figures.svg(speed))]
 

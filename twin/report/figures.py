@@ -119,7 +119,7 @@ def _legend(axes: Axes, columns: int) -> None:
     with _style():
         axes.legend(
             loc="upper center",
-            bbox_to_anchor=(0.5, -0.16 if axes.get_aspect() == "auto" else -0.12),
+            bbox_to_anchor=(0.5, -0.22 if axes.get_aspect() == "auto" else -0.12),
             ncols=columns,
             handlelength=1.4,
             columnspacing=1.2,
@@ -265,13 +265,21 @@ def bars(values: dict[str, float], counts: dict[str, int], unit: str, label: str
     return figure
 
 
-def histogram(values: NDArray, label: str, highest: float | None = None) -> Figure:
-    """How often each value occurs, with its median; what is above `highest` is counted in the last bin."""
+def histogram(values: NDArray, label: str, highest: float | None = None, whole: bool = False) -> Figure:
+    """How often each value occurs, with its median; what is above `highest` is counted in the last bin.
+
+    Args:
+        values: Not negative, shape (n,).
+        label: What they are, with their unit.
+        highest: Right end; by default where 99.5 % of the values are.
+        whole: One bin per whole number.
+    """
     figure, axes = _figure(1.9)
     values = np.asarray(values, np.float64)
     top = float(highest if highest is not None else np.percentile(values, 99.5))
     with _style():
-        axes.hist(np.minimum(values, top), bins=40, range=(0.0, max(top, 1e-9)), color=SERIES[0], rwidth=0.9)
+        edges = np.arange(np.floor(top) + 2) - 0.5 if whole else np.linspace(0.0, max(top, 1e-9), 41)
+        axes.hist(np.minimum(values, top), bins=edges, color=SERIES[0], rwidth=0.9)  # type: ignore[arg-type]
         median = float(np.median(values))
         axes.axvline(median, color=SERIES[1], lw=1.2)
         at = (median, axes.get_ylim()[1])
@@ -283,9 +291,13 @@ def histogram(values: NDArray, label: str, highest: float | None = None) -> Figu
 
 
 def along_the_path(
-    distance: Sequence[float], curves: dict[str, Sequence[float]], label: str, limit: float | None = None
+    distance: Sequence[float],
+    curves: dict[str, Sequence[float]],
+    label: str,
+    limit: float | None = None,
+    lowest: float | None = None,
 ) -> Figure:
-    """Curves over the distance driven or filmed [m]; `limit` is drawn as a dashed line."""
+    """Curves over the distance driven or filmed [m]; ± `limit` are dashed lines, the axis starts at `lowest`."""
     figure, axes = _figure(2.2)
     with _style():
         for i, (name, values) in enumerate(curves.items()):
@@ -294,6 +306,8 @@ def along_the_path(
             axes.axhline(limit, color=SERIES[1], ls="--", lw=1.0)
             axes.axhline(-limit, color=SERIES[1], ls="--", lw=1.0)
         axes.set(xlabel="distance along the path [m]", ylabel=label)
+        if lowest is not None:
+            axes.set_ylim(bottom=lowest)
     if len(curves) > 1:
         _legend(axes, 4)
     return figure

@@ -46,7 +46,7 @@ def capture_section(report: dict[str, Any]) -> Section:
     for name, source in sources.items() if isinstance(sources, dict) else ():
         kept, damaged = pick(source, "kept"), pick(source, "damaged")
         if isinstance(kept, int):
-            facts.append(Fact(str(name), f"{kept} frames", str(pick(source, "lighting") or pick(source, "kind") or "")))
+            facts.append(Fact(str(name), f"{kept} frames", _about_source(source)))
         if isinstance(damaged, int) and damaged > 0:
             cautions.append(
                 Caution(
@@ -61,6 +61,13 @@ def capture_section(report: dict[str, Any]) -> Section:
         facts,
         cautions,
     )
+
+
+def _about_source(source: dict[str, Any]) -> str:
+    seconds = source.get("duration_s")
+    length = duration(seconds) if isinstance(seconds, int | float) and seconds > 0 else None
+    light = source.get("lighting")
+    return ", ".join(str(part) for part in (source.get("kind"), length, light and f"lighting “{light}”") if part)
 
 
 def _count(value: Any) -> int | None:
@@ -134,6 +141,9 @@ def _first(table: dict[str, Any], *keys: str) -> Any:
 
 def _focal(value: Any) -> str:
     if isinstance(value, dict):
+        each = {number(focal, "{:.0f} px") for focal in value.values()}
+        if len(each) == 1:
+            return each.pop()
         return ", ".join(f"{name} {number(focal, '{:.0f} px')}" for name, focal in value.items()) or NOT_MEASURED
     if isinstance(value, list) and value:
         return ", ".join(number(focal, "{:.0f} px") for focal in value[:4])
