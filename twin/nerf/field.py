@@ -5,6 +5,7 @@ colour (see `network.py`). A `Workspace` holds the arrays of a batch of rays, so
 Points and distances are in metres, in the world of the cameras; for other vocabulary see `kernels/space.py`.
 """
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from twin.nerf.compute import device, load_kernels, parallel, single_threaded_to
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler, space
 from twin.nerf.rendering import FAR, Rendering
-from twin.nerf.sampling import Space, grid_shape, level_cells, level_shapes
+from twin.nerf.sampling import Space, level_cells, level_shapes, stop_grids
 from twin.scene import read_json, write_json
 
 _FORMAT = 1
@@ -127,7 +128,7 @@ class RadianceField:
         appearance: Appearance,
         table: torch.Tensor,
         parameters: dict[str, torch.Tensor],
-        grid: torch.Tensor,
+        grids: tuple[torch.Tensor, torch.Tensor],
         about: dict[str, Any] | None = None,
     ):
         """
@@ -136,22 +137,22 @@ class RadianceField:
             appearance: The embeddings, on the same device as the rest.
             table: Hash tables, shape (levels, 2**log2_table, FEATURES).
             parameters: Weights, see `network.initial_parameters`.
-            grid: Density grid [1/m] over the contracted cube.
+            grids: Stop grids, near and far, see `kernels/sampler.py`.
             about: Whatever else is to be kept beside the numbers, JSON-able.
         """
         self.layout, self.appearance, self.about = layout, appearance, about or {}
-        self.table, self.parameters, self.grid = table, parameters, grid
+        self.table, self.parameters, self.grids = table, parameters, grids
         self.where = "cpu" if table.device.type == "cpu" else "cuda"
         load_kernels(self.where)
         self.w_table = view(table, hashgrid.Feature)
-        self.w_grid = view(grid, wp.float32)
+        self.w_near_grid, self.w_far_grid = (view(grid, wp.float32) for grid in grids)
         cells = level_cells(layout.space, layout.levels, layout.growth)
         self.w_cells = wp.array(cells, dtype=wp.vec3f, device=self.where)
         self.w_shapes = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.where)
         self.mask = wp.uint32(2**layout.log2_table - 1)
         self.centre = wp.vec3f(*layout.centre)
         self.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        self.grid_cell = grid_shape(layout.space)[1]
+        self.stop = stop_grids(layout.space)
         self._spare: list[Workspace] = []
 
     @property
@@ -192,7 +193,8 @@ class RadianceField:
         wp.launch(
             sampler.sample_rays,
             count,
-            [ws.w_origins, ws.w_directions, ws.w_targets, self.centre, self.inverse_half, self.w_grid, self.grid_cell]
+            [ws.w_origins, ws.w_directions, ws.w_targets, self.centre, self.inverse_half, self.w_near_grid]
+            + [self.w_far_grid, self.stop.near_cell, self.stop.far_cell]
             + [self.layout.near_plane, floor, target_mass, seed, start],
             [ws.w_edges, ws.w_distances, ws.w_ray_positions],
             device=self.where,
@@ -331,7 +333,7 @@ class RadianceField:
 
     def save(self, folder: Path) -> None:
         """Writes `field.safetensors` and `field.json`."""
-        tensors = {"table": self.table, "grid": self.grid}
+        tensors = {"table": self.table, "grid.near": self.grids[0], "grid.far": self.grids[1]}
         tensors |= {"appearance.vectors": self.appearance.vectors, "appearance.residuals": self.appearance.residuals}
         tensors |= {f"network.{name}": value for name, value in self.parameters.items()}
         save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, str(folder / "field.safetensors"))
@@ -370,9 +372,8 @@ class RadianceField:
             tensors["appearance.residuals"],
         )
         parameters = {k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")}
-        return RadianceField(
-            Layout(**layout), appearance, tensors["table"], parameters, tensors["grid"], head["about"]
-        )
+        grids = tensors["grid.near"], tensors["grid.far"]
+        return RadianceField(Layout(**layout), appearance, tensors["table"], parameters, grids, head["about"])
 
 
 def untrained(layout: Layout, appearance: Appearance, seed: int, where: str) -> RadianceField:
@@ -382,8 +383,9 @@ def untrained(layout: Layout, appearance: Appearance, seed: int, where: str) -> 
     parameters = network.initial_parameters(
         layout.levels * hashgrid.FEATURES, layout.hidden, layout.appearance_dim, seed
     )
-    shape, _ = grid_shape(layout.space)
-    grid = torch.full(shape, layout.density_unit)
+    stop = stop_grids(layout.space)
+    near = torch.full(stop.near_shape, -math.expm1(-layout.density_unit * stop.near_cell), device=where)
+    far = torch.full(stop.far_shape, -math.expm1(-layout.density_unit * stop.far_cell), device=where)
     moved = Appearance(
         appearance.lightings,
         appearance.frames,
@@ -391,6 +393,5 @@ def untrained(layout: Layout, appearance: Appearance, seed: int, where: str) -> 
         appearance.vectors.to(where),
         appearance.residuals.to(where),
     )
-    return RadianceField(
-        layout, moved, table.to(where), {k: v.to(where) for k, v in parameters.items()}, grid.to(where)
-    )
+    on_device = {name: value.to(where) for name, value in parameters.items()}
+    return RadianceField(layout, moved, table.to(where), on_device, (near, far))

@@ -41,6 +41,7 @@ _NETWORK_RATE = 1e-2  # learning rate of the networks and embeddings at the star
 _FINAL_RATE = 0.03  # learning rates end at this share
 _EDGE = 10.0  # a contrast of 1/10 makes bending count e times less
 _MOST_BEND = 0.5  # beyond this it is an edge of depth, whatever the colours say
+_RISE, _FALL = 0.3, 0.1  # how fast a cell of the stop grids follows what is found in it
 _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 _WARM_UP = 20  # steps of rising learning rate
 _EXPLORE = 0.15  # share of the steps over which sampling narrows down
@@ -234,9 +235,10 @@ class Trainer:
         levels = self.config.levels
         if task >= levels:
             wp.launch(
-                sampler.update_grid,
+                sampler.update_grids,
                 self.rays * ws.samples,
-                [ws.w_positions, ws.w_densities, 0.5, 0.1, task - levels, 2, f.w_grid],
+                [ws.w_positions, ws.w_densities, f.stop.near_cell, f.stop.far_cell, _RISE, _FALL, task - levels, 2]
+                + [f.w_near_grid, f.w_far_grid],
                 device=self.where,
             )
             return

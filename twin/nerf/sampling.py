@@ -1,4 +1,4 @@
-"""The near box, the density grid and the levels: how a field of given bounds is laid out.
+"""The near box, the stop grids and the levels: how a field of given bounds is laid out.
 
 Vocabulary as in `kernels/space.py` and `kernels/sampler.py`.
 """
@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_GRID_CELLS = 4_000_000  # cells of the density grid: 16 MB, about what a laptop's cache holds
+_NEAR_CELLS = 3_000_000  # cells of the fine stop grid: 12 MB, as a laptop's cache holds
+_FAR_CELLS = 1_000_000  # cells of the coarse one
 COARSEST = 16
 """Cells of the coarsest level along the longest axis."""
 
@@ -51,12 +52,30 @@ def space_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: flo
     return Space(tuple(map(float, centre)), tuple(map(float, half)))  # type: ignore[arg-type]
 
 
-def grid_shape(space: Space) -> tuple[tuple[int, int, int], float]:
-    """Cells of the density grid per axis over the contracted cube, and the cell's side [m]: cubes in the near box."""
-    sides = 4.0 * np.array(space.half)
-    cell = float((sides.prod() / _GRID_CELLS) ** (1 / 3))
-    shape = np.maximum(np.ceil(sides / cell), 4).astype(int)
-    return (int(shape[0]), int(shape[1]), int(shape[2])), cell
+@dataclass(frozen=True)
+class StopGrids:
+    """Sizes of the two stop grids."""
+
+    near_shape: tuple[int, int, int]
+    far_shape: tuple[int, int, int]
+    near_cell: float
+    """Side of a cell [m]."""
+    far_cell: float
+    """Side of a cell, measured inside the near box [m]."""
+
+
+def stop_grids(space: Space) -> StopGrids:
+    """The fine grid covers the near box, the coarse one the contracted cube, twice as wide; cells are cubes there."""
+    box = 2.0 * np.array(space.half)
+
+    def divide(sides: NDArray[np.float64], cells: int) -> tuple[tuple[int, int, int], float]:
+        cell = float((sides.prod() / cells) ** (1 / 3))
+        x, y, z = (int(n) for n in np.maximum(np.ceil(sides / cell), 4))
+        return (x, y, z), cell
+
+    near_shape, near_cell = divide(box, _NEAR_CELLS)
+    far_shape, far_cell = divide(2.0 * box, _FAR_CELLS)
+    return StopGrids(near_shape, far_shape, near_cell, far_cell)
 
 
 def level_cells(space: Space, levels: int, growth: float) -> NDArray[np.float32]:

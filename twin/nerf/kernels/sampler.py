@@ -1,8 +1,9 @@
-"""Where along a ray the field is asked: inverse-CDF sampling from a grid of densities.
+"""Where along a ray the field is asked: inverse-CDF sampling from grids of what stops light.
 
-*Density grid*: what is known of the density [1/m], one value per cell of the contracted cube, coarse and always a
-little late. *Bin*: one step of the march through it. *Stratum*: the stretch between two of K + 1 equal quantiles of
-the bins' weights; each is sampled once and stands for its whole length.
+*Stop grid*: per cell the share of light that would not leave it, averaged over the samples that fell into it. (The mean
+of density itself would call a cell opaque that a thin post merely passes through.) A fine one covers the near box, a
+coarse one all of the contracted cube. *Bin*: one step of the march through them. *Stratum*: the stretch between two of
+K + 1 equal quantiles of the bins' weights; each is sampled once and stands for its whole length.
 """
 
 import warp as wp
@@ -11,6 +12,8 @@ from twin.nerf.kernels.space import grid_position, max_norm
 
 BINS = wp.constant(256)
 _FAR = wp.constant(100.0)  # unit positions beyond this are one with the horizon
+_MOST = wp.constant(0.99)  # no cell is believed to stop more
+_STEP = wp.constant(0.75)  # bin length [cells]
 _BEYOND = wp.constant(3)  # bins behind an opaque one
 _WIDENING = wp.constant(0.02)  # least bin length as a share of the distance
 
@@ -22,6 +25,29 @@ def grid_cell(g: wp.vec3f, nx: wp.int32, ny: wp.int32, nz: wp.int32) -> wp.vec3i
     )
 
 
+@wp.func
+def in_near_box(g: wp.vec3f) -> wp.vec3f:
+    """Grid position → position in the near box scaled to [0, 1), which it leaves outside the box."""
+    return 2.0 * g - wp.vec3f(0.5, 0.5, 0.5)
+
+
+@wp.func
+def is_near(n: wp.vec3f) -> wp.bool:
+    low = wp.min(wp.min(n[0], n[1]), n[2])
+    high = wp.max(wp.max(n[0], n[1]), n[2])
+    return low >= 0.0 and high < 1.0
+
+
+@wp.func
+def cell_length(g: wp.vec3f, near_cell: wp.float32, far_cell: wp.float32) -> wp.float32:
+    """Length [m] of the stop-grid cell at a grid position: outside the near box cells widen with the contraction."""
+    if is_near(in_near_box(g)):
+        return near_cell
+    c = 4.0 * max_norm(g - wp.vec3f(0.5, 0.5, 0.5))
+    m = 1.0 / wp.max(2.0 - c, 1.0e-3)
+    return far_cell * wp.max(1.0, m * m)
+
+
 @wp.kernel(enable_backward=False)
 def sample_rays(
     origins: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
@@ -29,8 +55,10 @@ def sample_rays(
     targets: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
     centre: wp.vec3f,
     inverse_half: wp.vec3f,
-    grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
-    cell: wp.float32,
+    near_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
+    far_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
+    near_cell: wp.float32,
+    far_cell: wp.float32,
     near: wp.float32,
     floor: wp.float32,
     target_mass: wp.float32,
@@ -44,8 +72,8 @@ def sample_rays(
 
     Args:
         targets: Distance at which something is known to be [m], 0 = unknown; gets `target_mass` of extra weight.
-        grid: Densities [1/m] over the contracted cube.
-        cell: Side of a grid cell inside the near box [m].
+        near_grid, far_grid: Stop grids over the near box and the contracted cube.
+        near_cell, far_cell: Side of their cells inside the near box [m].
         near: Where rays begin [m].
         floor: Weight spread evenly over all bins, beside at most 1 of the surfaces.
         seed: Of the jitter within strata; negative takes their middles.
@@ -66,10 +94,20 @@ def sample_rays(
         m = max_norm(wp.cw_mul(o + d * t - centre, inverse_half))
         if m > _FAR:
             break
-        step = wp.max(cell * wp.max(0.75, m * m), _WIDENING * t)
-        u = wp.cw_mul(o + d * (t + 0.5 * step) - centre, inverse_half)
-        c = grid_cell(grid_position(u), grid.shape[0], grid.shape[1], grid.shape[2])
-        through = wp.exp(-grid[c[0], c[1], c[2]] * step)
+        length = near_cell
+        if m > 1.0:
+            length = far_cell * m * m
+        step = wp.max(_STEP * length, _WIDENING * t)
+        g = grid_position(wp.cw_mul(o + d * (t + 0.5 * step) - centre, inverse_half))
+        stop = float(0.0)
+        b = in_near_box(g)
+        if is_near(b):
+            c = grid_cell(b, near_grid.shape[0], near_grid.shape[1], near_grid.shape[2])
+            stop = near_grid[c[0], c[1], c[2]]
+        else:
+            c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
+            stop = far_grid[c[0], c[1], c[2]]
+        through = wp.exp(wp.log(1.0 - stop) * step / length)
         weights[n] = transmittance * (1.0 - through)
         transmittance *= through
         t += step
@@ -127,25 +165,34 @@ def sample_rays(
 
 
 @wp.kernel(enable_backward=False)
-def update_grid(
+def update_grids(
     positions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
     densities: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    near_cell: wp.float32,
+    far_cell: wp.float32,
     rise: wp.float32,
     fall: wp.float32,
     part: wp.int32,
     parts: wp.int32,
-    grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
+    near_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
+    far_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
 ):
-    """Moves the cells that were sampled towards the density found there, faster up (`rise`) than down (`fall`).
+    """Moves the cells that were sampled towards what was found there, faster up (`rise`) than down (`fall`).
 
     Launched once per `part` of the cells, so that parts may run side by side and each cell sees its samples in order.
     """
     i = wp.tid()
-    c = grid_cell(positions[i], grid.shape[0], grid.shape[1], grid.shape[2])
-    if (c[0] + c[1]) % parts == part:
-        old = grid[c[0], c[1], c[2]]
-        change = densities[i] - old
-        if change > 0.0:
-            grid[c[0], c[1], c[2]] = old + rise * change
-        else:
-            grid[c[0], c[1], c[2]] = old + fall * change
+    g = positions[i]
+    b = in_near_box(g)
+    if is_near(b):
+        c = grid_cell(b, near_grid.shape[0], near_grid.shape[1], near_grid.shape[2])
+        if (c[0] + c[1]) % parts == part:
+            stop = wp.min(1.0 - wp.exp(-densities[i] * near_cell), _MOST)
+            old = near_grid[c[0], c[1], c[2]]
+            near_grid[c[0], c[1], c[2]] = old + wp.where(stop > old, rise, fall) * (stop - old)
+    else:
+        c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
+        if (c[0] + c[1]) % parts == part:
+            stop = wp.min(1.0 - wp.exp(-densities[i] * cell_length(g, near_cell, far_cell)), _MOST)
+            old = far_grid[c[0], c[1], c[2]]
+            far_grid[c[0], c[1], c[2]] = old + wp.where(stop > old, rise, fall) * (stop - old)
