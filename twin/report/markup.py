@@ -117,10 +117,11 @@ th, td { text-align:left; padding:5px 10px 5px 0; border-bottom:1px solid var(--
 th { color:var(--muted); font-weight:500 }
 .n { text-align:right; font-variant-numeric:tabular-nums; white-space:nowrap }
 .bar { display:block; margin-top:.5em; height:9px; border-radius:3px; background:var(--c1); min-width:2px }
-#costs > .scroll td:nth-child(3) { width:45%; min-width:90px }
+#costs > .scroll td { overflow-wrap:normal } #costs > .scroll td:nth-child(3) { width:45%; min-width:40px }
 details { margin:8px 0 0 } summary { cursor:pointer; color:var(--link); font-size:.92rem }
 code { font:.88em ui-monospace, monospace } footer { color:var(--muted); font-size:.88rem }
 @media (max-width:520px) { main { padding:12px 8px 40px } section, header.top { padding:14px 12px; border-radius:10px }
-  dl { grid-template-columns:1fr 1fr; gap:8px } dl div { padding:8px 9px } }
+  dl { grid-template-columns:1fr 1fr; gap:8px } dl div { padding:8px 9px }
+  #costs > .scroll td:nth-child(3) { width:15% } }
 @media print { nav, video { display:none } section { break-inside:avoid } }
 """
