@@ -60,7 +60,7 @@ def parallel(work: Callable[[int], T], items: Iterable[int], where: str) -> list
     return list(_pool.map(work, items))
 
 
-class single_threaded_torch:  # noqa: N801  (reads as a statement)
+class single_threaded_torch:
     """Within it, torch uses one thread per op; the setting is restored after."""
 
     def __enter__(self) -> None:
@@ -77,6 +77,6 @@ def load_kernels(where: str) -> None:
         wp.load_module(f"twin.nerf.kernels.{module}", device=where)
 
 
-def view(tensor: torch.Tensor, dtype: Any) -> wp.array:
+def view(tensor: torch.Tensor, dtype: Any) -> Any:
     """A Warp array over a tensor's memory."""
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False)

@@ -1,4 +1,4 @@
-"""What a field is trained on: pixels of the training frames, and rays on which structure from motion knows the distance.
+"""What a field is trained on: pixels of the training frames, and rays whose length is known.
 
 A *sighting* is something at a known place that a training frame must see: a pixel (not rounded) and the distance along
 its ray. Sparse points are sighted where they were matched; the ground under the filmed path is sighted ahead of every
@@ -148,7 +148,9 @@ class TrainingPixels:
         parts = [self._triples(rng, shards * triples), self._pixels(self._random(rng, shards * singles))]
         each = [len(part) for part in np.array_split(np.arange(sightings), max(1, len(kinds)))]
         parts += [self._sightings(rng, pool, shards * n) for pool, n in zip(kinds, each, strict=False)]
-        columns = [np.concatenate([c.reshape(shards, -1, *c.shape[1:]) for c in cs], 1) for cs in zip(*parts, strict=True)]
+        columns = [
+            np.concatenate([c.reshape(shards, -1, *c.shape[1:]) for c in cs], 1) for cs in zip(*parts, strict=True)
+        ]
         frame, pixel, colour, distance = (c.reshape(-1, *c.shape[2:]) for c in columns)
         return RayBatch(frame.astype(np.int32), pixel.astype(np.float32), colour, distance)
 
@@ -169,7 +171,7 @@ class TrainingPixels:
         middle = self._random(rng, n)
         frame = np.searchsorted(self.start, middle, side="right") - 1
         row, column = np.divmod(middle - self.start[frame], self.width[frame])
-        reach = rng.uniform(1.0, _TRIPLE_REACH * self.width[frame])
+        reach = rng.uniform(1.0, np.maximum(2.0, _TRIPLE_REACH * self.width[frame]))
         angle = rng.uniform(0.0, np.pi, n)
         dx, dy = np.rint(reach * np.cos(angle)).astype(int), np.rint(reach * np.sin(angle)).astype(int)
         w, h = self.width[frame], self.height[frame]

@@ -114,9 +114,9 @@ class CameraArrays:
 
     def __init__(self, camera_to_world: NDArray, intrinsics: NDArray, where: str):
         pose = np.asarray(camera_to_world, np.float64)
-        self.rotation = wp.array(pose[:, :3, :3].astype(np.float32), dtype=wp.mat33f, device=where)
-        self.position = wp.array(pose[:, :3, 3].astype(np.float32), dtype=wp.vec3f, device=where)
-        self.intrinsics = wp.array(np.asarray(intrinsics, np.float32), dtype=wp.vec4f, device=where)
+        self.rotation: Any = wp.array(pose[:, :3, :3].astype(np.float32), dtype=wp.mat33f, device=where)
+        self.position: Any = wp.array(pose[:, :3, 3].astype(np.float32), dtype=wp.vec3f, device=where)
+        self.intrinsics: Any = wp.array(np.asarray(intrinsics, np.float32), dtype=wp.vec4f, device=where)
 
 
 class RadianceField:
@@ -147,8 +147,8 @@ class RadianceField:
         self.w_table = view(table, hashgrid.Feature)
         self.w_near_grid, self.w_far_grid = (view(grid, wp.float32) for grid in grids)
         cells = level_cells(layout.space, layout.levels, layout.growth)
-        self.w_cells = wp.array(cells, dtype=wp.vec3f, device=self.where)
-        self.w_shapes = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.where)
+        self.w_cells: Any = wp.array(cells, dtype=wp.vec3f, device=self.where)
+        self.w_shapes: Any = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.where)
         self.mask = wp.uint32(2**layout.log2_table - 1)
         self.centre = wp.vec3f(*layout.centre)
         self.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
@@ -193,9 +193,11 @@ class RadianceField:
         wp.launch(
             sampler.sample_rays,
             count,
-            [ws.w_origins, ws.w_directions, ws.w_targets, self.centre, self.inverse_half, self.w_near_grid]
-            + [self.w_far_grid, self.stop.near_cell, self.stop.far_cell]
-            + [self.layout.near_plane, floor, target_mass, seed, start],
+            [
+                *(ws.w_origins, ws.w_directions, ws.w_targets, self.centre, self.inverse_half),
+                *(self.w_near_grid, self.w_far_grid, self.stop.near_cell, self.stop.far_cell),
+                *(self.layout.near_plane, floor, target_mass, seed, start),
+            ],
             [ws.w_edges, ws.w_distances, ws.w_ray_positions],
             device=self.where,
         )

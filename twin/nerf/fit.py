@@ -42,6 +42,7 @@ _FINAL_RATE = 0.03  # learning rates end at this share
 _EDGE = 10.0  # a contrast of 1/10 makes bending count e times less
 _MOST_BEND = 0.5  # beyond this it is an edge of depth, whatever the colours say
 _RISE, _FALL = 0.3, 0.1  # how fast a cell of the stop grids follows what is found in it
+_LOG_OFFSET = 0.05  # of the distortion's logarithmic distance [share of the near box's longest half side]
 _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 _WARM_UP = 20  # steps of rising learning rate
 _EXPLORE = 0.15  # share of the steps over which sampling narrows down
@@ -107,7 +108,10 @@ class Trainer:
         self.first, self.second = torch.zeros_like(f.table), torch.zeros_like(f.table)
         feature = hashgrid.Feature
         self.w_table_grad = wp.from_torch(self.table_grad, dtype=feature)
-        self.w_first, self.w_second = wp.from_torch(self.first, dtype=feature), wp.from_torch(self.second, dtype=feature)
+        self.w_first, self.w_second = (
+            wp.from_torch(self.first, dtype=feature),
+            wp.from_torch(self.second, dtype=feature),
+        )
         self.steps_done = 0
 
     def _growth(self, space: Space) -> float:
@@ -190,9 +194,12 @@ class Trainer:
             wp.launch(
                 volume.composite_backward,
                 count,
-                [ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_weights, ws.w_targets, ws.w_composited_grad]
-                + [ws.w_inverse_grad, f.layout.density_unit, w.distortion / self.rays, w.depth / self.rays]
-                + [w.depth_reach, 0.05 * f.layout.space.scale, start],
+                [
+                    *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_weights, ws.w_targets),
+                    *(ws.w_composited_grad, ws.w_inverse_grad, f.layout.density_unit),
+                    *(w.distortion / self.rays, w.depth / self.rays, w.depth_reach),
+                    *(_LOG_OFFSET * f.layout.space.scale, start),
+                ],
                 [ws.w_ray_outputs_grad],
                 device=self.where,
             )
@@ -225,7 +232,9 @@ class Trainer:
         f, ws = self.field, self.ws
         f.query(ws, start, _FREE_POINTS)
         rows = slice(start, start + _FREE_POINTS)
-        depth = torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit * f.layout.space.scale
+        depth = (
+            torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit * f.layout.space.scale
+        )
         ws.outputs_grad[rows, 0] = self.weights.free / (_SHARDS * _FREE_POINTS) * depth / (1.0 + depth)
         return self._trunk_backward(rows)
 
@@ -237,8 +246,10 @@ class Trainer:
             wp.launch(
                 sampler.update_grids,
                 self.rays * ws.samples,
-                [ws.w_positions, ws.w_densities, f.stop.near_cell, f.stop.far_cell, _RISE, _FALL, task - levels, 2]
-                + [f.w_near_grid, f.w_far_grid],
+                [
+                    *(ws.w_positions, ws.w_densities, f.stop.near_cell, f.stop.far_cell),
+                    *(_RISE, _FALL, task - levels, 2, f.w_near_grid, f.w_far_grid),
+                ],
                 device=self.where,
             )
             return
@@ -252,8 +263,10 @@ class Trainer:
         wp.launch(
             hashgrid.adam_step,
             (1, f.table.shape[1]),
-            [task, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t), f.w_table]
-            + [self.w_table_grad, self.w_first, self.w_second],
+            [
+                *(task, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)),
+                *(f.w_table, self.w_table_grad, self.w_first, self.w_second),
+            ],
             device=self.where,
         )
 
@@ -263,7 +276,9 @@ class Trainer:
             return None
         pick = self.free[self.rng.integers(len(self.free), size=n)]
         offset = self.rng.normal(size=(n, 3))
-        offset *= (self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3)) / np.linalg.norm(offset, axis=1)[:, None]
+        offset *= (self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3)) / np.linalg.norm(offset, axis=1)[
+            :, None
+        ]
         x = pick[:, 0] + (pick[:, 1] - pick[:, 0]) * self.rng.random((n, 1)) + offset
         layout = self.field.layout
         u = (x - np.array(layout.centre)) / np.array(layout.half)  # camera positions lie in the near box
@@ -348,8 +363,9 @@ def fit(
 def constant_height(metric: dict[str, Any]) -> float:
     """The camera's height above the ground [m], if the metric stage found it to be known and constant; else 0."""
     height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
-    known = height and (metric.get("road_reliable") or metric.get("scale_source") == "camera_height")
-    return float(height) if known and (spread is None or spread < _HEIGHT_SPREAD * height) else 0.0
+    if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
+        return 0.0
+    return 0.0 if spread is not None and spread > _HEIGHT_SPREAD * height else float(height)
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:

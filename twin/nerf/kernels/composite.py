@@ -5,6 +5,9 @@ features in the others. Weight wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)) (Max 1995
 slot 0 and Σwᵢ·featureᵢ in the others.
 """
 
+# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# mypy: ignore-errors
+# ruff: noqa: UP018
 import warp as wp
 
 CHANNELS = 16
@@ -26,10 +29,10 @@ def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
 
 @wp.kernel(enable_backward=False)
 def densities_of(
-    outputs: wp.array(dtype=Channels),  # type: ignore[valid-type]
+    outputs: wp.array(dtype=Channels),
     unit: wp.float32,
     start: wp.int32,
-    densities: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    densities: wp.array(dtype=wp.float32),
 ):
     """Densities [1/m] of samples."""
     i = start + wp.tid()
@@ -38,17 +41,17 @@ def densities_of(
 
 @wp.kernel(enable_backward=False)
 def composite(
-    outputs: wp.array2d(dtype=Channels),  # type: ignore[valid-type]
-    edges: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    distances: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    outputs: wp.array2d(dtype=Channels),
+    edges: wp.array2d(dtype=wp.float32),
+    distances: wp.array2d(dtype=wp.float32),
     unit: wp.float32,
     start: wp.int32,
-    weights: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    composited: wp.array(dtype=Channels),  # type: ignore[valid-type]
-    inverse_distance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    median_distance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    weights: wp.array2d(dtype=wp.float32),
+    composited: wp.array(dtype=Channels),
+    inverse_distance: wp.array(dtype=wp.float32),
+    median_distance: wp.array(dtype=wp.float32),
 ):
-    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and the distance at which half the light is stopped [m] (−1: nowhere)."""
+    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and where half the light is stopped [m] (−1: nowhere)."""
     i = start + wp.tid()
     transmittance = float(1.0)
     total = Channels()
@@ -74,20 +77,20 @@ def composite(
 
 @wp.kernel(enable_backward=False)
 def composite_backward(
-    outputs: wp.array2d(dtype=Channels),  # type: ignore[valid-type]
-    edges: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    distances: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    weights: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    targets: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    composited_grad: wp.array(dtype=Channels),  # type: ignore[valid-type]
-    inverse_distance_grad: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    outputs: wp.array2d(dtype=Channels),
+    edges: wp.array2d(dtype=wp.float32),
+    distances: wp.array2d(dtype=wp.float32),
+    weights: wp.array2d(dtype=wp.float32),
+    targets: wp.array(dtype=wp.float32),
+    composited_grad: wp.array(dtype=Channels),
+    inverse_distance_grad: wp.array(dtype=wp.float32),
     unit: wp.float32,
     distortion: wp.float32,
     depth: wp.float32,
     depth_reach: wp.float32,
     log_offset: wp.float32,
     start: wp.int32,
-    outputs_grad: wp.array2d(dtype=Channels),  # type: ignore[valid-type]
+    outputs_grad: wp.array2d(dtype=Channels),
 ):
     """Gradient of the network outputs, given that of the composited output and of Σwᵢ/tᵢ.
 

@@ -6,6 +6,8 @@ coarse to fine; a level small enough is stored densely, the others are hashed. *
 by one thread in a fixed order: the result does not depend on how many threads there are.
 """
 
+# Warp reads annotations as values.
+# mypy: ignore-errors
 import warp as wp
 
 FEATURES = 4
@@ -27,13 +29,13 @@ def vertex_index(x: wp.int32, y: wp.int32, z: wp.int32, shape: wp.vec4i, mask: w
 
 @wp.kernel(enable_backward=False)
 def encode(
-    positions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    table: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
-    cells: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    shapes: wp.array(dtype=wp.vec4i),  # type: ignore[valid-type]
+    positions: wp.array(dtype=wp.vec3f),
+    table: wp.array2d(dtype=Feature),
+    cells: wp.array(dtype=wp.vec3f),
+    shapes: wp.array(dtype=wp.vec4i),
     mask: wp.uint32,
     start: wp.int32,
-    features: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
+    features: wp.array2d(dtype=Feature),
 ):
     """Trilinear features of grid positions [start, start + dim), shape (n, levels).
 
@@ -69,13 +71,13 @@ def encode(
 
 @wp.kernel(enable_backward=False)
 def encode_backward(
-    positions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    cells: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    shapes: wp.array(dtype=wp.vec4i),  # type: ignore[valid-type]
+    positions: wp.array(dtype=wp.vec3f),
+    cells: wp.array(dtype=wp.vec3f),
+    shapes: wp.array(dtype=wp.vec4i),
     mask: wp.uint32,
     first_level: wp.int32,
-    features_grad: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
-    table_grad: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
+    features_grad: wp.array2d(dtype=Feature),
+    table_grad: wp.array2d(dtype=Feature),
 ):
     """Adds the gradient of `encode` to `table_grad`; launched over (levels, n) from `first_level` on."""
     k, i = wp.tid()
@@ -110,10 +112,10 @@ def adam_step(
     first_level: wp.int32,
     rate: wp.float32,
     second_correction: wp.float32,
-    table: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
-    table_grad: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
-    first: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
-    second: wp.array2d(dtype=Feature),  # type: ignore[valid-type]
+    table: wp.array2d(dtype=Feature),
+    table_grad: wp.array2d(dtype=Feature),
+    first: wp.array2d(dtype=Feature),
+    second: wp.array2d(dtype=Feature),
 ):
     """Adam (Kingma and Ba 2015) on the rows that got a gradient, which is then cleared; launched over (levels, rows).
 

@@ -6,6 +6,9 @@ coarse one all of the contracted cube. *Bin*: one step of the march through them
 K + 1 equal quantiles of the bins' weights; each is sampled once and stands for its whole length.
 """
 
+# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# mypy: ignore-errors
+# ruff: noqa: UP018, RUF046
 import warp as wp
 
 from twin.nerf.kernels.space import grid_position, max_norm
@@ -20,9 +23,7 @@ _WIDENING = wp.constant(0.02)  # least bin length as a share of the distance
 
 @wp.func
 def grid_cell(g: wp.vec3f, nx: wp.int32, ny: wp.int32, nz: wp.int32) -> wp.vec3i:
-    return wp.vec3i(
-        wp.int32(g[0] * wp.float32(nx)), wp.int32(g[1] * wp.float32(ny)), wp.int32(g[2] * wp.float32(nz))
-    )
+    return wp.vec3i(wp.int32(g[0] * wp.float32(nx)), wp.int32(g[1] * wp.float32(ny)), wp.int32(g[2] * wp.float32(nz)))
 
 
 @wp.func
@@ -50,13 +51,13 @@ def cell_length(g: wp.vec3f, near_cell: wp.float32, far_cell: wp.float32) -> wp.
 
 @wp.kernel(enable_backward=False)
 def sample_rays(
-    origins: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    directions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    targets: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    targets: wp.array(dtype=wp.float32),
     centre: wp.vec3f,
     inverse_half: wp.vec3f,
-    near_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
-    far_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
+    near_grid: wp.array3d(dtype=wp.float32),
+    far_grid: wp.array3d(dtype=wp.float32),
     near_cell: wp.float32,
     far_cell: wp.float32,
     near: wp.float32,
@@ -64,9 +65,9 @@ def sample_rays(
     target_mass: wp.float32,
     seed: wp.int32,
     start: wp.int32,
-    edges: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    distances: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    positions: wp.array2d(dtype=wp.vec3f),  # type: ignore[valid-type]
+    edges: wp.array2d(dtype=wp.float32),
+    distances: wp.array2d(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.vec3f),
 ):
     """K samples per ray: stratum edges (n, K + 1) [m], sampled distances (n, K) [m] and grid positions (n, K).
 
@@ -107,7 +108,7 @@ def sample_rays(
         else:
             c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
             stop = far_grid[c[0], c[1], c[2]]
-        through = wp.exp(wp.log(1.0 - stop) * step / length)
+        through = 1.0 - stop * wp.min(1.0, step / length)
         weights[n] = transmittance * (1.0 - through)
         transmittance *= through
         t += step
@@ -166,16 +167,16 @@ def sample_rays(
 
 @wp.kernel(enable_backward=False)
 def update_grids(
-    positions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    densities: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    positions: wp.array(dtype=wp.vec3f),
+    densities: wp.array(dtype=wp.float32),
     near_cell: wp.float32,
     far_cell: wp.float32,
     rise: wp.float32,
     fall: wp.float32,
     part: wp.int32,
     parts: wp.int32,
-    near_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
-    far_grid: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
+    near_grid: wp.array3d(dtype=wp.float32),
+    far_grid: wp.array3d(dtype=wp.float32),
 ):
     """Moves the cells that were sampled towards what was found there, faster up (`rise`) than down (`fall`).
 

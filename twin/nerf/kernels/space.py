@@ -1,11 +1,13 @@
 """Unbounded space in a box: contraction, and the rays of pinhole cameras.
 
-*Near box*: an axis-aligned box [m] that is mapped without distortion. *Unit position* u: metres from its centre over its
-half extent, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, and outside
-(2 − 1/|u|)·u/|u| in the maximum norm (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so that all of
-space lies in (−2, 2)³. *Grid position*: the contracted position scaled to [0, 1]³.
+*Near box*: an axis-aligned box [m] that is mapped without distortion. *Unit position* u: metres from its centre over
+its half extent, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, and outside
+(2 − 1/|u|)·u/|u| in the maximum norm (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so that all
+of space lies in (−2, 2)³. *Grid position*: the contracted position scaled to [0, 1]³.
 """
 
+# Warp reads annotations as values.
+# mypy: ignore-errors
 import warp as wp
 
 _TOP = wp.constant(1.0 - 1.0e-6)
@@ -29,11 +31,11 @@ def grid_position(u: wp.vec3f) -> wp.vec3f:
 
 @wp.kernel(enable_backward=False)
 def contract_points(
-    points: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
+    points: wp.array(dtype=wp.vec3f),
     centre: wp.vec3f,
     inverse_half: wp.vec3f,
     start: wp.int32,
-    positions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
+    positions: wp.array(dtype=wp.vec3f),
 ):
     """Grid positions of points [m]."""
     i = start + wp.tid()
@@ -42,15 +44,15 @@ def contract_points(
 
 @wp.kernel(enable_backward=False)
 def pixel_rays(
-    camera: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    pixel: wp.array(dtype=wp.vec2f),  # type: ignore[valid-type]
-    rotation: wp.array(dtype=wp.mat33f),  # type: ignore[valid-type]
-    position: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    intrinsics: wp.array(dtype=wp.vec4f),  # type: ignore[valid-type]
+    camera: wp.array(dtype=wp.int32),
+    pixel: wp.array(dtype=wp.vec2f),
+    rotation: wp.array(dtype=wp.mat33f),
+    position: wp.array(dtype=wp.vec3f),
+    intrinsics: wp.array(dtype=wp.vec4f),
     start: wp.int32,
-    origins: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    directions: wp.array(dtype=wp.vec3f),  # type: ignore[valid-type]
-    cosines: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    cosines: wp.array(dtype=wp.float32),
 ):
     """Rays through pixels (u, v) [px]: origin [m], unit direction, and cosine to the optical axis.
 

@@ -1,0 +1,238 @@
+"""Training: what a batch holds, that it learns, that it repeats itself, that held-out scores are honest."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from twin.config import NerfConfig, SceneConfig, SourceConfig
+from twin.errors import InputError
+from twin.geometry.cameras import Cameras, project
+from twin.geometry.images import write_image
+from twin.geometry.points import SparsePoints
+from twin.geometry.poses import look_at
+from twin.nerf import compute
+from twin.nerf.compute import single_threaded_torch
+from twin.nerf.dataset import TrainingPixels, load_frame
+from twin.nerf.evaluate import evaluate, fit_embedding_to_image
+from twin.nerf.field import RadianceField
+from twin.nerf.fit import Trainer, bending, constant_height, fit, free_segments, run
+from twin.progress import set_quiet
+from twin.scene import SceneDir, write_json
+
+WIDTH, HEIGHT = 32, 24
+K = np.array([24.0, 24.0, 16.0, 12.0])
+CONFIG = NerfConfig(steps=6, rays=128, samples=8, levels=3, log2_table=10, max_width=WIDTH)
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch):
+    monkeypatch.setenv("TWIN_DEVICE", "cpu")
+    set_quiet(True)
+    yield
+    set_quiet(False)
+
+
+def ground_picture(pose: np.ndarray, brightness: float) -> np.ndarray:
+    """A chequered floor at z = 0 under a blue sky."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    ray = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1) @ pose[:3, :3].T
+    down = ray[..., 2] < -1e-3
+    t = np.where(down, -pose[2, 3] / np.where(down, ray[..., 2], -1.0), 0.0)
+    x = pose[:3, 3] + t[..., None] * ray
+    checks = (np.floor(x[..., 0]) + np.floor(x[..., 1])) % 2
+    floor = np.stack([0.3 + 0.4 * checks, 0.5 - 0.2 * checks, np.full_like(checks, 0.3)], -1)
+    return np.where(down[..., None], floor, [0.4, 0.6, 0.9]) * brightness
+
+
+def make_cameras(folder: Path, n: int = 8) -> Cameras:
+    """A drive along x at 1.5 m, once by day and once by night."""
+    names, poses = [], []
+    for source, brightness in (("day", 1.0), ("night", 0.4)):
+        for k in range(n):
+            pose = look_at(np.array([0.5 * k, 0.0, 1.5]), np.array([0.5 * k + 4.0, 0.3, 0.0]))
+            write_image(folder / "images" / source / f"{k:06d}.png", ground_picture(pose, brightness))
+            names.append(f"{source}/{k:06d}")
+            poses.append(pose)
+    lightings = tuple(name.split("/")[0] for name in names)
+    held_out = np.arange(2 * n) % n == n // 2
+    times = np.tile(np.arange(n, dtype=float), 2)
+    sizes = np.tile([WIDTH, HEIGHT], (2 * n, 1))
+    return Cameras(
+        tuple(names), np.array(poses), np.tile(K, (2 * n, 1)), sizes, lightings, lightings, times, held_out,
+        folder / "images",
+    )  # fmt: skip
+
+
+def floor_points(cameras: Cameras, m: int = 200) -> SparsePoints:
+    """Points on the floor, each seen by every frame in whose picture it falls."""
+    rng = np.random.default_rng(1)
+    xyz = np.stack([rng.uniform(0.0, 9.0, m), rng.uniform(-3.0, 3.0, m), np.zeros(m)], -1)
+    point, frame = [], []
+    for i in range(len(cameras)):
+        pixel, depth = project(xyz, cameras.camera_to_world[i], K)
+        seen = np.flatnonzero((depth > 0) & (pixel > 0).all(1) & (pixel < [WIDTH, HEIGHT]).all(1))
+        point.append(seen)
+        frame.append(np.full(len(seen), i))
+    none = np.zeros((m, 3), np.uint8)
+    return SparsePoints(xyz, none, np.full(m, 0.5), np.concatenate(point), np.concatenate(frame))
+
+
+@pytest.fixture
+def cameras(tmp_path) -> Cameras:
+    return make_cameras(tmp_path)
+
+
+def test_held_out_frames_are_not_among_the_training_pixels(cameras):
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    assert set(pixels.cameras.names) == {n for n, h in zip(cameras.names, cameras.held_out, strict=True) if not h}
+    assert len(pixels.colours) == (~cameras.held_out).sum() * WIDTH * HEIGHT
+
+
+def test_nothing_to_train_on_is_an_input_error(cameras):
+    with pytest.raises(InputError, match="held out"):
+        TrainingPixels(replace(cameras, held_out=np.ones(len(cameras), bool)), SparsePoints.empty(), WIDTH)
+
+
+def test_masked_pixels_are_never_drawn(cameras, tmp_path):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :20] = 0
+    for name in cameras.names:
+        write_image(tmp_path / "masks" / f"{name}.png", mask)
+    masked = replace(cameras, masks=tmp_path / "masks")
+    pixels = TrainingPixels(masked, floor_points(cameras), WIDTH, camera_height=1.5)
+    batch = pixels.batch(np.random.default_rng(0), 2, 20, 100, 40)
+    assert batch.pixel[:, 0].min() > 20.0
+    write_image(tmp_path / "none.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    for name in cameras.names:
+        write_image(tmp_path / "masks" / f"{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(InputError, match="masked"):
+        TrainingPixels(masked, SparsePoints.empty(), WIDTH)
+
+
+def test_a_batch_holds_what_the_pictures_show(cameras):
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    batch = pixels.batch(np.random.default_rng(0), 4, 3, 16, 0)
+    assert len(batch.frame) == 4 * (3 * 3 + 16)
+    for f, (u, v), colour in zip(batch.frame, batch.pixel, batch.colour, strict=True):
+        image, _, _ = load_frame(pixels.cameras, int(f), WIDTH)
+        np.testing.assert_allclose(colour, image[int(v), int(u)] / 255.0, atol=1e-6)
+    triples = batch.pixel.reshape(4, 25, 2)[:, :9].reshape(-1, 3, 2)
+    np.testing.assert_allclose(triples[:, 0] + triples[:, 2], 2.0 * triples[:, 1], atol=1e-5)
+
+
+def test_sightings_lie_on_the_floor(cameras):
+    pixels = TrainingPixels(cameras, floor_points(cameras), WIDTH, camera_height=1.5)
+    for pool in (pixels.points, pixels.path):
+        assert len(pool.frame) > 50
+        pose = pixels.cameras.camera_to_world[pool.frame]
+        ray = np.stack([*((pool.pixel - K[2:]) / K[:2]).T, np.ones(len(pool.frame))], -1)
+        ray = np.einsum("nij,nj->ni", pose[:, :3, :3], ray / np.linalg.norm(ray, axis=1, keepdims=True))
+        height = pose[:, 2, 3] + ray[:, 2] * pool.distance
+        np.testing.assert_allclose(height, 0.0, atol=1e-4)
+
+
+def test_a_plane_does_not_bend_and_an_edge_in_colour_may():
+    pixel = np.random.default_rng(0).uniform(0.0, 1.0, (10, 2))
+    step = np.random.default_rng(1).uniform(-0.1, 0.1, (10, 2))
+    line = np.stack([pixel - step, pixel, pixel + step], 1)
+    inverse = torch.from_numpy((0.3 * line[..., 0] + 0.7 * line[..., 1] + 0.2).ravel()).float()
+    grey = torch.full((30, 3), 0.5)
+    assert bending(inverse, grey) < 1e-6
+    bent = inverse.clone()
+    bent[1::3] += 0.05
+    striped = grey.clone()
+    striped[1::3] = 1.0
+    assert bending(bent, striped) < 0.01 * bending(bent, grey)
+
+
+def test_free_space_follows_the_path_but_not_jumps(cameras):
+    segments = free_segments(cameras, 0.3)
+    assert len(segments) == 16 + 14
+    jumped = cameras.camera_to_world.copy()
+    jumped[4:8, 0, 3] += 100.0
+    segments = free_segments(replace(cameras, camera_to_world=jumped), 0.3)
+    assert len(segments) == 16 + 13 and np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).max() < 1.0
+    assert len(free_segments(cameras, 0.0)) == 0
+
+
+def test_camera_height_counts_only_where_known_and_constant():
+    metric = {"camera_height_median_m": 1.2, "local_height_spread_m": 0.01, "road_reliable": True}
+    assert constant_height(metric) == 1.2
+    assert constant_height(metric | {"local_height_spread_m": 0.5}) == 0.0
+    assert constant_height(metric | {"road_reliable": False, "scale_source": "gps"}) == 0.0
+    assert constant_height({}) == 0.0
+
+
+def trained(cameras: Cameras, config: NerfConfig) -> RadianceField:
+    trainer = Trainer(cameras, floor_points(cameras), config, seed=5, where="cpu", camera_height=1.5)
+    with single_threaded_torch():
+        while not trainer.done:
+            trainer.step()
+    return trainer.finish()
+
+
+def test_two_runs_are_equal_bit_by_bit_on_any_number_of_cores(cameras, monkeypatch):
+    first = trained(cameras, CONFIG)
+    monkeypatch.setattr(compute, "cores", lambda: 1)
+    second = trained(cameras, CONFIG)
+    assert torch.equal(first.table, second.table)
+    assert all(torch.equal(a, b) for a, b in zip(first.grids, second.grids, strict=True))
+    assert all(torch.equal(first.parameters[name], second.parameters[name]) for name in first.parameters)
+    assert torch.equal(first.appearance.residuals, second.appearance.residuals)
+    assert first.table.abs().max() > 0.011  # it did move
+
+
+def test_another_seed_is_another_field(cameras):
+    a = Trainer(cameras, SparsePoints.empty(), CONFIG, 1, "cpu")
+    b = Trainer(cameras, SparsePoints.empty(), CONFIG, 2, "cpu")
+    assert not torch.equal(a.field.table, b.field.table)
+
+
+def test_it_learns_the_floor_and_both_lightings(cameras):
+    config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
+    field, metrics = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    metrics |= evaluate(field, cameras, WIDTH)
+    assert metrics["n"] == {"day": 1, "night": 1}
+    assert metrics["train_psnr"] > 17.0
+    for name in ("day", "night"):
+        assert metrics["psnr"][name] > 17.0
+        assert metrics["psnr"][name] > metrics["psnr_wrong_lighting"][name] + 3.0
+    i = int(np.flatnonzero(cameras.held_out)[0])
+    result = field.render(cameras.camera_to_world[i : i + 1], K[None], (WIDTH, HEIGHT), "day")
+    lower = slice(HEIGHT // 2, None)
+    v, u = np.mgrid[:HEIGHT, :WIDTH][:, lower] + 0.5
+    ray = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1)
+    floor_depth = -1.5 / (ray @ cameras.camera_to_world[i, :3, :3].T)[..., 2]
+    assert np.median(np.abs(result.depth[0, lower] / floor_depth - 1.0)) < 0.1
+
+    picture = ground_picture(cameras.camera_to_world[i], 0.7)
+    fitted = fit_embedding_to_image(field, picture, cameras.camera_to_world[i], K, "day")
+    seen = field.render(cameras.camera_to_world[i : i + 1], K[None], (WIDTH, HEIGHT), fitted).rgb[0]
+    assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
+
+
+def test_the_stage_writes_a_field_that_loads(cameras, tmp_path):
+    scene = SceneDir(tmp_path / "scene")
+    scene.stage("metric").mkdir(parents=True)
+    cameras.save(scene.stage("metric"))
+    floor_points(cameras).save(scene.stage("metric"))
+    write_json(scene.stage("metric") / "metric.json", {"camera_height_median_m": 1.5, "road_reliable": True})
+    out = tmp_path / "out"
+    out.mkdir()
+    config = SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=CONFIG)
+    metrics = run(scene, config, out)
+    assert metrics["steps"] == 6 and metrics["parameters"] > 0 and metrics["sightings_path"] > 0
+    assert sorted(p.name for p in out.iterdir()) == ["field.json", "field.safetensors"]
+    assert RadianceField.load(out).lightings == ("day", "night")
+
+
+@pytest.mark.parametrize(("value", "message"), [("tpu", "cpu or cuda"), ("cuda", "no CUDA device")])
+def test_a_device_that_is_not_there_is_an_input_error(monkeypatch, value, message):
+    if value == "cuda" and torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    monkeypatch.setenv("TWIN_DEVICE", value)
+    with pytest.raises(InputError, match=message):
+        compute.device()
