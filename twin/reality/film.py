@@ -4,6 +4,7 @@ A *film* is a list of frames at a fixed rate under one lighting; its poses are t
 lateral wander and shake, so that no two films share a viewpoint.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -163,16 +164,21 @@ def shoot(lighting: str, place: Place, plan: Plan, path: Path) -> tuple[Array, A
     gains = exposures(lighting, times)
     rng = np.random.default_rng([SEED, 13, sum(map(ord, lighting))])
     render = Renderer(lighting, place, plan)
+    steps = track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame")
+    encode((develop(rng, render(pose)[0], LIGHTINGS[lighting], float(gain)) for pose, gain in steps), plan, path)
+    return times, poses
+
+
+def encode(frames: Iterable[NDArray[np.uint8]], plan: Plan, path: Path) -> None:
+    """Writes RGB frames (h, w, 3) as H.264; the same frames give the same file."""
+    # x264's fast paths depend on the processor and even on memory alignment; these settings make its file repeat.
+    options = {"crf": str(plan.crf), "preset": "slower", "threads": "1", "x264-params": "cpu-independent=1"}
     with av.open(str(path), "w") as container:
-        # x264's fast paths depend on the processor and even on memory alignment; these settings make its file repeat.
-        options = {"crf": str(plan.crf), "preset": "slower", "threads": "1", "x264-params": "cpu-independent=1"}
         stream = container.add_stream("libx264", rate=plan.fps, options=options)
         stream.width, stream.height, stream.pix_fmt = plan.width, plan.height, "yuv420p"
-        for pose, gain in track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame"):
-            frame = develop(rng, render(pose)[0], LIGHTINGS[lighting], float(gain))
+        for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
-    return times, poses
 
 
 def depths(lighting: str, place: Place, plan: Plan, poses: Array) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
