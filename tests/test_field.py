@@ -36,6 +36,7 @@ def random_samples(field: RadianceField, rays: int, samples: int, seed: int = 0)
     edges = np.sort(rng.uniform(0.5, 20.0, (rays, samples + 1)), 1)
     ws.edges.copy_(torch.from_numpy(edges))
     ws.distances.copy_(torch.from_numpy(edges[:, :-1] + rng.random((rays, samples)) * np.diff(edges)))
+    ws.lengths.copy_(torch.from_numpy(np.diff(edges, axis=1) * rng.uniform(0.1, 1.0, (rays, samples))))
     ws.positions.copy_(torch.from_numpy(rng.random((rays * samples, 3))))
     ws.outputs.copy_(torch.from_numpy(rng.normal(0.0, 1.5, (rays * samples, volume.CHANNELS))))
     return ws
@@ -96,7 +97,7 @@ def test_encoding_equals_the_slow_one_and_so_does_its_gradient(field):
 def slow_composite(raw: torch.Tensor, ws: Workspace, unit: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Weights (n, K), composited output (n, CHANNELS) and Σw/t (n,), differentiable."""
     sigma = unit * torch.exp(raw[..., 0])
-    optical = sigma * (ws.edges[:, 1:] - ws.edges[:, :-1]).double()
+    optical = sigma * ws.lengths.double()
     before = torch.cumsum(optical, 1) - optical
     w = torch.exp(-before) * (1 - torch.exp(-optical))
     out = (w[..., None] * raw).sum(1)
@@ -135,8 +136,8 @@ def test_compositing_and_its_gradient_equal_the_slow_ones(field):
         volume.composite_backward,
         rays,
         [
-            *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_weights, ws.w_targets, ws.w_composited_grad),
-            *(ws.w_inverse_grad, unit, distortion, depth, reach, offset, 0),
+            *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_weights, ws.w_targets),
+            *(ws.w_composited_grad, ws.w_inverse_grad, unit, distortion, depth, reach, offset, 0),
         ],
         [ws.w_ray_outputs_grad],
         device="cpu",

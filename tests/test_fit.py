@@ -206,7 +206,7 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
     v, u = np.mgrid[:HEIGHT, :WIDTH][:, lower] + 0.5
     ray = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1)
     floor_depth = -1.5 / (ray @ cameras.camera_to_world[i, :3, :3].T)[..., 2]
-    assert np.median(np.abs(result.depth[0, lower] / floor_depth - 1.0)) < 0.1
+    assert np.median(np.abs(result.depth[0, lower] / floor_depth - 1.0)) < 0.2
 
     picture = ground_picture(cameras.camera_to_world[i], 0.7)
     fitted = fit_embedding_to_image(field, picture, cameras.camera_to_world[i], K, "day")

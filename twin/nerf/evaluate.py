@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import psnr, ssim
+from twin.nerf import network
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import load_frame
 from twin.nerf.field import CameraArrays, RadianceField
@@ -22,7 +23,7 @@ _FIT_STEPS = 40
 _FIT_RAYS = 4000  # of a half picture, spread evenly
 _FIT_RATE = 0.05
 _FIT_PRIOR = 1e-3  # pull towards the lighting's embedding, as residuals are in training
-_MAX_FRAMES = 24  # held-out frames scored per lighting, spread evenly
+_MAX_FRAMES = 8  # held-out frames scored per lighting, spread evenly
 
 
 def fit_embedding(
@@ -47,7 +48,7 @@ def fit_embedding(
     for step in range(steps):
         for group in optimiser.param_groups:
             group["lr"] = _FIT_RATE * (1.0 - step / steps)
-        rgb = field.colour(features, harmonics, embedding)
+        rgb = network.head(field.parameters, features, harmonics, embedding)
         loss = ((rgb - colours) ** 2).mean() + _FIT_PRIOR * ((embedding - origin) ** 2).mean()
         (embedding.grad,) = torch.autograd.grad(loss, [embedding])
         optimiser.step()
@@ -97,9 +98,7 @@ def score_frame(field: RadianceField, cameras: Cameras, i: int, max_width: int) 
     start = field.embedding(cameras.lightings[i])
 
     def picture(embedding: NDArray[np.float32]) -> NDArray[np.float32]:
-        with torch.no_grad():
-            vector = torch.as_tensor(embedding, device=field.where)
-            return field.colour(features, harmonics, vector).cpu().numpy().reshape(height, width, 3)
+        return field.colour(features, harmonics, embedding).reshape(height, width, 3)
 
     left = np.zeros((height, width), bool)
     left[:, : width // 2] = True

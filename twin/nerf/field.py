@@ -29,9 +29,10 @@ from twin.scene import read_json, write_json
 _FORMAT = 1
 _RENDER_RAYS = 4096  # per batch
 _RENDER_SAMPLES = 24
+_HEAD_RAYS = 8192  # per batch of the head
 _RENDER_FLOOR = 0.02  # weight of unlikely places when rendering
 _QUERY_POINTS = 65536  # per batch of density queries
-_START_DENSITY = 2.0  # optical depth of the untrained field across the near box's longest half side
+_START_DENSITY = 1.5  # optical depth of the untrained field across the near box's longest half side
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Layout:
 
     @property
     def density_unit(self) -> float:
-        """Density at raw output 0 [1/m]."""
+        """Density at raw output 0, per contracted metre."""
         return _START_DENSITY / self.space.scale
 
 
@@ -77,6 +78,7 @@ class Workspace:
         self.edges, self.distances = new(rays, samples + 1), new(rays, samples)
         self.positions, self.features = new(rows, 3), new(rows, width)
         self.hidden, self.outputs = new(rows, layout.hidden), new(rows, channels)
+        self.lengths = new(rays, samples)
         self.weights, self.composited = new(rays, samples), new(rays, channels)
         self.inverse_distance, self.median_distance = new(rays), new(rays)
 
@@ -86,6 +88,7 @@ class Workspace:
         self.w_targets, self.w_cosines = view(self.targets, wp.float32), view(self.cosines, wp.float32)
         self.w_origins, self.w_directions = view(self.origins, wp.vec3f), view(self.directions, wp.vec3f)
         self.w_edges, self.w_distances = view(self.edges, wp.float32), view(self.distances, wp.float32)
+        self.w_lengths = view(self.lengths, wp.float32)
         self.w_positions = view(self.positions, wp.vec3f)
         self.w_ray_positions = view(self.positions[:on_rays].view(rays, samples, 3), wp.vec3f)
         self.w_features = view(self.features.view(rows, layout.levels, hashgrid.FEATURES), hashgrid.Feature)
@@ -198,7 +201,7 @@ class RadianceField:
                 *(self.w_near_grid, self.w_far_grid, self.stop.near_cell, self.stop.far_cell),
                 *(self.layout.near_plane, floor, target_mass, seed, start),
             ],
-            [ws.w_edges, ws.w_distances, ws.w_ray_positions],
+            [ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_ray_positions],
             device=self.where,
         )
 
@@ -219,7 +222,7 @@ class RadianceField:
         wp.launch(
             volume.composite,
             count,
-            [ws.w_ray_outputs, ws.w_edges, ws.w_distances, self.layout.density_unit, start],
+            [ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, self.layout.density_unit, start],
             [ws.w_weights, ws.w_composited, ws.w_inverse, ws.w_median],
             device=self.where,
         )
@@ -232,6 +235,7 @@ class RadianceField:
         result = np.empty(len(points), np.float32)
         batch = _QUERY_POINTS
 
+        @torch.no_grad()
         def one(start: int) -> None:
             ws = self._borrow(0, 1, batch)
             n = min(batch, len(points) - start)
@@ -246,9 +250,11 @@ class RadianceField:
             self.query(ws, 0, n)
             raw = ws.outputs[:n, 0].clamp(max=volume.RAW_LIMIT)
             result[start : start + n] = (torch.exp(raw) * self.layout.density_unit).cpu().numpy()
+            u = np.abs((points[start : start + n] - self.layout.centre) / self.layout.half).max(1)
+            result[start : start + n] /= np.maximum(u, 1.0) ** 2
             self._spare.append(ws)
 
-        with single_threaded_torch(), torch.no_grad():
+        with single_threaded_torch():
             parallel(one, range(0, len(points), batch), self.where)
         return result
 
@@ -265,6 +271,7 @@ class RadianceField:
         harmonics = torch.empty(n, 16, device=self.where)
         depth, opacity = torch.empty(n, device=self.where), torch.empty(n, device=self.where)
 
+        @torch.no_grad()
         def one(start: int) -> None:
             ws = self._borrow(batch, samples, 0)
             stop = min(start + batch, n)
@@ -283,13 +290,24 @@ class RadianceField:
             opacity[rows] = ws.composited[:k, 0]
             self._spare.append(ws)
 
-        with single_threaded_torch(), torch.no_grad():
+        with single_threaded_torch():
             parallel(one, range(0, n, batch), self.where)
         return features, harmonics, depth, opacity
 
-    def colour(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: torch.Tensor) -> torch.Tensor:
-        """Colour of traced rays under embeddings (n, dim) or (dim,), shape (n, 3)."""
-        return network.head(self.parameters, features, harmonics, embedding)
+    def colour(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: NDArray) -> NDArray[np.float32]:
+        """Colour of traced rays under one embedding (dim,), shape (n, 3)."""
+        n, batch = len(features), _HEAD_RAYS
+        rgb = torch.empty(n, 3, device=self.where)
+        vector = torch.as_tensor(np.asarray(embedding, np.float32), device=self.where)
+
+        @torch.no_grad()
+        def one(start: int) -> None:
+            rows = slice(start, start + batch)
+            rgb[rows] = network.head(self.parameters, features[rows], harmonics[rows], vector)
+
+        with single_threaded_torch():
+            parallel(one, range(0, n, batch), self.where)
+        return rgb.cpu().numpy()
 
     def render(
         self, camera_to_world: NDArray, intrinsics: NDArray, size: tuple[int, int], lighting: str | NDArray
@@ -312,10 +330,8 @@ class RadianceField:
         v, u = np.mgrid[:height, :width] + 0.5
         pixel = np.tile(np.stack([u.ravel(), v.ravel()], -1), (n, 1))
         features, harmonics, depth, opacity = self.trace(cameras, np.repeat(np.arange(n), width * height), pixel)
-        with torch.no_grad():
-            rgb = self.colour(features, harmonics, torch.as_tensor(vector, device=self.where))
         return Rendering(
-            rgb.cpu().numpy().reshape(n, height, width, 3),
+            self.colour(features, harmonics, vector).reshape(n, height, width, 3),
             depth.cpu().numpy().reshape(n, height, width),
             opacity.cpu().numpy().reshape(n, height, width),
         )

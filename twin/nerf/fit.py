@@ -43,6 +43,7 @@ _EDGE = 10.0  # a contrast of 1/10 makes bending count e times less
 _MOST_BEND = 0.5  # beyond this it is an edge of depth, whatever the colours say
 _RISE, _FALL = 0.3, 0.1  # how fast a cell of the stop grids follows what is found in it
 _LOG_OFFSET = 0.05  # of the distortion's logarithmic distance [share of the near box's longest half side]
+_HORIZON = 0.03  # rays this near to level are neither above nor below the horizon [sine]
 _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 _WARM_UP = 20  # steps of rising learning rate
 _EXPLORE = 0.15  # share of the steps over which sampling narrows down
@@ -57,6 +58,8 @@ class Weights:
     depth_reach: float = 0.5
     plane: float = 0.01
     free: float = 1e-3
+    sky: float = 1e-2
+    ground: float = 1e-2
     residual: float = 1e-3
 
 
@@ -182,6 +185,7 @@ class Trainer:
         # The shards' losses add up to a mean over the batch.
         loss = torch.nn.functional.smooth_l1_loss(rgb, colour[rays], beta=0.1) / _SHARDS
         loss = loss + w.residual * (residuals[frame] ** 2).mean() / _SHARDS
+        loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2], w.sky, w.ground) / _SHARDS
         inverse_depth = (ws.inverse_distance[rays] / ws.cosines[rays]).requires_grad_(True)
         if triples and w.plane > 0.0:
             loss = loss + w.plane / _SHARDS * bending(inverse_depth[: 3 * triples], colour[rays][: 3 * triples])
@@ -195,7 +199,7 @@ class Trainer:
                 volume.composite_backward,
                 count,
                 [
-                    *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_weights, ws.w_targets),
+                    *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_weights, ws.w_targets),
                     *(ws.w_composited_grad, ws.w_inverse_grad, f.layout.density_unit),
                     *(w.distortion / self.rays, w.depth / self.rays, w.depth_reach),
                     *(_LOG_OFFSET * f.layout.space.scale, start),
@@ -306,6 +310,19 @@ def bending(inverse_depth: torch.Tensor, colour: torch.Tensor) -> torch.Tensor:
     contrast = (c[:, 0] - c[:, 1]).abs().sum(-1) + (c[:, 2] - c[:, 1]).abs().sum(-1)
     bend = (d[:, 0] + d[:, 2] - 2.0 * d[:, 1]).abs() / (d.detach().mean(1) + 1e-3)
     return (torch.exp(-_EDGE * contrast) * bend.clamp(max=_MOST_BEND)).mean()
+
+
+def horizon_loss(opacity: torch.Tensor, up: torch.Tensor, sky: float, ground: float) -> torch.Tensor:
+    """Above the horizon what may be open is open (a plain sky fits at any distance); below it something is solid.
+
+    Args:
+        opacity: Of rays, shape (n,).
+        up: Vertical component of their unit directions, shape (n,).
+        sky: Cost of an opaque ray above the horizon.
+        ground: Cost of an open ray below it.
+    """
+    above, below = (up > _HORIZON).float(), (up < -_HORIZON).float()
+    return (sky * above * opacity + ground * below * (1.0 - opacity)).mean()
 
 
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:

@@ -1,8 +1,8 @@
 """Volume rendering of features along rays, with its hand-written backward pass and the per-sample regularisers.
 
-Per ray there are K strata between K + 1 edges [m]. Each sample's network output holds the raw density in slot 0 and
-features in the others. Weight wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)) (Max 1995). The composited output holds the *opacity* Σwᵢ in
-slot 0 and Σwᵢ·featureᵢ in the others.
+Per ray there are K strata between K + 1 edges [m], of contracted lengths δ [m]. Each sample's network output holds the
+raw density in slot 0 and features in the others. Weight wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)) (Max 1995). The composited output
+holds the *opacity* Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the others.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
@@ -23,7 +23,7 @@ _RAW_LIMIT = wp.constant(RAW_LIMIT)
 
 @wp.func
 def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
-    """Density [1/m] of the network's raw output; `unit` is the density at 0."""
+    """Density per contracted metre of the network's raw output; `unit` is the density at 0."""
     return unit * wp.exp(wp.min(raw, _RAW_LIMIT))
 
 
@@ -34,7 +34,7 @@ def densities_of(
     start: wp.int32,
     densities: wp.array(dtype=wp.float32),
 ):
-    """Densities [1/m] of samples."""
+    """Densities of samples, per contracted metre."""
     i = start + wp.tid()
     densities[i] = density_of(outputs[i][0], unit)
 
@@ -44,6 +44,7 @@ def composite(
     outputs: wp.array2d(dtype=Channels),
     edges: wp.array2d(dtype=wp.float32),
     distances: wp.array2d(dtype=wp.float32),
+    lengths: wp.array2d(dtype=wp.float32),
     unit: wp.float32,
     start: wp.int32,
     weights: wp.array2d(dtype=wp.float32),
@@ -60,14 +61,15 @@ def composite(
     for k in range(distances.shape[1]):
         out = outputs[i, k]
         sigma = density_of(out[0], unit)
-        delta = edges[i, k + 1] - edges[i, k]
-        through = wp.exp(-sigma * delta)
+        optical = sigma * lengths[i, k]
+        through = wp.exp(-optical)
         w = transmittance * (1.0 - through)
         weights[i, k] = w
         total += out * w
         inverse += w / distances[i, k]
         if median < 0.0 and transmittance * through < 0.5:
-            median = edges[i, k] + wp.log(transmittance / 0.5) / sigma
+            share = wp.log(transmittance / 0.5) / optical
+            median = edges[i, k] + share * (edges[i, k + 1] - edges[i, k])
         transmittance *= through
     total[0] = 1.0 - transmittance
     composited[i] = total
@@ -80,6 +82,7 @@ def composite_backward(
     outputs: wp.array2d(dtype=Channels),
     edges: wp.array2d(dtype=wp.float32),
     distances: wp.array2d(dtype=wp.float32),
+    lengths: wp.array2d(dtype=wp.float32),
     weights: wp.array2d(dtype=wp.float32),
     targets: wp.array(dtype=wp.float32),
     composited_grad: wp.array(dtype=Channels),
@@ -139,7 +142,7 @@ def composite_backward(
         slope = gw * (left - w) - behind
         behind += gw * w
         if out[0] < _RAW_LIMIT:
-            grad[0] = slope * sigma * (edges[i, k + 1] - edges[i, k])
+            grad[0] = slope * sigma * lengths[i, k]
         else:
             grad[0] = 0.0
         outputs_grad[i, k] = grad

@@ -11,13 +11,18 @@ K + 1 equal quantiles of the bins' weights; each is sampled once and stands for 
 # ruff: noqa: UP018, RUF046
 import warp as wp
 
-from twin.nerf.kernels.space import grid_position, max_norm
+from twin.nerf.kernels.space import grid_position, max_norm, widening
 
 BINS = wp.constant(256)
 _FAR = wp.constant(100.0)  # unit positions beyond this are one with the horizon
 _MOST = wp.constant(0.99)  # no cell is believed to stop more
 _STEP = wp.constant(0.75)  # bin length [cells]
-_BEYOND = wp.constant(3)  # bins behind an opaque one
+_BEYOND = wp.constant(2)  # bins behind an opaque one
+_OPAQUE = wp.constant(0.02)
+# A ray that grazes the ground runs for metres through cells that the ground passes through, before it meets the ground.
+# So a share of the weight is laid out as if cells stopped only a part of what they are said to stop.
+_SHARE = wp.constant(0.35)
+_DOUBT = wp.constant(0.25)
 _WIDENING = wp.constant(0.02)  # least bin length as a share of the distance
 
 
@@ -39,16 +44,6 @@ def is_near(n: wp.vec3f) -> wp.bool:
     return low >= 0.0 and high < 1.0
 
 
-@wp.func
-def cell_length(g: wp.vec3f, near_cell: wp.float32, far_cell: wp.float32) -> wp.float32:
-    """Length [m] of the stop-grid cell at a grid position: outside the near box cells widen with the contraction."""
-    if is_near(in_near_box(g)):
-        return near_cell
-    c = 4.0 * max_norm(g - wp.vec3f(0.5, 0.5, 0.5))
-    m = 1.0 / wp.max(2.0 - c, 1.0e-3)
-    return far_cell * wp.max(1.0, m * m)
-
-
 @wp.kernel(enable_backward=False)
 def sample_rays(
     origins: wp.array(dtype=wp.vec3f),
@@ -67,9 +62,11 @@ def sample_rays(
     start: wp.int32,
     edges: wp.array2d(dtype=wp.float32),
     distances: wp.array2d(dtype=wp.float32),
+    lengths: wp.array2d(dtype=wp.float32),
     positions: wp.array2d(dtype=wp.vec3f),
 ):
-    """K samples per ray: stratum edges (n, K + 1) [m], sampled distances (n, K) [m] and grid positions (n, K).
+    """K samples per ray: stratum edges (n, K + 1) [m], sampled distances (n, K) [m], contracted lengths of the strata
+    (n, K) [m], see `kernels/space.py`, and grid positions (n, K).
 
     Args:
         targets: Distance at which something is known to be [m], 0 = unknown; gets `target_mass` of extra weight.
@@ -88,16 +85,18 @@ def sample_rays(
 
     t = near
     transmittance = float(1.0)
+    reluctant = float(1.0)
     n = int(0)
     beyond = int(0)
     bounds[0] = t
     while n < BINS:
-        m = max_norm(wp.cw_mul(o + d * t - centre, inverse_half))
+        u = wp.cw_mul(o + d * t - centre, inverse_half)
+        m = max_norm(u)
         if m > _FAR:
             break
         length = near_cell
         if m > 1.0:
-            length = far_cell * m * m
+            length = far_cell * widening(u)
         step = wp.max(_STEP * length, _WIDENING * t)
         g = grid_position(wp.cw_mul(o + d * (t + 0.5 * step) - centre, inverse_half))
         stop = float(0.0)
@@ -108,14 +107,16 @@ def sample_rays(
         else:
             c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
             stop = far_grid[c[0], c[1], c[2]]
-        through = 1.0 - stop * wp.min(1.0, step / length)
-        weights[n] = transmittance * (1.0 - through)
-        transmittance *= through
+        stop *= wp.min(1.0, step / length)
+        doubt = _DOUBT * stop
+        weights[n] = (1.0 - _SHARE) * transmittance * stop + _SHARE * reluctant * doubt
+        transmittance *= 1.0 - stop
+        reluctant *= 1.0 - doubt
         t += step
         n += 1
         bounds[n] = t
         # The surface may lie a cell behind where the grid believes it; a target further back must be reached, too.
-        if transmittance < 1.0e-3 and t > target:
+        if reluctant < _OPAQUE and t > target:
             beyond += 1
             if beyond > _BEYOND:
                 break
@@ -123,20 +124,15 @@ def sample_rays(
     # Neighbours share weight: a surface need not lie in the bin whose cell first saw it.
     total = float(0.0)
     before = float(0.0)
-    before2 = float(0.0)
     uniform = floor / wp.float32(n)
     for b in range(n):
         here = weights[b]
         after = float(0.0)
-        after2 = float(0.0)
         if b + 1 < n:
             after = weights[b + 1]
-        if b + 2 < n:
-            after2 = weights[b + 2]
-        p = 0.4 * here + 0.2 * (before + after) + 0.1 * (before2 + after2) + uniform
+        p = 0.5 * here + 0.25 * (before + after) + uniform
         if target > bounds[b] and target <= bounds[b + 1]:
             p += target_mass
-        before2 = before
         before = here
         weights[b] = p
         total += p
@@ -156,13 +152,16 @@ def sample_rays(
             passed += weights[b]
             b += 1
         s = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((want - passed) / weights[b], 0.0, 1.0)
+        u = wp.cw_mul(o + d * s - centre, inverse_half)
         distances[i, k] = s
-        positions[i, k] = grid_position(wp.cw_mul(o + d * s - centre, inverse_half))
+        positions[i, k] = grid_position(u)
         want = wp.float32(k + 1) * share
         while b + 1 < n and passed + weights[b] < want:
             passed += weights[b]
             b += 1
-        edges[i, k + 1] = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((want - passed) / weights[b], 0.0, 1.0)
+        edge = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((want - passed) / weights[b], 0.0, 1.0)
+        edges[i, k + 1] = edge
+        lengths[i, k] = (edge - edges[i, k]) / widening(u)
 
 
 @wp.kernel(enable_backward=False)
@@ -194,6 +193,6 @@ def update_grids(
     else:
         c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
         if (c[0] + c[1]) % parts == part:
-            stop = wp.min(1.0 - wp.exp(-densities[i] * cell_length(g, near_cell, far_cell)), _MOST)
+            stop = wp.min(1.0 - wp.exp(-densities[i] * far_cell), _MOST)
             old = far_grid[c[0], c[1], c[2]]
             far_grid[c[0], c[1], c[2]] = old + wp.where(stop > old, rise, fall) * (stop - old)

@@ -3,7 +3,9 @@
 *Near box*: an axis-aligned box [m] that is mapped without distortion. *Unit position* u: metres from its centre over
 its half extent, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, and outside
 (2 − 1/|u|)·u/|u| in the maximum norm (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so that all
-of space lies in (−2, 2)³. *Grid position*: the contracted position scaled to [0, 1]³.
+of space lies in (−2, 2)³. *Grid position*: the contracted position scaled to [0, 1]³. *Contracted metre*: a metre
+inside the near box, and what a metre shrinks to outside; the field's density is per contracted metre, so that the far
+field starts out no more opaque than the near one.
 """
 
 # Warp reads annotations as values.
@@ -16,6 +18,13 @@ _TOP = wp.constant(1.0 - 1.0e-6)
 @wp.func
 def max_norm(u: wp.vec3f) -> wp.float32:
     return wp.max(wp.max(wp.abs(u[0]), wp.abs(u[1])), wp.abs(u[2]))
+
+
+@wp.func
+def widening(u: wp.vec3f) -> wp.float32:
+    """Metres per contracted metre along the way out: 1 in the near box, |u|² outside."""
+    m = max_norm(u)
+    return wp.max(1.0, m * m)
 
 
 @wp.func
