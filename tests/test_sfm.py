@@ -231,7 +231,9 @@ def test_unknown_mapper_is_refused(street: Street, tmp_path: Path) -> None:
         _run(street, tmp_path / "out", mapper="magic")
 
 
-@pytest.mark.parametrize(("signal", "cure"), [("ABRT", "film slower"), ("KILL", "too little memory")])
+@pytest.mark.parametrize(
+    ("signal", "cure"), [("ABRT", "film slower"), ("KILL", "too little memory"), ("TERM", "stopped from outside")]
+)
 def test_a_dying_worker_is_an_error_with_a_cure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal: str, cure: str
 ) -> None:

@@ -24,6 +24,12 @@ from twin.errors import InputError
 
 _LOG = "colmap.log"
 _BAD_INPUT = 2
+_CURES = {
+    "SIGABRT": "film slower and with more texture in view, check the calibration, or set cameras.mapper = "
+    '"incremental"',
+    "SIGKILL": "too little memory: lower cameras.features or capture.max_frames",
+    "SIGTERM": "stopped from outside: build again",
+}
 _DISK_FULL = ("no space left on device", "disk is full", "sqlite_full")
 _MAPPING_STEPS = (
     "Rotation averaging done",
@@ -87,12 +93,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     if code < 0:
         name = signal.Signals(-code).name
-        cure = (
-            "too little memory: lower cameras.features or capture.max_frames"
-            if name == "SIGKILL"
-            else "film slower and with more texture in view, check the calibration, or set cameras.mapper = "
-            '"incremental"'
-        )
+        cure = _CURES.get(name, _CURES["SIGABRT"])
         last = next((part for part in reversed(tail.split(" | ")) if part.strip()), "no log")[-160:]
         raise InputError(f"structure from motion died ({name}; {last}); {cure}")
     raise RuntimeError(f"structure from motion failed with exit status {code}: {tail}")
