@@ -132,7 +132,7 @@ class MetricConfig:
 class NerfConfig:
     """The radiance field and its training."""
 
-    steps: int = 3000
+    steps: int = 900
     rays: int = 4096
     """Rays per step."""
     samples: int = 16
@@ -163,14 +163,14 @@ class MeshConfig:
     """Low-pass length of the height field [m, standard deviation]."""
     obstacle_height: float = 0.2
     """What stands this much above the ground is an obstacle [m]."""
-    max_height: float = 4.0
+    max_height: float = 2.5
     """Obstacles are cut off above this; nothing the robot can touch is higher [m]."""
-    max_parts: int = 400
+    max_parts: int = 1500
     """Convex parts at most."""
-    max_protrusion: float = 0.1
+    max_protrusion: float = 0.2
     """No convex part may stick out of its mesh by more than this [m]."""
-    margin: float = 20.0
-    """What is further than this from the route is not meshed for collision [m]."""
+    margin: float = 12.0
+    """What is further than this from the route is not meshed [m]."""
     views: int = 100
     """Filmed poses at most that surface and ground are rendered from."""
     view_width: int = 200

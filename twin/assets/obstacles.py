@@ -1,8 +1,9 @@
 """What stands on the ground, as closed pieces for the convex decomposition, and the corridor kept clear.
 
-The *solid* is where the distance field is negative: as deep behind a seen surface as the fusion's band, hollow beyond.
-What is near the ground is closed downwards to it, so that nothing hovers on the gap between the two. The *corridor* is
-the filmed route ± half width, up to `HEADROOM` above the ground: the camera passed there, so it holds nothing.
+The *solid* is where the distance field is negative, and what lies hidden behind that, up to `_DEPTH`: a film from a
+road shows fronts only, and a wall needs a thickness to be touched. What is near the ground is closed downwards to it, so
+that nothing hovers on the gap between. The *corridor* is the filmed route ± half width, up to `HEADROOM` above the
+ground: the camera passed there, so it holds nothing.
 """
 
 from dataclasses import dataclass
@@ -25,10 +26,12 @@ HEADROOM = 1.5  # [m] above the ground, that the corridor is clear to
 _FOOT = 0.1  # [m] nearer to the ground than this is ground
 _CLOSED_BELOW = 0.6  # [m] a gap to the ground up to this is closed
 _ROOT = 0.15  # [m] parts reach this far into the ground
-_TILE = 4.8  # [m] side of the columns big things are cut into
+_TILE = 3.0  # [m] side of the columns big things are cut into
 _SPECK = 8  # voxels; smaller things are noise
 _HOVERING_SPECK = 64  # voxels; so are these where they touch nothing below
-_SMOOTHING = 0.7  # voxels
+_DEPTH = 0.5  # [m] of hidden space behind a surface that counts as solid
+_GAP = 0.45  # [m] narrower gaps are closed
+_SMOOTHING = 1.0  # voxels
 _CLEAR = 0.02  # [m] parts stay this much further off than asked, for the rounding of later stages
 
 
@@ -57,12 +60,9 @@ def solid_pieces(
     floor = ground.at(xy)
     z = volume.origin[2] + voxel * np.arange(shape[2])
     above = (z[None, None] - floor[..., None]).astype(np.float32)
-    unseen = ~np.isfinite(volume.distance)
-    # Half a voxel of doubt: the unseen counts as free, so the solid is closed behind as well.
-    field = np.where(unseen, 0.5 * voxel, np.clip(volume.distance, -voxel, voxel)).astype(np.float32)
-    field = np.where(above < _FOOT, np.float32(0.5 * voxel), field)
+    field = _solid(volume)
+    field[above < _FOOT] = 0.5 * voxel
     _close_downwards(field, above, voxel)
-    field = gaussian_filter(field, _SMOOTHING, mode="nearest")
     field = np.maximum(field, above - config.max_height)
     field = np.maximum(field, -_ROOT - above)
     path = corridor.route[::2] if corridor else cameras.positions[:, :2]
@@ -95,12 +95,30 @@ def solid_pieces(
                 if block.sum() < _SPECK // 2:
                     continue
                 values = field[part][i : i + tile, j : j + tile]
-                piece = _closed(np.where(block, values, np.maximum(values, 0.3 * voxel)), voxel, volume, start + [i, j, 0])
+                piece = _closed(
+                    np.where(block, values, np.maximum(values, 0.3 * voxel)), voxel, volume, start + [i, j, 0]
+                )
                 if piece is not None:
                     middle = ((piece.vertices.min(0) + piece.vertices.max(0)) / 2)[:2]
                     pieces.append((float(np.linalg.norm(path - middle, axis=1).min()), piece))
     pieces.sort(key=lambda item: item[0])
     return [piece for _, piece in pieces], {"specks": specks, "low": low, "standing": count - specks - low}
+
+
+def _solid(volume: Volume) -> NDArray[np.float32]:
+    """Distance field [m] of the solid, clipped to a voxel; what is unknown beyond its depth counts as free.
+
+    Gaps narrower than `_GAP` are closed and the whole is smoothed: a fused surface is porous where foliage or noise is,
+    and every pore costs the decomposition more than it is worth to a robot that could not pass it.
+    """
+    voxel = volume.voxel
+    matter = np.nan_to_num(volume.distance, nan=np.inf) < 0
+    depth = distance_transform_edt(~matter) * voxel
+    matter |= volume.hidden & (depth < _DEPTH)
+    reach = _GAP / 2
+    outside = distance_transform_edt(~matter) * voxel
+    closed = distance_transform_edt(outside < reach) * voxel > reach
+    return (voxel * (0.5 - gaussian_filter((matter | closed).astype(np.float32), _SMOOTHING))).astype(np.float32)
 
 
 def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:

@@ -33,6 +33,8 @@ class Volume:
     """Signed distance [m] at origin + voxel · (i, j, k); NaN = no surface near, or unseen."""
 
     distance: NDArray[np.float32]
+    hidden: NDArray[np.bool_]
+    """Near a surface, and neither seen as matter nor looked through by any view: may be solid."""
     origin: Array
     voxel: float
     seen_through: int
@@ -66,6 +68,7 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
     distance = np.full(blocks * _BLOCK, np.nan, np.float32)
     inner = np.stack(np.meshgrid(*[np.arange(_BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3)
     voxels = (np.argwhere(active)[:, None] * _BLOCK + inner).reshape(-1, 3)
+    hidden = np.zeros(distance.shape, bool)
     outvoted = 0
     for start in range(0, len(voxels), _CHUNK):
         part = voxels[start : start + _CHUNK]
@@ -76,7 +79,8 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
         value = np.where(through | ((near == 0) & (free > 0)), np.fmax(value, 0.5 * voxel), value)
         value = np.where((near == 0) & (free > 0), _BAND * voxel, value)
         distance[tuple(part.T)] = value
-    return Volume(distance, np.asarray(box[0], float), voxel, outvoted)
+        hidden[tuple(part.T)] = (near == 0) & (free == 0)
+    return Volume(distance, hidden, np.asarray(box[0], float), voxel, outvoted)
 
 
 def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, NDArray[np.int64]]:
