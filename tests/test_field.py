@@ -323,3 +323,13 @@ def test_pixel_rays_are_the_cameras_own(field):
     np.testing.assert_allclose(ws.directions.numpy(), expected / np.linalg.norm(expected, axis=1)[:, None], atol=1e-6)
     np.testing.assert_allclose(ws.cosines.numpy(), 1.0 / np.linalg.norm(local, axis=1), rtol=1e-6)
     np.testing.assert_allclose(ws.origins.numpy(), np.repeat(pose[None, :3, 3], 2, 0), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_kernels_compile_for_a_data_centre_gpu_without_one(tmp_path):
+    import importlib
+
+    for name in ("space", "sampler", "hashgrid", "composite"):
+        module = importlib.import_module(f"twin.nerf.kernels.{name}")
+        wp.compile_aot_module(module, arch=90, module_dir=str(tmp_path))
+    assert len(list(tmp_path.glob("*.sm90.cubin"))) == 4

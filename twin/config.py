@@ -144,7 +144,7 @@ class NerfConfig:
     learning_rate: float = 3e-2
     appearance_dim: int = 32
     levels: int = 8
-    log2_table: int = 17
+    log2_table: int = 18
     near_half_extent: float = 0.0
     """Half side of the uncontracted near box [m]; 0 = from the cameras."""
     near_plane: float = 0.3

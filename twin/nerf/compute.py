@@ -75,6 +75,8 @@ def load_kernels(where: str) -> None:
     """Compiles or loads all kernels now: two threads that first need one would each compile it."""
     for module in ("space", "sampler", "hashgrid", "composite"):
         wp.load_module(f"twin.nerf.kernels.{module}", device=where)
+    if where == "cuda":  # torch and Warp hand arrays to each other without waiting, so they must share a stream
+        wp.set_stream(wp.stream_from_torch(torch.cuda.current_stream()), where)
 
 
 def view(tensor: torch.Tensor, dtype: Any) -> Any:

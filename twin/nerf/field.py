@@ -14,7 +14,8 @@ import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as to_bytes
 
 from twin.errors import InputError
 from twin.nerf import network
@@ -354,7 +355,8 @@ class RadianceField:
         tensors = {"table": self.table, "grid.near": self.grids[0], "grid.far": self.grids[1]}
         tensors |= {"appearance.vectors": self.appearance.vectors, "appearance.residuals": self.appearance.residuals}
         tensors |= {f"network.{name}": value for name, value in self.parameters.items()}
-        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, str(folder / "field.safetensors"))
+        stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+        (folder / "field.safetensors").write_bytes(to_bytes(stored))
         write_json(
             folder / "field.json",
             {

@@ -7,7 +7,8 @@ points around the filmed path, where a camera was and so nothing can be.
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -398,6 +399,12 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     field, metrics = fit(cameras, points, config.nerf, config.seed, height)
     metrics |= evaluate(field, cameras, config.nerf.max_width)
-    field.about = {"scene": config.name, "seed": config.seed, "metrics": metrics}
+    field.about = {
+        "scene": config.name,
+        "seed": config.seed,
+        "nerf": asdict(config.nerf),
+        "versions": {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")},
+        "metrics": metrics,
+    }
     field.save(out)
     return metrics

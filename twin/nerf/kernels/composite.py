@@ -7,7 +7,6 @@ holds the *opacity* Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the others.
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
 # mypy: ignore-errors
-# ruff: noqa: UP018
 import warp as wp
 
 CHANNELS = 16

@@ -8,7 +8,7 @@ K + 1 equal quantiles of the bins' weights; each is sampled once and stands for 
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
 # mypy: ignore-errors
-# ruff: noqa: UP018, RUF046
+# ruff: noqa: RUF046
 import warp as wp
 
 from twin.nerf.kernels.space import grid_position, max_norm, widening
