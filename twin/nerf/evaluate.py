@@ -23,7 +23,7 @@ _FIT_STEPS = 40
 _FIT_RAYS = 4000  # of a half picture, spread evenly
 _FIT_RATE = 0.05
 _FIT_PRIOR = 1e-3  # pull towards the lighting's embedding, as residuals are in training
-_MAX_FRAMES = 8  # held-out frames scored per lighting, spread evenly
+_MAX_FRAMES = 6  # held-out frames scored per lighting, spread evenly
 
 
 def fit_embedding(
