@@ -25,6 +25,7 @@ from twin.geometry.points import SparsePoints
 from twin.scene import SceneDir, read_json
 
 _MAX_THREADS = 16
+_MAX_POINT_ERROR = 20.0  # [px]
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
@@ -89,8 +90,13 @@ def _points(result: Any, frames: NDArray[np.int64], total: int) -> SparsePoints:
     row = np.full(total, -1)
     row[frames] = np.arange(len(frames))
     frame = row[result["frame"]]
-    seen = frame >= 0
-    return SparsePoints(result["xyz"], result["rgb"], result["error"], result["point"][seen], frame[seen])
+    # A point that the last adjustment threw behind a camera has an error beyond any pixel, and no place.
+    sane = np.isfinite(result["xyz"]).all(1) & (result["error"] < _MAX_POINT_ERROR)
+    seen = (frame >= 0) & sane[result["point"]]
+    number = np.cumsum(sane) - 1
+    return SparsePoints(
+        result["xyz"][sane], result["rgb"][sane], result["error"][sane], number[result["point"][seen]], frame[seen]
+    )
 
 
 def _refuse(capture: Capture, frames: NDArray[np.int64], settings: CamerasConfig) -> None:
