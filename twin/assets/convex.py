@@ -1,7 +1,8 @@
 """Closed meshes into convex parts that are checked against them.
 
-A *piece* is one closed mesh to decompose, a *part* a closed convex hull. A part's *protrusion* is how far a point of its
-surface lies outside its piece [m]; *uncovered* is the share of a piece's surface further than that bound from every part.
+A *piece* is one closed mesh to decompose, a *part* a closed convex hull. A part's *protrusion* is how far a point of
+its surface lies outside its piece [m]; *uncovered* is the share of a piece's surface further than that bound from every
+part.
 
 CoACD (Wei et al. 2022) has crashed, grown shapes, closed doorways and answered differently at the same seed. So it runs
 in child processes with one thread and a time limit, its answers are cached by what they were made from, every part is
@@ -183,7 +184,7 @@ def within_bound(part: Part, piece: Piece, bound: float, halvings: int = _MAX_HA
 def inside_hull(part: Part, points: Array, slack: float = 0.0) -> NDArray[np.bool_]:
     """Which points (k, 3) are in the part, or within about `slack` [m] of it."""
     normal, offset = half_spaces(part)
-    return (points @ normal.T <= offset + slack).all(1)
+    return np.all(points @ normal.T <= offset + slack, axis=1)
 
 
 def half_spaces(part: Part) -> tuple[Array, Array]:
@@ -205,7 +206,7 @@ def uncovered(piece: Piece, parts: list[Part], bound: float) -> float:
 
 
 def surface_samples(vertices: Array, faces: NDArray, spacing: float) -> Array:
-    """Points on every triangle about `spacing` apart, corners included; regular, so that the same mesh gives the same."""
+    """Points on every triangle about `spacing` apart, corners included; regular: the same mesh gives the same."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     level = np.clip(np.ceil(longest / spacing).astype(int), 1, 64)

@@ -1,10 +1,13 @@
 """Depth maps into a truncated signed distance field, and colours on to points: the loops over voxels × views.
 
-*Signed distance* [m] is positive in free space, negative behind a surface, and believed within ± `band` of it only. Each
-view votes at each voxel: `near` where its surface passes within the band, `free` where it looks further. A surface that
-few views make and many look through is a floater, and their votes outweigh it (Curless & Levoy 1996, eqs. 3 and 4, with
-free space counted in).
+*Signed distance* [m] is positive in free space, negative behind a surface, and believed within ± `band` of it only.
+Each view votes at each voxel: `near` where its surface passes within the band, `free` where it looks further. A surface
+that few views make and many look through is a floater, and their votes outweigh it (Curless & Levoy 1996, eqs. 3 and 4,
+with free space counted in).
 """
+
+# mypy: disable-error-code="index, attr-defined"
+# (inside kernels, Warp's own types hold, which mypy does not know)
 
 import numpy as np
 import warp as wp
@@ -28,17 +31,17 @@ def _look(point: wp.vec3, pose: wp.mat44, k: wp.vec4):
 
 @wp.kernel
 def _fuse(
-    points: wp.array(dtype=wp.vec3),
-    world_to_camera: wp.array(dtype=wp.mat44),
-    intrinsics: wp.array(dtype=wp.vec4),
-    depth: wp.array(dtype=wp.float32, ndim=3),
-    slant: wp.array(dtype=wp.float32, ndim=3),
+    points: wp.array[wp.vec3],
+    world_to_camera: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    depth: wp.array3d[wp.float32],
+    slant: wp.array3d[wp.float32],
     far: float,
     band: float,
     fade: float,
-    distance: wp.array(dtype=wp.float32),
-    near: wp.array(dtype=wp.float32),
-    free: wp.array(dtype=wp.float32),
+    distance: wp.array[wp.float32],
+    near: wp.array[wp.float32],
+    free: wp.array[wp.float32],
 ):
     i = wp.tid()
     point = points[i]
@@ -86,16 +89,16 @@ def _fuse(
 
 @wp.kernel
 def _colour(
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    eyes: wp.array(dtype=wp.vec3),
-    world_to_camera: wp.array(dtype=wp.mat44),
-    intrinsics: wp.array(dtype=wp.vec4),
-    depth: wp.array(dtype=wp.float32, ndim=3),
-    rgb: wp.array(dtype=wp.uint8, ndim=4),
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    eyes: wp.array[wp.vec3],
+    world_to_camera: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    depth: wp.array3d[wp.float32],
+    rgb: wp.array4d[wp.uint8],
     tolerance: float,
-    colours: wp.array(dtype=wp.vec3),
-    found: wp.array(dtype=wp.float32),
+    colours: wp.array[wp.vec3],
+    found: wp.array[wp.float32],
 ):
     i = wp.tid()
     point = points[i]
@@ -114,7 +117,9 @@ def _colour(
                     # Sharpest where nearest: the fourth power lets the few nearest views decide.
                     weight = 1.0 / (z * z * z * z)
                     pixel = wp.vec3(
-                        float(rgb[view, row, column, 0]), float(rgb[view, row, column, 1]), float(rgb[view, row, column, 2])
+                        float(rgb[view, row, column, 0]),
+                        float(rgb[view, row, column, 1]),
+                        float(rgb[view, row, column, 2]),
                     )
                     total += weight * pixel
                     weights += weight
@@ -124,12 +129,12 @@ def _colour(
 
 
 def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Votes of all views at points (k, 3): signed distance [m] (NaN where no surface passes), near and free votes, (k,)."""
+    """Votes of all views at points (k, 3), each (k,): signed distance [m] (NaN where no surface is), near and free."""
     device = "cpu"
     distance = wp.full(len(points), float("nan"), dtype=wp.float32, device=device)
     near = wp.zeros(len(points), dtype=wp.float32, device=device)
     free = wp.zeros(len(points), dtype=wp.float32, device=device)
-    slant = wp.array(views.slant, dtype=wp.float32, device=device)
+    slant: wp.array = wp.array(views.slant, dtype=wp.float32, device=device)
     inputs = [*_cameras(points, views, device), slant, far, band, _FADE]
     wp.launch(_fuse, len(points), inputs, [distance, near, free], device=device)
     return distance.numpy(), near.numpy(), free.numpy()
@@ -138,17 +143,17 @@ def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray,
 def colour(
     points: Array, normals: Array, views: Views, tolerance: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colours (k, 3) of surface points (k, 3) with normals (k, 3) from the nearest views, and whether any sees them (k,).
+    """Colours (k, 3) of surface points (k, 3) with normals (k, 3) from the nearest views, and whether any sees it (k,).
 
     A view sees a point that faces it and lies within `tolerance` [m] and 5 % of its depth.
     """
     device = "cpu"
     colours = wp.zeros(len(points), dtype=wp.vec3, device=device)
     found = wp.zeros(len(points), dtype=wp.float32, device=device)
-    rgb = wp.array(views.rgb, dtype=wp.uint8, device=device)
+    rgb: wp.array = wp.array(views.rgb, dtype=wp.uint8, device=device)
     where, *cameras = _cameras(points, views, device)
-    turned = wp.array(np.asarray(normals, np.float32), dtype=wp.vec3, device=device)
-    eyes = wp.array(views.camera_to_world[:, :3, 3].astype(np.float32), dtype=wp.vec3, device=device)
+    turned: wp.array = wp.array(np.asarray(normals, np.float32), dtype=wp.vec3, device=device)
+    eyes: wp.array = wp.array(views.camera_to_world[:, :3, 3].astype(np.float32), dtype=wp.vec3, device=device)
     inputs = [where, turned, eyes, *cameras, rgb, tolerance]
     wp.launch(_colour, len(points), inputs, [colours, found], device=device)
     return (colours.numpy() + 0.5).astype(np.uint8), found.numpy() > 0

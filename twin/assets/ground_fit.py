@@ -5,9 +5,9 @@ A *datum* is a measured height z ± σ at (x, y). Three kinds: `field` (rendered
 
     Σ ρ((h(xᵢ, yᵢ) − zᵢ) / σᵢ) + λ Σ |second differences of h|² + μ Σ |first differences of h|²,
 
-ρ = Geman-McClure by iterated reweighting: the second differences keep slopes and remove bumps, the first ones only decide
-how far a slope goes on where nothing was seen. Solved by sparse factorisation, reweighted on
-coarse nodes, then once on fine ones.
+ρ = Geman-McClure by iterated reweighting: the second differences keep slopes and remove bumps, the first ones only
+decide how far a slope goes on where nothing was seen. Solved by sparse factorisation, reweighted on coarse nodes, then
+once on fine ones.
 """
 
 from dataclasses import dataclass, replace
@@ -136,7 +136,7 @@ def _smoothness(grid: Grid) -> sparse.csr_array:
 
     def difference(n: int, order: int) -> sparse.csr_array:
         stencil = [-1.0, 1.0] if order == 1 else [1.0, -2.0, 1.0]
-        return sparse.diags_array(stencil, offsets=range(order + 1), shape=(n - order, n)).tocsr()  # type: ignore
+        return sparse.diags_array(stencil, offsets=range(order + 1), shape=(n - order, n)).tocsr()
 
     eye_r, eye_c = sparse.eye_array(rows), sparse.eye_array(columns)
     xx = sparse.kron(eye_r, difference(columns, 2))
@@ -195,7 +195,7 @@ def path_data(cameras: Cameras, ground_height: Array | None, camera_height: floa
 
     Args:
         cameras: Metric cameras.
-        ground_height: Height of the ground as seen by the other kinds below each camera, shape (n,) [m]; None = unknown.
+        ground_height: Height of the ground below each camera as the other kinds see it, shape (n,) [m]; None = unknown.
         camera_height: The height that set the scale [m]; 0 = each source's own median over `ground_height`.
 
     Returns:
@@ -216,7 +216,12 @@ def path_data(cameras: Cameras, ground_height: Array | None, camera_height: floa
             slow = 1.4826 * float(np.median(np.abs(drift - np.median(drift))))
         # The other kinds waver by some 3 cm themselves; only what is beyond that tells of a hand.
         sigma = float(np.sqrt(_SIGMA_PATH**2 + rapid**2 + max(0.0, slow**2 - 0.03**2)))
-        facts[cameras.sources[index[0]]] = {"camera_height_m": height, "rapid_m": rapid, "slow_m": slow, "sigma_m": sigma}
+        facts[cameras.sources[index[0]]] = {
+            "camera_height_m": height,
+            "rapid_m": rapid,
+            "slow_m": slow,
+            "sigma_m": sigma,
+        }
         if len(index) < 2:
             continue
         parts.append(_strip(np.column_stack([position[:, :2], z]), sigma))
@@ -266,7 +271,12 @@ def solve(data: Data, low: Array, high: Array, cell: float) -> tuple[Array, Grid
 
 
 def build_ground(
-    views: Views, cameras: Cameras, points: SparsePoints, box: tuple[Array, Array], config: MeshConfig, height: float | None
+    views: Views,
+    cameras: Cameras,
+    points: SparsePoints,
+    box: tuple[Array, Array],
+    config: MeshConfig,
+    height: float | None,
 ) -> tuple[Ground, dict[str, Any]]:
     """The low-passed height field over a box, and how it was found.
 
@@ -276,8 +286,8 @@ def build_ground(
         points: Sparse points in the same frame.
         box: Low and high corner (x, y) [m].
         config: Cell and low-pass length.
-        height: The camera's height above ground that set the scale [m], 0 = estimate it per source; None = the path says
-            nothing about the ground (an object filmed around).
+        height: The camera's height above ground that set the scale [m], 0 = estimate it per source; None = the path
+            says nothing about the ground (an object filmed around).
 
     Returns:
         The ground, and JSON-able facts.
@@ -297,7 +307,7 @@ def build_ground(
     if height is not None and sum(len(data.xyz) for data in seen) >= _FEW:
         below = coarse.sample(fit_height(Data.join(seen), coarse)[0], cameras.positions[:, :2])
         path, carried = path_data(cameras, below, height)
-        # Each kind errs in height as a whole (blurred depth, a tilted scale); beside the path they must not leave a step.
+        # Each kind errs in height as a whole (blurred depth, a tilted scale); beside the path that must leave no step.
         bias = [bias_to_path(data, path) for data in seen]
         seen = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(seen, bias, strict=True)]
     data = Data.join([*seen, path])

@@ -1,8 +1,8 @@
 """Stage mesh: from a radiance field to what can be touched, all metric.
 
-Writes `visual.npz` (coloured triangles), `ground.npz` (height field), `parts.npz` (closed convex parts of what stands on
-it) and, for a drive, `route.npz` (the filmed path on the ground). Order: render views → ground → distance field of what
-stands above it → surface and solid → convex parts → corridor cleared.
+Writes `visual.npz` (coloured triangles), `ground.npz` (height field), `parts.npz` (closed convex parts of what stands
+on it) and, for a drive, `route.npz` (the filmed path on the ground). Order: render views → ground → distance field of
+what stands above it → surface and solid → convex parts → corridor cleared.
 """
 
 import time
@@ -67,7 +67,7 @@ def make(
     volume = surface.fuse_volume(hits, views, box, settings.voxel, far)
     clock.lap("fuse")
     visual, visual_facts = _visual(volume, views, ground)
-    np.savez(out / "visual.npz", **visual)
+    np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
     clock.lap("surface")
     corridor = None
     if route is not None:
@@ -138,7 +138,7 @@ def _visual(volume: surface.Volume, views: Views, ground: Ground) -> tuple[dict[
     column, row = np.rint((ground_vertices[:, :2] - ground.origin) / ground.cell).astype(int).T
     rows, columns = ground.height.shape
     ground_colours = ground.rgb[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-    visual = {
+    visual: dict[str, NDArray] = {
         "vertices": np.concatenate([vertices, ground_vertices]).astype(np.float32),
         "faces": np.concatenate([faces, ground_faces + len(vertices)]).astype(np.int32),
         "colors": np.concatenate([colours, ground_colours]).astype(np.uint8),

@@ -1,8 +1,8 @@
 """What stands on the ground, as closed pieces for the convex decomposition, and the corridor kept clear.
 
 The *solid* is where the distance field is negative, and what lies hidden behind that, up to `_DEPTH`: a film from a
-road shows fronts only, and a wall needs a thickness to be touched. What is near the ground is closed downwards to it, so
-that nothing hovers on the gap between. The *corridor* is the filmed route ± half width, up to `HEADROOM` above the
+road shows fronts only, and a wall needs a thickness to be touched. What is near the ground is closed downwards to it,
+so that nothing hovers on the gap between. The *corridor* is the filmed route ± half width, up to `HEADROOM` above the
 ground: the camera passed there, so it holds nothing.
 """
 
@@ -96,7 +96,7 @@ def solid_pieces(
                     continue
                 values = field[part][i : i + tile, j : j + tile]
                 piece = _closed(
-                    np.where(block, values, np.maximum(values, 0.3 * voxel)), voxel, volume, start + [i, j, 0]
+                    np.where(block, values, np.maximum(values, 0.3 * voxel)), voxel, volume, start + np.array([i, j, 0])
                 )
                 if piece is not None:
                     middle = ((piece.vertices.min(0) + piece.vertices.max(0)) / 2)[:2]
@@ -198,7 +198,7 @@ def cut(part: Part, normal: Array, offset: float) -> Part | None:
 
 
 def _intrusion(part: Part, route: Array, reach: float, ground: Ground) -> tuple[float, Array, Array]:
-    """How deep [m] a part reaches into the corridor, at which route point, and the direction in which it should give way."""
+    """How deep [m] a part reaches into the corridor, at which route point, and which way it should yield."""
     none = (-1.0, np.zeros(2), np.zeros(2))
     low, high = part.vertices[:, :2].min(0) - reach, part.vertices[:, :2].max(0) + reach
     near = route[((route >= low) & (route <= high)).all(1)]
@@ -222,7 +222,7 @@ def _intrusion(part: Part, route: Array, reach: float, ground: Ground) -> tuple[
 
 
 def _outline(xy: Array) -> Array:
-    """Corners of the convex outline of points (k, 2), counterclockwise; the points themselves where they are on a line."""
+    """Corners of the convex outline of points (k, 2), counterclockwise; the two ends where they are on a line."""
     try:
         return xy[ConvexHull(xy).vertices]
     except QhullError:

@@ -1,9 +1,12 @@
 """The filmed path as a line to drive.
 
 The *path* is where the lens was, (x, y, z), in driving order. The *route* is the path seen from above, (x, y): without
-outliers, standing parts and rocking to and fro, smoothed, with points every `SPACING` metres. *Station* [m] is the length
-along it. The *corridor* is what lies within a half width of the route: the camera went through it, so it is free.
+outliers, standing parts and rocking to and fro, smoothed, with points every `SPACING` metres. *Station* [m] is the
+length along it. The *corridor* is what lies within a half width of the route: the camera went through it, so it is
+free.
 """
+
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +53,7 @@ def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:
 
 
 def smooth_route(positions: Array) -> Array:
-    """Camera centres in order of time (n, 3) → points of the route (m, 2), `SPACING` apart; (1, 2) if it stands still."""
+    """Camera centres in order of time (n, 3) → points of the route (m, 2), `SPACING` apart; (1, 2) if still."""
     xy = without_rocking(positions[path_inliers(positions)][:, :2])
     if len(xy) < 2:
         return xy[:1]
@@ -96,7 +99,7 @@ def distance_to_route(route: Array, xy: Array) -> Array:
     if len(route) < 2:
         return np.linalg.norm(xy - route[0], axis=-1)
     best = np.full(np.shape(xy)[:-1], np.inf)
-    for start, end in zip(route[:-1], route[1:], strict=True):
+    for start, end in pairwise(route):
         along = end - start
         share = np.clip((xy - start) @ along / (along @ along), 0.0, 1.0)
         best = np.minimum(best, np.linalg.norm(xy - start - share[..., None] * along, axis=-1))
@@ -106,7 +109,7 @@ def distance_to_route(route: Array, xy: Array) -> Array:
 def _resample(xy: Array, spacing: float, curved: bool) -> Array:
     station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     # Equal steps as near to the spacing as the length allows, so that the end of the path stays its end.
-    count = max(int(round(station[-1] / spacing)), 1)
+    count = max(round(float(station[-1]) / spacing), 1)
     at = np.linspace(0.0, station[-1], count + 1)
     if curved:
         return Akima1DInterpolator(station, xy, axis=0)(at)

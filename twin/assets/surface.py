@@ -1,8 +1,8 @@
 """From rendered depth to surfaces: a block-sparse distance field around what the views hit, and its zero level.
 
-The *volume* is a regular grid of voxels over a box; only voxels in *blocks* (4³) near a hit are computed, all others are
-unseen (NaN). What stands less than a threshold above the ground is left to the height field. The *solid* is the part
-behind the surface, as thick as the band, that convex parts are made of; the *surface* is the seen side.
+The *volume* is a regular grid of voxels over a box; only voxels in *blocks* (4³) near a hit are computed, all others
+are unseen (NaN). What stands less than a threshold above the ground is left to the height field. The *solid* is the
+part behind the surface, as thick as the band, that convex parts are made of; the *surface* is the seen side.
 """
 
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
 
 
 def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, NDArray[np.int64]]:
-    """Marching cubes of a distance field with NaN for the unseen: vertices (v, 3) [m], faces (f, 3) facing free space."""
+    """Marching cubes of a distance field, NaN = unseen: vertices (v, 3) [m], faces (f, 3) facing free space."""
     if not ((distance < 0).any() and (distance > 0).any()):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent", allow_degenerate=False)
@@ -142,7 +142,7 @@ def vertex_normals(vertices: Array, faces: NDArray) -> Array:
 
 
 def height_mesh(ground: Ground, cell: float, most: int) -> tuple[Array, NDArray[np.int64]]:
-    """The ground as triangles facing up, on every n-th node so that they are `cell` or more wide and `most` or fewer."""
+    """The ground as triangles facing up, on every n-th node: they are `cell` or more wide and `most` or fewer."""
     rows, columns = ground.height.shape
     step = max(1, round(cell / ground.cell), int(np.ceil(np.sqrt(2 * rows * columns / most))))
     row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))

@@ -42,9 +42,7 @@ class Field(Protocol):
     def lightings(self) -> tuple[str, ...]: ...
     @property
     def bounds(self) -> Array: ...
-    def render(
-        self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str
-    ) -> Rendered: ...
+    def render(self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str) -> Rendered: ...
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def believed_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
 def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> tuple[NDArray, NDArray]:
     """Slant and the upward part of the normal from depth maps (n, h, w): central differences of inverse depth.
 
-    A plane n · x = c seen along r = (x, y, 1) has inverse depth (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ) of q = 1/z.
+    A plane n · x = c seen along r = (x, y, 1) has inverse depth q = (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ).
     """
     n, height, width = depth.shape
     slant = np.ones(depth.shape, np.float32)
