@@ -13,6 +13,7 @@ import types
 import pytest
 
 from twin import build as verb
+from twin.config import SceneConfig
 from twin.scene import SceneDir
 from twin.stamp import Stamp
 
@@ -131,6 +132,7 @@ def test_a_killed_build_resumes_and_a_second_one_refuses(pipeline, tmp_path):
         import sys, time, types
         from pathlib import Path
         from twin import build as verb
+from twin.config import SceneConfig
         def slow(scene, config, out):
             (out / "half.txt").write_text("half")
             Path(sys.argv[2]).touch()
@@ -164,7 +166,9 @@ def test_a_killed_build_resumes_and_a_second_one_refuses(pipeline, tmp_path):
     assert pipeline.scene.partial("cameras").exists()
     assert _rerun(pipeline) == ["cameras", "field"]
     assert not pipeline.scene.partial("cameras").exists()
-    assert (pipeline.scene.stage("field") / "result.txt").read_text() == "film|2|3000|3000"
+    defaults = SceneConfig()
+    expected = f"film|2|{defaults.cameras.features}|{defaults.nerf.steps}"
+    assert (pipeline.scene.stage("field") / "result.txt").read_text() == expected
 
 
 def test_a_kill_between_the_two_renames_loses_nothing(pipeline):

@@ -132,7 +132,7 @@ class MetricConfig:
 class NerfConfig:
     """The radiance field and its training."""
 
-    steps: int = 900
+    steps: int = 1500
     rays: int = 4096
     """Rays per step."""
     samples: int = 16
