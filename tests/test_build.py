@@ -132,7 +132,6 @@ def test_a_killed_build_resumes_and_a_second_one_refuses(pipeline, tmp_path):
         import sys, time, types
         from pathlib import Path
         from twin import build as verb
-from twin.config import SceneConfig
         def slow(scene, config, out):
             (out / "half.txt").write_text("half")
             Path(sys.argv[2]).touch()
