@@ -153,7 +153,8 @@ class AnalyticField:
                 d = rays[..., :2]
                 a, b, c = (d**2).sum(-1), d @ offset, offset @ offset - post.radius**2
                 t_side = (-b - np.sqrt(b**2 - a * c)) / a
-                hit(np.where(origin[2] + t_side * rays[..., 2] < post.top, np.nan_to_num(t_side, nan=np.inf), np.inf), 3)
+                below = origin[2] + t_side * rays[..., 2] < post.top
+                hit(np.where(below, np.nan_to_num(t_side, nan=np.inf), np.inf), 3)
         return t, kind
 
 
@@ -183,7 +184,12 @@ def street(**changes: object) -> AnalyticField:
         Box(39.0, -12.0, 0.6, 0.6, 0.7),
         Box(39.5, -20.0, 2.0, 0.5, 1.1, 0.2),
     )
-    posts = (Post(15.0, 2.5, 0.12, 4.8), Post(26.0, -2.6, 0.15, 4.8), Post(33.5, -16.0, 0.12, 4.8), Post(22, 2.4, 0.2, 0.7))
+    posts = (
+        Post(15.0, 2.5, 0.12, 4.8),
+        Post(26.0, -2.6, 0.15, 4.8),
+        Post(33.5, -16.0, 0.12, 4.8),
+        Post(22, 2.4, 0.2, 0.7),
+    )
     return AnalyticField(**{"boxes": boxes, "posts": posts, **changes})  # type: ignore[arg-type]
 
 
