@@ -1,0 +1,175 @@
+"""Closed meshes into convex parts, and the corridor that is cut free of them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import right_turn
+
+from twin.assets.convex import (
+    Part,
+    Piece,
+    decompose,
+    half_spaces,
+    inside_hull,
+    surface_samples,
+    uncovered,
+    winding_number,
+    within_bound,
+)
+from twin.assets.ground import Ground
+from twin.assets.obstacles import HEADROOM, Corridor, clear_corridor, cut
+from twin.assets.route import distance_to_route
+
+BOUND = 0.2  # [m]
+
+
+def _box(low, high):
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
+    part = Part.hull(corners)
+    assert part is not None
+    return part
+
+
+def _ell():
+    """A closed L, 1 m high, its two arms 2 m long and 0.6 m wide."""
+    outline = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 0.6], [0.6, 0.6], [0.6, 2.0], [0.0, 2.0]])
+    vertices = np.concatenate([np.insert(outline, 2, 0.0, 1), np.insert(outline, 2, 1.0, 1)])
+    top = [[6, 6 + k, 7 + k] for k in range(1, 5)]
+    bottom = [[0, k + 1, k] for k in range(1, 5)]
+    sides = [[[k, (k + 1) % 6, (k + 1) % 6 + 6], [k, (k + 1) % 6 + 6, k + 6]] for k in range(6)]
+    return vertices, np.array([*top, *bottom, *(face for side in sides for face in side)])
+
+
+def _outside_ell(points):
+    """Distance [m] of points to the L, 0 inside."""
+    arms = []
+    for high in ((2.0, 0.6, 1.0), (0.6, 2.0, 1.0)):
+        arms.append(np.linalg.norm(np.maximum(np.maximum(-points, points - high), 0.0), axis=1))
+    return np.minimum(*arms)
+
+
+def _flat():
+    size = (60, 60)
+    return Ground(np.zeros(size), np.array([-5.0, -35.0]), 1.0, np.ones(size, bool), np.zeros((*size, 3), np.uint8))
+
+
+def _volume(part):
+    a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def test_hull_is_closed_and_faces_outward():
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 2, 0.5]
+    part = Part.hull(points)
+    assert part is not None and len(part.vertices) < len(points)
+    normal, offset = half_spaces(part)
+    assert (part.vertices.mean(0) @ normal.T < offset).all()
+    assert inside_hull(part, points, 1e-9).all()
+    edges = np.sort(part.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    assert _volume(_box((0, 0, 0), (1, 2, 3))) == pytest.approx(6.0)
+    assert Part.hull(points * [1, 1, 0]) is None and Part.hull(points[:3]) is None
+
+
+def test_winding_number_is_one_inside_and_zero_outside():
+    points = np.random.default_rng(1).uniform(-0.5, 2.5, (500, 3))
+    depth = np.abs(points[:, 2:] - [0.0, 1.0]).min(1)
+    points = points[(depth > 1e-3) & (_outside_ell(points) != 1e-3)]
+    inside = _outside_ell(points) == 0.0
+    assert 20 < inside.sum() < len(points) - 20
+    np.testing.assert_allclose(winding_number(points, *_ell()), inside, atol=1e-6)
+
+
+def test_samples_are_on_the_surface_and_no_further_apart_than_asked():
+    part = _box((0, 0, 0), (1, 1, 1))
+    samples = surface_samples(part.vertices, part.faces, 0.1)
+    assert np.abs(samples - 0.5).max(1) == pytest.approx(0.5)
+    wanted = np.insert(np.random.default_rng(2).uniform(0, 1, (200, 2)), 2, 1.0, 1)
+    assert np.linalg.norm(wanted[:, None] - samples, axis=-1).min(1).max() < 0.1
+
+
+def test_the_hull_of_an_ell_sticks_out_as_far_as_geometry_says():
+    piece = Piece.of(*_ell())
+    hull = Part.hull(piece.vertices)
+    assert hull is not None
+    # The middle of the hull's slanted face is 0.7 m from either arm.
+    assert piece.protrusion(hull) == pytest.approx(0.7, abs=0.05)
+    assert piece.protrusion(_box((0, 0, 0), (2, 0.6, 1))) == 0.0
+    assert piece.protrusion(_box((1, 0, 0), (2, 0.9, 1))) == pytest.approx(0.3, abs=0.05)
+    assert uncovered(piece, [hull], 0.01) == 0.0
+    assert 0.2 < uncovered(piece, [_box((0, 0, 0), (2, 0.6, 1))], 0.05) < 0.6
+
+
+def test_halving_alone_comes_close_and_tells_how_close():
+    piece = Piece.of(*_ell())
+    hull = Part.hull(piece.vertices)
+    assert hull is not None
+    halves = within_bound(hull, piece, BOUND)
+    assert len(halves) > 1
+    for part, protrusion in halves:
+        truth = _outside_ell(surface_samples(part.vertices, part.faces, 0.05)).max()
+        # Less than the spacing of the samples is not told from touching.
+        assert truth - 0.07 <= protrusion < 0.5 * piece.protrusion(hull)
+    assert uncovered(piece, [part for part, _ in halves], BOUND) < 0.08
+
+
+def test_decomposition_covers_its_pieces_within_the_bound_and_is_remembered(tmp_path: Path):
+    crate = _box((5, 5, 0), (6, 6, 1))
+    pieces = [Piece.of(crate.vertices, crate.faces), Piece.of(*_ell())]
+    made = decompose(pieces, BOUND, tmp_path, seed=0)
+    assert made.failed == 0 and made.cached == 0 and made.uncovered < 0.01
+    assert (made.piece == 0).sum() == 1 and (made.piece == 1).sum() >= 2
+    assert made.protrusion.max() <= BOUND
+    arms = [part for part, of in zip(made.parts, made.piece, strict=True) if of == 1]
+    for part in arms:
+        assert _outside_ell(surface_samples(part.vertices, part.faces, 0.05)).max() <= BOUND
+    points = np.random.default_rng(3).uniform(0, [2, 2, 1], (2000, 3))
+    points = points[_outside_ell(points) == 0.0]
+    assert np.any([inside_hull(part, points, 0.02) for part in arms], axis=0).mean() > 0.97
+    again = decompose(pieces, BOUND, tmp_path, seed=0)
+    assert again.cached == 1
+    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(made.parts, again.parts, strict=True))
+
+
+def test_a_cut_keeps_exactly_its_side():
+    part = _box((0, 0, 0), (1, 1, 1))
+    normal = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+    corner = cut(part, normal, 0.5 / np.sqrt(2))
+    assert corner is not None
+    assert _volume(corner) == pytest.approx(0.125)
+    assert (corner.vertices @ normal).max() <= 0.5 / np.sqrt(2) + 1e-9
+    assert cut(part, normal, 2.0) is part
+    assert cut(part, normal, -0.1) is None
+
+
+def test_the_corridor_is_cleared_and_the_rest_stays():
+    route = right_turn(length=40.0, straight=15.0, step=0.25)
+    corridor = Corridor(route, 1.0)
+    parts = [
+        _box((4, -0.3, -0.1), (5, 0.4, 0.8)),  # in the middle
+        _box((7, 0.7, -0.1), (9, 3.0, 2.5)),  # a wall whose front is too near
+        _box((1, -3.0, 1.7), (2, 3.0, 2.5)),  # a beam over the road
+        _box((10, 5.0, -0.1), (12, 6.0, 2.0)),  # far
+    ]
+    xy = np.random.default_rng(4).uniform([0, -25], [25, 3], (40_000, 2))
+    xy = xy[distance_to_route(route, xy) <= corridor.reach]
+    inside = np.insert(xy, 2, np.random.default_rng(5).uniform(0.0, HEADROOM, len(xy)), 1)
+    assert [bool(inside_hull(part, inside).any()) for part in parts] == [True, True, False, False]
+    kept, clipped = clear_corridor(parts, corridor, _flat())
+    assert clipped == 2
+    assert not any(inside_hull(part, inside).any() for _, part in kept)
+    by = {i: [part for k, part in kept if k == i] for i in range(4)}
+    assert by[0] == [] and by[2] == [parts[2]] and by[3] == [parts[3]]
+    # Of the wall only the strip in front, up to the headroom, is missing.
+    assert sum(map(_volume, by[1])) == pytest.approx(_volume(parts[1]) - 2.0 * 0.3 * 1.6, rel=0.04)
+
+
+@pytest.mark.xfail(strict=True, reason="cuts leave 5 mm where 8 mm are asked between route points: the part is lost")
+def test_a_part_beside_a_bend_loses_only_its_corner():
+    route = right_turn(length=40.0, straight=15.0, step=0.25)
+    part = _box((15, -3.0, -0.1), (18, -1.6, 1.0))
+    kept, clipped = clear_corridor([part], Corridor(route, 1.0), _flat())
+    assert clipped == 1
+    # A third of a metre of one corner is in the way.
+    assert sum(_volume(rest) for _, rest in kept) > 0.9 * _volume(part)
