@@ -109,7 +109,6 @@ def test_wall_and_post_are_there_to_see_and_to_touch(made):
         assert np.linalg.norm(points[:, None] - vertices, axis=-1).min(1).max() < 0.2
 
 
-@pytest.mark.xfail(strict=True, reason="of a post two voxels wide only the foot is solid, though all of it is seen")
 def test_a_thin_post_is_there_to_its_height(made):
     points = _post_front(0.8, 1.6)
     assert np.any([inside_hull(part, points, 0.2) for part in _parts(made[0])], axis=0).all()
@@ -119,8 +118,8 @@ def test_nothing_stands_where_nothing_is(made):
     folder, facts = made
     corners = np.concatenate([part.vertices for part in _parts(folder)])
     corners = corners[corners[:, 2] > PLACE.ground(corners[:, :2]) + 0.2]
-    # Hidden space behind a front counts as solid for half a metre.
-    assert PLACE.distance_to_obstacles(corners).max() < 0.8
+    # Hidden space behind a front counts as solid for half a metre, beyond the two voxels that the front's band is deep.
+    assert PLACE.distance_to_obstacles(corners).max() < 0.5 + 2 * 0.15 + 0.1
     assert facts["parts_beyond_bound"] == 0 and facts["max_protrusion_m"] <= 0.2
 
 

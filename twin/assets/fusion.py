@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from twin.assets.views import Views
 from twin.geometry.poses import inverse_pose
 
+wp.config.log_level = wp.LOG_ERROR  # compiling is announced by our own bars
+
 Array = NDArray[np.float64]
 
 _FADE = 5.0  # [m] depth at which a view's vote counts half: its pixels and its errors have grown

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from twin.assets.convex import Part, Piece
 from twin.assets.ground import Ground
-from twin.assets.route import distance_to_route
+from twin.assets.route import SPACING, distance_to_route
 from twin.assets.surface import Volume, zero_level
 from twin.config import MeshConfig
 from twin.geometry.cameras import Cameras
@@ -112,13 +112,15 @@ def _solid(volume: Volume) -> NDArray[np.float32]:
     and every pore costs the decomposition more than it is worth to a robot that could not pass it.
     """
     voxel = volume.voxel
-    matter = np.nan_to_num(volume.distance, nan=np.inf) < 0
-    depth = distance_transform_edt(~matter) * voxel
-    matter |= volume.hidden & (depth < _DEPTH)
+    seen = np.nan_to_num(volume.distance, nan=np.inf) < 0
+    depth = distance_transform_edt(~seen) * voxel
+    matter = seen | (volume.hidden & (depth < _DEPTH))
     reach = _GAP / 2
     outside = distance_transform_edt(~matter) * voxel
     closed = distance_transform_edt(outside < reach) * voxel > reach
-    return (voxel * (0.5 - gaussian_filter((matter | closed).astype(np.float32), _SMOOTHING))).astype(np.float32)
+    field = voxel * (0.5 - gaussian_filter((matter | closed).astype(np.float32), _SMOOTHING))
+    # Smoothing must not take away what is as thin as a lamp post.
+    return np.where(seen, np.minimum(field, -0.1 * voxel), field).astype(np.float32)
 
 
 def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
@@ -162,6 +164,7 @@ def clear_corridor(parts: list[Part], corridor: Corridor, ground: Ground) -> tup
     out: list[tuple[int, Part]] = []
     clipped = 0
     reach = corridor.reach + 0.5 * _CLEAR
+    chord = _chord(reach)
     for i, part in enumerate(parts):
         if _intrusion(part, corridor.route, reach, ground)[0] <= 0.0:
             out.append((i, part))
@@ -180,7 +183,7 @@ def clear_corridor(parts: list[Part], corridor: Corridor, ground: Ground) -> tup
                 out.append((i, lower))
                 break
             # Keep what lies beyond the tangent line on the side where most of the part is.
-            lower = cut(lower, np.append(-side, 0.0), float(-side @ point - reach - 0.25 * _CLEAR))
+            lower = cut(lower, np.append(-side, 0.0), float(-side @ point - reach - chord - 0.25 * _CLEAR))
     return out, clipped
 
 
@@ -195,6 +198,11 @@ def cut(part: Part, normal: Array, offset: float) -> Part | None:
     share = (a / np.where(crosses, a - b, 1.0))[crosses, None]
     start, end = part.vertices[edges[crosses, 0]], part.vertices[edges[crosses, 1]]
     return Part.hull(np.concatenate([part.vertices[height <= 0], start + share * (end - start)]))
+
+
+def _chord(reach: float) -> float:
+    """How much nearer [m] the route comes between two of its points, at most; they are `SPACING` apart."""
+    return SPACING**2 / (8 * reach)
 
 
 def _intrusion(part: Part, route: Array, reach: float, ground: Ground) -> tuple[float, Array, Array]:
@@ -213,8 +221,7 @@ def _intrusion(part: Part, route: Array, reach: float, ground: Ground) -> tuple[
     flat = _outline(below.vertices[:, :2])
     distance, closest = _distance_to_outline(near, flat)
     worst = int(np.argmin(distance))
-    # Points of the route are 0.25 m apart; between two of them it is nearer by less than 0.25² / (8 · reach).
-    depth = reach + 0.25**2 / (8 * reach) - float(distance[worst])
+    depth = reach + _chord(reach) - float(distance[worst])
     point = near[worst]
     side = closest[worst] - point if distance[worst] > 1e-6 else flat.mean(0) - point
     length = float(np.linalg.norm(side))

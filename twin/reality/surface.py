@@ -7,6 +7,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+wp.config.log_level = wp.LOG_ERROR  # compiling is announced by our own bars
+
 Array = NDArray[np.float64]
 
 _FAR = 1.0e3  # [m]
