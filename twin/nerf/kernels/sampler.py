@@ -28,7 +28,12 @@ _WIDENING = wp.constant(0.02)  # least bin length as a share of the distance
 
 @wp.func
 def grid_cell(g: wp.vec3f, nx: wp.int32, ny: wp.int32, nz: wp.int32) -> wp.vec3i:
-    return wp.vec3i(wp.int32(g[0] * wp.float32(nx)), wp.int32(g[1] * wp.float32(ny)), wp.int32(g[2] * wp.float32(nz)))
+    # Rounding may carry a position just below 1 to the end of the grid.
+    return wp.vec3i(
+        wp.min(wp.int32(g[0] * wp.float32(nx)), nx - 1),
+        wp.min(wp.int32(g[1] * wp.float32(ny)), ny - 1),
+        wp.min(wp.int32(g[2] * wp.float32(nz)), nz - 1),
+    )
 
 
 @wp.func
