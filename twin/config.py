@@ -165,7 +165,7 @@ class MeshConfig:
     """What stands this much above the ground is an obstacle [m]."""
     max_height: float = 2.5
     """Obstacles are cut off above this; nothing the robot can touch is higher [m]."""
-    max_parts: int = 1500
+    max_parts: int = 2000
     """Convex parts at most."""
     max_protrusion: float = 0.2
     """No convex part may stick out of its mesh by more than this [m]."""
