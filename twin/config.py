@@ -137,8 +137,10 @@ class NerfConfig:
     """Rays per step."""
     samples: int = 16
     """Samples per ray and step."""
-    sightings: float = 0.2
-    """Share of each step's rays that go through sparse points, whose distance is then learned, too."""
+    sightings: float = 0.3
+    """Share of each step's rays that go through places whose distance is known, which is then learned, too."""
+    stereo: bool = True
+    """Find such places by stereo between the frames, besides the sparse points."""
     max_width: int = 480
     """Images are trained at this longer side [px]."""
     learning_rate: float = 3e-2

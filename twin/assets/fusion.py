@@ -3,7 +3,8 @@
 *Signed distance* [m] is positive in free space, negative behind a surface, and believed within ± `band` of it only.
 Each view votes at each voxel: `near` where its surface passes within the band, `free` where it looks further. A surface
 that few views make and many look through is a floater, and their votes outweigh it (Curless & Levoy 1996, eqs. 3 and 4,
-with free space counted in).
+with free space counted in). The ramp that a field leaves between the rim of a thing and what is behind it is seen
+edge-on, where votes count next to nothing; so views that look past it from elsewhere, even from far away, clear it.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -20,7 +21,10 @@ wp.config.log_level = wp.LOG_ERROR  # compiling is announced by our own bars
 
 Array = NDArray[np.float64]
 
+LOOK_THROUGH = 2.5  # a view says what is free this many times further than it says where a surface is
 _FADE = 5.0  # [m] depth at which a view's vote counts half: its pixels and its errors have grown
+_CLEARANCE = 0.1  # share of the depth a surface beyond that reach must lie behind what it is to leave free
+_ONE_SURFACE = 1.1  # neighbouring pixels whose depths differ by more than this ratio belong to two
 
 
 @wp.func
@@ -40,7 +44,10 @@ def _fuse(
     slant: wp.array3d[wp.float32],
     far: float,
     band: float,
+    reach: float,
     fade: float,
+    clearance: float,
+    one_surface: float,
     distance: wp.array[wp.float32],
     near: wp.array[wp.float32],
     free: wp.array[wp.float32],
@@ -55,7 +62,7 @@ def _fuse(
     for view in range(depth.shape[0]):
         seen = _look(point, world_to_camera[view], intrinsics[view])
         z = seen[2]
-        if z > 0.35 and z < far:
+        if z > 0.35 and z < reach:
             u = seen[0] - 0.5
             v = seen[1] - 0.5
             if u >= 0.0 and v >= 0.0 and u < float(width - 1) and v < float(height - 1):
@@ -70,7 +77,7 @@ def _fuse(
                 low = wp.min(wp.min(a, b), wp.min(c, d))
                 high = wp.max(wp.max(a, b), wp.max(c, d))
                 surface = depth[view, nearest_row, nearest_column]
-                if low > 0.0 and high < 1.3 * low:
+                if low > 0.0 and high < one_surface * low:
                     # One surface: inverse depth is bilinear on it.
                     s = u - float(column)
                     t = v - float(row)
@@ -78,9 +85,11 @@ def _fuse(
                 if surface > 0.0:
                     away = (surface - z) * slant[view, nearest_row, nearest_column]
                     weight = 1.0 / (1.0 + (z / fade) * (z / fade))
-                    if away >= band:
+                    if away >= band and (z < far or surface - z > clearance * z):
                         free_votes += weight
-                    elif away > -band:
+                    elif away < band and away > -band and z < far:
+                        lean = wp.min(slant[view, nearest_row, nearest_column], 1.0)
+                        weight *= lean * lean
                         near_votes += weight
                         total += weight * away
     near[i] = near_votes
@@ -131,13 +140,16 @@ def _colour(
 
 
 def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Votes of all views at points (k, 3), each (k,): signed distance [m] (NaN where no surface is), near and free."""
+    """Votes of all views at points (k, 3), each (k,): signed distance [m] (NaN where no surface is), near and free.
+
+    Surfaces are believed up to the depth `far` [m], free space up to `LOOK_THROUGH` times as far.
+    """
     device = "cpu"
     distance = wp.full(len(points), float("nan"), dtype=wp.float32, device=device)
     near = wp.zeros(len(points), dtype=wp.float32, device=device)
     free = wp.zeros(len(points), dtype=wp.float32, device=device)
     slant: wp.array = wp.array(views.slant, dtype=wp.float32, device=device)
-    inputs = [*_cameras(points, views, device), slant, far, band, _FADE]
+    inputs = [*_cameras(points, views, device), slant, far, band, LOOK_THROUGH * far, _FADE, _CLEARANCE, _ONE_SURFACE]
     wp.launch(_fuse, len(points), inputs, [distance, near, free], device=device)
     return distance.numpy(), near.numpy(), free.numpy()
 

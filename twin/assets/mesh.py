@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from twin import progress
 from twin.assets import convex, ground_fit, obstacles, surface
-from twin.assets.fusion import colour
+from twin.assets.fusion import LOOK_THROUGH, colour
 from twin.assets.ground import Ground
 from twin.assets.route import distance_to_route, filmed_route, route_length
 from twin.assets.views import Field, Views, render_views
@@ -55,7 +55,7 @@ def make(
         # Around an object the far is backdrop; what the field resolves is its near box.
         low, high = np.maximum(low, field.bounds[0, :2]), np.minimum(high, field.bounds[1, :2])
     far = settings.margin + 2.0
-    views = render_views(field, cameras, settings.views, settings.view_width, far)
+    views = render_views(field, cameras, settings.views, settings.view_width, LOOK_THROUGH * far)
     clock.lap("render")
     height = _camera_height(config) if route is not None else None
     ground, ground_facts = ground_fit.build_ground(views, cameras, points, (low, high), settings, height)

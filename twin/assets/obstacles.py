@@ -29,9 +29,11 @@ _ROOT = 0.15  # [m] parts reach this far into the ground
 _TILE = 3.0  # [m] side of the columns big things are cut into
 _SPECK = 8  # voxels; smaller things are noise
 _HOVERING_SPECK = 64  # voxels; so are these where they touch nothing below
-_DEPTH = 0.5  # [m] of hidden space behind a surface that counts as solid
+_DEPTH = 0.3  # [m] of hidden space behind a surface that counts as solid
 _GAP = 0.45  # [m] narrower gaps are closed
-_SMOOTHING = 1.0  # voxels
+_SMOOTHING = 0.7  # voxels
+_SHRINK = 0.06  # [m] rims blur outwards and hulls only grow: surfaces start so much further in
+_SURE = 0.02  # [m] what was seen so deep inside a surface stays solid all the same
 _CLEAR = 0.02  # [m] parts stay this much further off than asked, for the rounding of later stages
 
 
@@ -108,8 +110,9 @@ def solid_pieces(
 def _solid(volume: Volume) -> NDArray[np.float32]:
     """Distance field [m] of the solid, clipped to a voxel; what is unknown beyond its depth counts as free.
 
-    Gaps narrower than `_GAP` are closed and the whole is smoothed: a fused surface is porous where foliage or noise is,
-    and every pore costs the decomposition more than it is worth to a robot that could not pass it.
+    Where a surface was seen it is the surface's own. Gaps narrower than `_GAP` are closed: a fused surface is porous
+    where foliage or noise is, and every pore costs the decomposition more than it is worth to a robot that could not
+    pass it. All of it is drawn in by `_SHRINK`.
     """
     voxel = volume.voxel
     seen = np.nan_to_num(volume.distance, nan=np.inf) < 0
@@ -117,10 +120,13 @@ def _solid(volume: Volume) -> NDArray[np.float32]:
     matter = seen | (volume.hidden & (depth < _DEPTH))
     reach = _GAP / 2
     outside = distance_transform_edt(~matter) * voxel
-    closed = distance_transform_edt(outside < reach) * voxel > reach
-    field = voxel * (0.5 - gaussian_filter((matter | closed).astype(np.float32), _SMOOTHING))
-    # Smoothing must not take away what is as thin as a lamp post.
-    return np.where(seen, np.minimum(field, -0.1 * voxel), field).astype(np.float32)
+    closed = matter | (distance_transform_edt(outside < reach) * voxel > reach)
+    smooth = voxel * (0.5 - gaussian_filter(closed.astype(np.float32), 1.0))
+    field = np.where(np.isfinite(volume.distance), np.clip(volume.distance, -voxel, voxel), smooth)
+    field = np.where(closed & ~seen, np.minimum(field, smooth), field)
+    field = gaussian_filter(field, _SMOOTHING) + _SHRINK
+    # What is as thin as a lamp post must not vanish.
+    return np.where(volume.distance < -_SURE, np.minimum(field, -0.1 * voxel), field).astype(np.float32)
 
 
 def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:

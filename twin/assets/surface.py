@@ -56,7 +56,7 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
         views: The views they come from.
         box: Low and high corner, shape (2, 3) [m].
         voxel: Grid spacing [m]; grows where the box would hold more than 60 million.
-        far: Depth up to which a view votes [m].
+        far: Depth up to which a view votes for a surface [m].
     """
     voxel = max(voxel, float((np.prod(box[1] - box[0]) / _MOST_VOXELS) ** (1 / 3)))
     blocks = np.ceil((box[1] - box[0]) / (voxel * _BLOCK)).astype(int) + 1

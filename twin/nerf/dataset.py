@@ -91,6 +91,7 @@ class TrainingPixels:
         self.open = valid
         self.points = self._sight_points(points, chosen)
         self.path = self._sight_path(camera_height) if camera_height > 0.0 else joined([])
+        self.stereo = joined([])  # see `stereo.stereo_sightings`
 
     def _sight(self, i: int, xyz: NDArray) -> "Sightings":
         """Those of the points (k, 3) [m] that fall on open pixels of training frame i."""
@@ -140,9 +141,9 @@ class TrainingPixels:
         """Random rays for so many shards, shard after shard.
 
         Each shard begins with `triples` × 3 rays through pixels in a line at equal spacing, then `singles` pixels,
-        then `sightings`, half of them of sparse points and half of the path (or all of the one kind there is).
+        then `sightings`, in equal shares of sparse points, of the path and of stereo, or of those kinds there are.
         """
-        kinds = [pool for pool in (self.points, self.path) if len(pool.frame)]
+        kinds = [pool for pool in (self.points, self.path, self.stereo) if len(pool.frame)]
         if not kinds:
             singles, sightings = singles + sightings, 0
         parts = [self._triples(rng, shards * triples), self._pixels(self._random(rng, shards * singles))]

@@ -29,6 +29,7 @@ from twin.nerf.field import CameraArrays, Layout, RadianceField, Workspace, untr
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
 from twin.nerf.sampling import COARSEST, Space, space_of_cameras
+from twin.nerf.stereo import stereo_sightings
 from twin.progress import bar
 from twin.scene import SceneDir, read_json
 
@@ -80,6 +81,10 @@ class Trainer:
         self.config, self.seed, self.where = config, seed, where
         self.weights = weights or Weights()
         self.pixels = TrainingPixels(cameras, points, config.max_width, camera_height)
+        self.stereo: dict[str, Any] | None = None
+        """What there is to say of the sightings by stereo; None where they are switched off."""
+        if config.stereo:
+            self.pixels.stereo, self.stereo = stereo_sightings(self.pixels, seed, where)
         train = self.pixels.cameras
         self.lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([self.lightings.index(name) for name in train.lightings])
@@ -374,6 +379,7 @@ def fit(
         "parameters": int(field.table.numel() + small),
         "sightings_points": len(trainer.pixels.points.frame),
         "sightings_path": len(trainer.pixels.path.frame),
+        "stereo": trainer.stereo,
         "curve": curve,
     }
 

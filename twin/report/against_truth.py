@@ -39,7 +39,7 @@ def truth_section(report: dict[str, Any]) -> Section:
             ("ate_m", LARGE_PATH_ERROR, "The camera path", "{:.3f} m", "give the camera’s calibration."),
             ("scale_error", _LARGE_SCALE_ERROR, "The scale", "{:.1%}", "check what the metres come from."),
             ("ground_median_m", _LARGE_GROUND_ERROR, "The ground", "{:.3f} m", "check the camera’s height."),
-            ("obstacle_median_m", _LARGE_SURFACE_ERROR, "Solid parts", "{:.3f} m", "raise nerf.steps."),
+            ("obstacle_median_m", _LARGE_SURFACE_ERROR, "Solid parts", "{:.3f} m", "lower mesh.max_protrusion."),
         )
         if isinstance(truth.get(key), int | float) and abs(truth[key]) > limit
     ]

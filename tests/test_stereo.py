@@ -1,0 +1,165 @@
+"""Stereo between the frames of a film: right where there is something to see, silent where there is not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.analytic import AnalyticField, Box
+from twin import progress
+from twin.geometry.cameras import Cameras, pixel_grid, project, unproject
+from twin.geometry.images import write_image
+from twin.geometry.points import SparsePoints
+from twin.geometry.poses import look_at
+from twin.nerf.dataset import TrainingPixels
+from twin.nerf.stereo import choose_sources, stereo_sightings
+
+WIDTH, HEIGHT = 160, 90
+K = np.array([110.0, 110.0, 80.0, 45.0])
+PLACE = AnalyticField(boxes=(Box(9.0, 3.0, 2.0, 2.0, 2.5), Box(14.0, -2.5, 1.0, 3.0, 4.0)), amplitude=0.0)
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    progress.set_quiet(True)
+
+
+def pattern(points: np.ndarray) -> np.ndarray:
+    """Grey in [0, 1] of places (..., 3): waves of 0.3 to 3 m in all directions."""
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(40, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    waves = direction * (2 * np.pi / np.geomspace(0.3, 3.0, 40))[:, None]
+    return 0.5 + 0.06 * np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, 40)).sum(-1)
+
+
+def poses(n: int, lateral: float = 0.0) -> np.ndarray:
+    eyes = np.stack([np.linspace(0.0, 0.6 * (n - 1), n), np.full(n, lateral), np.full(n, 1.2)], 1)
+    return np.stack([look_at(eye, eye + np.array([5.0, 0.0, -0.7])) for eye in eyes])
+
+
+def film(folder: Path, n: int = 8, paint=None) -> Cameras:
+    """A drive past two boxes; `paint(i, places)` gives grey of frame i where it is not the pattern."""
+    pose = poses(n)
+    depth = PLACE.render(pose, np.tile(K, (n, 1)), (WIDTH, HEIGHT), "day").depth
+    names = tuple(f"day/{i:06d}" for i in range(n))
+    (folder / "day").mkdir(parents=True, exist_ok=True)
+    for i, name in enumerate(names):
+        rays = unproject(pixel_grid(WIDTH, HEIGHT), K)
+        places = (rays * depth[i][..., None]) @ pose[i, :3, :3].T + pose[i, :3, 3]
+        grey = (paint or (lambda i, p: pattern(p)))(i, places)
+        picture = np.repeat((np.clip(grey, 0, 1) * 255).astype(np.uint8)[..., None], 3, -1)
+        write_image(folder / f"{name}.png", picture)
+    return Cameras(
+        *(names, pose, np.tile(K, (n, 1)), np.tile([WIDTH, HEIGHT], (n, 1)), ("day",) * n, ("day",) * n),
+        *(np.arange(n) / 2.0, np.zeros(n, bool), folder),
+    )
+
+
+def points_of(cameras: Cameras, m: int = 150) -> SparsePoints:
+    """Some places on the ground that every frame may see."""
+    rng = np.random.default_rng(0)
+    xyz = np.stack([rng.uniform(2.0, 14.0, m), rng.uniform(-3.0, 3.0, m), np.zeros(m)], 1)
+    point, frame = (k.ravel() for k in np.meshgrid(np.arange(m), np.arange(len(cameras)), indexing="ij"))
+    return SparsePoints(xyz, np.zeros((m, 3), np.uint8), np.zeros(m), point, frame)
+
+
+def true_distance(cameras: Cameras, found) -> np.ndarray:
+    """Distance [m] along the rays of sightings."""
+    out = np.empty(len(found.frame))
+    for i in np.unique(found.frame):
+        mine = found.frame == i
+        pose = cameras.camera_to_world[i]
+        rays = unproject(found.pixel[mine], K)
+        depth, _ = PLACE._cast(pose[:3, 3], rays @ pose[:3, :3].T)
+        out[mine] = depth * np.linalg.norm(rays, axis=1)
+    return out
+
+
+def test_it_finds_the_ground_and_what_stands_on_it(tmp_path):
+    cameras = film(tmp_path)
+    pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
+    found, facts = stereo_sightings(pixels, 0, "cpu")
+    true = true_distance(cameras, found)
+    error = np.abs(found.distance / true - 1.0)
+    assert facts["frames"] == len(cameras)
+    assert facts["share"] > 0.3
+    assert np.median(error) < 0.01
+    assert np.quantile(error, 0.9) < 0.04
+    pose = cameras.camera_to_world[found.frame]
+    rays = unproject(found.pixel, K)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    places = pose[:, :3, 3] + np.einsum("nij,nj->ni", pose[:, :3, :3], rays) * found.distance[:, None]
+    standing = places[:, 2] > 0.3
+    assert standing.sum() > 500
+    assert np.median(np.abs(PLACE.distance_to_obstacles(places[standing]))) < 0.05
+
+
+@pytest.mark.parametrize("kind", ["noise", "plain"])
+def test_it_finds_nothing_where_nothing_matches(tmp_path, kind):
+    def paint(i, places):
+        return np.random.default_rng(i).random(places.shape[:2]) if kind == "noise" else np.full(places.shape[:2], 0.5)
+
+    cameras = film(tmp_path, paint=paint)
+    _, facts = stereo_sightings(TrainingPixels(cameras, points_of(cameras), WIDTH), 0, "cpu")
+    assert facts["share"] < 0.01
+
+
+def test_same_seed_same_sightings_on_any_number_of_cores(tmp_path, monkeypatch):
+    cameras = film(tmp_path, 5)
+    pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
+    first, _ = stereo_sightings(pixels, 4, "cpu")
+    monkeypatch.setattr("twin.nerf.compute.cores", lambda: 1)
+    second, _ = stereo_sightings(pixels, 4, "cpu")
+    assert np.array_equal(first.distance, second.distance)
+    assert np.array_equal(first.pixel, second.pixel)
+
+
+def test_masked_pixels_are_not_sighted(tmp_path):
+    cameras = film(tmp_path / "pictures")
+    mask = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    mask[:, : WIDTH // 2] = 0
+    for name in cameras.names:
+        (tmp_path / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
+        write_image(tmp_path / "masks" / f"{name}.png", mask)
+    cameras = replace(cameras, masks=tmp_path / "masks")
+    found, facts = stereo_sightings(TrainingPixels(cameras, points_of(cameras), WIDTH), 0, "cpu")
+    assert facts["sightings"] > 0
+    assert found.pixel[:, 0].min() > WIDTH // 2
+
+
+def test_without_sparse_points_there_is_no_stereo(tmp_path):
+    cameras = film(tmp_path, 4)
+    found, facts = stereo_sightings(TrainingPixels(cameras, SparsePoints.empty(), WIDTH), 0, "cpu")
+    assert len(found.frame) == 0
+    assert facts["sightings"] == 0
+
+
+def test_sources_are_of_the_same_film_and_some_degrees_aside(tmp_path):
+    cameras = film(tmp_path, 8)
+    mixed = replace(cameras, sources=("a", "b") * 4)
+    chosen = choose_sources(mixed, mixed.intrinsics, np.full(8, 6.0))
+    for i, sources in enumerate(chosen):
+        assert len(sources) > 0
+        assert all(mixed.sources[j] == mixed.sources[i] and j != i for j in sources)
+    # At 60 m, steps of 0.6 m show a place from less than a degree aside: the farthest frames are the best.
+    far = choose_sources(cameras, cameras.intrinsics, np.full(8, 60.0))
+    assert far[0][0] == 7
+
+
+def test_the_homography_agrees_with_projection(tmp_path):
+    """A plane's window goes where projecting its places puts it."""
+    from twin.nerf.stereo import _geometry
+
+    cameras = film(tmp_path, 4)
+    pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
+    geometry = _geometry(pixels, 0, np.array([1, 3], np.int32))
+    pixel, depth = np.array([[30.5, 70.5], [120.5, 60.5]]), np.array([3.0, 5.0])
+    place = unproject(pixel, K) * depth[:, None] @ cameras.camera_to_world[0, :3, :3].T + cameras.positions[0]
+    homogeneous = np.column_stack([pixel, np.ones(2)])
+    for k, j in enumerate((1, 3)):
+        h = homogeneous @ geometry.turn[k].T + geometry.shift[k] / depth[:, None]
+        expected, z = project(place, cameras.camera_to_world[j], K)
+        assert np.allclose(h[:, :2] / h[:, 2:], expected)
+        assert np.allclose(h[:, 2] * depth, z)
