@@ -132,12 +132,12 @@ class MetricConfig:
 class NerfConfig:
     """The radiance field and its training."""
 
-    steps: int = 1500
+    steps: int = 2000
     rays: int = 4096
     """Rays per step."""
     samples: int = 16
     """Samples per ray and step."""
-    sightings: float = 0.3
+    sightings: float = 0.35
     """Share of each step's rays that go through places whose distance is known, which is then learned, too."""
     stereo: bool = True
     """Find such places by stereo between the frames, besides the sparse points."""

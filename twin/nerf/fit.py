@@ -56,7 +56,7 @@ class Weights:
     """How much each part of the loss counts."""
 
     distortion: float = 0.005
-    depth: float = 0.5
+    depth: float = 1.0
     depth_reach: float = 0.5
     plane: float = 0.01
     free: float = 1e-3
