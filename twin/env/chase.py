@@ -76,6 +76,11 @@ class SceneCamera:
             self._parts = mjw.create_render_context(
                 self.model, enabled_geom_groups=_PART_GROUPS, render_seg=True, **common
             )
+        # Warp builds a pass's kernel at its first launch, and two built at once in two threads of one process mix up
+        # (seen as pictures without any ground); so each pass runs once here, one after the other.
+        for context in (self._looks, self._parts):
+            if context is not None:
+                self._draw(context)
 
     def render(self, qpos: Array, camera_to_world: Array) -> Picture:
         """One picture of the world with the robot at `qpos`, seen from an OpenCV pose. Shape (h, w, 3)."""

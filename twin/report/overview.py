@@ -51,25 +51,11 @@ def chase_shots(drive: Drive, every: int) -> list[Shot]:
     return [(drive.qpos[i], poses[i]) for i in frame_indices(len(drive.times), every)]
 
 
-class OrderedCamera(SceneCamera):
-    """A camera whose two passes have run once, one after the other, before any picture is taken.
-
-    Warp builds a pass's kernel at its first launch. Two of them built at once in two threads of one process mix up:
-    seen as a kernel with another hash than usual, and pictures without any ground.
-    """
-
-    def __init__(self, world: World, size: tuple[int, int]):
-        super().__init__(world, size)
-        for render_pass in (self._looks, self._parts):
-            if render_pass is not None:
-                self._draw(render_pass)
-
-
 def pictures_of(world: World, shots: list[Shot], size: tuple[int, int]) -> Iterator[Picture]:
     """Draws shots in order, solid parts over what is seen. One camera serves all: building it takes seconds."""
     if not shots:
         return
-    camera = OrderedCamera(world, size)
+    camera = SceneCamera(world, size)
     data = mujoco.MjData(camera.model)
     if camera.model.nkey:
         mujoco.mj_resetDataKeyframe(camera.model, data, 0)
