@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from analytic import AnalyticField, Box
 
-from tests.analytic import AnalyticField, Box
 from twin import progress
 from twin.geometry.cameras import Cameras, pixel_grid, project, unproject
 from twin.geometry.images import write_image
