@@ -10,10 +10,12 @@ import torch
 from twin.config import NerfConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, project
-from twin.geometry.images import write_image
+from twin.geometry.images import psnr, write_image
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
 from twin.nerf import compute
+from twin.nerf.bake import bake
+from twin.nerf.baked import BakedField
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
 from twin.nerf.evaluate import evaluate, fit_embedding_to_image
@@ -227,6 +229,39 @@ def test_the_stage_writes_a_field_that_loads(cameras, tmp_path):
     assert metrics["steps"] == 6 and metrics["parameters"] > 0 and metrics["sightings_path"] > 0
     assert sorted(p.name for p in out.iterdir()) == ["field.json", "field.safetensors"]
     assert RadianceField.load(out).lightings == ("day", "night")
+
+
+def test_a_baked_field_shows_what_the_field_shows(cameras):
+    config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
+    field, _ = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    baked, facts = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
+    again, _ = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
+    assert 100 < facts["bricks_near"] + facts["bricks_far"] <= 1500
+    assert facts["bytes"] < 30e6
+    held_out = cameras.select(np.flatnonzero(cameras.held_out))
+    for i, name in enumerate(held_out.lightings):
+        pose = held_out.camera_to_world[i : i + 1]
+        one = field.render(pose, K[None], (WIDTH, HEIGHT), name)
+        other = baked.render(pose, K[None], (WIDTH, HEIGHT), name)
+        assert psnr(other.rgb[0], one.rgb[0]) > 25.0
+        lower = (one.depth < 20.0) & (one.opacity > 0.9)
+        assert np.median(np.abs(other.depth / one.depth - 1.0)[lower]) < 0.05
+        assert np.array_equal(other.rgb, again.render(pose, K[None], (WIDTH, HEIGHT), name).rgb)
+    scores = evaluate(field, cameras, WIDTH, baked=baked)
+    assert all(scores["psnr_baked"][name] > scores["psnr_unfitted"][name] - 1.0 for name in ("day", "night"))
+
+
+def test_the_stage_bakes_when_asked(cameras, tmp_path):
+    scene = SceneDir(tmp_path / "scene")
+    scene.stage("metric").mkdir(parents=True)
+    cameras.save(scene.stage("metric"))
+    floor_points(cameras).save(scene.stage("metric"))
+    write_json(scene.stage("metric") / "metric.json", {"camera_height_median_m": 1.5, "road_reliable": True})
+    config = SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=replace(CONFIG, bake=True))
+    metrics = run(scene, config, tmp_path)
+    assert metrics["bake"]["bytes"] > 0 and set(metrics["psnr_baked"]) == {"day", "night"}
+    assert BakedField.load(tmp_path).lightings == ("day", "night")
 
 
 @pytest.mark.parametrize(("value", "message"), [("tpu", "cpu or cuda"), ("cuda", "no CUDA device")])

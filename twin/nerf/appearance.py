@@ -1,15 +1,14 @@
 """What makes one place look different: the appearance embedding.
 
 The embedding of a frame is its *lighting*'s vector plus a *residual* of its own, which is kept small and takes up what
-drifts within a film (exposure). A *lighting* can be asked for by name, as a frame (`day/000012`), or as a mixture
-`day:night:0.3`, which is 30 % of the way from day to night.
+drifts within a film (exposure). `lightings.py` says how one is asked for by name.
 """
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from twin.errors import InputError
+from twin.nerf.lightings import Lightings
 
 
 class Appearance:
@@ -39,26 +38,17 @@ class Appearance:
         """Embeddings of frame indices, shape (k,) → (k, dim)."""
         return self.vectors[self.lighting_of_frame[frame]] + self.residuals[frame]
 
-    def embedding(self, lighting: str) -> NDArray[np.float32]:
-        """The embedding of a lighting, a frame or a mixture, shape (dim,).
+    def named(self) -> Lightings:
+        """All embeddings by name, as plain arrays."""
+        every = torch.arange(len(self.frames), device=self.vectors.device)
+        with torch.no_grad():
+            return Lightings(
+                *(self.lightings, self.vectors.detach().cpu().numpy(), self.frames, self.of_frames(every).cpu().numpy())
+            )
 
-        Raises:
-            InputError: an unknown name, or a mixture that is not `a:b:share`.
-        """
-        if lighting in self.lightings:
-            return self.vectors[self.lightings.index(lighting)].detach().cpu().numpy()
-        if lighting in self.frames:
-            i = self.frames.index(lighting)
-            vector = self.vectors[int(self.frame_lighting[i])] + self.residuals[i]
-            return vector.detach().cpu().numpy()
-        if lighting.count(":") == 2:
-            a, b, share = lighting.split(":")
-            try:
-                s = float(share)
-            except ValueError:
-                raise InputError(f"lighting {lighting!r}: {share!r} is no number; expected a:b:share") from None
-            return ((1.0 - s) * self.embedding(a) + s * self.embedding(b)).astype(np.float32)
-        raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.lightings)}")
+    def embedding(self, lighting: str) -> NDArray[np.float32]:
+        """See `Lightings.embedding`."""
+        return self.named().embedding(lighting)
 
 
 def initial_appearance(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import psnr, ssim
 from twin.nerf import network
+from twin.nerf.baked import BakedField
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import load_frame
 from twin.nerf.field import CameraArrays, RadianceField
@@ -85,8 +86,11 @@ def fit_embedding_to_image(
     return fit_embedding(field, features, harmonics, colours, field.embedding(lighting))
 
 
-def score_frame(field: RadianceField, cameras: Cameras, i: int, max_width: int) -> dict[str, float]:
-    """PSNR [dB] and SSIM of one held-out frame: `psnr`, `ssim`, `unfitted`, and `wrong` (nan with one lighting)."""
+def score_frame(
+    field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
+) -> dict[str, float]:
+    """PSNR [dB] and SSIM of one held-out frame: `psnr`, `ssim`, `unfitted`, `wrong` (nan with one lighting), and
+    `baked`, which is as `unfitted` (nan without a baked field)."""
     bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
     image = bytes_.astype(np.float32) / 255.0
     height, width = mask.shape
@@ -116,7 +120,12 @@ def score_frame(field: RadianceField, cameras: Cameras, i: int, max_width: int) 
         ssims.append(ssim(shown[:, side], image[:, side]))
     others = [name for name in field.lightings if name != cameras.lightings[i]]
     wrong = [psnr(picture(field.embedding(name)), image, mask) for name in others]
+    again = float("nan")
+    if baked is not None:
+        pose = cameras.camera_to_world[i : i + 1]
+        again = psnr(baked.render(pose, intrinsics[None], (width, height), start).rgb[0], image, mask)
     return {
+        "baked": again,
         "psnr": float(np.mean(psnrs)) if psnrs else float("nan"),
         "ssim": float(np.mean(ssims)) if ssims else float("nan"),
         "unfitted": psnr(picture(start), image, mask),
@@ -124,10 +133,20 @@ def score_frame(field: RadianceField, cameras: Cameras, i: int, max_width: int) 
     }
 
 
-def evaluate(field: RadianceField, cameras: Cameras, max_width: int, max_frames: int = _MAX_FRAMES) -> dict[str, Any]:
-    """Held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted` and `psnr_wrong_lighting` (None where
-    there is no other lighting). Lightings without held-out frames have n = 0 and are left out of the rest."""
-    result: dict[str, Any] = {key: {} for key in ("psnr", "ssim", "n", "psnr_unfitted", "psnr_wrong_lighting")}
+def evaluate(
+    field: RadianceField,
+    cameras: Cameras,
+    max_width: int,
+    max_frames: int = _MAX_FRAMES,
+    baked: BakedField | None = None,
+) -> dict[str, Any]:
+    """Held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted`, `psnr_baked` (unfitted, too; of the baked
+    field where there is one) and `psnr_wrong_lighting` (None where there is no other lighting). Lightings without
+    held-out frames have n = 0 and are left out of the rest."""
+    columns = {"psnr": "psnr", "ssim": "ssim", "psnr_unfitted": "unfitted"}
+    if baked is not None:
+        columns["psnr_baked"] = "baked"
+    result: dict[str, Any] = {key: {} for key in (*columns, "n", "psnr_wrong_lighting")}
     frames = []
     for name in field.lightings:
         mine = [i for i in np.flatnonzero(cameras.held_out) if cameras.lightings[i] == name]
@@ -137,10 +156,10 @@ def evaluate(field: RadianceField, cameras: Cameras, max_width: int, max_frames:
     scores: dict[str, list[dict[str, float]]] = {name: [] for name in field.lightings}
     with single_threaded_torch():
         for name, i in track(frames, "held-out frames", unit="frame"):
-            scores[name].append(score_frame(field, cameras, i, max_width))
+            scores[name].append(score_frame(field, cameras, i, max_width, baked))
     for name, rows in scores.items():
         result["n"][name] = len(rows)
-        for key, column in (("psnr", "psnr"), ("ssim", "ssim"), ("psnr_unfitted", "unfitted")):
+        for key, column in columns.items():
             values = [row[column] for row in rows if np.isfinite(row[column])]
             if values:
                 result[key][name] = round(float(np.mean(values)), 4)

@@ -398,13 +398,17 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     Raises:
         InputError: nothing to train on, an unreadable frame, or a device that is not there.
     """
+    from twin.nerf.bake import bake
     from twin.nerf.evaluate import evaluate
 
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     field, metrics = fit(cameras, points, config.nerf, config.seed, height)
-    metrics |= evaluate(field, cameras, config.nerf.max_width)
+    baked = None
+    if config.nerf.bake:
+        baked, metrics["bake"] = bake(field, TrainingPixels(cameras, points, config.nerf.max_width), config.seed)
+    metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
     field.about = {
         "scene": config.name,
         "seed": config.seed,
@@ -413,4 +417,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         "metrics": metrics,
     }
     field.save(out)
+    if baked is not None:
+        baked.about = field.about
+        baked.save(out)
     return metrics

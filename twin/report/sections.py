@@ -223,6 +223,13 @@ def field_section(report: dict[str, Any]) -> Section:
     facts = facts or [Fact("held-out PSNR", NOT_MEASURED)]
     steps = pick(report, "field.steps")
     facts.append(Fact("training steps", number(steps, "{:,}"), "more make it sharper, and take longer"))
+    found = pick(report, "field.stereo.sightings")
+    if found is not None:
+        share = number(pick(report, "field.stereo.share"), "{:.0%}")
+        facts.append(Fact("distances by stereo", number(found, "{:,}"), f"learnt from too; {share} of those tried"))
+    for name, value in (pick(report, "field.psnr_baked") or {}).items():
+        lost = value - float(pick(report, f"field.psnr_unfitted.{name}") or value)
+        facts.append(Fact(f"{name}, baked", f"{lost:+.1f} dB", "what the bricks change, on the same frames"))
     return Section(
         "field",
         "Radiance field",

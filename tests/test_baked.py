@@ -1,0 +1,210 @@
+"""The baked field: its march against formulas and against a slow march, and the way from a trained field to it."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from twin import progress
+from twin.errors import InputError
+from twin.geometry.poses import look_at
+from twin.nerf.baked import BakedField, BrickLayout, brick_indices, leaps
+from twin.nerf.kernels import bricks
+from twin.nerf.lightings import Lightings
+from twin.nerf.rendering import FAR
+
+SIZE = (40, 24)
+K = np.array([30.0, 30.0, 20.0, 12.0])
+LAYOUT = BrickLayout((0.0, 0.0, 0.0), (4.0, 4.0, 2.0), 0.05, 0.5, (10, 10, 5), (8, 8, 4))
+LOW, STEP = -6.0, 18.0 / 255.0
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    progress.set_quiet(True)
+
+
+def places(layout: BrickLayout, near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Where the samples of bricks are [m], shape (s, 729, 3)."""
+    grid = np.stack(np.meshgrid(*[np.arange(bricks.CORNERS)] * 3, indexing="ij"), -1).reshape(-1, 3) / bricks.CELLS
+    unit = [((near[:, None] + grid) / layout.near_shape * 2 - 1), ((far[:, None] + grid) / layout.far_shape * 4 - 2)]
+    out = np.concatenate(unit)
+    m = np.abs(out).max(-1, keepdims=True)
+    # The contraction's inverse: |u| = 1 / (2 − |c|).
+    out = np.where(m > 1, out / np.maximum(m, 1e-9) / np.maximum(2 - m, 0.05), out)
+    return out * layout.half + layout.centre
+
+
+def networks(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Networks that show the first three features as colour."""
+
+    def zeros(*shape: int) -> np.ndarray:
+        return np.zeros(shape, np.float32)
+
+    p = {"head.0": zeros(15 + 16 + 4, 8), "head.1": np.eye(8, dtype=np.float32), "head.2": zeros(8, 3)}
+    p["head.0"][:3, :3] = np.eye(3)
+    p["head.2"][:3] = np.eye(3) * 4.0
+    p |= {"head.0.bias": zeros(8), "head.1.bias": zeros(8), "head.2.bias": np.full(3, -2.0, np.float32)}
+    p |= {"backdrop.0": zeros(16, 4), "backdrop.0.bias": zeros(4), "backdrop.1": zeros(4, 15)}
+    return {f"network.{name}": value for name, value in p.items()}
+
+
+def baked(raw, layout: BrickLayout = LAYOUT) -> BakedField:
+    """All bricks stored; raw density by formula of places (..., 3) [m], features of waves."""
+    near = np.argwhere(np.ones(layout.near_shape, bool)).astype(np.int32)
+    far = np.argwhere(np.ones(layout.far_shape, bool)).astype(np.int32)
+    inside = ((far / layout.far_shape >= 0.25) & ((far + 1) / layout.far_shape <= 0.75)).all(1)
+    far = far[~inside]
+    at = places(layout, near, far)
+    values = np.empty((*at.shape[:2], 16))
+    values[..., 0] = np.clip(raw(at), LOW, LOW + 255 * STEP)
+    for c in range(15):
+        values[..., c + 1] = np.sin(at @ np.array([1.0 + 0.2 * c, 0.7 - 0.1 * c, 0.5]))
+    low, step = np.r_[LOW, np.full(15, -1.0)], np.r_[STEP, np.full(15, 2.0 / 255)]
+    codes = np.rint((values - low) / step).astype(np.uint8)
+    arrays = {
+        "near": near,
+        "far": far,
+        "density": np.ascontiguousarray(codes[..., 0]),
+        "features": codes,
+        "low": low.astype(np.float32),
+        "step": step.astype(np.float32),
+        **networks(np.random.default_rng(0)),
+    }
+    names = Lightings(("day", "night"), np.eye(2, 4, dtype=np.float32), ("day/0",), np.ones((1, 4), np.float32))
+    return BakedField(layout, names, arrays)
+
+
+def looking(eye=(-3.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> np.ndarray:
+    return look_at(np.array(eye), np.array(at))[None]
+
+
+def wall(x: float, raw: float):
+    """Raw density `raw` beyond x [m], nothing before."""
+    return lambda p: np.where(p[..., 0] >= x, raw, LOW)
+
+
+def test_an_opaque_wall_is_where_it_is():
+    out = baked(wall(1.0, 11.0)).render(looking(), K[None], SIZE, "day")
+    cell = LAYOUT.near_side[0] / bricks.CELLS
+    assert out.opacity.min() > 0.98
+    assert np.abs(out.depth - 4.0).max() < 1.5 * cell
+
+
+def test_nothing_is_transparent_and_infinitely_far():
+    out = baked(lambda p: np.full(p.shape[:-1], LOW)).render(looking(), K[None], SIZE, "day")
+    assert out.opacity.max() < 0.05
+    assert (out.depth == FAR).all()
+
+
+def test_a_slab_stops_as_much_as_its_thickness_says():
+    raw = 1.0
+    out = baked(lambda p: np.where(np.abs(p[..., 0]) < 0.501, raw, LOW)).render(looking(), K[None], SIZE, "day")
+    middle = out.opacity[0, SIZE[1] // 2, SIZE[0] // 2]
+    thickness = 1.0  # [m]; the rims of trilinear log density add little
+    assert middle == pytest.approx(1 - np.exp(-LAYOUT.density_unit * np.exp(raw) * thickness), abs=0.06)
+
+
+@pytest.mark.parametrize(("distance", "opacity"), [(2.0, 0.0), (6.0, 1.0)])
+def test_the_march_stops_at_what_else_stands_there(distance, opacity):
+    stop = np.full((1, SIZE[1], SIZE[0]), distance)
+    out = baked(wall(1.0, 11.0)).render(looking(), K[None], SIZE, "day", stop)
+    assert np.abs(out.opacity - opacity).max() < 0.05
+
+
+def slow_march(field: BakedField, eye: np.ndarray, directions: np.ndarray, step: float) -> np.ndarray:
+    """Opacity and features along rays (k, 3) by small equal steps through the near box, shape (k, 16)."""
+    near = brick_indices(field.layout, field._arrays["near"], field._arrays["far"])[0]
+    low, scale = field._arrays["low"].astype(float), field._arrays["step"].astype(float)
+    total, transmittance = np.zeros((len(directions), 16)), np.ones(len(directions))
+    for t in np.arange(field.layout.near_plane + step / 2, 12.0, step):
+        b = ((eye + directions * t - field.layout.centre) / field.layout.half + 1) / 2
+        inside = ((b >= 0) & (b < 1)).all(1)
+        p = b.clip(0, 1 - 1e-9) * field.layout.near_shape
+        slot = near[tuple(np.floor(p).astype(int).T)]
+        c = (p - np.floor(p)) * bricks.CELLS
+        cell = np.minimum(np.floor(c).astype(int), bricks.CELLS - 1)
+        value = np.zeros((len(p), 16))
+        for corner in np.ndindex(2, 2, 2):
+            x, y, z = (cell + corner).T
+            weight = np.prod(np.where(np.array(corner) == 1, c - cell, 1 - (c - cell)), axis=1)
+            code = field._arrays["features"][slot, (x * bricks.CORNERS + y) * bricks.CORNERS + z]
+            value += weight[:, None] * (low + scale * code)
+        optical = np.where(inside, field.layout.density_unit * np.exp(value[:, 0]) * step, 0.0)
+        weight = transmittance * -np.expm1(-optical)
+        total += weight[:, None] * value
+        transmittance *= np.exp(-optical)
+    total[:, 0] = 1 - transmittance
+    return total
+
+
+def test_the_march_equals_a_slow_one():
+    rng = np.random.default_rng(1)
+    centres, radii = rng.uniform([-1, -2, -1], [3, 2, 1], (9, 3)), rng.uniform(0.3, 0.7, 9)
+
+    def blobs(p):
+        near = np.min([np.linalg.norm(p - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)], axis=0)
+        return np.clip(4.0 - 12.0 * near, LOW, 5.0) - 100.0 * (np.abs(p) > np.array([3.9, 3.9, 1.9])).any(-1)
+
+    field = baked(blobs)
+    pose = looking((-3.5, 0.5, 0.3))
+    out = field.render(pose, K[None], SIZE, "day")
+    features, _, directions = (array.numpy()[0] for array in field._buffer(1, SIZE[0] * SIZE[1]))
+    slow = slow_march(field, pose[0, :3, 3], directions.astype(float), 0.005)
+    assert 0.2 < slow[:, 0].mean() < 0.95
+    assert np.abs(features[:, 0] - slow[:, 0]).mean() < 0.01
+    assert np.abs(features - slow).mean() < 0.02
+    assert np.abs(out.opacity.ravel() - slow[:, 0]).max() < 0.3  # at a rim the two may differ
+
+
+def test_a_leap_never_passes_a_filled_block():
+    rng = np.random.default_rng(2)
+    field = baked(wall(1.0, 11.0))
+    sparse = dict(field._arrays)
+    sparse["density"] = np.zeros_like(sparse["density"])
+    for _ in range(6):
+        sparse["density"][rng.integers(len(sparse["near"])), rng.integers(729)] = 255
+    near, far = leaps(LAYOUT, sparse)
+    filled = np.argwhere(near == 0)
+    assert len(filled) > 0
+    for block in np.argwhere(near > 1)[::97]:
+        assert np.abs(filled - block).max(1).min() >= near[tuple(block)]
+        rim = np.minimum(block, np.array(near.shape) - 1 - block).min() + 1
+        assert near[tuple(block)] <= rim
+    assert far.shape == tuple(np.multiply(LAYOUT.far_shape, bricks.BLOCKS))
+
+
+def test_one_camera_or_many_are_the_same(monkeypatch):
+    field = baked(wall(1.0, 2.0))
+    poses = np.concatenate([looking(), looking((-3.0, 1.0, 0.5)), looking((-2.0, -1.0, 0.0))])
+    intrinsics = np.tile(K, (3, 1))
+    together = field.render(poses, intrinsics, SIZE, "day:night:0.3")
+    for i in range(3):
+        alone = field.render(poses[i : i + 1], intrinsics[:1], SIZE, "day:night:0.3")
+        assert np.array_equal(alone.depth[0], together.depth[i])
+        assert np.allclose(alone.rgb[0], together.rgb[i], atol=1e-5)
+
+
+def test_it_comes_back_from_its_files_without_torch(tmp_path):
+    field = baked(wall(1.0, 3.0))
+    field.save(tmp_path)
+    before = field.render(looking(), K[None], SIZE, "night")
+    after = BakedField.load(tmp_path).render(looking(), K[None], SIZE, "night")
+    assert np.array_equal(before.depth, after.depth)
+    assert np.array_equal(before.rgb, after.rgb)
+    code = (
+        "import sys; from pathlib import Path; from twin.nerf.baked import BakedField;"
+        f"BakedField.load(Path({str(tmp_path)!r})); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_what_is_no_baked_field_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match=r"no baked\.json"):
+        BakedField.load(tmp_path)
+    (tmp_path / "baked.json").write_text('{"format": 99}')
+    with pytest.raises(InputError, match="format 99"):
+        BakedField.load(tmp_path)
+    with pytest.raises(InputError, match="unknown"):
+        baked(wall(1.0, 3.0)).render(looking(), K[None], SIZE, "dawn")
