@@ -13,7 +13,7 @@ import types
 import pytest
 
 from twin import build as verb
-from twin.config import SceneConfig
+from twin.config import SceneConfig, SourceConfig
 from twin.scene import SceneDir
 from twin.stamp import Stamp
 
@@ -81,6 +81,30 @@ def test_changed_input_version_damage_and_force(pipeline, monkeypatch):
     assert _rerun(pipeline) == ["field"]
     (pipeline.scene.stage("cameras") / "result.txt").unlink()
     assert _rerun(pipeline) == ["cameras"]
+
+
+def test_images_that_a_transforms_json_names_are_input_wherever_they_lie(tmp_path):
+    root, elsewhere = tmp_path / "scene", tmp_path / "photos"
+    (root / "input").mkdir(parents=True)
+    elsewhere.mkdir()
+    for name in ("a.png", "b.JPG", "mask.png"):
+        (elsewhere / name).write_bytes(name.encode())
+    frames = [
+        {"file_path": "../../photos/a.png", "mask_path": "../../photos/mask.png"},
+        {"file_path": "../../photos/b"},  # as instant-ngp writes it
+        {"file_path": "../../photos/absent.png"},
+        {"file_path": 3},
+        "no frame",
+    ]
+    (root / "input/transforms.json").write_text(json.dumps({"frames": frames}))
+    config = SceneConfig(source=(SourceConfig(path="input/transforms.json"),))
+    digests = verb.input_digests(SceneDir(root), config)
+    names = {"a.png", "b.JPG", "mask.png"}
+    assert set(digests) == {"input/transforms.json", *(f"../photos/{name}" for name in names)}
+    (elsewhere / "a.png").write_bytes(b"another")
+    assert verb.input_digests(SceneDir(root), config) != digests
+    (root / "input/transforms.json").write_text("{")
+    assert set(verb.input_digests(SceneDir(root), config)) == {"input/transforms.json"}
 
 
 def test_until_and_report(pipeline):

@@ -94,6 +94,8 @@ def build(
 
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     """SHA-256 of every file the sources name, by path relative to the scene. Raises InputError if one is absent."""
+    from twin.capture.formats import files_named
+
     digests: dict[str, str] = {}
     for source in config.source:
         for name in filter(None, (source.path, source.images, source.mask)):
@@ -104,6 +106,8 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
             posed = path.suffix == ".json" or any(path.glob("cameras.*"))
             folder = scene.root / Path(name).parts[0] if posed and not Path(name).is_absolute() else path
             files = sorted(p for p in folder.rglob("*") if p.is_file()) if folder.is_dir() else [path]
+            if path.suffix == ".json":
+                files += files_named(path, scene.root / source.images if source.images else None)
             digests |= {os.path.relpath(file, scene.root): digest_file(file) for file in files}
     return digests
 

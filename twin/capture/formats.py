@@ -155,6 +155,22 @@ def read_transforms(path: Path, images: Path | None = None) -> ImageSet:
     )
 
 
+def files_named(path: Path, images: Path | None = None) -> list[Path]:
+    """The images and masks that a `transforms.json` names and that are there, wherever they lie; none of a bad file."""
+    try:
+        frames = _json(path).get("frames")
+    except InputError:
+        return []  # reading it for good will say what is wrong
+    found = set()
+    for frame in frames if isinstance(frames, list) else ():
+        if isinstance(frame, dict):
+            if isinstance(frame.get("file_path"), str):
+                found.add(_find_image(path.parent, images, frame["file_path"]))
+            if isinstance(frame.get("mask_path"), str) and (path.parent / frame["mask_path"]).is_file():
+                found.add(path.parent / frame["mask_path"])
+    return sorted(file for file in found if file is not None)
+
+
 def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
     """The lens of one frame; `table` is the file's top level overlaid with the frame's own entries.
 
