@@ -54,7 +54,7 @@ def bake(
     values = _sample(field, layout, slots)
     tuner = _Tuner(field, pixels, layout, slots, values, steps, seed)
     error = tuner.run()
-    arrays = _in_bytes(values.numpy(), slots, field)
+    arrays = _in_bytes(values.cpu().numpy(), slots, field)
     baked = BakedField(layout, field.appearance.named(), arrays, field.where, field.about)
     return baked, {
         "bricks_near": len(slots[0]),
