@@ -169,7 +169,7 @@ def main(argv: list[str]) -> int:
     except InputError as error:
         tell(error=str(error))
         return _BAD_INPUT
-    except Exception:
+    except Exception:  # a bug, shown here because the exit below goes past the interpreter and its own report
         traceback.print_exc()
         return 1
     return 0

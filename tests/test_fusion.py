@@ -1,0 +1,47 @@
+"""Votes of views: what is seen edge-on counts little, and free space is believed further out than surfaces."""
+
+import numpy as np
+import pytest
+
+from twin.assets.fusion import LOOK_THROUGH, fuse
+from twin.assets.views import Views
+
+BAND, FAR = 0.3, 10.0
+
+
+def views(depth: list[float], slant: list[float]) -> Views:
+    """Views from one place along z, each of a surface at one depth [m]."""
+    n, shape = len(depth), (len(depth), 5, 5)
+    flat = np.ones(shape, np.float32)
+    return Views(
+        np.tile(np.eye(4), (n, 1, 1)),
+        np.tile([5.0, 5.0, 2.5, 2.5], (n, 1)),
+        np.zeros((*shape, 3), np.uint8),
+        flat * np.array(depth, np.float32)[:, None, None],
+        flat * np.array(slant, np.float32)[:, None, None],
+        np.zeros(shape, np.float32),
+    )
+
+
+def vote(z: float, *seen: tuple[float, float]) -> tuple[float, float, float]:
+    """Distance, near and free votes at depth z, from views given by (depth, slant)."""
+    found = fuse(np.array([[0.0, 0.0, z]]), views(*map(list, zip(*seen, strict=True))), BAND, FAR)
+    return tuple(float(values[0]) for values in found)
+
+
+def test_two_that_see_a_surface_outvote_one_that_looks_through_unless_they_see_it_edge_on():
+    behind = 0.25  # [m] the point lies so far behind the surface
+    square = vote(5.0, (5.0 - behind, 1.0), (5.0 - behind, 1.0), (9.0, 1.0))
+    lean = 0.12
+    edge_on = vote(5.0, (5.0 - behind / lean, lean), (5.0 - behind / lean, lean), (9.0, 1.0))
+    assert square[0] < 0.0
+    assert edge_on[0] > 0.5 * BAND
+    assert edge_on[1] == pytest.approx(lean**2 * square[1], rel=1e-4)
+
+
+def test_free_space_is_believed_further_out_than_surfaces():
+    assert vote(1.5 * FAR, (1.5 * FAR, 1.0))[1:] == (0.0, 0.0)
+    near, free = vote(1.5 * FAR, (3.0 * FAR, 1.0))[1:]
+    assert near == 0.0 and free > 0.0
+    assert vote(1.5 * FAR, (1.55 * FAR, 1.0))[2] == 0.0  # too near to the surface to be told from it
+    assert vote(1.01 * LOOK_THROUGH * FAR, (9.0 * FAR, 1.0))[2] == 0.0
