@@ -8,10 +8,12 @@ once the metric stage has run; in `2_cameras` it is still the reconstruction's o
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.errors import InputError
 from twin.geometry.poses import Similarity, inverse_pose
 from twin.scene import read_json, write_json
 
@@ -125,6 +127,56 @@ class Cameras:
                 images=base / head["images"],
                 masks=base / head["masks"] if head["masks"] else None,
             )
+
+
+class Posed(Protocol):
+    """What a renderer needs of cameras: `Cameras` and `Viewpoints` are such."""
+
+    @property
+    def camera_to_world(self) -> Array: ...
+    @property
+    def intrinsics(self) -> Array: ...
+    @property
+    def sizes(self) -> NDArray[np.int64]: ...
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """n pinhole views that nobody filmed."""
+
+    camera_to_world: Array
+    """Shape (n, 4, 4)."""
+    intrinsics: Array
+    """fx, fy, cx, cy [px], shape (n, 4)."""
+    sizes: NDArray[np.int64]
+    """Width, height [px] that the intrinsics are for, shape (n, 2)."""
+
+    @staticmethod
+    def of(camera_to_world: Array, intrinsics: Array, size: tuple[int, int]) -> "Viewpoints":
+        """One or many views from one camera.
+
+        Args:
+            camera_to_world: Shape (4, 4) or (n, 4, 4).
+            intrinsics: fx, fy, cx, cy [px], shape (4,), or (n, 4) where they differ.
+            size: Width, height [px] that the intrinsics are for.
+        """
+        pose = np.asarray(camera_to_world, np.float64).reshape(-1, 4, 4)
+        k = np.broadcast_to(np.asarray(intrinsics, np.float64), (len(pose), 4))
+        return Viewpoints(pose, k, np.broadcast_to(np.array(size, np.int64), (len(pose), 2)))
+
+
+def resized(cameras: Posed, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
+    """Intrinsics (n, 4) for pictures of one size, and that size: the one given, else that of the cameras.
+
+    Raises:
+        InputError: no size given, and the cameras' differ.
+    """
+    own = np.asarray(cameras.sizes)
+    if size is None:
+        if len(own) == 0 or (own != own[0]).any():
+            raise InputError(f"cameras of {len(np.unique(own, axis=0))} sizes; give render one size=(width, height)")
+        size = int(own[0, 0]), int(own[0, 1])
+    return np.asarray(cameras.intrinsics) * np.tile(np.array(size) / own, 2), size
 
 
 def pixel_grid(width: int, height: int) -> Array:

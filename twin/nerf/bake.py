@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from twin.nerf import network
-from twin.nerf.baked import BakedField, BrickLayout, brick_indices
+from twin.nerf.baked import BakedField, BrickLayout, brick_indices, leaps
 from twin.nerf.compute import parallel, single_threaded_torch, view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import CameraArrays, RadianceField, Workspace
@@ -54,7 +54,7 @@ def bake(
     values = _sample(field, layout, slots)
     tuner = _Tuner(field, pixels, layout, slots, values, steps, seed)
     error = tuner.run()
-    arrays = _in_bytes(values.cpu().numpy(), slots, field)
+    arrays = _in_bytes(values.cpu().numpy(), slots, field, layout)
     baked = BakedField(layout, field.appearance.named(), arrays, field.where, field.about)
     return baked, {
         "bricks_near": len(slots[0]),
@@ -270,7 +270,9 @@ class _Tuner:
         )
 
 
-def _in_bytes(values: NDArray, slots: tuple[NDArray, NDArray], field: RadianceField) -> dict[str, NDArray]:
+def _in_bytes(
+    values: NDArray, slots: tuple[NDArray, NDArray], field: RadianceField, layout: BrickLayout
+) -> dict[str, NDArray]:
     """Arrays as `BakedField` takes them."""
     flat = values.reshape(-1, volume.CHANNELS)
     matter = flat[flat[:, 0] > 0.0]
@@ -282,10 +284,10 @@ def _in_bytes(values: NDArray, slots: tuple[NDArray, NDArray], field: RadianceFi
     arrays: dict[str, NDArray] = {
         "near": slots[0].astype(np.int32),
         "far": slots[1].astype(np.int32),
-        "density": np.ascontiguousarray(codes[..., 0]),
         "features": codes,
         "low": low,
         "step": step.astype(np.float32),
     }
     parameters = {k: v for k, v in field.parameters.items() if not k.startswith("trunk")}
-    return arrays | {f"network.{k}": v.detach().cpu().numpy() for k, v in parameters.items()}
+    arrays |= {f"network.{k}": v.detach().cpu().numpy() for k, v in parameters.items()}
+    return arrays | leaps(layout, arrays)

@@ -5,9 +5,12 @@ Density and features of a trained radiance field, sampled into sparse bricks of 
 baked field shows its place under every lighting.
 """
 
+import itertools
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +21,23 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as to_bytes
 
 from twin.errors import InputError
-from twin.nerf.kernels import bricks as kernels
-from twin.nerf.kernels.composite import CHANNELS
+from twin.geometry.cameras import Posed, resized
+from twin.nerf.kernels import march as kernels
+from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, Bytes
+from twin.nerf.kernels.composite import CHANNELS, Channels
+from twin.nerf.kernels.shade import HARMONICS, shade
+from twin.nerf.kernels.shade import LANES as SHADE_LANES
 from twin.nerf.lightings import Lightings
-from twin.nerf.rendering import FAR, Rendering
+from twin.nerf.rendering import Rendering
 from twin.scene import read_json, write_json
 
 wp.config.log_level = wp.LOG_ERROR
 
 Floats = NDArray[np.float32]
 
-_FORMAT = 1
-_TRACE = 0.01  # share of light that a cell may stop and count as empty
-_TASKS = 4  # pieces a picture's pixels are cut into, at least
+_FORMAT = 2
+_TRACE = 0.03  # share of light that a cell may stop and count as empty
+_PIECES = 3  # of a picture, per core
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,7 @@ class BrickLayout:
     @property
     def far_cell(self) -> float:
         """Smallest side of a far cell [contracted m]."""
-        return float((4.0 * np.array(self.half) / np.array(self.far_shape)).min()) / kernels.CELLS
+        return float((4.0 * np.array(self.half) / np.array(self.far_shape)).min()) / CELLS
 
 
 class BakedField:
@@ -76,32 +83,55 @@ class BakedField:
         Args:
             layout: Sizes and bounds.
             lightings: The appearance embeddings by name.
-            arrays: `near` and `far` (bricks' grid positions of the slots, (s, 3), near ones first), `density` (s, 729)
-                and `features` (s, 729, CHANNELS) bytes, `low` and `step` (CHANNELS,), and `network.*`.
+            arrays: `near` and `far` (bricks' grid positions of the slots, (s, 3), near ones first), `features`
+                (s, 729, CHANNELS) bytes, `low` and `step` (CHANNELS,), `near_leap` and `far_leap` (see `leaps`), and
+                `network.*`.
             where: Device.
             about: Whatever else is to be kept beside the numbers, JSON-able.
         """
         self.layout, self.lightings_by_name, self.about, self.where = layout, lightings, about or {}, where
         self._arrays = arrays
-        self._network = {k.removeprefix("network."): v for k, v in arrays.items() if k.startswith("network.")}
         near, far = brick_indices(layout, arrays["near"], arrays["far"])
-        near_leap, far_leap = leaps(layout, arrays)
+
+        def on_device(array: NDArray, dtype: Any) -> Any:
+            if where == "cpu":
+                own = np.empty(array.shape, array.dtype)
+                own[...] = array
+                return wp.array(own, dtype=dtype, device=where, copy=False)
+            return wp.array(np.ascontiguousarray(array), dtype=dtype, device=where)
+
         b: Any = kernels.Bricks()
-        b.near_index = wp.array(near, dtype=wp.int32, device=where)
-        b.far_index = wp.array(far, dtype=wp.int32, device=where)
-        b.near_leap = wp.array(near_leap, dtype=wp.uint8, device=where)
-        b.far_leap = wp.array(far_leap, dtype=wp.uint8, device=where)
-        b.density = wp.array(arrays["density"].ravel(), dtype=wp.uint8, device=where)
-        b.features = wp.array(arrays["features"].reshape(-1, CHANNELS), dtype=kernels.Bytes, device=where)
-        b.low, b.step = kernels.Channels(*arrays["low"].tolist()), kernels.Channels(*arrays["step"].tolist())
+        b.near_index, b.far_index = on_device(near.ravel(), wp.int32), on_device(far.ravel(), wp.int32)
+        b.near_leap = on_device(arrays["near_leap"].ravel(), wp.uint8)
+        b.far_leap = on_device(arrays["far_leap"].ravel(), wp.uint8)
+        b.near_blocks = wp.vec3i(*(BLOCKS * n for n in layout.near_shape))
+        b.far_blocks = wp.vec3i(*(BLOCKS * n for n in layout.far_shape))
+        b.corners = on_device(cell_corners(arrays["features"][..., 0]), wp.uint64)
+        b.features = on_device(arrays["features"].reshape(-1, CHANNELS), Bytes)
+        b.low, b.step = Channels(*arrays["low"].tolist()), Channels(*arrays["step"].tolist())
         b.centre = wp.vec3f(*layout.centre)
         b.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        b.near_cell, b.far_cell = float(layout.near_side.min()) / kernels.CELLS, layout.far_cell
+        b.near_cell, b.far_cell = float(layout.near_side.min()) / CELLS, layout.far_cell
         b.unit, b.near_plane = layout.density_unit, layout.near_plane
         self._bricks = b
-        self._buffers: dict[tuple[int, int], Any] = {}
-        self._no_stop: Any = wp.zeros((0, 0), dtype=wp.float32, device=where)
-        wp.load_module("twin.nerf.kernels.bricks", device=where)
+        self._pictures: dict[tuple[int, int, int, bool], _Picture] = {}
+
+        p = {k.removeprefix("network."): v for k, v in arrays.items() if k.startswith("network.")}
+        hidden, behind = p["head.1"].shape[0], p["backdrop.0"].shape[1]
+        self._march = kernels.march(kernels.LANES[where])
+        self._shade, weights = shade(SHADE_LANES[where], hidden, behind)
+        rows = CHANNELS - 1 + HARMONICS
+        w: Any = weights()
+        for name, matrix in (("head_0", p["head.0"][:rows]), ("head_1", p["head.1"])):
+            fours = matrix.reshape(len(matrix), -1, 4).transpose(1, 0, 2)
+            setattr(w, name, on_device(fours.ravel(), wp.float32))
+        for name in ("head.2", "backdrop.0", "backdrop.1"):
+            setattr(w, name.replace(".", "_"), on_device(p[name].ravel(), wp.float32))
+        w.head_1_bias, w.head_2_bias = on_device(p["head.1.bias"], wp.float32), wp.vec3f(*p["head.2.bias"].tolist())
+        w.backdrop_0_bias = on_device(p["backdrop.0.bias"], wp.float32)
+        self._weights = w
+        self._bias_of = p["head.0.bias"], p["head.0"][rows:]
+        load_kernels([kernels.approach, self._march, self._shade], where)
         self._threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(self._threads) if where == "cpu" and self._threads > 1 else None
 
@@ -128,79 +158,53 @@ class BakedField:
 
     def render(
         self,
-        camera_to_world: NDArray,
-        intrinsics: NDArray,
-        size: tuple[int, int],
-        lighting: str | NDArray,
+        cameras: Posed,
+        lighting: str | NDArray | Sequence[str],
+        size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
     ) -> Rendering:
-        """Views of n cameras under one lighting.
+        """What n cameras see.
 
         Args:
-            camera_to_world: OpenCV axes, shape (n, 4, 4).
-            intrinsics: fx, fy, cx, cy [px] at `size`, shape (n, 4).
-            size: Width, height [px].
-            lighting: A name, see `Lightings.embedding`, or an embedding (dim,).
+            cameras: `Cameras` of a scene, or `Viewpoints`.
+            lighting: A name, see `Lightings.embedding`, or an embedding (dim,); or one of either per camera.
+            size: Width, height [px] of the pictures; that of the cameras unless given.
             stop: z-depth of what else stands there [m], shape (n, height, width): the march ends at it. `opacity` is
                 then what the field holds back of it, and `rgb` the colour of the field's own share alone.
 
         Raises:
-            InputError: unknown lighting.
+            InputError: unknown lighting, or cameras of several sizes and none given.
         """
-        vector = self.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
-        pose = np.asarray(camera_to_world, np.float64)
-        n, (width, height) = len(pose), size
-        pixels = width * height
-        features, depth, directions = self._buffer(n, pixels)
-        inputs: list[Any] = [
-            self._bricks,
-            wp.array(pose[:, :3, :3].astype(np.float32), dtype=wp.mat33f, device=self.where),
-            wp.array(pose[:, :3, 3].astype(np.float32), dtype=wp.vec3f, device=self.where),
-            wp.array(np.asarray(intrinsics, np.float32), dtype=wp.vec4f, device=self.where),
-            self._no_stop
-            if stop is None
-            else wp.array(np.asarray(stop, np.float32).reshape(n, pixels), dtype=wp.float32, device=self.where),
-            width,
-        ]
-        rgb = np.empty((n, pixels, 3), np.float32)
-        opacity = np.empty((n, pixels), np.float32)
-        bias = self._network["head.0.bias"] + vector @ self._network["head.0"][CHANNELS - 1 + 16 :]
-        if self.where != "cpu":
-            wp.launch(kernels.march, (n, pixels), [*inputs, 0], [features, depth, directions], device=self.where)
-        f, d = features.numpy(), directions.numpy()
-        share = -(-pixels // max(_TASKS, self._threads)) if n < self._threads else pixels
+        intrinsics, (width, height) = resized(cameras, size)
+        pose = np.asarray(cameras.camera_to_world, np.float64)
+        picture = self._picture(len(pose), width, height, stop is not None)
+        picture.aim(pose, intrinsics, self._biases(lighting, len(pose)), stop)
+        if self._pool is None:
+            for piece in picture.pieces:
+                picture.develop(piece)
+        else:
+            list(self._pool.map(picture.develop, picture.pieces))
+        return picture.rendering()
 
-        def work(task: tuple[int, int]) -> None:
-            camera, first = task
-            rows = slice(first, min(first + share, pixels))
-            if self.where == "cpu":
-                one = [array[camera : camera + 1] for array in (features, depth, directions)]
-                mine = [inputs[0], *(array[camera : camera + 1] for array in inputs[1:4])]
-                mine += [self._no_stop if stop is None else inputs[4][camera : camera + 1], width, first]
-                wp.launch(kernels.march, (1, rows.stop - first), mine, one, device=self.where)
-            opacity[camera, rows] = f[camera, rows, 0]
-            rgb[camera, rows] = shade(self._network, bias, f[camera, rows], d[camera, rows], backdrop=stop is None)
+    def _biases(self, lighting: str | NDArray | Sequence[str], n: int) -> Floats:
+        """The head's first bias with the appearance in it, shape (n, hidden)."""
+        if isinstance(lighting, str):
+            vectors = self.embedding(lighting)[None]
+        elif isinstance(lighting, np.ndarray) and lighting.dtype.kind == "f":
+            vectors = np.asarray(lighting, np.float32).reshape(-1, lighting.shape[-1])
+        else:
+            vectors = np.stack([self.embedding(name) for name in lighting])
+        if len(vectors) not in (1, n):
+            raise InputError(f"{len(vectors)} lightings for {n} cameras; expected one, or one per camera")
+        bias, matrix = self._bias_of
+        return np.broadcast_to(bias + vectors @ matrix, (n, len(bias)))
 
-        tasks = [(camera, first) for camera in range(n) for first in range(0, pixels, share)]
-        list(self._pool.map(work, tasks) if self._pool else map(work, tasks))
-        z = depth.numpy()
-        return Rendering(
-            rgb.reshape(n, height, width, 3),
-            np.where(z > 0.0, np.minimum(z, FAR), FAR).astype(np.float32).reshape(n, height, width),
-            opacity.reshape(n, height, width),
-        )
-
-    def _buffer(self, n: int, pixels: int) -> tuple[Any, Any, Any]:
-        """Arrays for so many pixels; the last ones are kept, as the next picture is likely of the same size."""
-        if (n, pixels) not in self._buffers:
-            self._buffers = {
-                (n, pixels): (
-                    wp.zeros((n, pixels), dtype=kernels.Channels, device=self.where),
-                    wp.zeros((n, pixels), dtype=wp.float32, device=self.where),
-                    wp.zeros((n, pixels), dtype=wp.vec3f, device=self.where),
-                )
-            }
-        return self._buffers[n, pixels]
+    def _picture(self, n: int, width: int, height: int, stopped: bool) -> "_Picture":
+        """Arrays for pictures of this size; the last ones are kept, as the next picture is likely of the same size."""
+        key = n, width, height, stopped
+        if key not in self._pictures:
+            self._pictures = {key: _Picture(self, *key)}
+        return self._pictures[key]
 
     # ---- files
 
@@ -253,74 +257,115 @@ def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDA
     return out[0], out[1]
 
 
-def leaps(layout: BrickLayout, arrays: dict[str, NDArray]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """How far rays may leap from every block of the near and the far grid, see `kernels/bricks.py`."""
+def cell_corners(codes: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Density codes (s, 729) as one number per cell, see `Bricks.corners` in `kernels/march.py`; shape (s · 512,)."""
+    side = [CORNERS] * 3
+    cube = codes.reshape(-1, *side)
+    out = np.empty((len(cube), CELLS, CELLS, CELLS, 8), np.uint8)
+    for n in range(8):
+        x, y, z = n >> 2, (n >> 1) & 1, n & 1
+        out[..., n] = cube[:, x : x + CELLS, y : y + CELLS, z : z + CELLS]
+    return out.reshape(-1, 8).view("<u8").ravel()
+
+
+def leaps(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
+    """How far rays may leap from every block of the `near_leap` and the `far_leap` grid, see `kernels/march.py`."""
     from scipy.ndimage import distance_transform_cdt
 
-    n = kernels.BLOCKS
     filled = filled_blocks(layout, arrays)
     split = len(arrays["near"])
-    out = []
-    for shape, slots, mine in (
-        (layout.near_shape, arrays["near"], filled[:split]),
-        (layout.far_shape, arrays["far"], filled[split:]),
+    out = {}
+    for name, shape, slots, mine in (
+        ("near_leap", layout.near_shape, arrays["near"], filled[:split]),
+        ("far_leap", layout.far_shape, arrays["far"], filled[split:]),
     ):
-        bricks = np.zeros((*shape, n, n, n), bool)
+        bricks = np.zeros((*shape, BLOCKS, BLOCKS, BLOCKS), bool)
         bricks[tuple(slots.T)] = mine
-        blocks = bricks.transpose(0, 3, 1, 4, 2, 5).reshape(np.multiply(shape, n))
-        # What lies beyond a grid may be full; so may the near box be, to the far grid.
-        whole = np.pad(blocks, 1, constant_values=True)
-        if shape is layout.far_shape:
-            low = np.floor(0.25 * n * np.array(shape)).astype(int) + 1
-            high = np.ceil(0.75 * n * np.array(shape)).astype(int) + 1
-            whole[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = True
-        leap = distance_transform_cdt(~whole, "chessboard")[1:-1, 1:-1, 1:-1]
-        out.append(np.minimum(leap, 255).astype(np.uint8))
-    return out[0], out[1]
+        blocks = bricks.transpose(0, 3, 1, 4, 2, 5).reshape(np.multiply(shape, BLOCKS))
+        leap = distance_transform_cdt(~blocks, "chessboard") if blocks.any() else np.full(blocks.shape, 255)
+        out[name] = np.minimum(leap, 255).astype(np.uint8)
+    return out
 
 
 def filled_blocks(layout: BrickLayout, arrays: dict[str, NDArray]) -> NDArray[np.bool_]:
     """Whether some corner of a block stops more than a trace of light per cell, shape (slots, 4, 4, 4)."""
-    near_cell = float(layout.near_side.min()) / kernels.CELLS
-    cell = np.where(np.arange(len(arrays["density"])) < len(arrays["near"]), near_cell, layout.far_cell)
-    codes = (np.log(_TRACE / (cell * layout.density_unit)) - arrays["low"][0]) / arrays["step"][0]
-    stops = arrays["density"].reshape(-1, *[kernels.CORNERS] * 3) > codes[:, None, None, None]
+    codes = arrays["features"][..., 0].reshape(-1, *[CORNERS] * 3)
+    cell = np.where(np.arange(len(codes)) < len(arrays["near"]), float(layout.near_side.min()) / CELLS, layout.far_cell)
+    least = (np.log(_TRACE / (cell * layout.density_unit)) - arrays["low"][0]) / arrays["step"][0]
+    stops = codes > least[:, None, None, None]
     for axis in (1, 2, 3):
-        first, second, third = (np.take(stops, np.arange(k, k + kernels.CELLS - 1, 2), axis) for k in (0, 1, 2))
+        first, second, third = (np.take(stops, np.arange(k, k + CELLS - 1, 2), axis) for k in (0, 1, 2))
         stops = first | second | third
     return stops
 
 
-def shade(p: dict[str, Floats], bias: Floats, composited: Floats, directions: Floats, backdrop: bool = True) -> Floats:
-    """Colour (k, 3) of rays from what was composited along them (k, CHANNELS) and their unit directions (k, 3).
+class _Picture:
+    """What pictures of one size are rendered into, and the launches that do it, cut into pieces for the cores."""
 
-    `bias` is the first layer's with the appearance in it. Without the backdrop, a ray's features are scaled up to a
-    full share, so that the colour is that of what was met and its opacity says how much of it.
-    """
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    harmonics = np.empty((len(x), 16), np.float32)
-    harmonics[:, 0] = 1.0
-    harmonics[:, 1:4] = directions
-    harmonics[:, 4], harmonics[:, 5], harmonics[:, 6] = x * y, y * z, 3.0 * zz - 1.0
-    harmonics[:, 7], harmonics[:, 8], harmonics[:, 9] = x * z, xx - yy, y * (3.0 * xx - yy)
-    harmonics[:, 10], harmonics[:, 11], harmonics[:, 12] = x * y * z, y * (5.0 * zz - 1.0), z * (5.0 * zz - 3.0)
-    harmonics[:, 13], harmonics[:, 14], harmonics[:, 15] = x * (5.0 * zz - 1.0), z * (xx - yy), x * (xx - 3.0 * yy)
-    features = composited[:, 1:].copy()
-    if backdrop:
-        open_ = np.flatnonzero(composited[:, 0] < 0.999)
-        behind = np.maximum(harmonics[open_] @ p["backdrop.0"] + p["backdrop.0.bias"], 0.0) @ p["backdrop.1"]
-        features[open_] += (1.0 - composited[open_, :1]) * behind
-    else:
-        features /= np.maximum(composited[:, :1], 1e-3)
-    f = features.shape[1]
-    h = features @ p["head.0"][:f]
-    h += harmonics @ p["head.0"][f : f + 16]
-    h += bias
-    np.maximum(h, 0.0, out=h)
-    h = h @ p["head.1"]
-    h += p["head.1.bias"]
-    np.maximum(h, 0.0, out=h)
-    out = h @ p["head.2"]
-    out += p["head.2.bias"]
-    return (1.0 / (1.0 + np.exp(-out))).astype(np.float32)
+    def __init__(self, field: BakedField, n: int, width: int, height: int, stopped: bool):
+        self.shape, where = (n, height, width), field.where
+        across, down, pixels = -(-width // kernels.TILE), -(-height // kernels.TILE), width * height
+
+        def new(shape: tuple[int, ...], dtype: Any = wp.float32) -> Any:
+            return wp.zeros(shape, dtype=dtype, device=where)
+
+        film: Any = kernels.Film()
+        film.rotation, film.position = new((n,), wp.mat33f), new((n,), wp.vec3f)
+        film.intrinsics = new((n,), wp.vec4f)
+        film.stop = new((n, pixels) if stopped else (0, 0))
+        film.width, film.height, film.across = width, height, across
+        self.film, self.bias = film, new((n, len(field._bias_of[0])))
+        self.depth, self.opacity, self.rgb = new((n, pixels)), new((n, pixels)), new((n, pixels), wp.vec3f)
+        self.features = new((n, CHANNELS, pixels))
+        start = new((n, across * down))
+        # More pieces than cores, as those with sky in them are done sooner.
+        pieces = _PIECES * field._threads if field._pool else 1
+        edges = np.unique(np.linspace(0, down, pieces + 1).round().astype(int)).tolist()
+        self.pieces = range(len(edges) - 1)
+        self.launches = []
+        for first, last in itertools.pairwise(edges):
+            record = partial(wp.launch, device=where, record_cmd=True)
+            tiles = (last - first) * across
+            top, bottom = first * kernels.TILE * width, min(last * kernels.TILE, height) * width
+            packets = tiles * kernels.TILE**2 // kernels.LANES[where]
+            runs = -(-(bottom - top) // SHADE_LANES[where])
+            self.launches.append(
+                [
+                    record(kernels.approach, (n, tiles), [field._bricks, film, first * across], [start]),
+                    record(
+                        *(field._march, (n, packets), [field._bricks, film, first * across, start]),
+                        [self.features, self.depth],
+                    ),
+                    record(
+                        *(field._shade, (n, runs), [field._weights, self.bias, film, top, bottom, self.features]),
+                        [self.depth, self.rgb, self.opacity],
+                    ),
+                ]
+            )
+
+    def aim(self, pose: NDArray, intrinsics: NDArray, bias: NDArray, stop: NDArray | None) -> None:
+        film = self.film
+        film.rotation.assign(pose[:, :3, :3].astype(np.float32))
+        film.position.assign(pose[:, :3, 3].astype(np.float32))
+        film.intrinsics.assign(intrinsics.astype(np.float32))
+        self.bias.assign(np.ascontiguousarray(bias, np.float32))
+        if stop is not None:
+            film.stop.assign(np.asarray(stop, np.float32).reshape(film.stop.shape))
+
+    def develop(self, piece: int) -> None:
+        for launch in self.launches[piece]:
+            launch.launch()
+
+    def rendering(self) -> Rendering:
+        """A copy, as the arrays are rendered into again."""
+        return Rendering(
+            self.rgb.numpy().reshape(*self.shape, 3).copy(),
+            self.depth.numpy().reshape(self.shape).copy(),
+            self.opacity.numpy().reshape(self.shape).copy(),
+        )
+
+
+def load_kernels(needed: list[Any], where: str) -> None:
+    """Compiles or loads kernels now, so that no two threads compile them."""
+    for kernel in needed:
+        kernel.module.load(wp.get_device(where))
