@@ -7,7 +7,7 @@ baked field shows its place under every lighting.
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from twin.errors import InputError
 from twin.nerf.kernels import bricks as kernels
 from twin.nerf.kernels.composite import CHANNELS
 from twin.nerf.lightings import Lightings
+from twin.nerf.plausible import Probes
 from twin.nerf.rendering import FAR, Rendering
 from twin.scene import read_json, write_json
 
@@ -28,7 +29,7 @@ wp.config.log_level = wp.LOG_ERROR
 
 Floats = NDArray[np.float32]
 
-_FORMAT = 1
+_FORMAT = 2
 _TRACE = 0.01  # share of light that a cell may stop and count as empty
 _TASKS = 4  # pieces a picture's pixels are cut into, at least
 
@@ -77,13 +78,17 @@ class BakedField:
             layout: Sizes and bounds.
             lightings: The appearance embeddings by name.
             arrays: `near` and `far` (bricks' grid positions of the slots, (s, 3), near ones first), `density` (s, 729)
-                and `features` (s, 729, CHANNELS) bytes, `low` and `step` (CHANNELS,), and `network.*`.
+                and `features` (s, 729, CHANNELS) bytes, `low` and `step` (CHANNELS,), `network.*`, and `probes.*`,
+                see `plausible.Probes`, where random lightings are to be had.
             where: Device.
             about: Whatever else is to be kept beside the numbers, JSON-able.
         """
         self.layout, self.lightings_by_name, self.about, self.where = layout, lightings, about or {}, where
         self._arrays = arrays
         self._network = {k.removeprefix("network."): v for k, v in arrays.items() if k.startswith("network.")}
+        if "probes.features" in arrays:
+            probes = Probes(arrays["probes.features"], arrays["probes.harmonics"], self._network)
+            self.lightings_by_name = replace(lightings, probes=probes)
         near, far = brick_indices(layout, arrays["near"], arrays["far"])
         near_leap, far_leap = leaps(layout, arrays)
         b: Any = kernels.Bricks()
@@ -107,7 +112,7 @@ class BakedField:
 
     @property
     def lightings(self) -> tuple[str, ...]:
-        """Names of the lightings it was filmed under."""
+        """Names of the lightings it was filmed under, and of those added to it."""
         return self.lightings_by_name.names
 
     @property
@@ -125,6 +130,14 @@ class BakedField:
     def embedding(self, lighting: str) -> Floats:
         """See `Lightings.embedding`."""
         return self.lightings_by_name.embedding(lighting)
+
+    def sample_lighting(self, rng: np.random.Generator) -> Floats:
+        """The embedding of a random lighting that could have been filmed, shape (dim,). See `Lightings.sample`."""
+        return self.lightings_by_name.sample(rng)
+
+    def add_lightings(self, more: dict[str, Floats], stale: tuple[str, ...] = ()) -> None:
+        """See `Lightings.added`."""
+        self.lightings_by_name = self.lightings_by_name.added(more, stale)
 
     def render(
         self,
