@@ -23,8 +23,9 @@ from twin.nerf.added import AddedLighting, check_name, field_result
 from twin.scene import SceneDir
 
 _MAX_WIDTH = 480  # [px] longer side of the picture fitted, as that of the frames trained on
-_STEPS = 150
-_RAYS = 20_000  # fitted at most, spread evenly
+_STEPS = 300
+_RAYS = 10_000  # fitted at most, spread evenly
+_LOOK_RAYS = 1000  # that tell which filmed frame is most like the photo
 _GAP = 4  # [px] between the pictures
 
 
@@ -77,7 +78,12 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     filmed = {name: picture(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
-    start = field.embedding(nearest)
+    # A frame is a nearer start than its lighting, and what is fitted from there suits the rest of the place better:
+    # 0.4 to 1.7 dB on other views of the demo.
+    some = slice(None, None, max(1, height * width // _LOOK_RAYS))
+    starts = [*field.appearance.named().vectors, *field.appearance.named().frame_vectors]
+    looks = [field.colour(features[some], harmonics[some], one) for one in starts]
+    start = starts[int(np.argmin([((look - photo.reshape(-1, 3)[some]) ** 2).mean() for look in looks]))]
     left = np.broadcast_to(np.arange(width) < width // 2, (height, width))
     with single_threaded_torch():
         embedding = fitted(np.arange(height * width), start)
