@@ -202,6 +202,21 @@ def test_it_comes_back_from_its_files_without_torch(tmp_path):
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_random_lightings_come_back_from_its_files(tmp_path):
+    bare = baked(wall(1.0, 3.0))
+    with pytest.raises(InputError, match="no probes"):
+        bare.sample_lighting(np.random.default_rng(0))
+    rng = np.random.default_rng(3)
+    rays = rng.normal(size=(50, 15)).astype(np.float32), rng.normal(size=(50, 16)).astype(np.float32)
+    arrays = {**bare._arrays, "probes.features": rays[0], "probes.harmonics": rays[1]}
+    field = BakedField(LAYOUT, bare.lightings_by_name, arrays)
+    field.save(tmp_path)
+    again = BakedField.load(tmp_path)
+    drawn = field.sample_lighting(np.random.default_rng(0))
+    assert np.array_equal(drawn, again.sample_lighting(np.random.default_rng(0)))
+    assert again.render(looking(), K[None], SIZE, drawn).rgb.shape == (1, SIZE[1], SIZE[0], 3)
+
+
 def test_what_is_no_baked_field_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match=r"no baked\.json"):
         BakedField.load(tmp_path)

@@ -248,6 +248,12 @@ def test_a_baked_field_shows_what_the_field_shows(cameras):
         lower = (one.depth < 20.0) & (one.opacity > 0.9)
         assert np.median(np.abs(other.depth / one.depth - 1.0)[lower]) < 0.05
         assert np.array_equal(other.rgb, again.render(pose, K[None], (WIDTH, HEIGHT), name).rgb)
+    probes, day = baked.lightings_by_name.probes, field.embedding("day")
+    rays = torch.from_numpy(probes.features), torch.from_numpy(probes.harmonics)
+    assert np.allclose(probes.picture(day), field.colour(*rays, day), atol=1e-5)
+    assert np.ptp(probes.picture(day).mean(1)) > 0.1
+    drawn = baked.sample_lighting(np.random.default_rng(0))
+    assert not baked.lightings_by_name.judge.faults(drawn)
     scores = evaluate(field, cameras, WIDTH, baked=baked)
     assert all(scores["psnr_baked"][name] > scores["psnr_unfitted"][name] - 1.0 for name in ("day", "night"))
 

@@ -32,16 +32,22 @@ class Twin:
         return Cameras.load(self._folder("metric"))
 
     def field(self) -> RadianceField:
-        """The radiance field, with every lighting it was filmed under."""
+        """The radiance field, with every lighting it was filmed under and those added by `python -m twin.relight`."""
+        from twin.nerf.added import added_lightings
         from twin.nerf.field import RadianceField
 
-        return RadianceField.load(self._folder("field"))
+        field = RadianceField.load(self._folder("field"))
+        field.add_lightings(*added_lightings(self.scene))
+        return field
 
     def baked(self) -> BakedField:
         """The field as bricks, many times faster to render; there with the setting `nerf.bake = true`."""
+        from twin.nerf.added import added_lightings
         from twin.nerf.baked import BakedField
 
-        return BakedField.load(self._folder("field"))
+        baked = BakedField.load(self._folder("field"))
+        baked.add_lightings(*added_lightings(self.scene))
+        return baked
 
     def world(self) -> World:
         """The MJCF scene with its route, corridor and goal."""

@@ -6,6 +6,7 @@ scenes/<name>/
   build/
     1_capture/ ... 6_review/   one folder per stage, written aside as `<folder>.partial` and renamed when done
     report.json report.html review.mp4
+  lightings/            <name>.json and .png: lightings fitted to photos of the built place
 """
 
 import hashlib
@@ -62,6 +63,11 @@ class SceneDir:
     @property
     def review_mp4(self) -> Path:
         return self.build / "review.mp4"
+
+    @property
+    def lightings(self) -> Path:
+        """Lightings added to the built field; outside `build/`, which may be deleted."""
+        return self.root / "lightings"
 
     @property
     def truth(self) -> Path:

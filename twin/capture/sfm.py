@@ -48,6 +48,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         raise InputError(f"cameras.mapper = {settings.mapper!r}; expected auto, global or incremental")
     run_worker(
         {
+            "task": "map",
             "capture": str(scene.stage("capture").resolve()),
             "work": str(work.resolve()),
             "features": settings.features,

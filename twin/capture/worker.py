@@ -161,11 +161,12 @@ def main(argv: list[str]) -> int:
     """The worker. Exit status: 0 done, 2 bad input (said in the news), 1 anything else."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Loaded here only: the parent needs no COLMAP to start a worker.
-    from twin.capture import mapping
+    from twin.capture import mapping, register
 
     job = json.loads(Path(argv[0]).read_text(encoding="utf-8"))
+    solve = {"map": mapping.solve, "register": register.solve}[job["task"]]
     try:
-        mapping.solve(job)
+        solve(job)
     except InputError as error:
         tell(error=str(error))
         return _BAD_INPUT

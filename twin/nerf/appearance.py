@@ -21,6 +21,7 @@ class Appearance:
         frame_lighting: NDArray[np.int64],
         vectors: torch.Tensor,
         residuals: torch.Tensor,
+        stale: tuple[str, ...] = (),
     ):
         """
         Args:
@@ -29,9 +30,10 @@ class Appearance:
             frame_lighting: Index of each frame's lighting, shape (n,).
             vectors: Shape (lightings, dim).
             residuals: Shape (n, dim).
+            stale: See `Lightings.stale`.
         """
         self.lightings, self.frames, self.frame_lighting = lightings, frames, frame_lighting
-        self.vectors, self.residuals = vectors, residuals
+        self.vectors, self.residuals, self.stale = vectors, residuals, stale
         self.lighting_of_frame = torch.as_tensor(frame_lighting, device=vectors.device)
 
     def of_frames(self, frame: torch.Tensor) -> torch.Tensor:
@@ -42,13 +44,20 @@ class Appearance:
         """All embeddings by name, as plain arrays."""
         every = torch.arange(len(self.frames), device=self.vectors.device)
         with torch.no_grad():
-            return Lightings(
-                *(self.lightings, self.vectors.detach().cpu().numpy(), self.frames, self.of_frames(every).cpu().numpy())
-            )
+            vectors, frame_vectors = self.vectors.detach().cpu().numpy(), self.of_frames(every).cpu().numpy()
+        return Lightings(self.lightings, vectors, self.frames, frame_vectors, stale=self.stale)
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """See `Lightings.embedding`."""
         return self.named().embedding(lighting)
+
+    def added(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> "Appearance":
+        """See `Lightings.added`."""
+        new = [torch.as_tensor(vector, device=self.vectors.device)[None] for vector in more.values()]
+        return Appearance(
+            *((*self.lightings, *more), self.frames, self.frame_lighting, torch.cat([self.vectors, *new])),
+            *(self.residuals, (*self.stale, *stale)),
+        )
 
 
 def initial_appearance(

@@ -34,6 +34,7 @@ _RAW_RANGE = (-6.0, 12.0)  # of raw density, that bytes cover
 _TAIL = 2e-4  # share of the features' values beyond what bytes cover
 _RATES = (0.05, 0.02)  # of raw density and features
 _BATCH = 65536
+_PROBES = 1024  # rays that random lightings are judged on, see `plausible.py`
 
 
 def bake(
@@ -54,7 +55,7 @@ def bake(
     values = _sample(field, layout, slots)
     tuner = _Tuner(field, pixels, layout, slots, values, steps, seed)
     error = tuner.run()
-    arrays = _in_bytes(values.cpu().numpy(), slots, field, layout)
+    arrays = _in_bytes(values.cpu().numpy(), slots, field, layout) | _probes(field, pixels, seed)
     baked = BakedField(layout, field.appearance.named(), arrays, field.where, field.about)
     return baked, {
         "bricks_near": len(slots[0]),
@@ -268,6 +269,16 @@ class _Tuner:
             ],
             device=self.field.where,
         )
+
+
+def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str, NDArray]:
+    """Rays spread over the training frames, as `plausible.Probes` takes them."""
+    rng = np.random.default_rng([seed, 6])
+    frame = np.linspace(0, len(pixels.cameras) - 1, _PROBES).round().astype(int)
+    pixel = rng.random((_PROBES, 2)) * np.stack([pixels.width, pixels.height], 1)[frame]
+    cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, field.where)
+    features, harmonics, _, _ = field.trace(cameras, frame, pixel)
+    return {"probes.features": features.cpu().numpy(), "probes.harmonics": harmonics.cpu().numpy()}
 
 
 def _in_bytes(

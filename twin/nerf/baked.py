@@ -9,7 +9,7 @@ import itertools
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.shade import HARMONICS, shade
 from twin.nerf.kernels.shade import LANES as SHADE_LANES
 from twin.nerf.lightings import Lightings
+from twin.nerf.plausible import Probes
 from twin.nerf.rendering import Rendering
 from twin.scene import read_json, write_json
 
@@ -84,13 +85,17 @@ class BakedField:
             layout: Sizes and bounds.
             lightings: The appearance embeddings by name.
             arrays: `near` and `far` (bricks' grid positions of the slots, (s, 3), near ones first), `features`
-                (s, 729, CHANNELS) bytes, `low` and `step` (CHANNELS,), `near_leap` and `far_leap` (see `leaps`), and
-                `network.*`.
+                (s, 729, CHANNELS) bytes, `low` and `step` (CHANNELS,), `near_leap` and `far_leap` (see `leaps`),
+                `network.*`, and `probes.*`, see `plausible.Probes`, where random lightings are to be had.
             where: Device.
             about: Whatever else is to be kept beside the numbers, JSON-able.
         """
         self.layout, self.lightings_by_name, self.about, self.where = layout, lightings, about or {}, where
         self._arrays = arrays
+        p = {k.removeprefix("network."): v for k, v in arrays.items() if k.startswith("network.")}
+        if "probes.features" in arrays:
+            probes = Probes(arrays["probes.features"], arrays["probes.harmonics"], p)
+            self.lightings_by_name = replace(lightings, probes=probes)
         near, far = brick_indices(layout, arrays["near"], arrays["far"])
 
         def on_device(array: NDArray, dtype: Any) -> Any:
@@ -116,7 +121,6 @@ class BakedField:
         self._bricks = b
         self._pictures: dict[tuple[int, int, int, bool], _Picture] = {}
 
-        p = {k.removeprefix("network."): v for k, v in arrays.items() if k.startswith("network.")}
         hidden, behind = p["head.1"].shape[0], p["backdrop.0"].shape[1]
         self._march = kernels.march(kernels.LANES[where])
         self._shade, weights = shade(SHADE_LANES[where], hidden, behind)
@@ -137,7 +141,7 @@ class BakedField:
 
     @property
     def lightings(self) -> tuple[str, ...]:
-        """Names of the lightings it was filmed under."""
+        """Names of the lightings it was filmed under, and of those added to it."""
         return self.lightings_by_name.names
 
     @property
@@ -155,6 +159,14 @@ class BakedField:
     def embedding(self, lighting: str) -> Floats:
         """See `Lightings.embedding`."""
         return self.lightings_by_name.embedding(lighting)
+
+    def sample_lighting(self, rng: np.random.Generator) -> Floats:
+        """The embedding of a random lighting that could have been filmed, shape (dim,). See `Lightings.sample`."""
+        return self.lightings_by_name.sample(rng)
+
+    def add_lightings(self, more: dict[str, Floats], stale: tuple[str, ...] = ()) -> None:
+        """See `Lightings.added`."""
+        self.lightings_by_name = self.lightings_by_name.added(more, stale)
 
     def render(
         self,

@@ -172,6 +172,10 @@ class RadianceField:
         """See `Appearance.embedding`."""
         return self.appearance.embedding(lighting)
 
+    def add_lightings(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> None:
+        """See `Lightings.added`."""
+        self.appearance = self.appearance.added(more, stale)
+
     def frame_embedding(self, name: str) -> NDArray[np.float32]:
         """The embedding of a training frame, shape (dim,). Raises InputError where it was not trained on."""
         if name not in self.appearance.frames:

@@ -1,15 +1,18 @@
 """Lightings by name: plain arrays, for whoever renders without training.
 
 A *lighting* can be asked for by name, as a frame (`day/000012`), or as a mixture `day:night:0.3`, which is 30 % of the
-way from day to night.
+way from day to night. One that nobody filmed can be drawn at random, see `plausible.py`. To the lightings that a field
+was trained on those may be *added* that photos were fitted for, see `added.py`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import InputError
+from twin.nerf import plausible
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,10 @@ class Lightings:
     frames: tuple[str, ...]
     frame_vectors: NDArray[np.float32]
     """Shape (frames, dim)."""
+    probes: plausible.Probes | None = None
+    """What a random lighting is judged on; a baked field has them."""
+    stale: tuple[str, ...] = ()
+    """Lightings that were added to another build of the field, and mean nothing to this one."""
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """The embedding of a lighting, a frame or a mixture, shape (dim,).
@@ -40,4 +47,31 @@ class Lightings:
             except ValueError:
                 raise InputError(f"lighting {lighting!r}: {share!r} is no number; expected a:b:share") from None
             return ((1.0 - s) * self.embedding(a) + s * self.embedding(b)).astype(np.float32)
+        if lighting in self.stale:
+            raise InputError(
+                f"lighting {lighting!r}: fitted to another build of this field; fit its photo again: "
+                f"python -m twin.relight SCENE PHOTO --name {lighting}"
+            )
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
+
+    def sample(self, rng: np.random.Generator) -> NDArray[np.float32]:
+        """The embedding of a random lighting that could have been filmed, shape (dim,); `plausible.py` has the rule.
+
+        The same generator state gives the same lighting.
+
+        Raises:
+            InputError: there are no probes, or none of the lightings drawn was plausible.
+        """
+        return plausible.sample(rng, self.judge, self.vectors, self.frame_vectors)
+
+    @cached_property
+    def judge(self) -> plausible.Judge:
+        """Tells whether an embedding could have been filmed. Raises InputError where there are no probes."""
+        if self.probes is None:
+            raise InputError("no probes to judge a random lighting on; take the baked field (nerf.bake = true)")
+        return plausible.Judge(self.probes, self.vectors, self.frame_vectors)
+
+    def added(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> "Lightings":
+        """With more lightings, embeddings (dim,) by name, and the names of those that are not to be used."""
+        vectors = np.concatenate([self.vectors, *(vector[None] for vector in more.values())])
+        return replace(self, names=(*self.names, *more), vectors=vectors, stale=(*self.stale, *stale))

@@ -1,0 +1,133 @@
+"""One photo adds its lighting: the fit, the file, what it is tied to, and what the verb refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from textured import SIZE, K, filmed_corridor, picture, pose_at
+
+import twin
+from twin import progress
+from twin.errors import InputError
+from twin.geometry.images import psnr, read_image, write_image
+from twin.nerf.added import AddedLighting, added_lightings
+from twin.nerf.appearance import initial_appearance
+from twin.nerf.field import Layout, RadianceField, untrained
+from twin.nerf.lightings import Lightings
+from twin.relight import fit_photo, main
+from twin.scene import SceneDir, write_json
+
+
+def small_field(seed: int = 0) -> RadianceField:
+    """Untrained: its backdrop's colours vary with direction and embedding, which is all that a fit needs."""
+    frames = tuple(f"day/{i:06d}" for i in range(4))
+    appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, seed)
+    layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
+    return untrained(layout, appearance, seed, "cpu")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> SceneDir:
+    progress.set_quiet(True)
+    scene = filmed_corridor(tmp_path_factory.mktemp("relight") / "scene")
+    scene.stage("field").mkdir()
+    small_field().save(scene.stage("field"))
+    write_json(scene.stamp("field"), {"result": "first"})
+    write_json(scene.stage("metric") / "stamp.json", {"result": "x"})
+    write_image(scene.root / "photo.png", picture(pose_at(2.4, 0.2), tint=(0.9, 0.6, 0.4)))
+    return scene
+
+
+def test_a_fit_finds_the_light_of_a_photo():
+    field, pose = small_field(), pose_at(0.0)
+    hidden = field.embedding("night") + np.random.default_rng(1).normal(0.0, 0.8, 8).astype(np.float32)
+    small = (64, 48)
+    photo = field.render(pose[None], K[None] / 5, small, hidden).rgb[0]
+    relit = fit_photo(field, photo, pose, K / 5)
+    assert relit.psnr_nearest == pytest.approx(max(psnr(p, photo) for p in _filmed(field, pose, small)), abs=1e-3)
+    assert relit.psnr_fitted > relit.psnr_nearest + 10.0
+    assert relit.psnr_nearest < relit.psnr_other_half <= relit.psnr_fitted + 0.5
+    again = field.render(pose[None], K[None] / 5, small, relit.embedding).rgb[0]
+    assert psnr(again, photo) == pytest.approx(relit.psnr_fitted, abs=1e-3)
+    elsewhere = pose_at(1.0, 0.0, 2.0)[None]
+    there = [field.render(elsewhere, K[None] / 5, small, one).rgb[0] for one in (hidden, relit.embedding)]
+    assert psnr(there[1], there[0]) > 25.0
+
+
+def _filmed(field, pose, size):
+    return [field.render(pose[None], K[None] / 5, size, name).rgb[0] for name in field.lightings]
+
+
+def test_the_verb_adds_a_lighting_that_the_scene_then_has(scene, capsys):
+    assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "dusk"]) == 0
+    said = capsys.readouterr().out
+    assert "inliers of" in said and "dB fitted" in said
+    field = twin.load_scene(scene.root).field()
+    assert field.lightings == ("day", "night", "dusk")
+    stored = json.loads((scene.lightings / "dusk.json").read_text())
+    assert np.allclose(field.embedding("dusk"), stored["embedding"])
+    assert stored["figures"]["psnr_fitted"] > stored["figures"]["psnr_nearest"] + 1.0
+    middle = 0.5 * field.embedding("day") + 0.5 * field.embedding("dusk")
+    assert np.allclose(field.embedding("day:dusk:0.5"), middle, atol=1e-6)
+    photo, fitted, _ = np.split(_without_gaps(read_image(scene.lightings / "dusk.png")) / 255.0, 3, axis=1)
+    assert psnr(fitted, photo) == pytest.approx(stored["figures"]["psnr_fitted"], abs=0.3)
+
+
+def _without_gaps(picture: np.ndarray) -> np.ndarray:
+    width = SIZE[0]
+    return np.hstack([picture[:, k * (width + 4) : k * (width + 4) + width] for k in range(3)])
+
+
+def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
+    AddedLighting("old", [0.0] * 8, "first", "photo.png", {}).save(scene)
+    assert "old" in added_lightings(scene)[0]
+    write_json(scene.stamp("field"), {"result": "second"})
+    try:
+        field = twin.load_scene(scene.root).field()
+        assert "old" not in field.lightings
+        for asked in ("old", "day:old:0.5"):
+            with pytest.raises(
+                InputError, match=r"'old': fitted to another build.*twin\.relight SCENE PHOTO --name old"
+            ):
+                field.embedding(asked)
+    finally:
+        write_json(scene.stamp("field"), {"result": "first"})
+    assert "old" in twin.load_scene(scene.root).field().lightings
+
+
+def test_what_cannot_be_used_ends_with_one_line_and_status_2(scene, tmp_path, capsys):
+    noise = np.kron(np.random.default_rng(0).integers(0, 255, (60, 80, 3)), np.ones((4, 4, 1))).astype(np.uint8)
+    write_image(tmp_path / "noise.png", noise)
+    photo = str(scene.root / "photo.png")
+    for arguments, words in (
+        ([str(scene.root), str(tmp_path / "noise.png"), "--name", "x"], "features of the photo fit the place (need 25"),
+        ([str(scene.root), str(tmp_path / "absent.png"), "--name", "x"], "not a readable image"),
+        ([str(scene.root), photo, "--name", "day"], "filmed under a lighting of this name"),
+        ([str(scene.root), photo, "--name", "a:b"], "expected letters"),
+        ([str(scene.root), photo, "--name", "../x"], "expected letters"),
+        ([str(tmp_path), photo, "--name", "x"], "no scene.toml"),
+    ):
+        assert main([*arguments, "--quiet"]) == 2
+        error = capsys.readouterr().err.strip()
+        assert error.startswith("error: ") and words in error and "\n" not in error
+    assert not (scene.lightings / "x.json").exists()
+
+
+def test_a_damaged_file_is_named(scene):
+    path = scene.lightings / "broken.json"
+    scene.lightings.mkdir(exist_ok=True)
+    path.write_text('{"format": 1}')
+    try:
+        with pytest.raises(InputError, match=r"broken\.json: no lighting \(KeyError"):
+            added_lightings(scene)
+    finally:
+        path.unlink()
+
+
+def test_plain_lightings_take_more_too():
+    mine = Lightings(("a",), np.zeros((1, 3), np.float32), (), np.zeros((0, 3), np.float32))
+    more = mine.added({"b": np.ones(3, np.float32)}, ("c",))
+    assert more.names == ("a", "b")
+    assert np.array_equal(more.embedding("a:b:0.25"), np.full(3, 0.25, np.float32))
+    with pytest.raises(InputError, match="another build"):
+        more.embedding("c")

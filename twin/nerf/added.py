@@ -1,0 +1,80 @@
+"""Lightings added to a built scene: `<scene>/lightings/<name>.json`, fitted to a photo by `python -m twin.relight`.
+
+They lie outside `build/`, which may be deleted at any time. An embedding means something to one field only, so each is
+tied to the content digest of the field stage it was fitted with; beside another build of the field it is *stale*.
+"""
+
+import re
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import InputError
+from twin.scene import SceneDir, read_json, write_json
+
+_FORMAT = 1
+_NAME = re.compile(r"\w[\w.-]*")
+
+
+@dataclass(frozen=True)
+class AddedLighting:
+    """One lighting, and what is known of how it came about."""
+
+    name: str
+    embedding: list[float]
+    """Length dim."""
+    field: str
+    """`result` in the stamp of the field stage it belongs to."""
+    photo: str
+    """Path of the photo it was fitted to, as it was given."""
+    figures: dict[str, Any]
+    """Numbers of the fit, JSON-able."""
+
+    def save(self, scene: SceneDir) -> None:
+        """Writes `lightings/<name>.json`, in place of what had this name before."""
+        scene.lightings.mkdir(exist_ok=True)
+        write_json(scene.lightings / f"{self.name}.json", {"format": _FORMAT, **asdict(self)})
+
+
+def check_name(name: str, filmed: tuple[str, ...]) -> None:
+    """Raises InputError where a name cannot be that of an added lighting: it names a file, and a part of a mixture."""
+    if not _NAME.fullmatch(name):
+        raise InputError(f"--name {name!r}: expected letters, digits and _ . - only, such as afternoon")
+    if name in filmed:
+        raise InputError(f"--name {name!r}: the place was filmed under a lighting of this name; choose another")
+
+
+def field_result(scene: SceneDir) -> str:
+    """What the field of a scene is known by. Raises InputError where it has not been built."""
+    path = scene.stamp("field")
+    if not path.exists():
+        raise InputError(f"{scene.root} has no {path.parent.name} yet; run python -m twin.build {scene.root}")
+    return str(read_json(path)["result"])
+
+
+def added_lightings(scene: SceneDir) -> tuple[dict[str, NDArray[np.float32]], tuple[str, ...]]:
+    """Embeddings (dim,) by name of the lightings added to a scene's present field, and the names of the stale ones.
+
+    Raises:
+        InputError: a file there is damaged or of another format.
+    """
+    result = field_result(scene)
+    fresh: dict[str, NDArray[np.float32]] = {}
+    stale = []
+    for path in sorted(scene.lightings.glob("*.json")):
+        try:
+            head = read_json(path)
+            form, made_by, vector = head["format"], head["field"], np.array(head["embedding"], np.float32)
+        except (ValueError, TypeError, KeyError) as error:
+            raise InputError(
+                f"{path}: no lighting ({type(error).__name__}: {error}); fit it again or delete it"
+            ) from None
+        if form != _FORMAT:
+            raise InputError(f"{path}: format {form}, expected {_FORMAT}; fit it again or delete it")
+        if made_by == result:
+            fresh[path.stem] = vector
+        else:
+            stale.append(path.stem)
+    return fresh, tuple(stale)
