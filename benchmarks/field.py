@@ -18,17 +18,31 @@ from typing import Any
 
 from field_common import Bench
 
-TARGETS: dict[str, tuple[str, float | None]] = {
+TARGETS: dict[str, tuple[str, float]] = {
+    "fox.psnr_60s": ("≥", 24.0),
+    "fox.psnr_300s": ("≥", 25.5),
     "fox.seconds_60s": ("≤", 60.0),
     "fox.seconds_300s": ("≤", 300.0),
     "fox.seconds_1200s": ("≤", 1200.0),
+    "bake.psnr_drop": ("≤", 0.5),
+    "bake.bytes": ("≤", 150e6),
+    "render.fps_1core": ("≥", 100.0),
+    "render.fps_2core": ("≥", 190.0),
+    "render.ratio_to_nerfacto": ("≥", 1000.0),
+    "render.first_frame_s": ("≤", 1.0),
+    "render.cold_compile_s": ("≤", 30.0),
+    "depth.median_error_m": ("≤", 0.05),
+    "train.peak_bytes": ("≤", 3e9),
+    "gpu.fox.psnr_60s": ("≥", 26.5),
+    "gpu.render_fps": ("≥", 10000.0),
+    "gpu.cpu_difference_max": ("≤", 1 / 255),
 }
 """What is wanted of a figure. A score within a budget is not met either where the budget was exceeded."""
 
 
 def judge(name: str, figures: dict[str, Any]) -> tuple[str, str]:
     """A figure's target and whether it is met, in words; empty where nothing is wanted of it."""
-    sense, wanted = TARGETS.get(name, ("", None))
+    sense, wanted = TARGETS.get(name, (None, 0.0))
     late = ""
     section, _, rest = name.rpartition(".")
     if rest.startswith("psnr_") and rest.split("_")[1].removesuffix("s").isdigit():
@@ -36,11 +50,11 @@ def judge(name: str, figures: dict[str, Any]) -> tuple[str, str]:
         wall = figures.get(f"{section}.seconds_{budget}", 0.0)
         if wall > float(budget.removesuffix("s")):
             late = f"no, took {wall:.1f} s"
-    if wanted is None:
+    if sense is None:
         return "", late
     value = figures[name]
     met = value is not None and (value <= wanted if sense == "≤" else value >= wanted)
-    return f"{sense} {wanted:g}", late or ("yes" if met else "no")
+    return f"{sense} {wanted:.4g}", late or ("yes" if met else "no")
 
 
 def shown(value: Any) -> str:

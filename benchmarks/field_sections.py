@@ -166,10 +166,8 @@ def speed(bench: Bench) -> Figures:
     for used in (1, 2)[: compute.cores()]:
         row = worker("frames", place, views, used, count, repeats)
         found |= {f"render.{key}_{used}core": value for key, value in row.items()}
-    row = worker("ratio", place, views, bench.pick(SIZE[0], 16), bench.pick(5, 1))
-    found["render.ratio_to_nerfacto"] = row.pop("ratio")
-    found |= {f"render.{key}": row[key] for key in ("nerfacto_s", "nerfacto_chunk", "nerfacto_s_by_chunk")}
-    found["render.ms_beside_nerfacto"] = row["ms"]
+    row = worker("ratio", place, views, bench.pick(SIZE[0], 16), bench.pick(3, 1))
+    found |= {f"render.{key}": value for key, value in row.items()}
     return found | _first_frame(bench, place, views)
 
 

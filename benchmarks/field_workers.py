@@ -14,6 +14,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,10 @@ def frames(place: str, views: str, cores: str, count: str, repeats: str) -> dict
 
 
 def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
-    """The reference and the baked field by turns, the same frames on one core."""
+    """By turns on one core: Nerfacto plain and tuned, one frame each, and eight of the baked field."""
     use_cores(1)
+    import nerfacto_reference
+    import nerfacto_tuned
     import numpy as np
     import torch
     from field_common import SIZE, load_baked, render
@@ -83,31 +86,34 @@ def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
     scaled = poses.copy()  # into Nerfacto's units
     scaled[:, :3, 3] = (poses[:, :3, 3] - (low + high) / 2) / (high - low).max() * 2
     scaled = torch.as_tensor(scaled, dtype=torch.float32)
-    reference, intrinsics = Nerfacto.random(), torch.as_tensor(k)
+    intrinsics, networks = torch.as_tensor(k), nerfacto_reference.networks()
+    plain, tuned = Nerfacto(*networks), nerfacto_tuned.tuned(*networks)
 
-    def nerfacto(i: int, chunk: int) -> float:
+    def seconds(reference: Nerfacto, i: int, chunk: int, shrink: int = 1) -> float:
         began = time.perf_counter()
-        reference.frame(scaled[i], intrinsics, size, chunk)
+        reference.frame(scaled[i], intrinsics / shrink, (size[0] // shrink, size[1] // shrink), chunk)
         return time.perf_counter() - began
 
-    by_chunk = {chunk: nerfacto(0, chunk) for chunk in (256, 512, 1024, 4096, 8192, 32768)}
-    best = min(by_chunk, key=lambda chunk: by_chunk[chunk])
+    seconds(plain, 0, nerfacto_reference.CHUNK, 8)  # a small picture, to have everything loaded
+    seconds(tuned, 0, nerfacto_tuned.CHUNK)
     render(field, poses[:1], k, size, lightings[0])
-    slow, fast = [], []
-    for turn in range(int(repeats)):
-        slow.append(nerfacto(8 * turn, best))
+    turns = []
+    for first_view in range(0, 8 * int(repeats), 8):
+        slow = seconds(plain, first_view, nerfacto_reference.CHUNK)
+        less_slow = seconds(tuned, first_view, nerfacto_tuned.CHUNK)
         of_turn = []
-        for i in range(8 * turn, 8 * turn + 8):
+        for i in range(first_view, first_view + 8):
             began = time.perf_counter()
             render(field, poses[i : i + 1], k, size, lightings[i])
             of_turn.append(time.perf_counter() - began)
-        fast.append(float(np.median(of_turn)))
+        turns.append((slow, less_slow, float(np.median(of_turn))))
+    of_plain, of_tuned, baked = np.transpose(turns)
     return {
-        "ratio": float(np.median(np.divide(slow, fast))),
-        "nerfacto_s": float(np.median(slow)),
-        "nerfacto_chunk": best,
-        "nerfacto_s_by_chunk": {str(chunk): round(seconds, 3) for chunk, seconds in by_chunk.items()},
-        "ms": float(np.median(fast)) * 1e3,
+        "ratio_to_nerfacto": float(np.median(of_plain / baked)),
+        "ratio_to_nerfacto_tuned": float(np.median(of_tuned / baked)),
+        "nerfacto_s": float(np.median(of_plain)),
+        "nerfacto_tuned_s": float(np.median(of_tuned)),
+        "ms_beside_nerfacto": float(np.median(baked)) * 1e3,
     }
 
 
@@ -182,5 +188,7 @@ def _views(file: str, count: int, lightings: tuple[str, ...]) -> tuple[Any, Any,
 
 
 if __name__ == "__main__":
-    work = {"frames": frames, "ratio": ratio, "first": first, "memory": memory}[sys.argv[1]]
+    workers: dict[str, Callable[..., dict[str, Any]]] = {"frames": frames, "ratio": ratio, "first": first}
+    workers["memory"] = memory
+    work = workers[sys.argv[1]]
     print(json.dumps(work(*sys.argv[2:])))

@@ -34,6 +34,7 @@ def test_a_score_is_not_met_where_its_budget_was_exceeded(scripts, monkeypatch):
     assert field.judge("fox.seconds_60s", figures) == ("≤ 60", "yes")
     late = figures | {"fox.seconds_60s": 61.0}
     assert field.judge("fox.psnr_60s", late)[1] == field.judge("fox.psnr_60s_unfitted", late)[1] == "no, took 61.0 s"
+    assert field.judge("gpu.cpu_difference_max", {"gpu.cpu_difference_max": 1 / 255}) == ("≤ 0.003922", "yes")
     assert field.judge("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
 
 

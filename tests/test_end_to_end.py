@@ -111,6 +111,7 @@ def test_the_benchmark_of_the_field_runs(built, tmp_path):
     figures = json.loads(file.read_text())
     assert abs(figures["bake.psnr_drop"]) < 10 and figures["bake.bytes"] > 1e5
     assert figures["render.fps_1core"] > 0 and figures["render.ratio_to_nerfacto"] > 0
+    assert figures["render.nerfacto_s"] > 0 and figures["render.ratio_to_nerfacto_tuned"] > 0
     assert 0 < figures["render.first_frame_s"] < figures["render.first_frame_cold_s"]
     assert 0 < figures["depth.median_error_m"] < 5 and figures["train.peak_bytes"] > 1e8
     assert all(name in done.stdout for name in figures if name != "about")
