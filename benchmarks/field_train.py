@@ -14,6 +14,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -87,9 +88,9 @@ def main() -> None:
     began = time.perf_counter()
     result |= {k: v for k, v in metrics.items() if k != "curve"} | evaluate(field, cameras, config.nerf.max_width)
     result["seconds_evaluate"] = round(time.perf_counter() - began, 2)
-    view = slice(0, 4)
+    views = cameras.select(np.arange(4))
     began = time.perf_counter()
-    field.render(cameras.camera_to_world[view], cameras.intrinsics[view] / 4, (160, 90), field.lightings[0])
+    field.render(views, field.lightings[0], (160, 90))
     result["render_160x90_seconds"] = round((time.perf_counter() - began) / 4, 3)
     result["peak_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 

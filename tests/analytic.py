@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import Cameras, pixel_grid, unproject
+from twin.geometry.cameras import Cameras, Posed, pixel_grid, resized, unproject
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
 from twin.scene import write_json
@@ -102,9 +102,10 @@ class AnalyticField:
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         return np.full(32, float(self.lightings.index(lighting)), np.float32)
 
-    def render(self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: object) -> Rendering:
+    def render(self, cameras: Posed, lighting: object, size: tuple[int, int] | None = None) -> Rendering:
         """Exact depth; colours by what was hit."""
-        width, height = size
+        camera_to_world = cameras.camera_to_world
+        intrinsics, (width, height) = resized(cameras, size)
         n = len(camera_to_world)
         rgb = np.zeros((n, height, width, 3), np.float32)
         depth = np.full((n, height, width), FAR, np.float32)

@@ -214,7 +214,7 @@ def test_random_lightings_come_back_from_its_files(tmp_path):
     again = BakedField.load(tmp_path)
     drawn = field.sample_lighting(np.random.default_rng(0))
     assert np.array_equal(drawn, again.sample_lighting(np.random.default_rng(0)))
-    assert again.render(looking(), K[None], SIZE, drawn).rgb.shape == (1, SIZE[1], SIZE[0], 3)
+    assert again.render(Viewpoints.of(looking(), K, SIZE), drawn).rgb.shape == (1, SIZE[1], SIZE[0], 3)
 
 
 def test_what_is_no_baked_field_is_an_input_error(tmp_path):

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -15,7 +16,15 @@ from twin.scene import STAGES
 
 pytestmark = pytest.mark.slow
 
-_QUICK = ("nerf.steps=400", "nerf.rays=2048", "nerf.max_width=240", "review.fps=5", "review.width=240")
+_QUICK = (
+    "nerf.steps=400",
+    "nerf.rays=2048",
+    "nerf.max_width=240",
+    "nerf.bake_steps=60",
+    "nerf.max_bricks=2500",
+    "review.fps=5",
+    "review.width=240",
+)
 
 
 def _command(root, *options):
@@ -98,3 +107,19 @@ def test_opening_the_twin(built):
     assert scene.world().model().nu >= 2 and len(scene.cameras()) > 20
     with pytest.raises(twin.InputError, match="no scene"):
         twin.load_scene(root / "input")
+
+
+def test_the_benchmark_of_the_field_runs(built, tmp_path):
+    root, _ = built
+    script, file = Path(__file__).parents[1] / "benchmarks/field.py", tmp_path / "figures.json"
+    sections = ["bake", "render", "depth", "train"]
+    command = [sys.executable, str(script), "--quick", "--scene", str(root), "--json", str(file), "--only", *sections]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    figures = json.loads(file.read_text())
+    assert abs(figures["bake.psnr_drop"]) < 10 and figures["bake.bytes"] > 1e5
+    assert figures["render.fps_1core"] > 0 and figures["render.ratio_to_nerfacto"] > 0
+    assert figures["render.nerfacto_s"] > 0 and figures["render.ratio_to_nerfacto_tuned"] > 0
+    assert 0 < figures["render.first_frame_s"] < figures["render.first_frame_cold_s"]
+    assert 0 < figures["depth.median_error_m"] < 5 and figures["train.peak_bytes"] > 1e8
+    assert all(name in done.stdout for name in figures if name != "about")

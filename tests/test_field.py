@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from twin.errors import InputError
+from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
@@ -238,13 +239,13 @@ def make_ground(field: RadianceField, height: float) -> None:
 def test_ground_renders_at_its_depth_and_sky_is_open(field):
     make_ground(field, 0.0)
     pose = look_at(np.array([0.0, -2.0, 1.5]), np.array([4.0, -2.0, 0.0]))
-    result = field.render(pose[None], np.array([[20.0, 20.0, 16.0, 9.0]]), (32, 18), "day")
+    result = field.render(Viewpoints.of(pose[None], np.array([[20.0, 20.0, 16.0, 9.0]]), (32, 18)), "day")
     assert result.rgb.shape == (1, 18, 32, 3) and result.depth.shape == result.opacity.shape == (1, 18, 32)
     assert result.rgb.dtype == result.depth.dtype == np.float32
     centre = result.depth[0, 8:10, 15:17].mean()
     assert centre == pytest.approx(np.hypot(4.0, 1.5), rel=0.03)
     up = look_at(np.array([0.0, -2.0, 1.5]), np.array([1.0, -2.0, 4.0]))
-    sky = field.render(up[None], np.array([[20.0, 20.0, 16.0, 9.0]]), (32, 18), "night")
+    sky = field.render(Viewpoints.of(up[None], np.array([[20.0, 20.0, 16.0, 9.0]]), (32, 18)), "night")
     density = field.density(np.array([[0.0, -2.0, 1.0], [0.0, -2.0, -0.3]]))
     assert density[0] < 1e-4 and density[1] > 100.0
     assert (sky.depth == FAR).all() and sky.opacity.max() < 0.05 and result.opacity.max() > 0.99
@@ -253,15 +254,15 @@ def test_ground_renders_at_its_depth_and_sky_is_open(field):
 def test_rendering_does_not_depend_on_how_it_is_cut(field):
     pose = look_at(np.array([0.0, -2.0, 1.5]), np.array([4.0, -2.0, 0.0]))
     k = np.array([[60.0, 60.0, 48.0, 32.0]])
-    one = field.render(pose[None], k, (96, 64), "day")
-    three = field.render(np.repeat(pose[None], 3, 0), np.repeat(k, 3, 0), (96, 64), "day")
+    one = field.render(Viewpoints.of(pose[None], k, (96, 64)), "day")
+    three = field.render(Viewpoints.of(np.repeat(pose[None], 3, 0), np.repeat(k, 3, 0), (96, 64)), "day")
     np.testing.assert_array_equal(np.repeat(one.rgb, 3, 0), three.rgb)
 
 
 def test_lighting_changes_colour_and_never_geometry(field):
     pose = look_at(np.array([0.0, -2.0, 1.5]), np.array([4.0, -2.0, 0.0]))
     k = np.array([[20.0, 20.0, 16.0, 9.0]])
-    day, night = (field.render(pose[None], k, (32, 18), name) for name in ("day", "night"))
+    day, night = (field.render(Viewpoints.of(pose[None], k, (32, 18)), name) for name in ("day", "night"))
     np.testing.assert_array_equal(day.depth, night.depth)
     np.testing.assert_array_equal(day.opacity, night.opacity)
     assert np.abs(day.rgb - night.rgb).mean() > 1e-3
@@ -278,7 +279,7 @@ def test_save_and_load_are_the_identity(field, tmp_path):
     np.testing.assert_array_equal(loaded.density(points), field.density(points))
     pose = look_at(np.array([0.0, -2.0, 1.5]), np.array([4.0, -2.0, 0.0]))[None]
     k = np.array([[20.0, 20.0, 16.0, 9.0]])
-    a, b = (f.render(pose, k, (32, 18), "night") for f in (field, loaded))
+    a, b = (f.render(Viewpoints.of(pose, k, (32, 18)), "night") for f in (field, loaded))
     np.testing.assert_array_equal(a.rgb, b.rgb)
 
 

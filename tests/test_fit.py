@@ -9,7 +9,7 @@ import torch
 
 from twin.config import NerfConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
-from twin.geometry.cameras import Cameras, project
+from twin.geometry.cameras import Cameras, Viewpoints, project
 from twin.geometry.images import psnr, write_image
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
@@ -203,7 +203,7 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
         assert metrics["psnr"][name] > 17.0
         assert metrics["psnr"][name] > metrics["psnr_wrong_lighting"][name] + 3.0
     i = int(np.flatnonzero(cameras.held_out)[0])
-    result = field.render(cameras.camera_to_world[i : i + 1], K[None], (WIDTH, HEIGHT), "day")
+    result = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), "day")
     lower = slice(HEIGHT // 2, None)
     v, u = np.mgrid[:HEIGHT, :WIDTH][:, lower] + 0.5
     ray = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1)
@@ -212,7 +212,7 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
 
     picture = ground_picture(cameras.camera_to_world[i], 0.7)
     fitted = fit_embedding_to_image(field, picture, cameras.camera_to_world[i], K, "day")
-    seen = field.render(cameras.camera_to_world[i : i + 1], K[None], (WIDTH, HEIGHT), fitted).rgb[0]
+    seen = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), fitted).rgb[0]
     assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
 
 
@@ -242,12 +242,12 @@ def test_a_baked_field_shows_what_the_field_shows(cameras):
     held_out = cameras.select(np.flatnonzero(cameras.held_out))
     for i, name in enumerate(held_out.lightings):
         pose = held_out.camera_to_world[i : i + 1]
-        one = field.render(pose, K[None], (WIDTH, HEIGHT), name)
-        other = baked.render(pose, K[None], (WIDTH, HEIGHT), name)
+        one = field.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), name)
+        other = baked.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), name)
         assert psnr(other.rgb[0], one.rgb[0]) > 25.0
         lower = (one.depth < 20.0) & (one.opacity > 0.9)
         assert np.median(np.abs(other.depth / one.depth - 1.0)[lower]) < 0.05
-        assert np.array_equal(other.rgb, again.render(pose, K[None], (WIDTH, HEIGHT), name).rgb)
+        assert np.array_equal(other.rgb, again.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), name).rgb)
     probes, day = baked.lightings_by_name.probes, field.embedding("day")
     rays = torch.from_numpy(probes.features), torch.from_numpy(probes.harmonics)
     assert np.allclose(probes.picture(day), field.colour(*rays, day), atol=1e-5)
@@ -264,7 +264,7 @@ def test_the_stage_bakes_when_asked(cameras, tmp_path):
     cameras.save(scene.stage("metric"))
     floor_points(cameras).save(scene.stage("metric"))
     write_json(scene.stage("metric") / "metric.json", {"camera_height_median_m": 1.5, "road_reliable": True})
-    config = SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=replace(CONFIG, bake=True))
+    config = SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=replace(CONFIG, bake_steps=20))
     metrics = run(scene, config, tmp_path)
     assert metrics["bake"]["bytes"] > 0 and set(metrics["psnr_baked"]) == {"day", "night"}
     assert BakedField.load(tmp_path).lightings == ("day", "night")

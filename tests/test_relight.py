@@ -9,6 +9,7 @@ from textured import SIZE, K, filmed_corridor, picture, pose_at
 import twin
 from twin import progress
 from twin.errors import InputError
+from twin.geometry.cameras import Viewpoints
 from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.added import AddedLighting, added_lightings
 from twin.nerf.appearance import initial_appearance
@@ -42,20 +43,20 @@ def test_a_fit_finds_the_light_of_a_photo():
     field, pose = small_field(), pose_at(0.0)
     hidden = field.embedding("night") + np.random.default_rng(1).normal(0.0, 0.8, 8).astype(np.float32)
     small = (64, 48)
-    photo = field.render(pose[None], K[None] / 5, small, hidden).rgb[0]
+    photo = field.render(Viewpoints.of(pose[None], K / 5, small), hidden).rgb[0]
     relit = fit_photo(field, photo, pose, K / 5)
     assert relit.psnr_nearest == pytest.approx(max(psnr(p, photo) for p in _filmed(field, pose, small)), abs=1e-3)
     assert relit.psnr_fitted > relit.psnr_nearest + 10.0
     assert relit.psnr_nearest < relit.psnr_other_half <= relit.psnr_fitted + 0.5
-    again = field.render(pose[None], K[None] / 5, small, relit.embedding).rgb[0]
+    again = field.render(Viewpoints.of(pose[None], K / 5, small), relit.embedding).rgb[0]
     assert psnr(again, photo) == pytest.approx(relit.psnr_fitted, abs=1e-3)
     elsewhere = pose_at(1.0, 0.0, 2.0)[None]
-    there = [field.render(elsewhere, K[None] / 5, small, one).rgb[0] for one in (hidden, relit.embedding)]
+    there = [field.render(Viewpoints.of(elsewhere, K / 5, small), one).rgb[0] for one in (hidden, relit.embedding)]
     assert psnr(there[1], there[0]) > 25.0
 
 
 def _filmed(field, pose, size):
-    return [field.render(pose[None], K[None] / 5, size, name).rgb[0] for name in field.lightings]
+    return [field.render(Viewpoints.of(pose[None], K / 5, size), name).rgb[0] for name in field.lightings]
 
 
 def test_the_verb_adds_a_lighting_that_the_scene_then_has(scene, capsys):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
-from twin.geometry.cameras import Cameras, pixel_grid, unproject
+from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
@@ -76,7 +76,7 @@ def make_cameras(folder: Path, field: ChequeredField, frames: int = 12, size: tu
         images=images,
     )
     for i, name in enumerate(lightings):
-        write_image(cameras.image_path(i), field.render(poses[i : i + 1], k[i : i + 1], size, name).rgb[0])
+        write_image(cameras.image_path(i), field.render(Viewpoints.of(poses[i], k[i], size), name).rgb[0])
     folder.mkdir(parents=True, exist_ok=True)
     cameras.save(folder)
     return cameras

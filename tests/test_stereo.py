@@ -8,7 +8,7 @@ import pytest
 from analytic import AnalyticField, Box
 
 from twin import progress
-from twin.geometry.cameras import Cameras, pixel_grid, project, unproject
+from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, project, unproject
 from twin.geometry.images import write_image
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
@@ -42,7 +42,7 @@ def poses(n: int, lateral: float = 0.0) -> np.ndarray:
 def film(folder: Path, n: int = 8, paint=None) -> Cameras:
     """A drive past two boxes; `paint(i, places)` gives grey of frame i where it is not the pattern."""
     pose = poses(n)
-    depth = PLACE.render(pose, np.tile(K, (n, 1)), (WIDTH, HEIGHT), "day").depth
+    depth = PLACE.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), "day").depth
     names = tuple(f"day/{i:06d}" for i in range(n))
     (folder / "day").mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):

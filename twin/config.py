@@ -141,8 +141,10 @@ class NerfConfig:
     """Share of each step's rays that go through places whose distance is known, which is then learned, too."""
     stereo: bool = True
     """Find such places by stereo between the frames, besides the sparse points."""
-    bake: bool = False
-    """Also bake the field into bricks, which render many times faster: a minute more, and some 0.1 GB."""
+    bake_steps: int = 300
+    """Steps of fine-tuning of the baked field, which is what renders."""
+    max_bricks: int = 9000
+    """Bricks of the baked field at most; 9,000 are some 105 MB. Its cells are as fine as that allows."""
     max_width: int = 480
     """Images are trained at this longer side [px]."""
     learning_rate: float = 3e-2

@@ -31,23 +31,26 @@ class Twin:
 
         return Cameras.load(self._folder("metric"))
 
-    def field(self) -> RadianceField:
-        """The radiance field, with every lighting it was filmed under and those added by `python -m twin.relight`."""
+    def field(self) -> BakedField:
+        """The place to look at, under every lighting it was filmed in and those added by `python -m twin.relight`.
+
+        Needs no torch.
+        """
+        from twin.nerf.added import added_lightings
+        from twin.nerf.baked import BakedField
+
+        field = BakedField.load(self._folder("field"))
+        field.add_lightings(*added_lightings(self.scene))
+        return field
+
+    def radiance_field(self) -> RadianceField:
+        """The field as it was trained, in torch: slower and a little finer than `field`, with its lightings."""
         from twin.nerf.added import added_lightings
         from twin.nerf.field import RadianceField
 
         field = RadianceField.load(self._folder("field"))
         field.add_lightings(*added_lightings(self.scene))
         return field
-
-    def baked(self) -> BakedField:
-        """The field as bricks, many times faster to render; there with the setting `nerf.bake = true`."""
-        from twin.nerf.added import added_lightings
-        from twin.nerf.baked import BakedField
-
-        baked = BakedField.load(self._folder("field"))
-        baked.add_lightings(*added_lightings(self.scene))
-        return baked
 
     def world(self) -> World:
         """The MJCF scene with its route, corridor and goal."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import progress
-from twin.geometry.cameras import Cameras, pixel_grid, scaled_intrinsics, unproject
+from twin.geometry.cameras import Cameras, Posed, pixel_grid, scaled_intrinsics, unproject
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class Field(Protocol):
     def lightings(self) -> tuple[str, ...]: ...
     @property
     def bounds(self) -> Array: ...
-    def render(self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str) -> Rendered: ...
+    def render(self, cameras: Posed, lighting: str, size: tuple[int, int]) -> Rendered: ...
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def render_views(field: Field, cameras: Cameras, count: int, width: int, far: fl
     with progress.bar("rendering depth", len(chosen), "view") as bar:
         for start in range(0, len(chosen), _BATCH):
             part = slice(start, start + _BATCH)
-            image = field.render(chosen.camera_to_world[part], intrinsics[part], size, field.lightings[0])
+            image = field.render(chosen.select(np.arange(len(chosen))[part]), field.lightings[0], size)
             rgb.append((np.clip(image.rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
             depth.append(believed_depth(np.asarray(image.depth), np.asarray(image.opacity), far))
             bar.update(len(image.depth))

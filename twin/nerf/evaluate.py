@@ -122,8 +122,7 @@ def score_frame(
     wrong = [psnr(picture(field.embedding(name)), image, mask) for name in others]
     again = float("nan")
     if baked is not None:
-        pose = cameras.camera_to_world[i : i + 1]
-        again = psnr(baked.render(pose, intrinsics[None], (width, height), start).rgb[0], image, mask)
+        again = psnr(baked.render(cameras.select(np.array([i])), start, (width, height)).rgb[0], image, mask)
     return {
         "baked": again,
         "psnr": float(np.mean(psnrs)) if psnrs else float("nan"),

@@ -18,6 +18,7 @@ from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
 from twin.errors import InputError
+from twin.geometry.cameras import Posed, resized
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
 from twin.nerf.compute import device, load_kernels, parallel, single_threaded_torch, view
@@ -314,27 +315,19 @@ class RadianceField:
             parallel(one, range(0, n, batch), self.where)
         return rgb.cpu().numpy()
 
-    def render(
-        self, camera_to_world: NDArray, intrinsics: NDArray, size: tuple[int, int], lighting: str | NDArray
-    ) -> Rendering:
-        """Views of n cameras under one lighting.
-
-        Args:
-            camera_to_world: OpenCV axes, shape (n, 4, 4).
-            intrinsics: fx, fy, cx, cy [px] at `size`, shape (n, 4).
-            size: Width, height [px].
-            lighting: A name, see `Appearance.embedding`, or an embedding (dim,).
+    def render(self, cameras: Posed, lighting: str | NDArray, size: tuple[int, int] | None = None) -> Rendering:
+        """What n cameras see under one lighting; as `BakedField.render`, which is many times faster.
 
         Raises:
-            InputError: unknown lighting.
+            InputError: unknown lighting, or cameras of several sizes and none given.
         """
         vector = self.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
-        width, height = size
-        n = len(camera_to_world)
-        cameras = CameraArrays(camera_to_world, intrinsics, self.where)
+        intrinsics, (width, height) = resized(cameras, size)
+        n = len(intrinsics)
+        arrays = CameraArrays(cameras.camera_to_world, intrinsics, self.where)
         v, u = np.mgrid[:height, :width] + 0.5
         pixel = np.tile(np.stack([u.ravel(), v.ravel()], -1), (n, 1))
-        features, harmonics, depth, opacity = self.trace(cameras, np.repeat(np.arange(n), width * height), pixel)
+        features, harmonics, depth, opacity = self.trace(arrays, np.repeat(np.arange(n), width * height), pixel)
         return Rendering(
             self.colour(features, harmonics, vector).reshape(n, height, width, 3),
             depth.cpu().numpy().reshape(n, height, width),

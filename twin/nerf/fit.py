@@ -405,9 +405,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     field, metrics = fit(cameras, points, config.nerf, config.seed, height)
-    baked = None
-    if config.nerf.bake:
-        baked, metrics["bake"] = bake(field, TrainingPixels(cameras, points, config.nerf.max_width), config.seed)
+    pixels = TrainingPixels(cameras, points, config.nerf.max_width)
+    baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
     field.about = {
         "scene": config.name,
@@ -417,7 +416,6 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         "metrics": metrics,
     }
     field.save(out)
-    if baked is not None:
-        baked.about = field.about
-        baked.save(out)
+    baked.about = field.about
+    baked.save(out)
     return metrics

@@ -18,6 +18,7 @@ from twin.env.follower import Drive, follow
 from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import Cameras
 from twin.mjcf.world import World, arc_lengths
+from twin.nerf.baked import BakedField
 from twin.progress import bar
 from twin.report.ahead import Ahead
 from twin.report.chapters import (
@@ -58,9 +59,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         Metrics for the report: `follower` (None where there is no route, and then `not_applicable` says why),
         `frames`, `duration_s`, `renders`, `render_seconds_per_frame`.
     """
-    from twin.nerf.field import RadianceField  # loads torch, which a reader of this module may not need
-
-    return film(scene, config, out, RadianceField.load(scene.stage("field")))
+    return film(scene, config, out, BakedField.load(scene.stage("field")))
 
 
 def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[str, Any]:
@@ -113,7 +112,7 @@ def _film_chapters(
     views, model = _views(studio, scene, world)
     behind = chase_shots(drive, stride(drive, studio.fps)[0]) if drive else []
     # Warp compiles kernels when they are first used; the field's are, before a second thread compiles the scene's.
-    field.render(cameras.camera_to_world[:1], cameras.intrinsics[:1], (16, 8), field.lightings[0])
+    field.render(cameras.select(np.array([0])), field.lightings[0], (16, 8))
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += light_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
     # MuJoCo's pictures need no view of the field, so they are made while those of the first chapters are.

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import Cameras, scaled_intrinsics
+from twin.geometry.cameras import Cameras, Posed, Viewpoints
 from twin.geometry.images import read_image
 from twin.nerf.rendering import Rendering
 from twin.report.panels import Layout, Picture
@@ -32,7 +32,7 @@ class Field(Protocol):
     @property
     def lightings(self) -> tuple[str, ...]: ...
 
-    def render(self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str) -> Rendering: ...
+    def render(self, cameras: Posed, lighting: str, size: tuple[int, int]) -> Rendering: ...
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,7 @@ class Studio:
         longer = max(size)
         small = (even(round(size[0] * self.render_width / longer)), even(round(size[1] * self.render_width / longer)))
         start = time.perf_counter()
-        rendering = self.field.render(
-            camera_to_world[None], scaled_intrinsics(intrinsics, size, small)[None], small, lighting
-        )
+        rendering = self.field.render(Viewpoints.of(camera_to_world, intrinsics, size), lighting, small)
         self.render_seconds += time.perf_counter() - start
         self.renders += 1
         return rendering

@@ -6,18 +6,22 @@ metres of the twin are what a robot drives in. Surfaces are compared where some 
 """
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
 from twin.assets.ground import Ground
-from twin.geometry.cameras import Cameras, pixel_grid, scaled_intrinsics, unproject
+from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, scaled_intrinsics, unproject
 from twin.geometry.poses import Similarity, rotation_angle, umeyama
+from twin.nerf.baked import BakedField
 from twin.reality.surface import Surface
 from twin.reality.truth import Truth
 from twin.scene import SceneDir
+
+if TYPE_CHECKING:
+    from twin.nerf.field import RadianceField
 
 Array = NDArray[np.float64]
 
@@ -27,6 +31,7 @@ _STANDING = 0.15  # [m] what stands less than this above the ground is ground or
 _INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] above the ground where the corridor must be free
 _RAYS = (96, 54)  # per camera, to find what it sees
 _EYES = 48  # cameras that surfaces are looked at from, at most
+_DEPTH_REACH = 20.0  # [m] depth beyond is not compared
 _SEEN_CELL = 0.1  # [m] seen surface is thinned to one point per cell
 
 
@@ -205,12 +210,15 @@ def visible_points(surface: Surface, eyes: Array, truth: Truth) -> Array:
 
 
 def _depth_errors(folder: Path, truth: Truth, to_truth: Similarity) -> dict[str, float | None]:
-    """The field's depth at true viewpoints against the true depth; three frames of each film."""
-    if not (folder / "field.json").exists():
+    if not (folder / "baked.json").exists():
         return {"depth_median_m": None, "depth_relative": None}
-    from twin.nerf.field import RadianceField  # torch is slow to import, and most callers of this module need none
+    return depth_errors(BakedField.load(folder), truth, to_truth)
 
-    field = RadianceField.load(folder)
+
+def depth_errors(
+    field: "BakedField | RadianceField", truth: Truth, to_truth: Similarity, reach: float = _DEPTH_REACH
+) -> dict[str, float | None]:
+    """A field's depth at true viewpoints against the true depth up to `reach` [m]; three frames of each film."""
     errors, relative = [], []
     for name, film in truth.films.items():
         if name not in field.lightings:
@@ -218,10 +226,9 @@ def _depth_errors(folder: Path, truth: Truth, to_truth: Similarity) -> dict[str,
         pick = np.unique(np.linspace(0, len(film.depth) - 1, 5).round().astype(int))[1:4]
         poses = to_truth.inverse().poses(film.camera_to_world[film.depth_frames[pick]])
         height, width = film.depth.shape[1:]
-        intrinsics = np.tile(scaled_intrinsics(truth.intrinsics, truth.size, (width, height)), (len(pick), 1))
-        depth = field.render(poses, intrinsics, (width, height), name).depth
+        depth = field.render(Viewpoints.of(poses, truth.intrinsics, truth.size), name, (width, height)).depth
         true_depth = film.depth[pick].astype(np.float64)
-        valid = (true_depth > 0.0) & (true_depth < 20.0)
+        valid = (true_depth > 0.0) & (true_depth < reach)
         errors.append(np.abs(depth - true_depth)[valid])
         relative.append(errors[-1] / true_depth[valid])
     if not errors:

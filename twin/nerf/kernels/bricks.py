@@ -3,19 +3,16 @@
 *Brick*: 8³ cells of a grid, stored as the 9³ samples on their corners, so that interpolation never leaves it. A sample
 is `CHANNELS` bytes: the raw density and the features of a radiance field (see `composite.py`), each in its channel's
 range. *Slot*: row of a stored brick; the *index* gives it per brick of a grid, −1 where nothing is stored. *Block*: 2³
-cells. *Leap*: per block of a grid 0 where there is something in it, else d ≥ 1, the distance to the nearest such block,
-in blocks along the axis where it is furthest: so far a ray may go without looking. There are two grids: the *near* one
-over the near box, the *far* one, of larger cells, over all of the contracted cube.
+cells. There are two grids: the *near* one over the near box, the *far* one, of larger cells, over all of the contracted
+cube. `march.py` renders them.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
 # mypy: ignore-errors
-# ruff: noqa: RUF046
 import warp as wp
 
-from twin.nerf.kernels.composite import CHANNELS, Channels, density_of
+from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.sampler import in_near_box, is_near
-from twin.nerf.kernels.space import grid_position, max_norm
 
 CELLS = 8
 """Cells along a brick's side."""

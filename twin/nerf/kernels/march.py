@@ -4,7 +4,8 @@
 so that the compiler turns it into vector instructions; on CUDA, where the hardware does that, a packet has one lane.
 *Tile*: 8 × 8 pixels; no ray of it meets anything before the tile's *start*. *Leap*: per block of a grid 0 where there
 is something in it, else d ≥ 1, the distance to the nearest such block, in blocks along the axis where it is furthest:
-so far a ray may go in that grid without looking. For bricks, blocks and the two grids see `bricks.py`, for positions `space.py`.
+so far a ray may go in that grid without looking. For bricks, blocks and the two grids see `bricks.py`, for positions
+`space.py`.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
@@ -237,8 +238,8 @@ def approach(bricks: Bricks, film: Film, first: wp.int32, start: wp.array2d(dtyp
 def march(lanes: int) -> Any:
     """The march's kernel for packets of `lanes` rays, one of 1, 2, 4 and 8.
 
-    Launched over cameras and `TILE`² / lanes packets for each of some tiles. It takes the bricks, the film, the first of
-    the tiles and the tiles' starts; it writes opacity and composited features (cameras, CHANNELS, pixels), and the
+    Launched over cameras and `TILE`² / lanes packets for each of some tiles. It takes the bricks, the film, the first
+    of the tiles and the tiles' starts; it writes opacity and composited features (cameras, CHANNELS, pixels), and the
     z-depth of half the light [m] (−1: nowhere).
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
@@ -339,7 +340,7 @@ def march(lanes: int) -> Any:
         ahead = Floats()
         pending = Floats()  # weight of steps too faint to look up features for, passed on to the next step
         counted = Floats()
-        # Steps whose features are wanted are noted, and looked up together: a look-up waits for memory, not for another.
+        # Steps whose features are wanted are noted and looked up together: a look-up then waits for none but memory.
         note = int(0)
         noted = Noted()
         noted_weight = NotedFloats()

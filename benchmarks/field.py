@@ -1,0 +1,108 @@
+"""Figures of the radiance field and of its renderer: a table on standard output, and as JSON where asked.
+
+    python benchmarks/field.py --scene BUILT_SCENE [--only fox bake render depth train gpu] [--json FILE] [--quick]
+
+`fox` reads the real captures in ../shared/data beside the project (or `--data`) and trains for 60, 300 and 1200 s;
+all sections but `fox` and `gpu` need a scene that was built to its end. Nothing is written into the scene. Alone on
+the machine the whole takes some 35 minutes. What each figure is, is said where it is measured: `field_sections.py`.
+"""
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from field_common import Bench
+
+TARGETS: dict[str, tuple[str, float]] = {
+    "fox.psnr_60s": ("≥", 24.0),
+    "fox.psnr_300s": ("≥", 25.5),
+    "fox.seconds_60s": ("≤", 60.0),
+    "fox.seconds_300s": ("≤", 300.0),
+    "fox.seconds_1200s": ("≤", 1200.0),
+    "bake.psnr_drop": ("≤", 0.5),
+    "bake.bytes": ("≤", 150e6),
+    "render.fps_1core": ("≥", 100.0),
+    "render.fps_2core": ("≥", 190.0),
+    "render.ratio_to_nerfacto": ("≥", 1000.0),
+    "render.first_frame_s": ("≤", 1.0),
+    "render.cold_compile_s": ("≤", 30.0),
+    "depth.median_error_m": ("≤", 0.05),
+    "train.peak_bytes": ("≤", 3e9),
+    "gpu.fox.psnr_60s": ("≥", 26.5),
+    "gpu.render_fps": ("≥", 10000.0),
+    "gpu.cpu_difference_max": ("≤", 1 / 255),
+}
+"""What is wanted of a figure. A score within a budget is not met either where the budget was exceeded."""
+
+
+def judge(name: str, figures: dict[str, Any]) -> tuple[str, str]:
+    """A figure's target and whether it is met, in words; empty where nothing is wanted of it."""
+    sense, wanted = TARGETS.get(name, (None, 0.0))
+    late = ""
+    section, _, rest = name.rpartition(".")
+    if rest.startswith("psnr_") and rest.split("_")[1].removesuffix("s").isdigit():
+        budget = rest.split("_")[1]
+        wall = figures.get(f"{section}.seconds_{budget}", 0.0)
+        if wall > float(budget.removesuffix("s")):
+            late = f"no, took {wall:.1f} s"
+    if sense is None:
+        return "", late
+    value = figures[name]
+    met = value is not None and (value <= wanted if sense == "≤" else value >= wanted)
+    return f"{sense} {wanted:.4g}", late or ("yes" if met else "no")
+
+
+def shown(value: Any) -> str:
+    """A figure for the table."""
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def main() -> None:
+    from field_sections import NEED_SCENE, SECTIONS
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, help="a built scene, such as scenes/demo")
+    parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared/data")
+    parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean nothing")
+    options = parser.parse_args()
+    sections = options.only or list(SECTIONS)
+    if not options.scene and any(name in NEED_SCENE for name in sections):
+        parser.error(f"--scene is needed for {', '.join(name for name in sections if name in NEED_SCENE)}")
+    if "fox" in sections and not (options.data / "fox").is_dir():
+        parser.error(f"no fox in {options.data}; say where with --data, or leave the section out with --only")
+
+    # All sections but `gpu` are about the processor.
+    os.environ["TWIN_DEVICE"] = "cpu"
+    figures: dict[str, Any] = {}
+    print(f"{'figure':32} {'value':>16} {'target':>12}  met")
+    with tempfile.TemporaryDirectory() as work:
+        bench = Bench(options.scene, options.data, Path(work), options.quick)
+        for section in sections:
+            found = SECTIONS[section](bench)
+            figures |= found
+            for name in found:
+                wanted, met = judge(name, figures)
+                print(f"{name:32} {shown(figures[name]):>16} {wanted:>12}  {met}".rstrip(), flush=True)
+            if options.json:  # after every section, as a run is long
+                options.json.write_text(json.dumps(figures | {"about": about(options)}, indent=1) + "\n", "utf-8")
+
+
+def about(options: argparse.Namespace) -> dict[str, Any]:
+    """What the figures were measured with."""
+    from twin.nerf import compute
+
+    packages = {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")}
+    return {"cores": compute.cores(), "machine": platform.machine(), "versions": packages, "quick": options.quick}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,269 @@
+"""The sections of `field.py`: each measures one thing and returns figures by name.
+
+*Unfitted* and *fitted* scores are those of `twin/nerf/evaluate.py`. A *budget* is wall time [s] from the start of `fit`
+to the finished field, reading the frames and stereo included; what is compiled once per machine is compiled before.
+"""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from field_common import SIZE, Bench, load_baked, load_field, render, route_views, worker
+
+from twin.config import NerfConfig, load_config
+from twin.geometry.cameras import Cameras
+from twin.geometry.points import SparsePoints
+from twin.nerf import compute
+from twin.scene import SceneDir
+
+_MARGIN = 0.05  # share of a budget that is left for what the forecast of the pace misses
+_PROBE_STEPS = 150
+_NEAR = 10.0  # [m] depth is compared up to here
+
+Figures = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How long `fit` takes: seconds before the first step, and per step."""
+
+    overhead: float
+    step: float
+
+    def steps(self, budget: float) -> int:
+        """Steps that fit into a budget [s], less the margin."""
+        return max(1, int(((1.0 - _MARGIN) * budget - self.overhead) / self.step))
+
+
+def timed_fit(cameras: Cameras, points: SparsePoints, config: NerfConfig, steps: int) -> tuple[Any, float, Pace]:
+    """The field after so many steps, the wall seconds of the whole call, and its pace."""
+    from twin.nerf.fit import fit
+
+    began = time.perf_counter()
+    field, metrics = fit(cameras, points, replace(config, steps=steps))
+    wall = time.perf_counter() - began
+    return field, wall, Pace(wall - metrics["seconds_train"], metrics["seconds_train"] / steps)
+
+
+def fox(bench: Bench) -> Figures:
+    """Training within budgets on the fox: poses given, every 8th image held out, 270 × 480 px, default settings."""
+    cameras, points = _fox_scene(bench)
+    config = replace(NerfConfig(), max_width=bench.pick(NerfConfig().max_width, 96))
+    budgets = bench.pick((60, 300, 1200), (10,))
+    return {f"fox.{key}": value for key, value in _within_budgets(bench, cameras, points, config, budgets).items()}
+
+
+def _fox_scene(bench: Bench) -> tuple[Cameras, SparsePoints]:
+    """The capture through the product's own stages, which undistort the pictures and keep the poses."""
+    from twin.build import build
+
+    root = bench.work / "fox"
+    if not (root / "build").exists():
+        root.mkdir()
+        (root / "scene.toml").write_text(
+            f'[[source]]\npath = "{(bench.data / "fox/transforms_orig_1080x1920.json").resolve().as_posix()}"\n'
+            'lighting = "indoor"\n[capture]\nheld_out_every = 8\n[metric]\nposes_are_metric = true\nup = "cameras"\n'
+            "[mjcf]\nroute = false\n",
+            encoding="utf-8",
+        )
+        build(root, until="metric", overrides=bench.pick((), ("capture.max_size=240", "cameras.features=500")))
+    folder = SceneDir(root).stage("metric")
+    return Cameras.load(folder), SparsePoints.load(folder)
+
+
+def _within_budgets(
+    bench: Bench, cameras: Cameras, points: SparsePoints, config: NerfConfig, budgets: tuple[int, ...]
+) -> Figures:
+    from twin.nerf.dataset import load_frame
+    from twin.nerf.evaluate import evaluate
+
+    timed_fit(cameras, points, config, 2)  # compiles kernels and reads the files once
+    _, _, pace = timed_fit(cameras, points, config, bench.pick(_PROBE_STEPS, 20))
+    found: Figures = {"overhead_s": pace.overhead, "step_s": pace.step}
+    found["frame_size"] = "{1}x{0}".format(*load_frame(cameras, 0, config.max_width)[1].shape)
+    for budget in budgets:
+        steps = pace.steps(budget)
+        field, wall, pace = timed_fit(cameras, points, config, steps)
+        scores = evaluate(field, cameras, config.max_width, max_frames=len(cameras))
+        (name,) = field.lightings
+        found |= {
+            f"psnr_{budget}s": scores["psnr"][name],
+            f"psnr_{budget}s_unfitted": scores["psnr_unfitted"][name],
+            f"ssim_{budget}s": scores["ssim"][name],
+            f"seconds_{budget}s": wall,
+            f"steps_{budget}s": steps,
+            "n": scores["n"][name],
+        }
+    return found
+
+
+def bake(bench: Bench) -> Figures:
+    """What baking costs in quality, bytes and time; all held-out frames."""
+    from twin.nerf.evaluate import evaluate
+
+    scene = SceneDir(bench.scene)
+    field = load_field(bench.scene)
+    baked, about, seconds = _bake(bench, field)
+    width = load_config(scene.config_file, ()).nerf.max_width
+    cameras = Cameras.load(scene.stage("metric"))
+    scores = evaluate(field, cameras, width, bench.pick(len(cameras), 1), baked=baked)
+    drops = {name: scores["psnr_unfitted"][name] - scores["psnr_baked"][name] for name in scores["psnr_baked"]}
+    file = bench.work / "baked/baked.safetensors"
+    return {
+        "bake.psnr_drop": float(np.mean(list(drops.values()))),
+        **{f"bake.psnr_drop.{name}": drop for name, drop in drops.items()},
+        **{f"bake.psnr_unfitted.{name}": value for name, value in scores["psnr_unfitted"].items()},
+        "bake.n": sum(scores["n"].values()),
+        "bake.bytes": baked.bytes,
+        "bake.file_bytes": file.stat().st_size,
+        "bake.seconds": seconds,
+        "bake.bricks": about["bricks_near"] + about["bricks_far"],
+        "bake.cell_m": about["cell_m"],
+    }
+
+
+def _bake(bench: Bench, field: Any) -> tuple[Any, Figures, float]:
+    """Bakes the scene's field into the work folder: the baked field, what `bake` says, and its wall seconds."""
+    import warp as wp
+
+    from twin.nerf.bake import bake as run
+    from twin.nerf.dataset import TrainingPixels
+
+    scene = SceneDir(bench.scene)
+    config = load_config(scene.config_file, ())
+    cameras, points = Cameras.load(scene.stage("metric")), SparsePoints.load(scene.stage("metric"))
+    pixels = TrainingPixels(cameras, points, config.nerf.max_width)
+    wp.load_module("twin.nerf.kernels.bricks", device=field.where)
+    began = time.perf_counter()
+    baked, about = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "most_bricks": 1500}))
+    seconds = time.perf_counter() - began
+    folder = bench.work / "baked"
+    folder.mkdir(exist_ok=True)
+    baked.save(folder)
+    return baked, about, seconds
+
+
+def baked_place(bench: Bench) -> Path:
+    """Where a baked field is: the scene, if it was built with one, else a folder it is baked into now."""
+    if (SceneDir(bench.scene).stage("field") / "baked.json").exists():
+        return bench.scene
+    folder = bench.work / "baked"
+    if not (folder / "baked.json").exists():
+        _bake(bench, load_field(bench.scene))
+    return folder
+
+
+def speed(bench: Bench) -> Figures:
+    """160 × 90 pictures with depth along the route, in processes of their own."""
+    place, views = baked_place(bench), route_views(bench)
+    count, repeats = bench.pick((60, 5), (4, 1))
+    found: Figures = {}
+    for used in (1, 2)[: compute.cores()]:
+        row = worker("frames", place, views, used, count, repeats)
+        found |= {f"render.{key}_{used}core": value for key, value in row.items()}
+    row = worker("ratio", place, views, bench.pick(SIZE[0], 16), bench.pick(3, 1))
+    found |= {f"render.{key}": value for key, value in row.items()}
+    return found | _first_frame(bench, place, views)
+
+
+def _first_frame(bench: Bench, place: Path, views: Path) -> Figures:
+    """New processes: the median of three with the kernels cached, and one with an empty cache."""
+    runs = [worker("first", place, views) for _ in range(bench.pick(4, 1))]
+    runs = runs[1:] or runs  # the first one brings the files into memory
+    warm = {key: float(np.median([run[key] for run in runs])) for key in runs[0]}
+    cache = bench.work / "cold_cache"
+    cold = worker("first", place, views, environment={"WARP_CACHE_PATH": str(cache)})
+    return {
+        "render.import_s": warm["import_s"],
+        "render.load_s": warm["load_s"],
+        "render.first_frame_s": warm["first_frame_s"],
+        "render.first_frame_cold_s": cold["first_frame_s"],
+        "render.cold_compile_s": cold["first_frame_s"] - warm["first_frame_s"],
+    }
+
+
+def depth(bench: Bench) -> Figures:
+    """Rendered depth against the known truth, up to 10 m away, at the true cameras."""
+    from twin.reality.truth import Truth
+    from twin.report.truth import align_rigid, depth_errors, matched_poses
+
+    scene = SceneDir(bench.scene)
+    if not (scene.truth / "truth.npz").exists():
+        return {"depth.none": "the scene has no known truth"}
+    truth = Truth.load(scene.truth)
+    cameras = Cameras.load(scene.stage("metric"))
+    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    found: Figures = {}
+    for suffix, field in (("", load_baked(baked_place(bench))), ("_field", load_field(bench.scene))):
+        errors = depth_errors(field, truth, to_truth, _NEAR)
+        found[f"depth.median_error{suffix}_m"] = errors["depth_median_m"]
+        found[f"depth.median_relative{suffix}"] = errors["depth_relative"]
+    return found
+
+
+def train(bench: Bench) -> Figures:
+    """Memory of training: 200 frames of the scene at the trained size, in a process of its own."""
+    row = worker("memory", bench.scene, bench.pick(200, 12), bench.pick(60, 3))
+    size = "{:.0f}x{:.0f}".format(*row["size"])
+    return {"train.peak_bytes": row["peak_bytes"], "train.frames": row["frames"], "train.frame_size": size}
+
+
+def gpu(bench: Bench) -> Figures:
+    """On CUDA, where both torch and Warp see it."""
+    import torch
+    import warp as wp
+
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        return {"gpu.none": "no CUDA device here; nothing of this section was measured"}
+    found: Figures = {"gpu.device": torch.cuda.get_device_name()}
+    with _device("cuda"):
+        cameras, points = _fox_scene(bench)
+        config = replace(NerfConfig(), max_width=bench.pick(960, 96))
+        budget = bench.pick(60, 10)
+        row = _within_budgets(bench, cameras, points, config, (budget,))
+        found |= {f"gpu.fox.{key}": value for key, value in row.items()}
+    if bench.scene is None:
+        return found
+    place, views = baked_place(bench), route_views(bench)
+    with np.load(views) as data:
+        poses, k = data["poses"], data["intrinsics"]
+    poses = poses[np.linspace(0, len(poses) - 1, bench.pick(256, 4)).round().astype(int)]
+    on_gpu, on_cpu = load_baked(place, "cuda"), load_baked(place, "cpu")
+    name = on_gpu.lightings[0]
+    render(on_gpu, poses, k, SIZE, name)
+    times = []
+    for _ in range(bench.pick(10, 2)):
+        began = time.perf_counter()
+        render(on_gpu, poses, k, SIZE, name)  # its pictures come back as numpy arrays, so it is done when it returns
+        times.append(time.perf_counter() - began)
+    some = poses[:: max(1, len(poses) // 8)]
+    apart = np.abs(render(on_gpu, some, k, SIZE, name).rgb - render(on_cpu, some, k, SIZE, name).rgb)
+    return found | {
+        "gpu.render_batch": len(poses),
+        "gpu.render_fps": len(poses) / float(np.median(times)),
+        "gpu.cpu_difference_max": float(apart.max()),
+        "gpu.cpu_difference_mean": float(apart.mean()),
+    }
+
+
+@contextmanager
+def _device(name: str) -> Iterator[None]:
+    """TWIN_DEVICE for a while."""
+    former = os.environ.get("TWIN_DEVICE")
+    os.environ["TWIN_DEVICE"] = name
+    try:
+        yield
+    finally:
+        if former is None:
+            del os.environ["TWIN_DEVICE"]
+        else:
+            os.environ["TWIN_DEVICE"] = former
+
+
+SECTIONS = {"fox": fox, "bake": bake, "render": speed, "depth": depth, "train": train, "gpu": gpu}
+NEED_SCENE = ("bake", "render", "depth", "train")

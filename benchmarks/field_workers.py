@@ -1,0 +1,194 @@
+"""Measurements that need a process of their own; `field.py` starts them. Each prints one line of JSON.
+
+    python field_workers.py frames PLACE VIEWS CORES FRAMES REPEATS
+    python field_workers.py ratio  PLACE VIEWS WIDTH REPEATS
+    python field_workers.py first  PLACE VIEWS
+    python field_workers.py memory SCENE FRAMES STEPS
+
+PLACE is a scene with a baked field, or a folder that holds one; VIEWS is a file of `field_common.route_views`.
+Whatever is imported late is so because the core count must be set, or the clock be running, before.
+"""
+
+import itertools
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def use_cores(count: int) -> None:
+    """Binds this process to so many cores; call before numpy and torch, which count cores when they are imported.
+
+    Threads are left to the product: what it does by itself on such a machine is what counts.
+
+    Raises:
+        OSError: the system cannot bind processes, so that no figure of one core can be had.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        raise OSError("this system cannot bind a process to a core; figures per core need Linux")
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+
+
+def frames(place: str, views: str, cores: str, count: str, repeats: str) -> dict[str, Any]:
+    """Single frames one after another, and batches; times [ms] and frames per second."""
+    use_cores(int(cores))
+    import numpy as np
+    from field_common import SIZE, load_baked, render
+
+    field = load_baked(Path(place))
+    poses, k, lightings = _views(views, int(count), field.lightings)
+
+    def one(i: int) -> None:
+        render(field, poses[i : i + 1], k, SIZE, lightings[i])
+
+    for i in range(min(5, len(poses))):
+        one(i)
+    latency, speed, batched, busy = [], [], [], []
+    for _ in range(int(repeats)):
+        began, began_cpu = time.perf_counter(), time.process_time()
+        for i in range(len(poses)):
+            before = time.perf_counter()
+            one(i)
+            latency.append(time.perf_counter() - before)
+        speed.append(len(poses) / (time.perf_counter() - began))
+        busy.append((time.process_time() - began_cpu) / len(poses))
+        began = time.perf_counter()
+        render(field, poses, k, SIZE, lightings[0])
+        batched.append(len(poses) / (time.perf_counter() - began))
+    return {
+        "fps": float(np.median(speed)),
+        "ms": float(np.median(latency)) * 1e3,
+        "ms_95": float(np.quantile(latency, 0.95)) * 1e3,
+        "cpu_ms": float(np.median(busy)) * 1e3,
+        "batch_fps": float(np.median(batched)),
+    }
+
+
+def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
+    """By turns on one core: Nerfacto plain and tuned, one frame each, and eight of the baked field."""
+    use_cores(1)
+    import nerfacto_reference
+    import nerfacto_tuned
+    import numpy as np
+    import torch
+    from field_common import SIZE, load_baked, render
+    from nerfacto_reference import Nerfacto
+
+    torch.set_num_threads(1)
+    field = load_baked(Path(place))
+    size = (int(width), round(int(width) * SIZE[1] / SIZE[0]))
+    poses, k, lightings = _views(views, 8 * int(repeats), field.lightings)
+    k = k * size[0] / SIZE[0]
+    low, high = field.bounds
+    scaled = poses.copy()  # into Nerfacto's units
+    scaled[:, :3, 3] = (poses[:, :3, 3] - (low + high) / 2) / (high - low).max() * 2
+    scaled = torch.as_tensor(scaled, dtype=torch.float32)
+    intrinsics, networks = torch.as_tensor(k), nerfacto_reference.networks()
+    plain, tuned = Nerfacto(*networks), nerfacto_tuned.tuned(*networks)
+
+    def seconds(reference: Nerfacto, i: int, chunk: int, shrink: int = 1) -> float:
+        began = time.perf_counter()
+        reference.frame(scaled[i], intrinsics / shrink, (size[0] // shrink, size[1] // shrink), chunk)
+        return time.perf_counter() - began
+
+    seconds(plain, 0, nerfacto_reference.CHUNK, 8)  # a small picture, to have everything loaded
+    seconds(tuned, 0, nerfacto_tuned.CHUNK)
+    render(field, poses[:1], k, size, lightings[0])
+    turns = []
+    for first_view in range(0, 8 * int(repeats), 8):
+        slow = seconds(plain, first_view, nerfacto_reference.CHUNK)
+        less_slow = seconds(tuned, first_view, nerfacto_tuned.CHUNK)
+        of_turn = []
+        for i in range(first_view, first_view + 8):
+            began = time.perf_counter()
+            render(field, poses[i : i + 1], k, size, lightings[i])
+            of_turn.append(time.perf_counter() - began)
+        turns.append((slow, less_slow, float(np.median(of_turn))))
+    of_plain, of_tuned, baked = np.transpose(turns)
+    return {
+        "ratio_to_nerfacto": float(np.median(of_plain / baked)),
+        "ratio_to_nerfacto_tuned": float(np.median(of_tuned / baked)),
+        "nerfacto_s": float(np.median(of_plain)),
+        "nerfacto_tuned_s": float(np.median(of_tuned)),
+        "ms_beside_nerfacto": float(np.median(baked)) * 1e3,
+    }
+
+
+def first(place: str, views: str) -> dict[str, Any]:
+    """From nothing to the first frame: `import_s`, then `first_frame_s` from the call that loads to the frame."""
+    began = time.perf_counter()
+    from field_common import SIZE, load_baked, render
+
+    import twin.loading
+    import twin.nerf.baked  # noqa: F401
+
+    imported = time.perf_counter()
+    poses, k, _ = _views(views, 1, ("",))
+    loading = time.perf_counter()
+    field = load_baked(Path(place))
+    loaded = time.perf_counter()
+    render(field, poses[:1], k, SIZE, field.lightings[0])
+    done = time.perf_counter()
+    return {"import_s": imported - began, "load_s": loaded - loading, "first_frame_s": done - loading}
+
+
+def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
+    """Peak resident memory of training on so many frames, the scene's own and, where too few, the first ones again."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from twin.config import load_config
+    from twin.geometry.cameras import Cameras
+    from twin.geometry.points import SparsePoints
+    from twin.nerf.fit import constant_height, fit
+    from twin.progress import set_quiet
+    from twin.scene import SceneDir, read_json
+
+    set_quiet(True)
+    paths = SceneDir(Path(scene))
+    config = load_config(paths.config_file, ())
+    cameras = Cameras.load(paths.stage("metric"))
+    points = SparsePoints.load(paths.stage("metric"))
+    cameras = replace(cameras, held_out=np.zeros(len(cameras), bool))
+    chosen = np.resize(np.arange(len(cameras)), int(count))  # the points know the frames by index, so no sorting
+    height = constant_height(read_json(paths.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
+    trained, _ = fit(cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height)
+    shown = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
+    return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(shown).tolist()}
+
+
+def peak_bytes() -> int:
+    """Most memory this process ever held.
+
+    Linux counts it from the program's start; `getrusage`, used elsewhere, would also count the parent's at the fork.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return int(line.split()[1]) * 1024
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _views(file: str, count: int, lightings: tuple[str, ...]) -> tuple[Any, Any, list[str]]:
+    """Poses spread along the route, intrinsics, and a lighting for each: every one by name, and mixtures."""
+    import numpy as np
+
+    with np.load(file) as data:
+        poses, intrinsics = data["poses"], data["intrinsics"]
+    chosen = np.linspace(0, len(poses) - 1, count).round().astype(int)
+    mixtures = [f"{a}:{b}:0.3" for a, b in itertools.pairwise(lightings)]
+    every = [*lightings, *mixtures]
+    return poses[chosen], intrinsics, [every[i % len(every)] for i in range(count)]
+
+
+if __name__ == "__main__":
+    workers: dict[str, Callable[..., dict[str, Any]]] = {"frames": frames, "ratio": ratio, "first": first}
+    workers["memory"] = memory
+    work = workers[sys.argv[1]]
+    print(json.dumps(work(*sys.argv[2:])))

@@ -1,0 +1,60 @@
+"""The benchmark of the field: how it fills a budget and judges a figure; that it runs is shown on the real captures
+here, and on a built scene in `test_end_to_end.py`."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+def test_steps_fill_a_budget_and_leave_a_margin(scripts):
+    from field_sections import Pace
+
+    pace = Pace(overhead=20.0, step=0.1)
+    assert pace.steps(60.0) == 370 and pace.overhead + 370 * pace.step == pytest.approx(57.0)
+    assert pace.steps(10.0) == 1
+
+
+def test_a_score_is_not_met_where_its_budget_was_exceeded(scripts, monkeypatch):
+    import field
+
+    monkeypatch.setitem(field.TARGETS, "fox.psnr_60s", ("≥", 25.0))
+    figures = {"fox.psnr_60s": 26.0, "fox.psnr_60s_unfitted": 25.0, "fox.seconds_60s": 59.0}
+    assert field.judge("fox.psnr_60s", figures) == ("≥ 25", "yes")
+    assert field.judge("fox.psnr_60s", figures | {"fox.psnr_60s": 24.0}) == ("≥ 25", "no")
+    assert field.judge("fox.seconds_60s", figures) == ("≤ 60", "yes")
+    late = figures | {"fox.seconds_60s": 61.0}
+    assert field.judge("fox.psnr_60s", late)[1] == field.judge("fox.psnr_60s_unfitted", late)[1] == "no, took 61.0 s"
+    assert field.judge("gpu.cpu_difference_max", {"gpu.cpu_difference_max": 1 / 255}) == ("≤ 0.003922", "yes")
+    assert field.judge("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
+
+
+def test_the_peak_is_that_of_this_process(scripts):
+    from field_workers import peak_bytes
+
+    before = peak_bytes()
+    block = bytearray(64 * 2**20)
+    block[::4096] = b"x" * len(block[::4096])
+    assert 32 * 2**20 < peak_bytes() < before + 512 * 2**20
+
+
+@pytest.mark.realdata
+@pytest.mark.slow
+def test_training_within_a_budget(real_data, tmp_path):
+    file = tmp_path / "figures.json"
+    command = [sys.executable, BENCHMARKS / "field.py", "--quick", "--only", "fox", "gpu", "--data", real_data]
+    done = subprocess.run([*map(str, command), "--json", str(file)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    figures = json.loads(file.read_text())
+    assert figures["fox.n"] == 6 and figures["fox.steps_10s"] >= 1
+    assert 5.0 < figures["fox.psnr_10s_unfitted"] < 40.0 and figures["fox.frame_size"] == "54x96"
+    assert "fox.psnr_10s" in done.stdout and any(name.startswith("gpu.") for name in figures)

@@ -1,0 +1,24 @@
+"""Every kernel compiles for a GPU ahead of time, on a machine that has none."""
+
+import pkgutil
+from importlib import import_module
+
+import pytest
+import warp as wp
+
+from twin.nerf import compute, kernels
+
+_ARCH = 90  # sm_90: Hopper
+_SLOW = {"stereo"}
+"""Unrolled windows make it 20 s of compiling to machine code; to PTX, which a driver takes on, it is half of that."""
+
+
+@pytest.mark.parametrize("name", [module.name for module in pkgutil.iter_modules(kernels.__path__)])
+def test_kernels_compile_for_sm_90(name, tmp_path):
+    assert compute.wp is wp  # importing it initialises Warp quietly
+    module = import_module(f"{kernels.__name__}.{name}")
+    made = wp.compile_aot_module(module, arch=_ARCH, module_dir=tmp_path, use_ptx=name in _SLOW)
+    suffix = f".sm{_ARCH}.ptx" if name in _SLOW else f".sm{_ARCH}.cubin"
+    assert [path.name.endswith(suffix) for path in made] == [True]
+    content = made[0].read_bytes()
+    assert f"sm_{_ARCH}".encode() in content if name in _SLOW else content.startswith(b"\x7fELF")
