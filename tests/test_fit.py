@@ -224,11 +224,13 @@ def test_the_stage_writes_a_field_that_loads(cameras, tmp_path):
     write_json(scene.stage("metric") / "metric.json", {"camera_height_median_m": 1.5, "road_reliable": True})
     out = tmp_path / "out"
     out.mkdir()
-    config = SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=CONFIG)
-    metrics = run(scene, config, out)
+    nerf = replace(CONFIG, bake_steps=20, max_bricks=1500)
+    metrics = run(scene, SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=nerf), out)
     assert metrics["steps"] == 6 and metrics["parameters"] > 0 and metrics["sightings_path"] > 0
-    assert sorted(p.name for p in out.iterdir()) == ["field.json", "field.safetensors"]
-    assert RadianceField.load(out).lightings == ("day", "night")
+    names = ["baked.json", "baked.safetensors", "field.json", "field.safetensors"]
+    assert sorted(p.name for p in out.iterdir()) == names
+    assert metrics["bake"]["bytes"] > 0 and set(metrics["psnr_baked"]) == {"day", "night"}
+    assert BakedField.load(out).lightings == RadianceField.load(out).lightings == ("day", "night")
 
 
 def test_a_baked_field_shows_what_the_field_shows(cameras):
@@ -256,18 +258,6 @@ def test_a_baked_field_shows_what_the_field_shows(cameras):
     assert not baked.lightings_by_name.judge.faults(drawn)
     scores = evaluate(field, cameras, WIDTH, baked=baked)
     assert all(scores["psnr_baked"][name] > scores["psnr_unfitted"][name] - 1.0 for name in ("day", "night"))
-
-
-def test_the_stage_bakes_when_asked(cameras, tmp_path):
-    scene = SceneDir(tmp_path / "scene")
-    scene.stage("metric").mkdir(parents=True)
-    cameras.save(scene.stage("metric"))
-    floor_points(cameras).save(scene.stage("metric"))
-    write_json(scene.stage("metric") / "metric.json", {"camera_height_median_m": 1.5, "road_reliable": True})
-    config = SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=replace(CONFIG, bake_steps=20))
-    metrics = run(scene, config, tmp_path)
-    assert metrics["bake"]["bytes"] > 0 and set(metrics["psnr_baked"]) == {"day", "night"}
-    assert BakedField.load(tmp_path).lightings == ("day", "night")
 
 
 @pytest.mark.parametrize(("value", "message"), [("tpu", "cpu or cuda"), ("cuda", "no CUDA device")])

@@ -63,7 +63,7 @@ def test_the_verb_adds_a_lighting_that_the_scene_then_has(scene, capsys):
     assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "dusk"]) == 0
     said = capsys.readouterr().out
     assert "inliers of" in said and "dB fitted" in said
-    field = twin.load_scene(scene.root).field()
+    field = twin.load_scene(scene.root).radiance_field()
     assert field.lightings == ("day", "night", "dusk")
     stored = json.loads((scene.lightings / "dusk.json").read_text())
     assert np.allclose(field.embedding("dusk"), stored["embedding"])
@@ -84,7 +84,7 @@ def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
     assert "old" in added_lightings(scene)[0]
     write_json(scene.stamp("field"), {"result": "second"})
     try:
-        field = twin.load_scene(scene.root).field()
+        field = twin.load_scene(scene.root).radiance_field()
         assert "old" not in field.lightings
         for asked in ("old", "day:old:0.5"):
             with pytest.raises(
@@ -93,7 +93,7 @@ def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
                 field.embedding(asked)
     finally:
         write_json(scene.stamp("field"), {"result": "first"})
-    assert "old" in twin.load_scene(scene.root).field().lightings
+    assert "old" in twin.load_scene(scene.root).radiance_field().lightings
 
 
 def test_what_cannot_be_used_ends_with_one_line_and_status_2(scene, tmp_path, capsys):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
-from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
+from twin.geometry.cameras import Cameras, Posed, Viewpoints, pixel_grid, resized, unproject
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
@@ -34,14 +34,13 @@ class ChequeredField:
     def lightings(self) -> tuple[str, ...]:
         return tuple(self.brightness)
 
-    def render(
-        self, camera_to_world: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], lighting: str
-    ) -> Rendering:
+    def render(self, cameras: Posed, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
         self.asked.append(lighting)
+        intrinsics, size = resized(cameras, size)
         a, b, share = lighting.split(":") if ":" in lighting else (lighting, lighting, "0")
         dark, bright = (self.brightness[name.split("/")[0]] for name in (a, b))
         level = (1 - float(share)) * dark + float(share) * bright
-        views = [self._view(pose, k, size, level) for pose, k in zip(camera_to_world, intrinsics, strict=True)]
+        views = [self._view(pose, k, size, level) for pose, k in zip(cameras.camera_to_world, intrinsics, strict=True)]
         return Rendering(*(np.stack(part).astype(np.float32) for part in zip(*views, strict=True)))
 
     def _view(
