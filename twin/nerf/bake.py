@@ -113,9 +113,10 @@ def _layout(
         # The far grid leaves to the near one what lies wholly inside the near box.
         low, high = slots[1] / far_shape, (slots[1] + 1) / far_shape
         slots = slots[0], slots[1][~((low >= 0.25) & (high <= 0.75)).all(1)]
-        if sum(map(len, slots)) <= most:
+        count = sum(map(len, slots))
+        if count <= most:
             break
-        cell *= _COARSENING
+        cell *= max(_COARSENING, (count / most) ** 0.4)
     shapes = [tuple(int(x) for x in shape) for shape in (near_shape, far_shape)]
     layout = BrickLayout(
         *(field.layout.centre, field.layout.half, field.layout.near_plane, field.layout.density_unit),
@@ -192,7 +193,7 @@ class _Tuner:
         rng = np.random.default_rng([self.seed, 5])
         errors = []
         steps = self.steps
-        parts = 2 * _SHARDS
+        parts = _SHARDS
         with bar("fine-tuning", steps, "step") as progress, single_threaded_torch():
             for step in range(steps):
                 batch = self.pixels.batch(rng, _SHARDS, 0, self.rays // _SHARDS, 0)
@@ -262,9 +263,10 @@ class _Tuner:
         scale = rate / (1.0 - 0.9**t)
         wp.launch(
             kernels.adam_step,
-            (-(-len(self.values) // parts), kernels.SAMPLES),
+            self.rays * _SAMPLES,
             [
-                *(part, parts, volume.Channels(_RATES[0] * scale, *[_RATES[1] * scale] * (volume.CHANNELS - 1))),
+                *(self.ws.w_positions, *self.index, w_outputs_grad, part, parts),
+                volume.Channels(_RATES[0] * scale, *[_RATES[1] * scale] * (volume.CHANNELS - 1)),
                 *(1.0 / (1.0 - 0.99**t), self.w_values, self.w_gradient, self.w_first, self.w_second),
             ],
             device=self.field.where,

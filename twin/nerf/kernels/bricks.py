@@ -25,12 +25,8 @@ Bytes = wp.types.vector(length=CHANNELS, dtype=wp.uint8)
 
 _CELLS = wp.constant(CELLS)
 _CORNERS = wp.constant(CORNERS)
+_LEAST_GRADIENT = wp.constant(1.0e-22)  # squared, from which a sample takes part in a step
 _SIDE = wp.constant(float(CELLS))
-_PER_BLOCK = wp.constant(2.0)  # cells
-_SAMPLES = wp.constant(SAMPLES)
-_X = wp.constant(CORNERS * CORNERS)  # from one sample to the next along each axis
-_Y = wp.constant(CORNERS)
-_Z = wp.constant(1)
 
 
 @wp.struct
@@ -124,16 +120,21 @@ def interpolate_backward(
 ):
     """Adds the gradient of `interpolate`; launched once per `part` of the slots, so that the order of sums is fixed."""
     i = wp.tid()
+    g = outputs_grad[i]
+    if wp.dot(g, g) < _LEAST_GRADIENT:
+        return
     place = place_of(positions[i], near_index, far_index)
     if place.slot >= 0 and place.slot % parts == part:
         for n in range(8):
-            wp.atomic_add(
-                gradient, place.slot, place.corner + corner_offset(n), outputs_grad[i] * corner_weight(place, n)
-            )
+            wp.atomic_add(gradient, place.slot, place.corner + corner_offset(n), g * corner_weight(place, n))
 
 
 @wp.kernel(enable_backward=False)
 def adam_step(
+    positions: wp.array(dtype=wp.vec3f),
+    near_index: wp.array3d(dtype=wp.int32),
+    far_index: wp.array3d(dtype=wp.int32),
+    outputs_grad: wp.array(dtype=Channels),
     part: wp.int32,
     parts: wp.int32,
     rates: Channels,
@@ -143,19 +144,29 @@ def adam_step(
     first: wp.array2d(dtype=Channels),
     second: wp.array2d(dtype=Channels),
 ):
-    """Adam (Kingma and Ba 2015) on samples that got a gradient, which is then cleared; β = (0.9, 0.99)."""
-    row, i = wp.tid()
-    slot = row * parts + part
-    if slot >= values.shape[0]:
+    """Adam (Kingma and Ba 2015) on samples that got a gradient, which is then cleared; β = (0.9, 0.99).
+
+    Goes where `interpolate_backward` went, since most samples get none. On CUDA a corner may be met by two threads at
+    once; both then take the same step, or the later one none.
+    """
+    i = wp.tid()
+    g = outputs_grad[i]
+    if wp.dot(g, g) < _LEAST_GRADIENT:
         return
-    g = gradient[slot, i]
-    if wp.dot(g, g) > 0.0:
-        m = first[slot, i] * 0.9 + g * 0.1
-        v = second[slot, i] * 0.99 + wp.cw_mul(g, g) * 0.01
-        first[slot, i] = m
-        second[slot, i] = v
-        value = values[slot, i]
-        for c in range(CHANNELS):
-            value[c] = value[c] - rates[c] * m[c] / (wp.sqrt(v[c] * second_correction) + 1.0e-15)
-        values[slot, i] = value
-        gradient[slot, i] = Channels()
+    place = place_of(positions[i], near_index, far_index)
+    if place.slot < 0 or place.slot % parts != part:
+        return
+    slot = place.slot
+    for n in range(8):
+        at = place.corner + corner_offset(n)
+        g = gradient[slot, at]
+        if wp.dot(g, g) > 0.0:
+            m = first[slot, at] * 0.9 + g * 0.1
+            v = second[slot, at] * 0.99 + wp.cw_mul(g, g) * 0.01
+            first[slot, at] = m
+            second[slot, at] = v
+            value = values[slot, at]
+            for c in range(CHANNELS):
+                value[c] = value[c] - rates[c] * m[c] / (wp.sqrt(v[c] * second_correction) + 1.0e-15)
+            values[slot, at] = value
+            gradient[slot, at] = Channels()
