@@ -1,7 +1,8 @@
 """The march: rays through bricks of 8-bit samples, for one picture or many, on a CPU or on CUDA.
 
-*Packet*: neighbouring rays of one row that march together, one per *lane*. Every loop over lanes is free of branches,
-so that the compiler turns it into vector instructions; on CUDA, where the hardware does that, a packet has one lane.
+*Packet*: neighbouring rays, eight to a row, that march together, one per *lane*. Every loop over lanes is free of
+branches, so that the compiler turns it into vector instructions; on CUDA, where the hardware does that, a packet has
+one lane.
 *Tile*: 8 × 8 pixels; no ray of it meets anything before the tile's *start*. *Leap*: per block of a grid 0 where there
 is something in it, else d ≥ 1, the distance to the nearest such block, in blocks along the axis where it is furthest:
 so far a ray may go in that grid without looking. For bricks, blocks and the two grids see `bricks.py`, for positions
@@ -22,7 +23,7 @@ from twin.nerf.kernels.space import grid_position, max_norm
 
 TILE = 8
 """Pixels along a tile's side."""
-LANES = {"cpu": 8, "cuda": 1}
+LANES = {"cpu": 16, "cuda": 1}
 """Rays of a packet."""
 
 # Loops over lanes stay loops, for the compiler to make vectors of; nothing here needs IEEE's order of additions.
@@ -236,7 +237,7 @@ def approach(bricks: Bricks, film: Film, first: wp.int32, start: wp.array2d(dtyp
 
 @cache
 def march(lanes: int) -> Any:
-    """The march's kernel for packets of `lanes` rays, one of 1, 2, 4 and 8.
+    """The march's kernel for packets of `lanes` rays, 1, 8 or 16.
 
     Launched over cameras and `TILE`² / lanes packets for each of some tiles. It takes the bricks, the film, the first
     of the tiles and the tiles' starts; it writes opacity and composited features (cameras, CHANNELS, pixels), and the
@@ -245,10 +246,10 @@ def march(lanes: int) -> Any:
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
     Ints = wp.types.vector(length=lanes, dtype=wp.int32)
     Totals = wp.types.matrix(shape=(lanes, CHANNELS), dtype=wp.float32)
-    Noted = wp.types.vector(length=4 * lanes, dtype=wp.int32)
-    NotedFloats = wp.types.matrix(shape=(4 * lanes, lanes), dtype=wp.float32)
-    NotedInts = wp.types.matrix(shape=(4 * lanes, lanes), dtype=wp.int32)
-    notes = wp.constant(4 * lanes)
+    Noted = wp.types.vector(length=32, dtype=wp.int32)
+    NotedFloats = wp.types.matrix(shape=(32, lanes), dtype=wp.float32)
+    NotedInts = wp.types.matrix(shape=(32, lanes), dtype=wp.int32)
+    notes = wp.constant(32)
     count = wp.constant(lanes)
     per_tile = wp.constant(TILE * TILE // lanes)
 
@@ -296,8 +297,8 @@ def march(lanes: int) -> Any:
         transmittance = Floats()
         median = Floats()
         for j in range(count):
-            x = (float(column + j) + 0.5 - k[2]) / k[0]
-            y = (float(row) + 0.5 - k[3]) / k[1]
+            x = (float(column + (j & 7)) + 0.5 - k[2]) / k[0]
+            y = (float(row + (j >> 3)) + 0.5 - k[3]) / k[1]
             c = 1.0 / wp.sqrt(x * x + y * y + 1.0)
             cosine[j] = c
             a0 = nonzero((rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]) * c * per_metre[0])
@@ -322,10 +323,10 @@ def march(lanes: int) -> Any:
             t[j] = begin
             transmittance[j] = 1.0
             median[j] = -1.0
-            limit[j] = wp.where(column + j < film.width, _NEVER, 0.0)
+            limit[j] = wp.where(column + (j & 7) < film.width, wp.where(row + (j >> 3) < film.height, _NEVER, 0.0), 0.0)
         if film.stop.shape[0] > 0:
             for j in range(count):
-                pixel = row * film.width + wp.min(column + j, film.width - 1)
+                pixel = wp.min(row + (j >> 3), film.height - 1) * film.width + wp.min(column + (j & 7), film.width - 1)
                 limit[j] = wp.min(limit[j], film.stop[camera, pixel] / cosine[j])
 
         footprint = _STRIDE / k[0]  # of a pixel, per metre
@@ -476,8 +477,8 @@ def march(lanes: int) -> Any:
             for j in range(count):
                 t[j] = t[j] + ahead[j]
         for j in range(count):
-            if column + j < film.width:
-                pixel = row * film.width + column + j
+            if column + (j & 7) < film.width and row + (j >> 3) < film.height:
+                pixel = (row + (j >> 3)) * film.width + column + (j & 7)
                 opacity = wp.where(transmittance[j] > _OPAQUE, 1.0 - transmittance[j], 1.0)
                 share = opacity / wp.max(counted[j], 1.0e-6)
                 features[camera, 0, pixel] = opacity
