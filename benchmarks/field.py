@@ -72,6 +72,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared/data")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
     parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--budgets", nargs="+", type=int, default=[60, 300, 1200], metavar="S", help="of the fox [s]")
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean nothing")
     options = parser.parse_args()
     sections = options.only or list(SECTIONS)
@@ -85,7 +86,7 @@ def main() -> None:
     figures: dict[str, Any] = {}
     print(f"{'figure':32} {'value':>16} {'target':>12}  met")
     with tempfile.TemporaryDirectory() as work:
-        bench = Bench(options.scene, options.data, Path(work), options.quick)
+        bench = Bench(options.scene, options.data, Path(work), tuple(options.budgets), options.quick)
         for section in sections:
             found = SECTIONS[section](bench)
             figures |= found

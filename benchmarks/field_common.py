@@ -27,6 +27,8 @@ class Bench:
     """Folder of the real captures."""
     work: Path
     """Empty folder for what is made on the way."""
+    budgets: tuple[int, ...]
+    """For training [s]."""
     quick: bool
     """Everything tiny: proves that the script runs, and no more."""
 

@@ -54,7 +54,7 @@ def fox(bench: Bench) -> Figures:
     """Training within budgets on the fox: poses given, every 8th image held out, 270 × 480 px, default settings."""
     cameras, points = _fox_scene(bench)
     config = replace(NerfConfig(), max_width=bench.pick(NerfConfig().max_width, 96))
-    budgets = bench.pick((60, 300, 1200), (10,))
+    budgets = bench.pick(bench.budgets, (10,))
     return {f"fox.{key}": value for key, value in _within_budgets(bench, cameras, points, config, budgets).items()}
 
 

@@ -10,8 +10,9 @@ from twin import progress
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
-from twin.nerf.baked import BakedField, BrickLayout, brick_indices, leaps
+from twin.nerf.baked import BakedField
 from twin.nerf.kernels import bricks
+from twin.nerf.layout import BrickLayout, brick_indices, leaps
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import FAR
 

@@ -7,16 +7,25 @@ import pytest
 import warp as wp
 
 from twin.nerf import compute, kernels
+from twin.nerf.kernels import march, shade
 
 _ARCH = 90  # sm_90: Hopper
 _SLOW = {"stereo"}
 """Unrolled windows make it 20 s of compiling to machine code; to PTX, which a driver takes on, it is half of that."""
+_MADE = {
+    "march of one lane": lambda: march.march(march.LANES["cuda"]).module,
+    "shade of one lane": lambda: shade.shade(shade.LANES["cuda"], 64, 32)[0].module,
+}
+"""Kernels that are made for a number of lanes are in modules of their own."""
+_NO_KERNEL = {"lookup", "shade"}
 
 
-@pytest.mark.parametrize("name", [module.name for module in pkgutil.iter_modules(kernels.__path__)])
+@pytest.mark.parametrize(
+    "name", [*(m.name for m in pkgutil.iter_modules(kernels.__path__) if m.name not in _NO_KERNEL), *_MADE]
+)
 def test_kernels_compile_for_sm_90(name, tmp_path):
     assert compute.wp is wp  # importing it initialises Warp quietly
-    module = import_module(f"{kernels.__name__}.{name}")
+    module = _MADE[name]() if name in _MADE else import_module(f"{kernels.__name__}.{name}")
     made = wp.compile_aot_module(module, arch=_ARCH, module_dir=tmp_path, use_ptx=name in _SLOW)
     suffix = f".sm{_ARCH}.ptx" if name in _SLOW else f".sm{_ARCH}.cubin"
     assert [path.name.endswith(suffix) for path in made] == [True]

@@ -5,7 +5,8 @@ import zlib  # noqa: F401
 from importlib import metadata
 
 from twin.errors import InputError
+from twin.geometry.cameras import Viewpoints
 from twin.loading import Twin, load_scene
 
-__all__ = ["InputError", "Twin", "load_scene"]
+__all__ = ["InputError", "Twin", "Viewpoints", "load_scene"]
 __version__ = metadata.version("twin")

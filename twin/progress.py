@@ -17,10 +17,15 @@ def set_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
-def bar(what: str, total: int, unit: str = "it") -> tqdm:
-    """A bar to be driven by hand: `update(n)`, `set_postfix_str(s)`, `close()`; also a context manager."""
+def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
+    """A bar to be driven by hand: `update(n)`, `set_postfix_str(s)`, `close()`; also a context manager.
+
+    It shows from `after` seconds on, for what takes long the first time only.
+    """
     every = 0.1 if sys.stderr.isatty() else 10.0
-    return tqdm(total=total, desc=f"  {what}", unit=unit, disable=_quiet, mininterval=every, dynamic_ncols=True)
+    return tqdm(
+        total=total, desc=f"  {what}", unit=unit, disable=_quiet, mininterval=every, dynamic_ncols=True, delay=after
+    )
 
 
 def track(items: Iterable[T], what: str, total: int | None = None, unit: str = "it") -> Iterator[T]:

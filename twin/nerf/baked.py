@@ -7,9 +7,10 @@ baked field shows its place under every lighting.
 
 import itertools
 import os
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,13 +24,16 @@ from safetensors.numpy import save as to_bytes
 from twin.errors import InputError
 from twin.geometry.cameras import Posed, resized
 from twin.nerf.kernels import march as kernels
-from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, Bytes
+from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bytes
 from twin.nerf.kernels.composite import CHANNELS, Channels
+from twin.nerf.kernels.lookup import Bricks
 from twin.nerf.kernels.shade import HARMONICS, shade
 from twin.nerf.kernels.shade import LANES as SHADE_LANES
+from twin.nerf.layout import BrickLayout, brick_indices, cell_corners
 from twin.nerf.lightings import Lightings
 from twin.nerf.plausible import Probes
 from twin.nerf.rendering import Rendering
+from twin.progress import bar
 from twin.scene import read_json, write_json
 
 wp.config.log_level = wp.LOG_ERROR
@@ -37,36 +41,7 @@ wp.config.log_level = wp.LOG_ERROR
 Floats = NDArray[np.float32]
 
 _FORMAT = 2
-_TRACE = 0.03  # share of light that a cell may stop and count as empty
 _PIECES = 3  # of a picture, per core
-
-
-@dataclass(frozen=True)
-class BrickLayout:
-    """Everything about a baked field that is no array."""
-
-    centre: tuple[float, float, float]
-    """Of the near box [m]."""
-    half: tuple[float, float, float]
-    """Half sides of the near box [m]."""
-    near_plane: float
-    """Rays begin here [m]."""
-    density_unit: float
-    """Density at raw value 0, per contracted metre."""
-    near_shape: tuple[int, int, int]
-    """Bricks over the near box."""
-    far_shape: tuple[int, int, int]
-    """Bricks over the contracted cube."""
-
-    @property
-    def near_side(self) -> NDArray[np.float64]:
-        """Sides of a brick in the near box [m]."""
-        return 2.0 * np.array(self.half) / np.array(self.near_shape)
-
-    @property
-    def far_cell(self) -> float:
-        """Smallest side of a far cell [contracted m]."""
-        return float((4.0 * np.array(self.half) / np.array(self.far_shape)).min()) / CELLS
 
 
 class BakedField:
@@ -99,13 +74,13 @@ class BakedField:
         near, far = brick_indices(layout, arrays["near"], arrays["far"])
 
         def on_device(array: NDArray, dtype: Any) -> Any:
-            if where == "cpu":
+            if where == "cpu":  # NumPy puts large arrays of its own on huge pages, where random reads cost less
                 own = np.empty(array.shape, array.dtype)
                 own[...] = array
                 return wp.array(own, dtype=dtype, device=where, copy=False)
             return wp.array(np.ascontiguousarray(array), dtype=dtype, device=where)
 
-        b: Any = kernels.Bricks()
+        b: Any = Bricks()
         b.near_index, b.far_index = on_device(near.ravel(), wp.int32), on_device(far.ravel(), wp.int32)
         b.near_leap = on_device(arrays["near_leap"].ravel(), wp.uint8)
         b.far_leap = on_device(arrays["far_leap"].ravel(), wp.uint8)
@@ -119,6 +94,7 @@ class BakedField:
         b.near_cell, b.far_cell = float(layout.near_side.min()) / CELLS, layout.far_cell
         b.unit, b.near_plane = layout.density_unit, layout.near_plane
         self._bricks = b
+        self._lock = threading.Lock()
         self._pictures: dict[tuple[int, int, int, bool], _Picture] = {}
 
         hidden, behind = p["head.1"].shape[0], p["backdrop.0"].shape[1]
@@ -189,14 +165,15 @@ class BakedField:
         """
         intrinsics, (width, height) = resized(cameras, size)
         pose = np.asarray(cameras.camera_to_world, np.float64)
-        picture = self._picture(len(pose), width, height, stop is not None)
-        picture.aim(pose, intrinsics, self._biases(lighting, len(pose)), stop)
-        if self._pool is None:
-            for piece in picture.pieces:
-                picture.develop(piece)
-        else:
-            list(self._pool.map(picture.develop, picture.pieces))
-        return picture.rendering()
+        with self._lock:  # the arrays are shared by all who call
+            picture = self._picture(len(pose), width, height, stop is not None)
+            picture.aim(pose, intrinsics, self._biases(lighting, len(pose)), stop)
+            if self._pool is None:
+                for piece in picture.pieces:
+                    picture.develop(piece)
+            else:
+                list(self._pool.map(picture.develop, picture.pieces))
+            return picture.rendering()
 
     def _biases(self, lighting: str | NDArray | Sequence[str], n: int) -> Floats:
         """The head's first bias with the appearance in it, shape (n, hidden)."""
@@ -257,58 +234,6 @@ class BakedField:
         )
         layout: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in head["layout"].items()}
         return BakedField(BrickLayout(**layout), lightings, arrays, where, head["about"])
-
-
-def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The near and the far index (see `kernels/bricks.py`) of slots at bricks (s, 3), near ones first."""
-    out = []
-    for shape, slots, first in ((layout.near_shape, near, 0), (layout.far_shape, far, len(near))):
-        index = np.full(shape, -1, np.int32)
-        index[tuple(slots.T)] = np.arange(first, first + len(slots))
-        out.append(index)
-    return out[0], out[1]
-
-
-def cell_corners(codes: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Density codes (s, 729) as one number per cell, see `Bricks.corners` in `kernels/march.py`; shape (s · 512,)."""
-    side = [CORNERS] * 3
-    cube = codes.reshape(-1, *side)
-    out = np.empty((len(cube), CELLS, CELLS, CELLS, 8), np.uint8)
-    for n in range(8):
-        x, y, z = n >> 2, (n >> 1) & 1, n & 1
-        out[..., n] = cube[:, x : x + CELLS, y : y + CELLS, z : z + CELLS]
-    return out.reshape(-1, 8).view("<u8").ravel()
-
-
-def leaps(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
-    """How far rays may leap from every block of the `near_leap` and the `far_leap` grid, see `kernels/march.py`."""
-    from scipy.ndimage import distance_transform_cdt
-
-    filled = filled_blocks(layout, arrays)
-    split = len(arrays["near"])
-    out = {}
-    for name, shape, slots, mine in (
-        ("near_leap", layout.near_shape, arrays["near"], filled[:split]),
-        ("far_leap", layout.far_shape, arrays["far"], filled[split:]),
-    ):
-        bricks = np.zeros((*shape, BLOCKS, BLOCKS, BLOCKS), bool)
-        bricks[tuple(slots.T)] = mine
-        blocks = bricks.transpose(0, 3, 1, 4, 2, 5).reshape(np.multiply(shape, BLOCKS))
-        leap = distance_transform_cdt(~blocks, "chessboard") if blocks.any() else np.full(blocks.shape, 255)
-        out[name] = np.minimum(leap, 255).astype(np.uint8)
-    return out
-
-
-def filled_blocks(layout: BrickLayout, arrays: dict[str, NDArray]) -> NDArray[np.bool_]:
-    """Whether some corner of a block stops more than a trace of light per cell, shape (slots, 4, 4, 4)."""
-    codes = arrays["features"][..., 0].reshape(-1, *[CORNERS] * 3)
-    cell = np.where(np.arange(len(codes)) < len(arrays["near"]), float(layout.near_side.min()) / CELLS, layout.far_cell)
-    least = (np.log(_TRACE / (cell * layout.density_unit)) - arrays["low"][0]) / arrays["step"][0]
-    stops = codes > least[:, None, None, None]
-    for axis in (1, 2, 3):
-        first, second, third = (np.take(stops, np.arange(k, k + CELLS - 1, 2), axis) for k in (0, 1, 2))
-        stops = first | second | third
-    return stops
 
 
 class _Picture:
@@ -379,5 +304,7 @@ class _Picture:
 
 def load_kernels(needed: list[Any], where: str) -> None:
     """Compiles or loads kernels now, so that no two threads compile them."""
-    for kernel in needed:
-        kernel.module.load(wp.get_device(where))
+    with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
+        for kernel in needed:
+            kernel.module.load(wp.get_device(where))
+            progress.update()
