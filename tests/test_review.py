@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
-from twin.geometry.cameras import Cameras, Posed, Viewpoints, pixel_grid, resized, unproject
+from twin.geometry.cameras import Cameras, Posed, Viewpoints, nearest_frame, pixel_grid, resized, unproject
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
@@ -18,7 +18,7 @@ from twin.report.overview import bird_pose
 from twin.report.panels import Layout, depth_colours, draw_text, fit, shorten, text_width, wrap
 from twin.report.plan import Plan, footprints, turn_of
 from twin.report.review import film
-from twin.report.studio import frames_to_compare, greyed, light_of_frame, nearest_frame, side_by_side, spread
+from twin.report.studio import frames_to_compare, greyed, light_of_frame, side_by_side, spread
 from twin.report.video import describe, read_frames
 from twin.scene import SceneDir, read_json
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from twin.geometry.cameras import nearest_frame
 from twin.report.panels import (
     ACCENT,
     AMBER,
@@ -24,7 +25,7 @@ from twin.report.panels import (
     shorten,
 )
 from twin.report.plan import Plan
-from twin.report.studio import Studio, as_picture, frames_to_compare, nearest_frame, side_by_side
+from twin.report.studio import Studio, as_picture, frames_to_compare, side_by_side
 
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip below: depth, plan, facts
 LIGHT_STRIP = (0.62, 0.38)  # slider, plan

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import Cameras, Posed, Viewpoints
+from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import read_image
-from twin.nerf.rendering import Rendering
+from twin.nerf.rendering import Field, Rendering
 from twin.report.panels import Layout, Picture
 from twin.report.video import VideoWriter, even
 
@@ -24,15 +23,6 @@ Array = NDArray[np.float64]
 
 _PICTURE_WIDTH = 1000  # [px] at most, of a picture for the page
 _PICTURE_QUALITY = 82
-
-
-class Field(Protocol):
-    """The part of a radiance field that a film needs."""
-
-    @property
-    def lightings(self) -> tuple[str, ...]: ...
-
-    def render(self, cameras: Posed, lighting: str, size: tuple[int, int]) -> Rendering: ...
 
 
 @dataclass(frozen=True)
@@ -163,16 +153,6 @@ def light_of_frame(cameras: Cameras, i: int) -> str:
         return cameras.lightings[i] if only is None else cameras.names[only]
     span = cameras.times[after] - cameras.times[before]
     return f"{cameras.names[before]}:{cameras.names[after]}:{(cameras.times[i] - cameras.times[before]) / span:.6g}"
-
-
-def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
-    """The frame of a lighting that was taken closest to frame i and looks the same way; None where none does."""
-    offset = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
-    forward = cameras.camera_to_world[:, :3, 2]
-    # Looking elsewhere counts as far away: 10 m for a right angle.
-    cost = offset + 10.0 * (1.0 - forward @ forward[i])
-    candidates = [k for k, name in enumerate(cameras.lightings) if name == lighting]
-    return min(candidates, key=lambda k: float(cost[k])) if candidates else None
 
 
 def side_by_side(pictures: Sequence[Picture], height: int) -> Picture:
