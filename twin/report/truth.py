@@ -153,7 +153,8 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     solid = _surface([(p.vertices, p.faces) for p in kinds["obstacle"]])
     leafy = _surface([(p.vertices, p.faces) for p in kinds["obstacle"] + kinds["foliage"]])
     whole = _surface([(p.vertices, p.faces) for kind in kinds.values() for p in kind])
-    seen = _standing(visible_points(whole, eyes, truth), truth)
+    sight = visible_points(whole, eyes, truth)
+    seen = _standing(sight, truth)
     seen = seen[solid.distance(seen) < 1e-3]  # neither leaves nor ground
     if parts and len(seen):
         twin = _surface(parts)
@@ -165,7 +166,7 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     if (mesh / "visual.npz").exists():
         with np.load(mesh / "visual.npz", allow_pickle=False) as data:
             visual = _surface([(to_truth.points(data["vertices"].astype(np.float64)), data["faces"])])
-        near, seen = (_near(visible_points(surface, eyes, truth), truth) for surface in (visual, whole))
+        near, seen = _near(visible_points(visual, eyes, truth), truth), _near(sight, truth)
         if len(near) and len(seen):
             to_mesh = visual.distance(seen)
             out |= mesh_quality(whole.distance(near), to_mesh)
