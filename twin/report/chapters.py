@@ -77,7 +77,7 @@ def compare_with_the_film(studio: Studio, plan: Plan, chosen: dict[str, list[int
                 row, score = judged_row(studio, i)
                 caption = (
                     f"{lighting}: filmed, rendered from the same place at {score:.1f} dB PSNR, how far away things "
-                    "are, and where the render is wrong. The middle one of the frames never trained on."
+                    "are, and where the render is wrong. From the middle of the film, never trained on."
                 )
                 studio.keep(f"compare_{number}", "field", caption, row, row.shape[1])
             progress.update()

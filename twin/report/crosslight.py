@@ -14,9 +14,11 @@ def cross_lighting_words(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
     follows = numbers(pick(cross, "colour_follows"))
     facts, cautions = [], []
     for name, share in follows.items():
-        off, own = (number(pick(cross, f"{key}.{name}"), "{:.2f}") for key in ("to_shown_rms", "to_filmed_rms"))
-        told = f"of places filmed in other light look like its film once shown in it; colours {off} off it"
-        facts.append(Fact(f"{name}, swapped in", f"{share:.0%}", f"{told}, {own} off their own film"))
+        off, own = (number(pick(cross, f"{key}.{name}"), "{:.0%}") for key in ("to_shown_rms", "to_filmed_rms"))
+        told = f"of places filmed in other light look like its film once shown in it: {off} of full brightness off"
+        facts.append(
+            Fact(f"{name}, swapped in", f"{share:.0%}", f"{told}, but {own} off the light they were filmed in")
+        )
         if share < _FEW_FOLLOW:
             cautions.append(
                 Caution(
