@@ -229,6 +229,7 @@ def test_the_stage_writes_a_field_that_loads(cameras, tmp_path):
     assert metrics["steps"] == 6 and metrics["parameters"] > 0 and metrics["sightings_path"] > 0
     names = ["baked.json", "baked.safetensors", "field.json", "field.safetensors"]
     assert sorted(p.name for p in out.iterdir()) == names
+    assert metrics["cross_lighting"]["poses"] == 14 and metrics["cross_lighting"]["depth_moves_m"] == 0.0
     assert metrics["bake"]["bytes"] > 0 and set(metrics["psnr_baked"]) == {"day", "night"}
     assert BakedField.load(out).lightings == RadianceField.load(out).lightings == ("day", "night")
 

@@ -221,6 +221,8 @@ def test_no_drive_says_why(scene: SceneDir) -> None:
         ("metric", "scale_uncertainty", 0.1, "10.0%"),
         ("field", "psnr", {"day": 12.0}, "12.0 dB"),
         ("field", "n", {"day": 1}, "Only 1 frame"),
+        ("field", "cross_lighting", {"colour_follows": {"day": 0.4}}, "Only 40% of the places"),
+        ("field", "cross_lighting", {"colour_follows": {"day": 1.0}, "depth_moves_m": 0.2}, "moves by up to 0.200 m"),
         ("mesh", "parts", 0, "Nothing solid"),
         ("mesh", "parts_beyond_bound", 2, "2 solid part(s) stick out"),
         ("mesh", "ground", {"corridor_coverage": 0.2}, "Only 20%"),

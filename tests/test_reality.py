@@ -14,8 +14,9 @@ from twin.geometry.poses import Similarity, umeyama
 from twin.reality import film, place, route, world
 from twin.reality.lighting import LIGHTINGS, sky
 from twin.reality.route import Route
+from twin.reality.surface import Surface
 from twin.reality.truth import HALF_WIDTH, Film, Truth
-from twin.report.truth import align_rigid, camera_errors, compare, intrudes
+from twin.report.truth import align_rigid, camera_errors, compare, intrudes, mesh_quality
 from twin.scene import SceneDir
 
 DEMO = Path(__file__).parent.parent / "scenes" / "demo"
@@ -211,6 +212,40 @@ def test_errors_are_measured(truth, tmp_path):
     assert errors["tilt_deg"] == pytest.approx(2.0, abs=0.01)
     assert errors["ate_m"] < 1e-9
     assert errors["ate_rigid_m"] > 0.2
+
+
+@pytest.mark.parametrize("off", [0.0, 0.04, 0.07, 5.0])
+def test_a_shifted_mesh_is_as_far_off_as_it_was_shifted(off):
+    x, y = np.random.default_rng(0).uniform(0.2, 3.8, (2, 500))
+    square = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 4.0, 0.0], [0.0, 4.0, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    points, lift = np.stack([x, y, 0.0 * x], 1), np.array([0.0, 0.0, off])
+    true, mesh = Surface(square, faces), Surface(square + lift, faces)
+    found = mesh_quality(true.distance(points + lift), mesh.distance(points))
+    assert found["mesh_accuracy_median_m"] == pytest.approx(off, abs=1e-6)
+    assert found["mesh_chamfer_m"] == pytest.approx(min(off, 1.0), abs=1e-6)  # what is missing counts one metre
+    assert found["mesh_completeness_5cm"] == (off <= 0.05)
+    assert found["mesh_completeness_10cm"] == (off <= 0.1)
+
+
+def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(truth, tmp_path):
+    found = []
+    for name, kinds in (("all", {"ground", "obstacle", "foliage"}), ("flat", {"ground"})):
+        scene = fake_build(truth, tmp_path / name, Similarity.identity())
+        parts = [t.part for t in truth.place.things if t.kind in kinds]
+        starts = np.cumsum([0] + [len(p.vertices) for p in parts])
+        np.savez(
+            scene.stage("mesh") / "visual.npz",
+            vertices=np.concatenate([p.vertices for p in parts]),
+            faces=np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)]),
+        )
+        found.append(compare(scene))
+    whole, flat = found
+    assert whole["mesh_chamfer_m"] < 1e-3 and whole["mesh_completeness_5cm"] == 1.0
+    assert flat["mesh_accuracy_mean_m"] < 1e-3  # what there is, is right
+    assert flat["mesh_completeness_10cm_ground"] == 1.0
+    assert flat["mesh_completeness_10cm_obstacle"] < 0.5
+    assert flat["mesh_completeness_10cm"] < whole["mesh_completeness_10cm"]
 
 
 def test_a_scene_without_truth_is_not_compared(tmp_path):

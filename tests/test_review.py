@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
-from twin.geometry.cameras import Cameras, Posed, Viewpoints, pixel_grid, resized, unproject
-from twin.geometry.images import write_image
+from twin.geometry.cameras import Cameras, Posed, Viewpoints, nearest_frame, pixel_grid, resized, unproject
+from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
 from twin.report.ahead import Ahead
@@ -18,7 +18,8 @@ from twin.report.overview import bird_pose
 from twin.report.panels import Layout, depth_colours, draw_text, fit, shorten, text_width, wrap
 from twin.report.plan import Plan, footprints, turn_of
 from twin.report.review import film
-from twin.report.studio import frames_to_compare, greyed, light_of_frame, nearest_frame, side_by_side, spread
+from twin.report.rows import error_colours, judged_row, scale_bar
+from twin.report.studio import Studio, frames_to_compare, greyed, light_of_frame, side_by_side, spread
 from twin.report.video import describe, read_frames
 from twin.scene import SceneDir, read_json
 
@@ -282,3 +283,34 @@ def test_work_ahead_stops_when_nobody_reads() -> None:
     count = len(made)
     assert count <= 5
     assert len(made) == count
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_judged_row_shows_the_lighting_as_learnt_and_scores_what_is_not_masked(tmp_path: Path, masked: bool) -> None:
+    field = ChequeredField({"day": 1.0, "night": 0.25})
+    cameras = make_cameras(tmp_path / "build" / "2_metric", field, size=(320, 180))
+    if masked:
+        cameras = dataclasses.replace(cameras, masks=tmp_path / "masks")
+        ignored = np.zeros((180, 320), np.uint8)
+        ignored[:, 160:] = 255
+        write_image(tmp_path / "masks" / f"{cameras.names[14]}.png", ignored)
+        spoilt = read_image(cameras.image_path(14))
+        spoilt[:, :150] = 255  # what the mask ignores
+        write_image(cameras.image_path(14), spoilt)
+    layout = Layout.for_pictures(160, 9 / 16)
+    studio = Studio("x", field, cameras, layout, None, tmp_path, 48, cameras.positions[:, :2])  # type: ignore[arg-type]
+    field.asked.clear()
+    row, score = judged_row(studio, 14)
+    assert field.asked == ["night"]
+    assert score > 50.0  # only the rounding to bytes is wrong
+    wrong = row[30 : 30 + 180, -6 - 320 : -6]
+    dark = error_colours(np.zeros((1, 1)))[0, 0]
+    assert (np.abs(wrong[5:-5, 165:-5].astype(int) - dark).max(-1) < 5).all()
+    assert (wrong[5:-5, :145] == [150, 160, 174]).all() == masked
+    assert (error_colours(np.array([[0.1, 0.3, 0.9]])).astype(int).sum(-1)[0] > int(dark.sum())).all()
+
+
+def test_labels_of_a_scale_do_not_overlap() -> None:
+    ramp = np.zeros((1, 60, 3), np.uint8)
+    crowded = scale_bar(80, ramp, [(0.0, "near"), (0.4, "between"), (0.5, "both"), (1.0, "far")])
+    assert np.array_equal(crowded, scale_bar(80, ramp, [(0.0, "near"), (1.0, "far")]))

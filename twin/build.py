@@ -49,7 +49,7 @@ PIPELINE = (
     Stage("field", "twin.nerf.fit", 3, ("nerf",), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 2, ("mesh", "mjcf"), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.export", 1, ("mjcf",), ("metric", "mesh")),
-    Stage("review", "twin.report.review", 1, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
+    Stage("review", "twin.report.review", 2, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
 )
 
 

@@ -129,6 +129,16 @@ class Cameras:
             )
 
 
+def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
+    """The frame of a lighting that was taken closest to frame i and looks the same way; None where none does."""
+    offset = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
+    forward = cameras.camera_to_world[:, :3, 2]
+    # Looking elsewhere counts as far away: 10 m for a right angle.
+    cost = offset + 10.0 * (1.0 - forward @ forward[i])
+    candidates = [k for k, name in enumerate(cameras.lightings) if name == lighting]
+    return min(candidates, key=lambda k: float(cost[k])) if candidates else None
+
+
 class Posed(Protocol):
     """What a renderer needs of cameras: `Cameras` and `Viewpoints` are such."""
 

@@ -399,6 +399,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         InputError: nothing to train on, an unreadable frame, or a device that is not there.
     """
     from twin.nerf.bake import bake
+    from twin.nerf.crosslight import cross_lighting
     from twin.nerf.evaluate import evaluate
 
     cameras = Cameras.load(scene.stage("metric"))
@@ -408,6 +409,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
+    metrics["cross_lighting"] = cross_lighting(baked, cameras)
     field.about = {
         "scene": config.name,
         "seed": config.seed,

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from twin.report.words import LARGE_PATH_ERROR, Caution, Fact, Section, number, pick
+from twin.report.words import LARGE_PATH_ERROR, Caution, Fact, Section, listing, number, pick
 
 # From where on an error is worth a caution.
 _LARGE_SCALE_ERROR = 0.02  # relative
@@ -27,7 +27,11 @@ def truth_section(report: dict[str, Any]) -> Section:
         ("ground_p95_m", "ground height, worst places", "{:.3f} m", "95 of 100 places are better"),
         ("obstacle_accuracy_m", "solid parts to true surface", "{:.3f} m", "median: is there something where it says?"),
         ("obstacle_completeness_m", "true surface to solid parts", "{:.3f} m", "median: is everything there?"),
-        ("visual_median_m", "visible mesh", "{:.3f} m", "median distance to the true surface"),
+        ("mesh_accuracy_median_m", "visible mesh to true surface", "{:.3f} m", "median: is what it shows there?"),
+        ("mesh_accuracy_mean_m", "the same, mean", "{:.3f} m", "what is wrong by more than 1 m counts as 1 m"),
+        ("mesh_completeness_5cm", "true surface within 5 cm of it", "{:.0%}", "of all that the cameras saw near by"),
+        ("mesh_completeness_10cm", "true surface within 10 cm of it", "{:.0%}", _by_kind(truth)),
+        ("mesh_chamfer_m", "visible mesh, Chamfer distance", "{:.3f} m", "mean of there and back, each up to 1 m"),
         ("corridor_intrusions", "parts inside the true corridor", "{}", "nothing solid may stand there"),
         ("route_median_m", "route", "{:.3f} m", "median distance to the true centre line"),
         ("depth_median_m", "depth of the field", "{:.3f} m", "median error, up to 20 m"),
@@ -58,3 +62,11 @@ def truth_section(report: dict[str, Any]) -> Section:
         facts,
         cautions,
     )
+
+
+def _by_kind(truth: dict[str, Any]) -> str:
+    """How much of the ground, of solid things and of leaves the visible mesh has."""
+    words = (("ground", "ground"), ("obstacle", "solid things up to their roofs"), ("foliage", "leaves"))
+    shares = [(name, truth.get(f"mesh_completeness_10cm_{kind}")) for kind, name in words]
+    told = [f"{number(share, '{:.0%}')} of {name}" for name, share in shares if share is not None]
+    return listing(told) if told else "is everything shown?"

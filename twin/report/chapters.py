@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from twin.geometry.cameras import nearest_frame
 from twin.report.panels import (
     ACCENT,
     AMBER,
@@ -24,7 +25,8 @@ from twin.report.panels import (
     shorten,
 )
 from twin.report.plan import Plan
-from twin.report.studio import Studio, as_picture, frames_to_compare, nearest_frame, side_by_side
+from twin.report.rows import judged_row
+from twin.report.studio import Studio, as_picture, frames_to_compare, side_by_side
 
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip below: depth, plan, facts
 LIGHT_STRIP = (0.62, 0.38)  # slider, plan
@@ -40,13 +42,17 @@ def title_card(studio: Studio, title: str, lines: list[str], seconds: float = _C
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
-    """Which frames the first chapter shows, by lighting, no more than `budget` in all (one per lighting at least)."""
-    share = max(1, budget // max(1, len(studio.field.lightings)))
+    """Which frames the first chapter shows, by lighting: with a render more per lighting, which is for the page, no
+    more than `budget` in all (one frame per lighting at least)."""
+    share = max(1, budget // max(1, len(studio.field.lightings)) - 1)
     return {name: frames_to_compare(studio.cameras, name, share) for name in studio.field.lightings}
 
 
 def compare_with_the_film(studio: Studio, plan: Plan, chosen: dict[str, list[int]], progress: tqdm) -> None:
-    """Chapter 1: real frame, the field from the same place, and its depth, lighting by lighting."""
+    """Chapter 1: real frame, the field from the same place, and its depth, lighting by lighting.
+
+    Of each lighting the page gets the frame in the middle of those never trained on, see `judged_row`.
+    """
     title_card(
         studio,
         "1  The film and its twin",
@@ -68,9 +74,12 @@ def compare_with_the_film(studio: Studio, plan: Plan, chosen: dict[str, list[int
             if i == best and number == 0:
                 studio.keep("poster_compare", "poster", "the film and its twin", canvas)
             if i == best:
-                caption = f"{lighting}: filmed, rendered from the same place, and its depth; never trained on"
-                row = side_by_side((real, rgb, depth), _ROW_HEIGHT)
-                studio.keep(f"compare_{number}", "field", caption, row)
+                row, score = judged_row(studio, i)
+                caption = (
+                    f"{lighting}: filmed, rendered from the same place at {score:.1f} dB PSNR, how far away things "
+                    "are, and where the render is wrong. From the middle of the film, never trained on."
+                )
+                studio.keep(f"compare_{number}", "field", caption, row, row.shape[1])
             progress.update()
 
 

@@ -124,12 +124,16 @@ def depth_colours(depth: NDArray, opacity: NDArray | None = None) -> Picture:
 
     Where `opacity` is below one half nothing solid was found, and the colour is that of an empty panel.
     """
-    log_range = np.log(FARTHEST_DEPTH / NEAREST_DEPTH)
-    far = np.log(np.clip(np.nan_to_num(depth, nan=1e9), NEAREST_DEPTH, FARTHEST_DEPTH) / NEAREST_DEPTH) / log_range
-    colours = (colormaps["inferno"](1.0 - 0.86 * far)[..., :3] * 255 + 0.5).astype(np.uint8)
+    colours = (colormaps["inferno"](1.0 - 0.86 * depth_share(depth))[..., :3] * 255 + 0.5).astype(np.uint8)
     if opacity is not None:
         colours[np.asarray(opacity) < 0.5] = SUNKEN
     return colours
+
+
+def depth_share(depth: NDArray | float) -> NDArray[np.float64]:
+    """Where depths [m] lie on the scale of `depth_colours`: 0 at its near end, 1 at its far end."""
+    known = np.clip(np.nan_to_num(depth, nan=1e9), NEAREST_DEPTH, FARTHEST_DEPTH)
+    return np.log(known / NEAREST_DEPTH) / np.log(FARTHEST_DEPTH / NEAREST_DEPTH)
 
 
 @dataclass(frozen=True)

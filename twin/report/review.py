@@ -19,6 +19,7 @@ from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import Cameras
 from twin.mjcf.world import World, arc_lengths
 from twin.nerf.baked import BakedField
+from twin.nerf.rendering import Field
 from twin.progress import bar
 from twin.report.ahead import Ahead
 from twin.report.chapters import (
@@ -34,7 +35,7 @@ from twin.report.drive import DRIVE_STRIP, drive_metrics, film_drive, rendered_i
 from twin.report.overview import Shot, camera_shots, chase_shots, pictures_of, route_shots
 from twin.report.panels import AMBER, GREEN, RED, Box, Layout
 from twin.report.plan import Plan, footprints
-from twin.report.studio import Field, Studio, side_by_side, spread
+from twin.report.studio import Studio, side_by_side, spread
 from twin.report.video import VideoWriter
 from twin.report.words import follower_verdict
 from twin.scene import SceneDir, write_json

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from twin.report.crosslight import cross_lighting_words
 from twin.report.words import (
     ENOUGH_REGISTERED,
     LARGE_SCALE_UNCERTAINTY,
@@ -221,23 +222,22 @@ def field_section(report: dict[str, Any]) -> Section:
                 )
             )
     facts = facts or [Fact("held-out PSNR", NOT_MEASURED)]
-    steps = pick(report, "field.steps")
-    facts.append(Fact("training steps", number(steps, "{:,}"), "more make it sharper, and take longer"))
-    found = pick(report, "field.stereo.sightings")
-    if found is not None:
-        share = number(pick(report, "field.stereo.share"), "{:.0%}")
-        facts.append(Fact("distances by stereo", number(found, "{:,}"), f"learnt from too; {share} of those tried"))
+    facts.append(Fact("training steps", number(pick(report, "field.steps"), "{:,}"), "more: sharper, but slower"))
+    if (found := pick(report, "field.stereo.sightings")) is not None:
+        share = number(pick(report, "field.stereo.share"), "learnt from too; {:.0%} of those tried")
+        facts.append(Fact("distances by stereo", number(found, "{:,}"), share))
     for name, value in (pick(report, "field.psnr_baked") or {}).items():
         lost = value - float(pick(report, f"field.psnr_unfitted.{name}") or value)
         facts.append(Fact(f"{name}, baked", f"{lost:+.1f} dB", "what the bricks change, on the same frames"))
+    swapped, more = cross_lighting_words(report)
     return Section(
         "field",
         "Radiance field",
         "A NeRF learnt what every point looks like from every side, in each lighting. It is judged on frames it never "
-        "saw: only the light is fitted on one half of such a frame, the other half is scored. Higher is better; above "
-        "about 20 dB a view is easy to recognise, above 30 dB it is hard to tell from the film.",
-        facts,
-        cautions,
+        "saw: only the light is fitted on one half of such a frame, the other half is scored (for the pictures not "
+        "even that). Above about 20 dB a view is easy to recognise, above 30 dB it is hard to tell from the film.",
+        facts + swapped,
+        cautions + more,
     )
 
 

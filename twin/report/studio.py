@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from dataclasses import field as with_default
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import Cameras, Posed, Viewpoints
+from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import read_image
-from twin.nerf.rendering import Rendering
+from twin.nerf.rendering import Field, Rendering
 from twin.report.panels import Layout, Picture
 from twin.report.video import VideoWriter, even
 
@@ -24,15 +23,6 @@ Array = NDArray[np.float64]
 
 _PICTURE_WIDTH = 1000  # [px] at most, of a picture for the page
 _PICTURE_QUALITY = 82
-
-
-class Field(Protocol):
-    """The part of a radiance field that a film needs."""
-
-    @property
-    def lightings(self) -> tuple[str, ...]: ...
-
-    def render(self, cameras: Posed, lighting: str, size: tuple[int, int]) -> Rendering: ...
 
 
 @dataclass(frozen=True)
@@ -68,7 +58,9 @@ class Studio:
     def fps(self) -> int:
         return self.writer.fps
 
-    def view(self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str) -> Rendering:
+    def view(
+        self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str, width: int | None = None
+    ) -> Rendering:
         """One view of the field, shapes (1, h, w, ...).
 
         Args:
@@ -76,21 +68,22 @@ class Studio:
             intrinsics: fx, fy, cx, cy [px] at `size`.
             size: Of the camera [px]; the view is rendered smaller, with the same proportions.
             lighting: As the field takes it.
+            width: Longer side of the view [px]; `render_width` unless given.
         """
-        longer = max(size)
-        small = (even(round(size[0] * self.render_width / longer)), even(round(size[1] * self.render_width / longer)))
+        shrink = (width or self.render_width) / max(size)
+        small = (even(round(size[0] * shrink)), even(round(size[1] * shrink)))
         start = time.perf_counter()
         rendering = self.field.render(Viewpoints.of(camera_to_world, intrinsics, size), lighting, small)
         self.render_seconds += time.perf_counter() - start
         self.renders += 1
         return rendering
 
-    def frame_view(self, i: int, lighting: str | None = None) -> Rendering:
-        """The field seen from where frame i was taken, in that frame's light unless told otherwise."""
+    def frame_view(self, i: int, lighting: str | None = None, width: int | None = None) -> Rendering:
+        """The field seen from where frame i was taken, in that frame's light unless told otherwise; see `view`."""
         cameras = self.cameras
         size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
         light = lighting or light_of_frame(cameras, i)
-        return self.view(cameras.camera_to_world[i], cameras.intrinsics[i], size, light)
+        return self.view(cameras.camera_to_world[i], cameras.intrinsics[i], size, light, width)
 
     def real(self, i: int) -> Picture:
         """Frame i as it was filmed (undistorted), with what its mask ignores greyed out."""
@@ -98,11 +91,11 @@ class Studio:
         mask = self.cameras.mask_path(i)
         return image if mask is None else greyed(image, read_image(mask)[..., 0] == 0)
 
-    def keep(self, name: str, section: str, caption: str, picture: Picture) -> None:
-        """Stores a picture for the page as `pictures/<name>.jpg`."""
-        if picture.shape[1] > _PICTURE_WIDTH:
-            height = round(picture.shape[0] * _PICTURE_WIDTH / picture.shape[1])
-            picture = cv2.resize(picture, (_PICTURE_WIDTH, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    def keep(self, name: str, section: str, caption: str, picture: Picture, width: int = _PICTURE_WIDTH) -> None:
+        """Stores a picture for the page as `pictures/<name>.jpg`, `width` [px] wide at most."""
+        if picture.shape[1] > width:
+            height = round(picture.shape[0] * width / picture.shape[1])
+            picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
         bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
         ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _PICTURE_QUALITY])
         if not ok:
@@ -163,16 +156,6 @@ def light_of_frame(cameras: Cameras, i: int) -> str:
         return cameras.lightings[i] if only is None else cameras.names[only]
     span = cameras.times[after] - cameras.times[before]
     return f"{cameras.names[before]}:{cameras.names[after]}:{(cameras.times[i] - cameras.times[before]) / span:.6g}"
-
-
-def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
-    """The frame of a lighting that was taken closest to frame i and looks the same way; None where none does."""
-    offset = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
-    forward = cameras.camera_to_world[:, :3, 2]
-    # Looking elsewhere counts as far away: 10 m for a right angle.
-    cost = offset + 10.0 * (1.0 - forward @ forward[i])
-    candidates = [k for k, name in enumerate(cameras.lightings) if name == lighting]
-    return min(candidates, key=lambda k: float(cost[k])) if candidates else None
 
 
 def side_by_side(pictures: Sequence[Picture], height: int) -> Picture:

@@ -32,6 +32,11 @@ _INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] above the ground wh
 _RAYS = (96, 54)  # per camera, to find what it sees
 _EYES = 48  # cameras that surfaces are looked at from, at most
 _DEPTH_REACH = 20.0  # [m] depth beyond is not compared
+_MESH_KEYS = (
+    *("mesh_accuracy_median_m", "mesh_accuracy_mean_m", "mesh_completeness_mean_m"),
+    *("mesh_completeness_5cm", "mesh_completeness_10cm", "mesh_chamfer_m"),
+)
+_MOST_OFF = 1.0  # [m] what is missing counts as this far off in means
 _SEEN_CELL = 0.1  # [m] seen surface is thinned to one point per cell
 
 
@@ -42,8 +47,14 @@ def compare(scene: SceneDir) -> dict[str, Any] | None:
     metre over the true one, minus 1), `ate_rigid_m`, `tilt_deg` (of the twin's vertical), `rotation_median_deg`,
     `ground_median_m`, `ground_p95_m`, `ground_bias_m` (inside the corridor), `obstacle_accuracy_m` (seen surface of the
     convex parts to the true surface), `obstacle_completeness_m` (and back), `obstacle_median_m` (the larger of the
-    two), `visual_median_m` (visual mesh to any true surface), `corridor_intrusions`, `route_median_m` (twin's route
-    to the true centre line), `depth_median_m`, `depth_relative` (of the field, up to 20 m).
+    two), `corridor_intrusions`, `route_median_m` (twin's route to the true centre line), `depth_median_m`,
+    `depth_relative` (of the field, up to 20 m).
+
+    Of the visual mesh, all of it and of the true surface that cameras could see within 10 m of the route, at any
+    height: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to the true surface), `mesh_completeness_mean_m` (and
+    back), `mesh_completeness_5cm`, `mesh_completeness_10cm` (share of the true surface that has the mesh so near; the
+    latter by kind of thing, too: `_ground`, `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of the two means).
+    In the means no distance counts more than 1 m.
     """
     if not (scene.truth / "truth.npz").exists():
         return None
@@ -125,8 +136,8 @@ def _ground_errors(mesh: Path, truth: Truth, to_truth: Similarity) -> dict[str, 
 def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: Array) -> dict[str, float | int | None]:
     out: dict[str, float | int | None] = dict.fromkeys(
         (
-            *("obstacle_accuracy_m", "obstacle_completeness_m", "obstacle_median_m", "visual_median_m"),
-            *("corridor_intrusions", "route_median_m"),
+            *("obstacle_accuracy_m", "obstacle_completeness_m", "obstacle_median_m", "corridor_intrusions"),
+            *("route_median_m", *_MESH_KEYS),
         )
     )
     if (mesh / "route.npz").exists():
@@ -142,7 +153,8 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     solid = _surface([(p.vertices, p.faces) for p in kinds["obstacle"]])
     leafy = _surface([(p.vertices, p.faces) for p in kinds["obstacle"] + kinds["foliage"]])
     whole = _surface([(p.vertices, p.faces) for kind in kinds.values() for p in kind])
-    seen = _standing(visible_points(whole, eyes, truth), truth)
+    sight = visible_points(whole, eyes, truth)
+    seen = _standing(sight, truth)
     seen = seen[solid.distance(seen) < 1e-3]  # neither leaves nor ground
     if parts and len(seen):
         twin = _surface(parts)
@@ -154,11 +166,29 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     if (mesh / "visual.npz").exists():
         with np.load(mesh / "visual.npz", allow_pickle=False) as data:
             visual = _surface([(to_truth.points(data["vertices"].astype(np.float64)), data["faces"])])
-        near = visible_points(visual, eyes, truth)
-        near = near[np.abs(truth.route.project(near[:, :2])[1]) < _NEAR_ROUTE]
-        if len(near):
-            out["visual_median_m"] = float(np.median(whole.distance(near)))
+        near, seen = _near(visible_points(visual, eyes, truth), truth), _near(sight, truth)
+        if len(near) and len(seen):
+            to_mesh = visual.distance(seen)
+            out |= mesh_quality(whole.distance(near), to_mesh)
+            for kind, things in kinds.items():
+                mine = _surface([(p.vertices, p.faces) for p in things]).distance(seen) < 1e-3
+                if mine.any():
+                    out[f"mesh_completeness_10cm_{kind}"] = float((to_mesh[mine] <= 0.1).mean())
     return out
+
+
+def mesh_quality(to_true: Array, to_mesh: Array) -> dict[str, float]:
+    """What distances between a mesh and the true surface come to, by the keys of `compare`.
+
+    Args:
+        to_true: Of points of the mesh from the true surface [m], shape (n,).
+        to_mesh: Of points of the true surface from the mesh [m], shape (m,).
+    """
+    # Further off the nearest surface is another one, and how far only tells how empty the place is.
+    accuracy, completeness = (float(np.minimum(d, _MOST_OFF).mean()) for d in (to_true, to_mesh))
+    near = [float((to_mesh <= reach).mean()) for reach in (0.05, 0.1)]
+    values = (float(np.median(to_true)), accuracy, completeness, *near, 0.5 * (accuracy + completeness))
+    return dict(zip(_MESH_KEYS, values, strict=True))
 
 
 def load_parts(mesh: Path) -> list[tuple[Array, NDArray[np.int32]]]:
@@ -186,10 +216,16 @@ def intrudes(vertices: Array, faces: NDArray[np.int32], truth: Truth) -> bool:
 
 def _standing(points: Array, truth: Truth) -> Array:
     """Those points that stand on the ground near the filmed route, below the height that counts."""
+    points = _near(points, truth)
     height = points[:, 2] - truth.ground_height(points[:, :2])
+    return points[(height > _STANDING) & (height < _MAX_HEIGHT)]
+
+
+def _near(points: Array, truth: Truth) -> Array:
+    """Those points that are near the filmed route, at any height."""
     station, lateral = truth.route.project(points[:, :2])
     along = (station > truth.start) & (station < truth.start + truth.length + _NEAR_ROUTE)
-    return points[(height > _STANDING) & (height < _MAX_HEIGHT) & (np.abs(lateral) < _NEAR_ROUTE) & along]
+    return points[along & (np.abs(lateral) < _NEAR_ROUTE)]
 
 
 def _surface(meshes: list[tuple[Array, NDArray]]) -> Surface:
