@@ -56,7 +56,8 @@ def bake(
     values = _sample(field, layout, slots)
     tuner = _Tuner(field, pixels, layout, slots, values, steps, seed)
     error = tuner.run()
-    arrays = _in_bytes(values.cpu().numpy(), slots, field, layout) | _probes(field, pixels, seed)
+    del tuner
+    arrays = _in_bytes(values, slots, field, layout) | _probes(field, pixels, seed)
     baked = BakedField(layout, field.appearance.named(), arrays, field.where, field.about)
     return baked, {
         "bricks_near": len(slots[0]),
@@ -181,10 +182,9 @@ class _Tuner:
             wp.array(near, dtype=wp.int32, device=where),
             wp.array(far, dtype=wp.int32, device=where),
         ]
-        self.gradient, self.first, self.second = (torch.zeros_like(values) for _ in range(3))
-        self.w_values, self.w_gradient, self.w_first, self.w_second = (
-            view(t, volume.Channels) for t in (values, self.gradient, self.first, self.second)
-        )
+        self.gradient, self.second = torch.zeros_like(values), torch.zeros(*values.shape[:2], 2, device=where)
+        self.w_values, self.w_gradient = view(values, volume.Channels), view(self.gradient, volume.Channels)
+        self.w_second = view(self.second, wp.vec2f)
         self.rays = -(-_RAYS // _SHARDS) * _SHARDS
         self.ws = Workspace(field.layout, self.rays, _SAMPLES, where, training=True)
         self.cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, where)
@@ -261,14 +261,13 @@ class _Tuner:
             device=self.field.where,
         )
         t = step + 1
-        scale = rate / (1.0 - 0.9**t)
         wp.launch(
             kernels.adam_step,
             self.rays * _SAMPLES,
             [
                 *(self.ws.w_positions, *self.index, w_outputs_grad, part, parts),
-                volume.Channels(_RATES[0] * scale, *[_RATES[1] * scale] * (volume.CHANNELS - 1)),
-                *(1.0 / (1.0 - 0.99**t), self.w_values, self.w_gradient, self.w_first, self.w_second),
+                volume.Channels(_RATES[0] * rate, *[_RATES[1] * rate] * (volume.CHANNELS - 1)),
+                *(1.0 / (1.0 - 0.99**t), self.w_values, self.w_gradient, self.w_second),
             ],
             device=self.field.where,
         )
@@ -285,22 +284,23 @@ def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str
 
 
 def _in_bytes(
-    values: NDArray, slots: tuple[NDArray, NDArray], field: RadianceField, layout: BrickLayout
+    values: torch.Tensor, slots: tuple[NDArray, NDArray], field: RadianceField, layout: BrickLayout
 ) -> dict[str, NDArray]:
-    """Arrays as `BakedField` takes them."""
-    flat = values.reshape(-1, volume.CHANNELS)
-    matter = flat[flat[:, 0] > 0.0]
-    some = matter[:: max(1, len(matter) // 200_000)] if len(matter) else flat
+    """Arrays as `BakedField` takes them. The values are used up."""
+    flat = values.view(-1, volume.CHANNELS)
+    matter = torch.nonzero(flat[:, 0] > 0.0)[:, 0]
+    some = flat[matter[:: max(1, len(matter) // 200_000)] if len(matter) else slice(None, None, 100)].cpu().numpy()
     low, high = np.quantile(some, [_TAIL, 1.0 - _TAIL], axis=0).astype(np.float32)
     low[0], high[0] = _RAW_RANGE
-    step = np.maximum(high - low, 1e-6) / 255.0
-    codes = np.clip(np.rint((flat - low) / step), 0, 255).astype(np.uint8).reshape(values.shape)
+    step = (np.maximum(high - low, 1e-6) / 255.0).astype(np.float32)
+    flat.sub_(torch.as_tensor(low, device=flat.device)).div_(torch.as_tensor(step, device=flat.device))
+    codes = flat.round_().clamp_(0, 255).to(torch.uint8).view(values.shape).cpu().numpy()
     arrays: dict[str, NDArray] = {
         "near": slots[0].astype(np.int32),
         "far": slots[1].astype(np.int32),
         "features": codes,
         "low": low,
-        "step": step.astype(np.float32),
+        "step": step,
     }
     parameters = {k: v for k, v in field.parameters.items() if not k.startswith("trunk")}
     arrays |= {f"network.{k}": v.detach().cpu().numpy() for k, v in parameters.items()}

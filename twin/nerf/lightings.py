@@ -68,7 +68,9 @@ class Lightings:
     def judge(self) -> plausible.Judge:
         """Tells whether an embedding could have been filmed. Raises InputError where there are no probes."""
         if self.probes is None:
-            raise InputError("no probes to judge a random lighting on; take the baked field, twin.load_scene(SCENE).field()")
+            raise InputError(
+                "no probes to judge a random lighting on; take the baked field, twin.load_scene(SCENE).field()"
+            )
         return plausible.Judge(self.probes, self.vectors, self.frame_vectors)
 
     def added(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> "Lightings":

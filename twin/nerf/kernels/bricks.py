@@ -141,13 +141,13 @@ def adam_step(
     second_correction: wp.float32,
     values: wp.array2d(dtype=Channels),
     gradient: wp.array2d(dtype=Channels),
-    first: wp.array2d(dtype=Channels),
-    second: wp.array2d(dtype=Channels),
+    second: wp.array2d(dtype=wp.vec2f),
 ):
-    """Adam (Kingma and Ba 2015) on samples that got a gradient, which is then cleared; β = (0.9, 0.99).
+    """Adam (Kingma and Ba 2015) on samples that got a gradient, which is then cleared; β = (0, 0.99).
 
-    Goes where `interpolate_backward` went, since most samples get none. On CUDA a corner may be met by two threads at
-    once; both then take the same step, or the later one none.
+    To save memory there is no momentum, and a sample's features share one second moment. Goes where
+    `interpolate_backward` went, since most samples get none. On CUDA a corner may be met by two threads at once; both
+    then take the same step, or the later one none.
     """
     i = wp.tid()
     g = outputs_grad[i]
@@ -161,12 +161,13 @@ def adam_step(
         at = place.corner + corner_offset(n)
         g = gradient[slot, at]
         if wp.dot(g, g) > 0.0:
-            m = first[slot, at] * 0.9 + g * 0.1
-            v = second[slot, at] * 0.99 + wp.cw_mul(g, g) * 0.01
-            first[slot, at] = m
+            own = g[0] * g[0]
+            v = second[slot, at] * 0.99 + wp.vec2f(own, (wp.dot(g, g) - own) / float(CHANNELS - 1)) * 0.01
             second[slot, at] = v
             value = values[slot, at]
-            for c in range(CHANNELS):
-                value[c] = value[c] - rates[c] * m[c] / (wp.sqrt(v[c] * second_correction) + 1.0e-15)
+            value[0] = value[0] - rates[0] * g[0] / (wp.sqrt(v[0] * second_correction) + 1.0e-15)
+            scale = 1.0 / (wp.sqrt(v[1] * second_correction) + 1.0e-15)
+            for c in range(1, CHANNELS):
+                value[c] = value[c] - rates[c] * g[c] * scale
             values[slot, at] = value
             gradient[slot, at] = Channels()
