@@ -221,7 +221,7 @@ class BakedField:
             InputError: none there, or one of another format.
         """
         if not (folder / "baked.json").exists():
-            raise InputError(f"{folder}: holds no baked.json; build it with --set nerf.bake=true")
+            raise InputError(f"{folder}: holds no baked.json; build the scene (again)")
         head = read_json(folder / "baked.json")
         if head.get("format") != _FORMAT:
             raise InputError(f"{folder}/baked.json: format {head.get('format')}, expected {_FORMAT}; build it anew")
