@@ -189,6 +189,33 @@ def test_one_camera_or_many_are_the_same(monkeypatch):
         assert np.allclose(alone.rgb[0], together.rgb[i], atol=1e-5)
 
 
+def test_every_camera_may_have_a_lighting_of_its_own():
+    field = baked(wall(1.0, 2.0))
+    cameras = Viewpoints.of(np.concatenate([looking(), looking()]), K, SIZE)
+    together = field.render(cameras, ["day", field.embedding("night")])
+    for i, name in enumerate(("day", "night")):
+        alone = field.render(Viewpoints.of(looking(), K, SIZE), name)
+        assert np.array_equal(alone.rgb[0], together.rgb[i])
+    assert np.array_equal(
+        together.rgb, field.render(cameras, np.stack([field.embedding(n) for n in ("day", "night")])).rgb
+    )
+    with pytest.raises(InputError, match="3 lightings for 2 cameras"):
+        field.render(cameras, ["day"] * 3)
+
+
+@pytest.mark.parametrize("size", [(5, 3), (1, 41), (33, 17)])
+def test_a_picture_of_any_size_is_a_piece_of_a_larger_one(size):
+    field, rim = baked(wall(1.0, 11.0)), 10
+    middle = np.array([30.0, 30.0, size[0] / 2, size[1] / 2])
+    small = field.render(Viewpoints.of(looking(), middle, size), "day")
+    wide = size[0] + 2 * rim, size[1] + 2 * rim
+    large = field.render(Viewpoints.of(looking(), middle + np.array([0, 0, rim, rim]), wide), "day")
+    inner = np.s_[0, rim:-rim, rim:-rim]
+    assert small.depth.shape == (1, size[1], size[0])
+    assert np.abs(small.depth[0] - large.depth[inner]).max() < 0.1
+    assert np.abs(small.rgb[0] - large.rgb[inner]).max() < 0.05
+
+
 def test_it_comes_back_from_its_files_without_torch(tmp_path):
     field = baked(wall(1.0, 3.0))
     field.save(tmp_path)

@@ -147,7 +147,7 @@ class BakedField:
     def render(
         self,
         cameras: Posed,
-        lighting: str | NDArray | Sequence[str],
+        lighting: str | NDArray | Sequence[str | NDArray],
         size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
     ) -> Rendering:
@@ -175,14 +175,12 @@ class BakedField:
                 list(self._pool.map(picture.develop, picture.pieces))
             return picture.rendering()
 
-    def _biases(self, lighting: str | NDArray | Sequence[str], n: int) -> Floats:
+    def _biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Floats:
         """The head's first bias with the appearance in it, shape (n, hidden)."""
-        if isinstance(lighting, str):
-            vectors = self.embedding(lighting)[None]
-        elif isinstance(lighting, np.ndarray) and lighting.dtype.kind == "f":
-            vectors = np.asarray(lighting, np.float32).reshape(-1, lighting.shape[-1])
-        else:
-            vectors = np.stack([self.embedding(name) for name in lighting])
+        one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
+        vectors = np.stack(
+            [self.embedding(v) if isinstance(v, str) else np.asarray(v) for v in ([lighting] if one else lighting)]
+        ).astype(np.float32)
         if len(vectors) not in (1, n):
             raise InputError(f"{len(vectors)} lightings for {n} cameras; expected one, or one per camera")
         bias, matrix = self._bias_of

@@ -13,6 +13,7 @@ import warp as wp
 
 from twin.nerf.kernels.composite import CHANNELS
 from twin.nerf.kernels.march import OPTIONS, Film, exponential
+from twin.nerf.rendering import FAR
 
 HARMONICS = 16
 FEATURES = CHANNELS - 1
@@ -24,7 +25,7 @@ wp.set_module_options(OPTIONS)
 _HARMONICS = wp.constant(HARMONICS)
 _FEATURES = wp.constant(FEATURES)
 _INPUTS = wp.constant(FEATURES + HARMONICS)
-_FAR = wp.constant(1.0e4)
+_FAR = wp.constant(FAR)
 
 
 @wp.func
@@ -105,8 +106,7 @@ def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
         opacity: wp.array2d(dtype=wp.float32),
     ):
         camera, run = wp.tid()
-        start = wp.min(first + run * count, last - count)  # the last run takes up what is left
-        start = wp.max(start, 0)
+        start = first + run * count
         share = Floats()
         least = float(1.0)
         for j in range(count):
