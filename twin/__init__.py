@@ -6,7 +6,7 @@ from importlib import metadata
 
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints
-from twin.loading import Twin, load_scene
+from twin.loading import Twin, load, load_scene
 
-__all__ = ["InputError", "Twin", "Viewpoints", "load_scene"]
+__all__ = ["InputError", "Twin", "Viewpoints", "load", "load_scene"]
 __version__ = metadata.version("twin")

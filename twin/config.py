@@ -211,6 +211,17 @@ class ReviewConfig:
 
 
 @dataclass(frozen=True)
+class TaskConfig:
+    """A stretch of the route to be driven, besides the standard tasks (see `twin/env/stretches.py`)."""
+
+    name: str = ""
+    start: float = 0.0
+    """Arc length of the route at which it begins [m]."""
+    length: float = 0.0
+    """[m]"""
+
+
+@dataclass(frozen=True)
 class SceneConfig:
     """A whole `scene.toml`."""
 
@@ -224,6 +235,7 @@ class SceneConfig:
     mesh: MeshConfig = field(default_factory=MeshConfig)
     mjcf: MjcfConfig = field(default_factory=MjcfConfig)
     review: ReviewConfig = field(default_factory=ReviewConfig)
+    task: tuple[TaskConfig, ...] = ()
 
 
 def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
@@ -316,6 +328,12 @@ def _check(config: SceneConfig, path: Path) -> None:
             raise InputError(f"{path}: a [[source]] has no path; give the video or the image folder")
         if source.kind not in ("auto", "video", "images", "colmap", "transforms"):
             raise InputError(f"{path}: kind = {source.kind!r}; expected auto, video, images, colmap or transforms")
+    for task in config.task:
+        if not task.name or task.start < 0.0 or not task.length > 0.0:
+            raise InputError(
+                f"{path}: a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
+                "expected a name, start ≥ 0 and length > 0 [m]"
+            )
     for section, key, low in (
         ("capture", "fps", 1e-3),
         ("capture", "held_out_every", 2),

@@ -1,0 +1,82 @@
+"""What the robots' cameras see: one call renders the pictures of n worlds, each in its own light.
+
+A *stack* is the last few pictures of an episode, the newest last; at its beginning the first picture fills it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.env.dm_physics import DrivePhysics
+from twin.env.lightings import Light, LightSets, draw_light
+from twin.env.options import Options
+from twin.env.tasks import LIGHT, Drive
+from twin.env.trust import Trust
+from twin.geometry.cameras import Viewpoints
+from twin.mjcf.world import CAMERA_SIZE
+from twin.nerf.baked import BakedField
+from twin.nerf.rendering import Rendering
+
+Picture = NDArray[np.uint8]
+
+
+class Pixels:
+    """Observes n worlds."""
+
+    def __init__(
+        self,
+        field: BakedField,
+        trust: Trust,
+        options: Options,
+        intrinsics: NDArray,
+        worlds: Sequence[tuple[DrivePhysics, Drive]],
+    ) -> None:
+        """
+        Args:
+            field: Of the place.
+            trust: What was filmed of it.
+            options: Size, stack, lighting.
+            intrinsics: fx, fy, cx, cy [px] at CAMERA_SIZE, shape (4,).
+            worlds: Whose episodes are observed.
+        """
+        self.field, self.options, self.intrinsics, self.worlds = field, options, intrinsics, list(worlds)
+        self._trust, self._sets = trust, LightSets(field)
+        width, height = options.size
+        self.stacks = np.zeros((len(self.worlds), options.stack, height, width, 3), np.uint8)
+        """Shape (n, stack, height, width, 3)."""
+        self.lights: list[Light | None] = [None] * len(self.worlds)
+        self.trust = np.zeros(len(self.worlds))
+        """Of each world's newest picture, in [0, 1], shape (n,)."""
+
+    def begin(self, which: Sequence[int]) -> None:
+        """Draws the lights of episodes that have just begun, and fills their stacks."""
+        o = self.options
+        for i in which:
+            task = self.worlds[i][1]
+            self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
+        if len(which):
+            self.stacks[list(which)] = self._look(which)[:, None]
+
+    def look(self, which: Sequence[int]) -> None:
+        """Adds a new picture to the stacks of some worlds."""
+        if len(which):
+            index = list(which)
+            self.stacks[index] = np.concatenate([self.stacks[index][:, 1:], self._look(which)[:, None]], 1)
+
+    def info(self, i: int) -> dict[str, Any]:
+        """What is to be told of world i's picture: `lighting`, `trust`."""
+        light = self.lights[i]
+        return {"lighting": light.name if light else "", "trust": float(self.trust[i])}
+
+    def _look(self, which: Sequence[int]) -> Picture:
+        out = self._render(which)
+        poses = [self.worlds[i][0].camera_to_world for i in which]
+        self.trust[list(which)] = self._trust.of(np.array(poses), out)
+        return (np.clip(out.rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+    def _render(self, which: Sequence[int]) -> Rendering:
+        poses = np.array([self.worlds[i][0].camera_to_world for i in which])
+        lights = [self.lights[i].at(self.worlds[i][0].time()) for i in which]  # type: ignore[union-attr]
+        return self.field.render(Viewpoints.of(poses, self.intrinsics, CAMERA_SIZE), lights, self.options.size)
