@@ -13,8 +13,9 @@ from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import project
 from twin.geometry.poses import inverse_pose
 from twin.mjcf.export import run
-from twin.mjcf.husky import HuskyParams, add_husky, set_options
+from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.world import World
+from twin.robot import REAR_HEAVY, HuskyParams
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def world(tmp_path_factory) -> World:
 
 @pytest.fixture(scope="module")
 def drive(world):
-    return follow(world, HuskyPhysics(world.model()))
+    return follow(world, HuskyPhysics(world.model(), world.robot))
 
 
 def on_a_plane(params: HuskyParams | None = None) -> HuskyPhysics:
@@ -65,20 +66,20 @@ def test_front_camera_looks_ahead_and_upright(drive):
 
 
 def test_same_drive_twice(world, drive):
-    again = follow(world, HuskyPhysics(world.model()))
+    again = follow(world, HuskyPhysics(world.model(), world.robot))
     np.testing.assert_array_equal(again.qpos, drive.qpos)
 
 
-def test_rear_heavy_robot_is_followed_too(tmp_path, monkeypatch):
+def test_rear_heavy_robot_is_followed_too(tmp_path):
     """The yaw rate achieved is 1.3 times that commanded; heading feedback must absorb it."""
-    import twin.mjcf.husky as husky
-
-    rear = replace(HuskyParams(), center_of_mass=husky.REAR_HEAVY)
-    monkeypatch.setattr(husky, "HuskyParams", lambda: rear)
-    world = tiny_world(tmp_path)
-    monkeypatch.undo()
-    assert world.model().body("husky").ipos[0] == pytest.approx(-0.085)
-    drive = follow(world, HuskyPhysics(world.model()))
+    scene = tiny_scene(tmp_path)
+    out = scene.stage("mjcf")
+    out.mkdir()
+    run(scene, replace(tiny_config(), robot=HuskyParams(center_of_mass=REAR_HEAVY)), out)
+    world = World.load(out)
+    assert world.robot.center_of_mass == REAR_HEAVY
+    assert world.model().body("base_link").ipos[0] == pytest.approx(-0.085)
+    drive = follow(world, HuskyPhysics(world.model(), world.robot))
     assert drive.reached_goal and drive.max_cross_track < 0.2
 
 
@@ -88,7 +89,7 @@ def test_an_obstacle_on_the_road_ends_the_drive(tmp_path):
     out.mkdir()
     run(scene, tiny_config(), out)
     world = World.load(out)
-    drive = follow(world, HuskyPhysics(world.model()))
+    drive = follow(world, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "touched" and drive.touched == ("part_0001",)
     # The bumper of the chassis is 0.49 m ahead of the base, the box begins at 3.2 m.
     assert drive.base_to_world[-1, 0, 3] == pytest.approx(3.2 - 0.4937, abs=0.12)
@@ -96,12 +97,12 @@ def test_an_obstacle_on_the_road_ends_the_drive(tmp_path):
 
 def test_leaving_the_corridor_ends_the_drive(world):
     narrow = replace(world, half_width=0.002)
-    drive = follow(narrow, HuskyPhysics(world.model()))
+    drive = follow(narrow, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "off_corridor" and drive.max_cross_track > 0.002
 
 
 def test_time_limit(world):
-    drive = follow(world, HuskyPhysics(world.model()), timeout=1.0)
+    drive = follow(world, HuskyPhysics(world.model(), world.robot), timeout=1.0)
     assert drive.outcome == "timeout" and drive.times[-1] == pytest.approx(1.1, abs=0.11)
 
 

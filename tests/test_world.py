@@ -10,10 +10,10 @@ from tiny_world import box, tiny_config, tiny_ground, tiny_route, tiny_scene, ti
 
 from twin.errors import InputError
 from twin.geometry.images import read_image
-from twin.mjcf.export import compacted, covered_by_ground, front_camera, rest_pose, run
+from twin.mjcf.export import compacted, covered_by_ground, film_camera, rest_pose, run
 from twin.mjcf.files import face_tiles
-from twin.mjcf.husky import BASE_HEIGHT
 from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest, point_at, total_turn
+from twin.robot import BASE_HEIGHT, CAMERA_SIZE
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_loads_from_a_zip_unpacked_elsewhere(exported, tmp_path):
         file.extractall(tmp_path / "there")
     world = World.load(tmp_path / "there")
     model = world.model()
-    assert model.nkey == 1 and model.nu == 4
+    assert model.nkey == 1 and model.nu == 2
     text = (tmp_path / "there" / "scene.xml").read_text()
     files = re.findall(r'file="([^"]*)"', text)
     assert files and all("/" not in name and ".." not in name for name in files)
@@ -142,7 +142,7 @@ def test_camera_of_another_shape_keeps_square_pixels(exported):
     cameras = Cameras.load(SceneDir(exported[0].parent.parent).stage("metric"))
     tall = type(cameras)(**{**vars(cameras), "sizes": np.tile([640, 480], (3, 1))})
     # 640 × 480 becomes 160 × 120, of which 15 rows go at the top and at the bottom.
-    np.testing.assert_allclose(front_camera(tall).intrinsics, [125.0, 127.5, 82.5, 42.5 - 15.0])
+    np.testing.assert_allclose(film_camera(tall).resized(CAMERA_SIZE).intrinsics, [125.0, 127.5, 82.5, 42.5 - 15.0])
 
 
 def test_without_a_route_there_is_no_robot(tmp_path):

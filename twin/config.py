@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from twin.errors import InputError
+from twin.robot import HuskyParams
+
+ROBOT_TOML = "robot.toml"
 
 
 @dataclass(frozen=True)
@@ -234,12 +237,14 @@ class SceneConfig:
     nerf: NerfConfig = field(default_factory=NerfConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     mjcf: MjcfConfig = field(default_factory=MjcfConfig)
+    robot: HuskyParams = field(default_factory=HuskyParams)
+    """`scene.toml` before `robot.toml`, which lies beside it, before the defaults."""
     review: ReviewConfig = field(default_factory=ReviewConfig)
     task: tuple[TaskConfig, ...] = ()
 
 
 def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
-    """Reads `scene.toml` and applies `section.key=value` overrides.
+    """Reads `scene.toml` and, for `[robot]`, the `robot.toml` beside it; applies `section.key=value` overrides.
 
     Raises:
         InputError: no such file, wrong TOML, unknown key, wrong type, or a value out of range.
@@ -252,11 +257,25 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
         raise InputError(f"{path}: not valid TOML: {error}") from None
     for override in overrides:
         _apply_override(table, override)
+    if isinstance(table.get("robot", {}), dict):
+        table["robot"] = read_robot(path.parent / ROBOT_TOML) | table.get("robot", {})
     config = parse(SceneConfig, table, str(path))
     if not config.name:
         config = dataclasses.replace(config, name=path.resolve().parent.name)
     _check(config, path)
     return config
+
+
+def read_robot(path: Path) -> dict[str, Any]:
+    """The table in a `robot.toml`, checked; empty where there is no such file. Raises InputError."""
+    if not path.exists():
+        return {}
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    parse(HuskyParams, table, str(path))
+    return table
 
 
 def _apply_override(table: dict[str, Any], override: str) -> None:
@@ -285,7 +304,11 @@ def parse(kind: type, table: Any, where: str) -> Any:
             near = difflib.get_close_matches(key, list(hints), n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(hints))}"
             raise InputError(f"{where}: unknown key {key!r}; {hint}")
-    return kind(**{key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()})
+    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    try:
+        return kind(**values)
+    except InputError as error:  # a dataclass that checks its own values
+        raise InputError(f"{where}: {error}") from None
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.env.controller import CONTROL_PERIOD
 from twin.env.physics import HuskyPhysics
-from twin.mjcf.husky import CONTROL_PERIOD, MAX_SPEED, MAX_YAW_RATE
 from twin.mjcf.world import World, arc_lengths, heading_error, nearest, point_at
 
 Array = NDArray[np.float64]
@@ -79,7 +79,8 @@ def follow(world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: flo
         speed: [m/s]; the robot itself does at most 1 m/s at a wheel, so less in a turn.
         timeout: [s]; by default what three times the route takes, and 10 s.
     """
-    speed = min(speed, MAX_SPEED)
+    speed = min(speed, physics.params.max_speed)
+    fastest_turn = physics.params.max_yaw_rate
     route = world.route[:, :2]
     length = float(arc_lengths(route)[-1])
     timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
@@ -103,9 +104,9 @@ def follow(world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: flo
             commands.append((0.0, 0.0))
             break
         wanted = np.clip(
-            speed * pursuit_curvature(pose, _target(route, s + _LOOK_AHEAD, length)), -MAX_YAW_RATE, MAX_YAW_RATE
+            speed * pursuit_curvature(pose, _target(route, s + _LOOK_AHEAD, length)), -fastest_turn, fastest_turn
         )
-        command = (speed, float(np.clip(gain * wanted, -MAX_YAW_RATE, MAX_YAW_RATE)))
+        command = (speed, float(np.clip(gain * wanted, -fastest_turn, fastest_turn)))
         commands.append(command)
         physics.command(*command)
         physics.step()

@@ -22,9 +22,7 @@ from twin.geometry.cameras import Cameras
 from twin.geometry.images import write_image
 from twin.mjcf import husky
 from twin.mjcf.files import face_tiles, write_hfield, write_obj
-from twin.mjcf.husky import PixelCamera
 from twin.mjcf.world import (
-    CAMERA_SIZE,
     SCENE_XML,
     World,
     arc_lengths,
@@ -33,6 +31,7 @@ from twin.mjcf.world import (
     point_at,
     total_turn,
 )
+from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
 from twin.scene import SceneDir
 
 Array = NDArray[np.float64]
@@ -73,7 +72,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     Args:
         scene: Reads the stages `metric` (Cameras) and `mesh` (ground.npz, parts.npz, visual.npz and, for a drive,
             route.npz).
-        config: `mjcf`.
+        config: `mjcf` and `robot`.
         out: Gets `scene.xml`, `assets/` and, for a drive, `world.json`.
 
     Returns:
@@ -104,16 +103,17 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
     else:
-        camera = front_camera(Cameras.load(scene.stage("metric")))
-        spawn, blocked = _add_robot(spec, ground, route, camera)
+        camera = config.robot.camera(film_camera(Cameras.load(scene.stage("metric"))))
+        spawn, blocked = _add_robot(spec, ground, route, config.robot, camera)
         _add_route(spec, route, config.mjcf.half_width)
         (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
-        World(route, config.mjcf.half_width, spawn, np.array(camera.intrinsics), out).save()
+        world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot)
+        world.save()
         metrics |= {
             "route_length_m": float(arc_lengths(route)[-1]),
             "turn_deg": float(np.rad2deg(total_turn(route))),
             "half_width_m": config.mjcf.half_width,
-            "camera_intrinsics_px": [float(x) for x in camera.intrinsics],
+            "camera_intrinsics_px": world.intrinsics.tolist(),
         }
     metrics |= check_portable(out, with_robot=route is not None)
     if route is not None:
@@ -129,18 +129,12 @@ def load_route(path: Path) -> Array | None:
         return np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
 
 
-def front_camera(cameras: Cameras) -> PixelCamera:
-    """The real camera at CAMERA_SIZE: of the first training frame, fx scaled by the width.
-
-    Pixels keep their shape, so fy scales like fx; where the aspect ratio differs, the middle of the picture's height is
-    cut out (or, for a picture wider than 16:9, extended).
-    """
+def film_camera(cameras: Cameras) -> PixelCamera:
+    """The real camera of the first training frame."""
     training = np.flatnonzero(~cameras.held_out)
     first = int(training[0]) if len(training) else 0
-    width, height = cameras.sizes[first]
-    fx, fy, cx, cy = cameras.intrinsics[first] * (CAMERA_SIZE[0] / width)
-    cut = (height * CAMERA_SIZE[0] / width - CAMERA_SIZE[1]) / 2
-    return PixelCamera((float(fx), float(fy), float(cx), float(cy - cut)), CAMERA_SIZE)
+    (width, height), (fx, fy, cx, cy) = cameras.sizes[first].tolist(), cameras.intrinsics[first].tolist()
+    return PixelCamera((fx, fy, cx, cy), (width, height))
 
 
 def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
@@ -158,7 +152,7 @@ def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
     rotation = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1)
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    return np.array([*xy, height]) + z_axis * husky.BASE_HEIGHT, quaternion
+    return np.array([*xy, height]) + z_axis * BASE_HEIGHT, quaternion
 
 
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
@@ -276,7 +270,7 @@ def _add_parts(spec: mujoco.MjSpec, parts: Parts, assets: Path) -> None:
 
 
 def _add_robot(
-    spec: mujoco.MjSpec, ground: Ground, route: Array, camera: PixelCamera
+    spec: mujoco.MjSpec, ground: Ground, route: Array, params: HuskyParams, camera: PixelCamera
 ) -> tuple[tuple[float, float, float, float], set[str]]:
     """Puts the Husky at the route's start, lets it settle, and keeps that as keyframe `spawn`.
 
@@ -297,7 +291,7 @@ def _add_robot(
             f"the route starts {edge.min():.2f} m from the edge of the ground, expected at least 1 m; raise mesh.margin"
         )
     position, quaternion = rest_pose(ground, route[0, :2], yaw)
-    husky.add_husky(spec, position, quaternion, camera=camera)
+    husky.add_husky(spec, position, quaternion, params, camera)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -311,7 +305,7 @@ def _add_robot(
         )
     spec.add_key(name="spawn", qpos=data.qpos)
     x, y, z = data.qpos[:3]
-    forward = data.body("husky").xmat.reshape(3, 3)[:, 0]
+    forward = data.body("base_link").xmat.reshape(3, 3)[:, 0]
     return (float(x), float(y), float(z), float(np.arctan2(forward[1], forward[0]))), blocked
 
 
@@ -373,7 +367,7 @@ def check_portable(folder: Path, with_robot: bool) -> dict[str, Any]:
 
 def robot_geoms(model: mujoco.MjModel) -> NDArray[np.bool_]:
     """Which geoms belong to the robot, shape (ngeom,)."""
-    return model.body_rootid[model.geom_bodyid] == model.body("husky").id
+    return model.body_rootid[model.geom_bodyid] == model.body("base_link").id
 
 
 def touched_names(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
@@ -388,7 +382,7 @@ def spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
     """Distance from the robot to the nearest convex part [m]; None where none is within 5 m."""
     robot = np.flatnonzero(robot_geoms(model) & (model.geom_contype > 0))
     parts = np.flatnonzero(model.geom_group == PART_GROUP)
-    center = data.body("husky").xpos
+    center = data.body("base_link").xpos
     near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + _CLEARANCE_RANGE]
     distances = [
         mujoco.mj_geomDistance(model, data, int(a), int(b), _CLEARANCE_RANGE, None) for a in robot for b in near

@@ -67,7 +67,7 @@ def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[
     """`run` with any field."""
     cameras = Cameras.load(scene.stage("metric"))
     world = World.load(scene.stage("mjcf")) if config.mjcf.route and scene.has_route else None
-    drive = follow(world, HuskyPhysics(world.model()), config.review.speed) if world else None
+    drive = follow(world, HuskyPhysics(world.model(), world.robot), config.review.speed) if world else None
     aspect = float(np.median(cameras.sizes[:, 1] / cameras.sizes[:, 0]))
     layout = Layout.for_pictures(config.review.width, aspect)
     path = world.route[:, :2] if world else _longest_path(cameras)
@@ -140,7 +140,7 @@ def _views(studio: Studio, scene: SceneDir, world: World | None) -> tuple[list[S
     if world:
         return route_shots(world.route), world
     # Only its model is drawn; there is no route to know.
-    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), np.ones(4), folder)
+    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), folder)
     return (camera_shots(studio.cameras) if model.model_path.exists() else []), model
 
 
