@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.lightings import TRAINING
 from twin.env.randomisation import Ranges
 from twin.errors import InputError
@@ -94,6 +95,11 @@ def parse_options(given: dict[str, Any]) -> Options:
     for name, low in (("control_timestep", 0.01), ("speed", 0.01), ("yaw_rate", 0.01), ("stack", 1)):
         if not getattr(options, name) >= low:
             raise InputError(f"{name} = {getattr(options, name)}; expected at least {low:g}")
+    if not options.control_timestep <= COMMAND_TIMEOUT:
+        raise InputError(
+            f"control_timestep = {options.control_timestep}; expected at most {COMMAND_TIMEOUT} s: the robot stops "
+            "where it hears nothing for so long"
+        )
     for name in ("half_width", "time_limit"):
         value = getattr(options, name)
         if value is not None and not value > 0.0:

@@ -15,9 +15,9 @@ from twin.env.options import Options
 from twin.env.tasks import LIGHT, Drive
 from twin.env.trust import Trust
 from twin.geometry.cameras import Viewpoints
-from twin.mjcf.world import CAMERA_SIZE
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
+from twin.robot import CAMERA_SIZE
 
 Picture = NDArray[np.uint8]
 

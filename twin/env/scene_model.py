@@ -56,16 +56,10 @@ def episode_spec(world: World, start: float, end: float, half_width: float, look
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     spec.modelfiledir = str(world.folder.resolve())
     base = spec.body(world.names["body"])
-    payload = base.add_body(name=PAYLOAD, pos=_payload_position(spec, world))
+    payload = base.add_body(name=PAYLOAD, pos=world.robot.payload_position)
     payload.explicitinertial = True
     payload.mass, payload.ipos, payload.inertia = 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     return spec
-
-
-def _payload_position(spec: mujoco.MjSpec, world: World) -> tuple[float, float, float]:
-    from twin.mjcf.husky import HuskyParams
-
-    return HuskyParams().payload_position
 
 
 def _ball(path: Path) -> tuple[Array, float]:

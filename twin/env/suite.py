@@ -3,6 +3,7 @@
 Physics and task know nothing of pictures; `SeenDrive` adds them. Both are `dm_control.rl.control.Environment`s.
 """
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,9 +55,7 @@ class Stage:
 
     def drive(self, seed: int | None) -> tuple[DrivePhysics, Drive]:
         """One more world, with a model of its own."""
-        import copy
-
-        physics = DrivePhysics.of(copy.copy(self.model))
+        physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
         return physics, Drive(self.world, self.stretch, self.options, self.model, seed)
 
     def pixels(self, worlds: list[tuple[DrivePhysics, Drive]]) -> Pixels | None:

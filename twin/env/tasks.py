@@ -9,6 +9,7 @@ changing one of them leaves the others as they were, and two policies can be com
 """
 
 from collections import OrderedDict
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -79,10 +80,11 @@ class Drive(control.Task):
         self.draw = self.options.randomise.draw(self.rng(ROBOT)) if self.options.randomise else Draw()
         if self._nominal:
             self._nominal.apply(self.draw, physics.model.ptr)
-        physics.latency = self.draw.latency
+        params = self.world.robot
+        physics.set_robot(replace(params, command_latency=params.command_latency + self.draw.latency))
         rng = self.rng(START)
         for _ in range(_START_TRIES):
-            physics.place(*self._start(rng))
+            physics.robot.place(*self._start(rng))
             if not physics.touched:
                 break
         else:
@@ -98,9 +100,9 @@ class Drive(control.Task):
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
         action = np.clip(np.asarray(action, float), *self._bounds())
         if self.options.action == STEERING:
-            physics.command(self.options.speed, float(action[0]))
+            physics.robot.command(self.options.speed, float(action[0]))
         else:
-            physics.command(float(action[0]), float(action[1]))
+            physics.robot.command(float(action[0]), float(action[1]))
 
     def after_step(self, physics: DrivePhysics) -> None:
         position = physics.planar_pose[:2]
