@@ -44,8 +44,8 @@ class Pixels:
         self.field, self.options, self.intrinsics, self.worlds = field, options, intrinsics, list(worlds)
         self._trust, self._sets = trust, LightSets(field)
         width, height = options.size
-        self.stacks = np.zeros((len(self.worlds), options.stack, height, width, 3), np.uint8)
-        """Shape (n, stack, height, width, 3)."""
+        self.stacks = np.zeros((len(self.worlds), options.stack, 3, height, width), np.uint8)
+        """Shape (n, stack, 3, height, width): colours first, as networks want them."""
         self.lights: list[Light | None] = [None] * len(self.worlds)
         self.trust = np.zeros(len(self.worlds))
         """Of each world's newest picture, in [0, 1], shape (n,)."""
@@ -74,7 +74,7 @@ class Pixels:
         out = self._render(which)
         poses = [self.worlds[i][0].camera_to_world for i in which]
         self.trust[list(which)] = self._trust.of(np.array(poses), out)
-        return (np.clip(out.rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+        return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
     def _render(self, which: Sequence[int]) -> Rendering:
         poses = np.array([self.worlds[i][0].camera_to_world for i in which])

@@ -85,11 +85,11 @@ class SeenDrive(control.Environment):
         return self._with_pixels(step)
 
     def observation_spec(self) -> dict[str, specs.BoundedArray]:
-        shape = self.pixels.stacks.shape[1:]
-        return {"pixels": specs.BoundedArray(shape, np.uint8, 0, 255, name="pixels")}
+        _, stack, three, height, width = self.pixels.stacks.shape
+        return {"pixels": specs.BoundedArray((stack, height, width, three), np.uint8, 0, 255, name="pixels")}
 
     def _with_pixels(self, step: dm_env.TimeStep) -> dm_env.TimeStep:
-        return step._replace(observation={"pixels": self.pixels.stacks[0].copy()})
+        return step._replace(observation={"pixels": np.ascontiguousarray(self.pixels.stacks[0].transpose(0, 2, 3, 1))})
 
 
 def environment(scene: str | Path | Twin, task: str, seed: int | None, **options: Any) -> control.Environment:

@@ -142,6 +142,10 @@ class Drive(control.Task):
             turns=heading_error(ahead, heading).astype(np.float32),
         )
 
+    def observation_spec(self, physics: DrivePhysics) -> "OrderedDict[str, specs.Array]":
+        shapes = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": len(_AHEAD)}
+        return OrderedDict((name, specs.Array((n,), np.float32, name)) for name, n in shapes.items())
+
     def action_spec(self, physics: DrivePhysics) -> specs.BoundedArray:
         low, high = self._bounds()
         return specs.BoundedArray(low.shape, np.float64, low, high, name="\t".join(self.action_names))
