@@ -213,5 +213,3 @@ def add_shape(shape: Shape, kind: str, color: Sequence[float] = (), size: Sequen
     red, green, blue = color or _COLORS[kind]
     make = partial(_MAKERS[kind], size=size) if kind == "box" else _MAKERS[kind]
     make(shape, (red, green, blue))
-
-

@@ -134,7 +134,7 @@ def route_of(model: mujoco.MjModel) -> Array:
 
 
 def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
-    """Bilinear height [m] of the geom `ground`, a height field that is not turned; beyond its edge, that of the edge."""
+    """Bilinear height [m] of the geom `ground`, an upright height field; beyond its edge, that of the edge."""
     geom = model.geom("ground")
     k = int(geom.dataid[0])
     rows, columns, adr = int(model.hfield_nrow[k]), int(model.hfield_ncol[k]), int(model.hfield_adr[k])
