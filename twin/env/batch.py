@@ -109,7 +109,7 @@ class Worlds:
         return Outcome(np.array([step.reward for step in steps]), last & ~goes_on, last & goes_on)
 
     def observation(self) -> NDArray:
-        """Of all worlds: pictures uint8 (n, 3 · stack, height, width), the newest last; or the states, (n, k) float32."""
+        """Pictures uint8 (n, 3 · stack, height, width), the newest last; or the states, float32 (n, k)."""
         if self.pixels:
             n, stack, three, height, width = self.pixels.stacks.shape
             return self.pixels.stacks.reshape(n, stack * three, height, width).copy()

@@ -1,7 +1,8 @@
 """Who drives: what an episode's observations are turned into actions by.
 
 A *driver* is asked with the environment and the newest `dm_env.TimeStep`, and answers with an action that the
-environment's `action_spec` allows. Drivers that are told the poses show what a task is worth; a policy is told pictures.
+environment's `action_spec` allows. Drivers that are told the poses show what a task is worth; a policy is told
+pictures.
 """
 
 import importlib
@@ -74,9 +75,7 @@ def load_policy(name: str) -> PolicyDriver:
     """
     module, _, function = name.partition(":")
     if not function:
-        raise InputError(
-            f"policy {name!r}: expected module:function, a callable of pictures (3 · stack, height, width)"
-        )
+        raise InputError(f"policy {name!r}: expected module:function, a callable of pixels (3 · stack, h, w)")
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from twin.config import ObstacleConfig
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.lightings import TRAINING
 from twin.env.randomisation import Ranges
@@ -66,6 +67,8 @@ class Options:
     """See `lightings.py`."""
     lighting_drift: bool = False
     """The light changes during an episode."""
+    obstacles: str | int | Sequence[ObstacleConfig] = "scene"
+    """`scene`: those of scene.toml; a number: so many that stand, drawn for every episode; or these."""
     randomise: Ranges | None = None
     """How far the robot differs from episode to episode; None: it does not. `True` stands for the default ranges."""
 
@@ -107,6 +110,8 @@ def parse_options(given: dict[str, Any]) -> Options:
     for name in ("start_offset", "start_heading"):
         if not getattr(options, name) >= 0.0:
             raise InputError(f"{name} = {getattr(options, name)}; expected at least 0")
+    if options.obstacles != "scene" and isinstance(options.obstacles, str):
+        raise InputError(f"obstacles = {options.obstacles!r}; expected 'scene', a number, or ObstacleConfigs")
     if len(options.size) != 2 or min(options.size) < 8:
         raise InputError(f"size = {options.size}; expected (width, height) of at least 8 px")
     return options

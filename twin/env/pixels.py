@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from twin.env.dm_physics import DrivePhysics
 from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.options import Options
+from twin.env.overlay import Overlay
 from twin.env.tasks import LIGHT, Drive
 from twin.env.trust import Trust
-from twin.geometry.cameras import Viewpoints
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
-from twin.robot import CAMERA_SIZE
 
 Picture = NDArray[np.uint8]
 
@@ -27,21 +26,21 @@ class Pixels:
 
     def __init__(
         self,
+        overlay: Overlay,
         field: BakedField,
         trust: Trust,
         options: Options,
-        intrinsics: NDArray,
         worlds: Sequence[tuple[DrivePhysics, Drive]],
     ) -> None:
         """
         Args:
-            field: Of the place.
+            overlay: Renders the worlds.
+            field: Of the place; knows its lightings.
             trust: What was filmed of it.
             options: Size, stack, lighting.
-            intrinsics: fx, fy, cx, cy [px] at CAMERA_SIZE, shape (4,).
             worlds: Whose episodes are observed.
         """
-        self.field, self.options, self.intrinsics, self.worlds = field, options, intrinsics, list(worlds)
+        self._overlay, self.options, self.worlds = overlay, options, list(worlds)
         self._trust, self._sets = trust, LightSets(field)
         width, height = options.size
         self.stacks = np.zeros((len(self.worlds), options.stack, 3, height, width), np.uint8)
@@ -77,6 +76,5 @@ class Pixels:
         return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
     def _render(self, which: Sequence[int]) -> Rendering:
-        poses = np.array([self.worlds[i][0].camera_to_world for i in which])
         lights = [self.lights[i].at(self.worlds[i][0].time()) for i in which]  # type: ignore[union-attr]
-        return self.field.render(Viewpoints.of(poses, self.intrinsics, CAMERA_SIZE), lights, self.options.size)
+        return self._overlay.render([self.worlds[i][0].data.ptr for i in which], lights)

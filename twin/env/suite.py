@@ -16,7 +16,10 @@ from dm_env import specs
 
 from twin.config import load_config
 from twin.env.dm_physics import DrivePhysics
+from twin.env.episode_obstacles import EpisodeObstacles
+from twin.env.obstacles import add_obstacles
 from twin.env.options import Options, parse_options
+from twin.env.overlay import Overlay
 from twin.env.pixels import Pixels
 from twin.env.scene_model import episode_spec
 from twin.env.stretches import Stretch, find_task
@@ -35,6 +38,7 @@ class Stage:
     world: World
     stretch: Stretch
     options: Options
+    obstacles: EpisodeObstacles
     model: mujoco.MjModel
     field: BakedField | None
     """None where no pictures are wanted."""
@@ -48,20 +52,25 @@ class Stage:
         if not twin.scene.has_route:
             raise InputError(f"{twin.scene.root}: nothing to drive, as its build has no route (mjcf.route)")
         world = twin.world()
-        stretch = find_task(task, world, load_config(twin.scene.config_file).task)
+        config = load_config(twin.scene.config_file)
+        stretch = find_task(task, world, config.task)
+        wanted = config.obstacle if isinstance(parsed.obstacles, str) else parsed.obstacles
+        obstacles = EpisodeObstacles(wanted, world, stretch)
         spec = episode_spec(world, stretch.start, stretch.end, parsed.half_width or world.half_width)
+        add_obstacles(spec, obstacles.pool, world)
         field, trust = (twin.field(), Trust(twin.cameras())) if parsed.pixels else (None, None)
-        return Stage(world, stretch, parsed, spec.compile(), field, trust)
+        return Stage(world, stretch, parsed, obstacles, spec.compile(), field, trust)
 
     def drive(self, seed: int | None) -> tuple[DrivePhysics, Drive]:
         """One more world, with a model of its own."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
-        return physics, Drive(self.world, self.stretch, self.options, self.model, seed)
+        return physics, Drive(self.world, self.stretch, self.options, self.obstacles, self.model, seed)
 
     def pixels(self, worlds: list[tuple[DrivePhysics, Drive]]) -> Pixels | None:
         if self.field is None or self.trust is None:
             return None
-        return Pixels(self.field, self.trust, self.options, self.world.intrinsics, worlds)
+        overlay = Overlay(self.model, self.field, self.options.size, len(worlds))
+        return Pixels(overlay, self.field, self.trust, self.options, worlds)
 
 
 class SeenDrive(control.Environment):

@@ -18,7 +18,9 @@ from dm_control.rl import control
 from dm_env import specs
 from numpy.typing import NDArray
 
+from twin.config import ObstacleConfig
 from twin.env.dm_physics import DrivePhysics
+from twin.env.episode_obstacles import EpisodeObstacles, Surroundings
 from twin.env.options import STEERING, Options
 from twin.env.randomisation import Draw, Nominal
 from twin.env.stretches import Stretch
@@ -42,26 +44,35 @@ class Drive(control.Task):
     """Drives a stretch."""
 
     def __init__(
-        self, world: World, stretch: Stretch, options: Options, model: mujoco.MjModel, seed: int | None = None
+        self,
+        world: World,
+        stretch: Stretch,
+        options: Options,
+        obstacles: EpisodeObstacles,
+        model: mujoco.MjModel,
+        seed: int | None = None,
     ) -> None:
         """
         Args:
             world: Route and corridor.
             stretch: What is driven.
             options: How.
+            obstacles: What stands or moves in the way; the model holds its pool.
             model: As compiled; the one that is driven in may be a copy.
             seed: Of the sequence of episodes; None: unpredictable.
         """
         self.world, self.stretch, self.options = world, stretch, options
         self.half_width = options.half_width or world.half_width
         self.time_limit = options.time_limit or 2.0 * stretch.length / options.speed
-        self._route = world.route[:, :2]
+        self._route, self._obstacles = world.route[:, :2], obstacles
         self._nominal = Nominal(model) if options.randomise else None
         self.seed(seed)
         self.episode_seed = 0
         """Of the episode under way."""
         self.draw = Draw()
         """The robot of the episode under way."""
+        self.obstacles: tuple[ObstacleConfig, ...] = ()
+        """Of the episode under way."""
         self.cause = ""
         """Why the episode ended; empty while it goes on."""
 
@@ -82,6 +93,8 @@ class Drive(control.Task):
             self._nominal.apply(self.draw, physics.model.ptr)
         params = self.world.robot
         physics.set_robot(replace(params, command_latency=params.command_latency + self.draw.latency))
+        self.obstacles = self._obstacles.draw(self.rng(OBSTACLES))
+        physics.robot.surroundings = Surroundings(self.obstacles, physics.data.ptr)
         rng = self.rng(START)
         for _ in range(_START_TRIES):
             physics.robot.place(*self._start(rng))

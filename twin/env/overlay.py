@@ -1,0 +1,128 @@
+"""The picture a policy gets: a radiance field with obstacles, other robots and the robot's own body put into it.
+
+For every pixel that an obstacle covers, the field is marched a second time up to the obstacle's depth: what it holds
+back in front, such as leaves, stays in front, and the obstacle is blended in by the remaining transmittance. Beside the
+obstacle, and behind the uncovered share of a pixel at its edge, the field is as it is anyway.
+"""
+
+import copy
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.env.light import FieldLight
+from twin.env.obstacle_view import Drawn, ObstacleView, camera_intrinsics, camera_pose
+from twin.env.obstacles import route_of
+from twin.errors import InputError
+from twin.geometry.cameras import Viewpoints
+from twin.nerf.baked import BakedField
+from twin.nerf.rendering import Rendering
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Lighting = str | NDArray
+
+_CAMERA = "front"
+_WINDOW_STEP = 32  # [px] windows of the second march come in multiples of this, so that few sizes are needed
+_KNEE = 0.75  # colours above roll off towards 1, as in a camera
+
+
+class Overlay:
+    """Renders worlds of one model as their front cameras see them."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        field: BakedField,
+        size: tuple[int, int] = (160, 90),
+        worlds: int = 1,
+        shaded: bool = True,
+    ):
+        """
+        Args:
+            model: With a camera `front`, compiled after `add_obstacles` (be it of none).
+            field: The place.
+            size: Width, height of the pictures [px].
+            worlds: How many worlds a call renders at most.
+            shaded: False leaves obstacles in their own plain colours; to compare.
+        """
+        self.size, self.worlds, self._field = size, worlds, field
+        self._camera = model.camera(_CAMERA).id
+        self.intrinsics = camera_intrinsics(model, self._camera, size)
+        self._view = ObstacleView(model, self.intrinsics, size)
+        self._light = FieldLight(field, route_of(model)) if shaded and len(self._view.geoms) else None
+        self._fronts: dict[tuple[int, int], BakedField] = {}
+
+    def render(self, datas: Sequence[mujoco.MjData], lighting: Lighting | Sequence[Lighting]) -> Rendering:
+        """What the front camera of every world sees.
+
+        Args:
+            datas: Of every world, with poses of geoms and cameras as of now (`mj_forward` or `mj_kinematics` and
+                `mj_camlight` after the last step).
+            lighting: As `BakedField.render` takes it: one, or one per world.
+
+        Raises:
+            InputError: an unknown lighting, or more worlds than stated.
+        """
+        if len(datas) > self.worlds:
+            raise InputError(
+                f"{len(datas)} worlds to render; expected at most {self.worlds}, as the overlay was made for"
+            )
+        poses = np.stack([camera_pose(data, self._camera) for data in datas])
+        one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
+        out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
+        for k, (data, pose) in enumerate(zip(datas, poses, strict=True)):
+            mask = self._view.in_view(data, pose)
+            if mask is None:
+                continue
+            mine: Lighting = lighting if one else lighting[k]  # type: ignore[assignment]
+            drawn = self._view.draw(data, pose, mask, self._light.under(mine) if self._light else None)
+            if drawn is not None:
+                left, top, width, height = drawn.window
+                inner = np.s_[k, top : top + height, left : left + width]
+                composite(out, inner, drawn, self._front(pose, drawn, mine))
+        return out
+
+    def _front(self, pose: Array, drawn: Drawn, lighting: Lighting) -> Rendering:
+        """What the field holds back in front of what is drawn, in its window."""
+        left, top, width, height = drawn.window
+        across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
+        stop = np.zeros((1, down, across), np.float32)
+        stop[0, :height, :width] = drawn.depth
+        if (across, down) not in self._fronts:
+            # A field keeps the arrays of one size of picture; so each size has a shallow copy of it.
+            front = copy.copy(self._field)
+            front._pictures = {}
+            self._fronts[across, down] = front
+        intrinsics = self.intrinsics - np.array([0.0, 0.0, left, top])
+        view = Viewpoints.of(pose, intrinsics, (across, down))
+        out = self._fronts[across, down].render(view, lighting, stop=stop)
+        inner = np.s_[0, :height, :width]
+        return Rendering(out.rgb[inner], out.depth[inner], out.opacity[inner])
+
+
+def composite(out: Rendering, inner: tuple, drawn: Drawn, front: Rendering) -> None:
+    """Blends what is drawn into a window of a rendering, in place.
+
+    Args:
+        out: Of the field alone.
+        inner: Index of the window in its arrays.
+        drawn: What covers the window.
+        front: Of the field up to `drawn.depth`: its own share's colour, depth and opacity, arrays (height, width).
+    """
+    cover = drawn.coverage[..., None]
+    held = front.opacity[..., None]
+    covered = held * front.rgb + (1.0 - held) * rolled_off(drawn.rgb)
+    out.rgb[inner] += cover * (covered - out.rgb[inner])
+    mostly = drawn.coverage >= 0.5
+    depth = np.where(front.opacity >= 0.5, np.minimum(front.depth, drawn.depth), drawn.depth)
+    out.depth[inner] = np.where(mostly, depth, out.depth[inner])
+    out.opacity[inner] += drawn.coverage * (1.0 - out.opacity[inner])
+
+
+def rolled_off(rgb: Floats) -> Floats:
+    """Film colours in [0, 1] of what may be brighter: a shoulder instead of a cut."""
+    over = np.maximum(rgb - _KNEE, 0.0)
+    return np.minimum(rgb, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))
