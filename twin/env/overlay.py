@@ -68,7 +68,7 @@ class Overlay:
         """
         if len(datas) > self.worlds:
             raise InputError(
-                f"{len(datas)} worlds to render; expected at most {self.worlds}, as the overlay was made for"
+                f"{len(datas)} worlds to render; expected at most {self.worlds}, as it was made for"
             )
         poses = np.stack([camera_pose(data, self._camera) for data in datas])
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)

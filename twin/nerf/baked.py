@@ -190,7 +190,7 @@ class BakedField:
         return np.broadcast_to(bias + vectors @ matrix, (n, len(bias)))
 
     def _picture(self, n: int, width: int, height: int, stopped: bool) -> "_Picture":
-        """Arrays for pictures of this size; the last few are kept, as the next picture is likely of one of their sizes."""
+        """Arrays for pictures of this size; the last few are kept, as the next is likely of a size there was before."""
         key = n, width, height, stopped
         picture = self._pictures.pop(key, None) or _Picture(self, *key)
         self._pictures[key] = picture
