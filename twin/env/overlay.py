@@ -67,9 +67,7 @@ class Overlay:
             InputError: an unknown lighting, or more worlds than stated.
         """
         if len(datas) > self.worlds:
-            raise InputError(
-                f"{len(datas)} worlds to render; expected at most {self.worlds}, as it was made for"
-            )
+            raise InputError(f"{len(datas)} worlds to render; expected at most {self.worlds}, as it was made for")
         poses = np.stack([camera_pose(data, self._camera) for data in datas])
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
