@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from twin.env.light import FieldLight
 from twin.env.obstacle_view import Drawn, ObstacleView, camera_intrinsics, camera_pose
 from twin.env.obstacles import route_of
+from twin.env.shadow import Shadows
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints
+from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
 
@@ -53,6 +54,8 @@ class Overlay:
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         self._view = ObstacleView(model, self.intrinsics, size)
         self._light = FieldLight(field, route_of(model)) if shaded and len(self._view.geoms) else None
+        self._shadows = Shadows(model, self._view.geoms) if self._light else None
+        self._rays = unproject(pixel_grid(*size), self.intrinsics)
         self._fronts: dict[tuple[int, int], BakedField] = {}
 
     def render(self, datas: Sequence[mujoco.MjData], lighting: Lighting | Sequence[Lighting]) -> Rendering:
@@ -76,7 +79,10 @@ class Overlay:
             if mask is None:
                 continue
             mine: Lighting = lighting if one else lighting[k]  # type: ignore[assignment]
-            drawn = self._view.draw(data, pose, mask, self._light.under(mine) if self._light else None)
+            light = self._light.under(mine) if self._light else None
+            if self._shadows and light:
+                self._shadows.darken(out.rgb[k], out.depth[k], self._rays, pose, data, light)
+            drawn = self._view.draw(data, pose, mask, light)
             if drawn is not None:
                 left, top, width, height = drawn.window
                 inner = np.s_[k, top : top + height, left : left + width]
