@@ -30,7 +30,7 @@ from twin.geometry.poses import Similarity
 from twin.loading import load_scene
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.reality import world as reality
-from twin.reality.film import Plan, develop
+from twin.reality.film import develop
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import Truth
 from twin.report.truth import align_rigid, matched_poses
@@ -61,7 +61,7 @@ class TrueWorld:
         for kind in KINDS:
             body = spec.worldbody.add_body(name=f"added_{kind}", mocap=True, pos=(0, 0, -100.0))
             add_shape(Shape(spec, body, group=1, solid=False), kind)
-        width, height = SIZE
+        height = SIZE[1]
         spec.camera("film").fovy = float(np.rad2deg(2 * np.arctan(height / 2 / intrinsics[1])))
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
@@ -167,7 +167,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                     data.body(f"obstacle_{kind}").xpos,
                 )
                 true_eye, true_pose = to_truth.poses(eye), to_truth.poses(pose)
-                bare, bare_depth = true_world.show(true_eye, None, true_pose)
+                _, bare_depth = true_world.show(true_eye, None, true_pose)
                 wanted, depth = true_world.show(true_eye, kind, true_pose)
                 seen = depth < bare_depth - 1e-3
                 if seen.sum() < 20:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.world import arc_lengths, heading_at, point_at
@@ -47,6 +48,7 @@ _MOST_SUN, _LOWEST_SUN = 0.8, 3.0  # share of one direction at most; cotangent o
 _DARK = 0.02  # a probe whose mean colour is below tells nothing
 _MOST = 1.5  # times the ground's brightest: what seems brighter shines by itself
 _NEIGHBOURS = 16  # of the ground's probes, around one that stands
+_FEW = 50  # probes of a kind are none
 _KEPT = 64  # lightings
 
 
@@ -106,6 +108,9 @@ class FieldLight:
         Args:
             field: Looked at from along the route, once.
             route: On the ground [m], shape (m, 3).
+
+        Raises:
+            InputError: no ground is seen there.
         """
         self._field = field
         self._kept: OrderedDict[bytes, Light] = OrderedDict()
@@ -116,6 +121,11 @@ class FieldLight:
         standing = (height > _STANDING) & (found.facing > 0.25)
         rng = np.random.default_rng(0)
         self._ground, self._standing = found.pick(_some(rng, ground)), found.pick(_some(rng, standing))
+        if len(self._ground.points) < _FEW:
+            raise InputError(
+                "no ground is seen along the route, and so nothing to tell the light from; was the field built with "
+                "this scene? Overlay(..., shaded=False) does without"
+            )
         self._xy = self._ground.points[:, :2]
         self._beside = _nearest_of(self._xy, self._standing.points[:, :2])
         names = field.lightings
@@ -147,6 +157,8 @@ class FieldLight:
         colours = self._standing.probes.picture(embedding).astype(np.float64)
         seen = colours / np.maximum(self._mean, _DARK) * self._reference
         over = seen - np.maximum(self._standing.normals[:, 2:], 0.0) * level
+        if len(self._rows) < _FEW:  # nothing stands here to tell by: a uniform sky
+            return Light(self._xy, up, np.zeros((5, 3)), np.array([_POLE, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3))
         found = np.empty((10, 3))
         for c in range(3):
             usable = (self._mean[:, c] > _DARK) & (seen[:, c] < _MOST * up[:, c].max())

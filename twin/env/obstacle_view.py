@@ -1,9 +1,9 @@
 """What of a MuJoCo model a camera sees besides the field: obstacles, other robots, the robot's own body.
 
 `mujoco_warp`'s ray caster draws them, without OpenGL, from a small model of their geoms alone. It is given only the
-XX
-out smooth. Its lights are set so that the colour it draws is the surface's normal; what a surface looks like is then
-its own colour times the irradiance of that normal there. *Coverage* is the share of a pixel that is covered.
+rays it needs: of the pixels that some geom's box may cover, one each, and at edges four more each, so that outlines
+come out smooth. Its lights are set so that the colour it draws is the surface's normal; what a surface looks like is
+then its own colour times the irradiance of that normal there. *Coverage* is the share of a pixel that is covered.
 """
 
 from collections.abc import Callable
@@ -220,7 +220,10 @@ class ObstacleView:
 
 def _rgba(model: mujoco.MjModel) -> Array:
     """Colour of every geom, shape (ngeom, 4)."""
-    return np.where(model.geom_matid[:, None] < 0, model.geom_rgba, model.mat_rgba[model.geom_matid])
+    out = model.geom_rgba.copy()
+    has = model.geom_matid >= 0
+    out[has] = model.mat_rgba[model.geom_matid[has]]
+    return out
 
 
 def _only(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> mujoco.MjModel:

@@ -1,9 +1,9 @@
 """Soft shadows of obstacles on the reconstructed ground.
 
-The sky is taken for uniform but for one *sun*, whose direction and share of the light `Light.sun` tells. Of the sky, the
-ground beside an obstacle loses what its side hides; of the sun, the ground behind it loses what its outline hides, with
-a penumbra that widens with the distance. So under clouds the ground darkens around the foot alone, and in sunshine on
-the far side. An obstacle is two upright boxes, around its lower and its upper geoms.
+The sky is taken for uniform but for one *sun*, whose direction and share of the light `Light.sun` tells. Of the sky,
+the ground beside an obstacle loses what its side hides; of the sun, the ground behind it loses what its outline hides,
+with a penumbra that widens with the distance. So under clouds the ground darkens around the foot alone, and in sunshine
+on the far side. An obstacle is two upright boxes, around its lower and its upper geoms.
 """
 
 import mujoco
