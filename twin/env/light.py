@@ -1,15 +1,15 @@
 """What light falls on things in a radiance field, estimated from the field itself.
 
 A field knows colours, not light. *Irradiance* here is what a colour of 1 (perfect white, facing some way) would look
-like in the film of a lighting: an obstacle's own colour times the irradiance is what it looks like there. It has two
-factors: the *level*, of what faces up at a place, and the *shape*, how much of that reaches what faces elsewhere.
+like in the film of a lighting: an obstacle's own colour times the irradiance is what it looks like there. That of what
+faces up at a place is its *level*: the colour of the reconstructed ground around it, over the albedo taken for it.
 
-Level: the colour of the reconstructed ground around the place, over the albedo that is taken for it. Shape: probes with
-other normals are compared with themselves under the mean of the filmed lightings, which cancels their albedo, and with
-the ground near them, which cancels the level; that mean is taken for a uniform sky over a dim ground. Six coefficients
-are fitted per colour (an *ambient cube*: Mitchell et al. 2006 without its lower face, plus a constant).
+How much reaches what faces elsewhere is learnt from *probes*, points of the field that stand and face all ways. Each is
+compared with itself under the mean of the filmed lightings, which cancels its albedo; that mean is taken for a uniform
+sky over a dim ground. Per direction of `SIDES` one share of the light grows with the level of the place, as that of the
+lamp or sun that lights the ground, too, and one does not, as that of the sky does.
 
-*Probes* are rays whose composited features are kept, so that any embedding gives them colours in a millisecond.
+Of the probes the composited features are kept, so that any embedding gives them colours in a millisecond.
 """
 
 from collections import OrderedDict
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.world import arc_lengths, heading_at, point_at
@@ -27,22 +28,27 @@ from twin.nerf.plausible import Probes
 Array = NDArray[np.float64]
 
 GROUND_ALBEDO = 0.38
-"""What the ground along the route is taken to reflect, in film colours: worn asphalt reflects about 12 %, which a film's
-tone curve (exponent 1 / 2.2) shows as 0.38."""
+"""What the ground along the route is taken to reflect, in film colours: worn asphalt reflects about 12 %, which the
+tone curve of a film (exponent 1 / 2.2) shows as 0.38."""
 
-DIRECTIONS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-"""From where the lights of the shape come, shape (5, 3); a constant comes on top."""
+SIDES = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+"""Directions that light comes from besides above and everywhere, shape (4, 3)."""
 
 _EYE_HEIGHT, _PITCH = 1.0, 8.0  # [m], [°] of the views that probes are taken from
 _EYE_STEP = 1.0  # [m] of the route
 _VIEW, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
-_GROUND_REACH, _WALL_REACH = 7.0, 12.0  # [m] depth up to which probes are taken
+_GROUND_REACH, _REACH = 7.0, 12.0  # [m] depth up to which probes are taken
 _GROUND_SKIN = 0.12  # [m] from the ground
 _STANDING = 0.3  # [m] above the ground from where on a probe is none of it
 _MOST_PROBES = 4000  # of each kind
 _NEAR = 0.7  # [m] standard deviation of the ground's weights around a place
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
+_POLE = 0.5 * (1.0 + _BOUNCE)
+_MOST_SUN, _LOWEST_SUN = 0.8, 3.0  # share of one direction at most; cotangent of its elevation at most
 _DARK = 0.02  # a probe whose mean colour is below tells nothing
+_MOST = 1.5  # times the ground's brightest: what seems brighter shines by itself
+_NEIGHBOURS = 16  # of the ground's probes, around one that stands
+_FEW = 50  # probes of a kind are none
 _KEPT = 64  # lightings
 
 
@@ -52,23 +58,46 @@ class Light:
 
     xy: Array
     """Places of the ground's probes [m], shape (k, 2)."""
-    irradiance: Array
-    """Of what faces up there, shape (k, 3)."""
-    constant: Array
-    """Share of the level that reaches everything, shape (3,)."""
-    lights: Array
-    """Share of the level that light from each of `DIRECTIONS` adds, times the cosine, shape (5, 3)."""
+    up: Array
+    """Irradiance of what faces up there, shape (k, 3)."""
+    steady: Array
+    """What reaches all that does not face up, and what comes from each of `SIDES`, whatever the level, shape (5, 3)."""
+    growing: Array
+    """The same per unit of the level, shape (5, 3)."""
 
     def level(self, xy: Array) -> Array:
         """Irradiance of what faces up at places (n, 2) [m], shape (n, 3)."""
         distance2 = ((np.asarray(xy)[:, None] - self.xy) ** 2).sum(-1)
         # Where no probe is near, the nearest ones count.
         weight = np.exp(-0.5 * distance2 / _NEAR**2) + 1e-6 / (1.0 + distance2**2)
-        return (weight / weight.sum(1, keepdims=True)) @ self.irradiance
+        return (weight / weight.sum(1, keepdims=True)) @ self.up
 
-    def shape(self, normals: Array) -> Array:
-        """Irradiance of unit normals (n, 3) over the level, shape (n, 3)."""
-        return self.constant + np.maximum(np.asarray(normals) @ DIRECTIONS.T, 0.0) @ self.lights
+    def irradiance(self, level: Array, normals: Array) -> Array:
+        """Of unit normals (n, 3) where the level is (n, 3), shape (n, 3)."""
+        basis = _basis(normals)
+        up = np.maximum(normals[:, 2:], 0.0)
+        return up * level + basis @ self.steady + (basis @ self.growing) * level
+
+    def sun(self, xy: Array) -> tuple[float, Array]:
+        """Share of the light at a place (2,) that comes from one direction, and that direction, shape (3,).
+
+        Around a vertical pole a uniform sky gives `_POLE` of what faces up, and a sun at elevation e gives cot e / π;
+        only the sun favours one side, by cot e. So both its share and e follow from the light on upright surfaces.
+        """
+        level = self.level(np.asarray(xy)[None])[0]
+        parts = (self.steady + self.growing * level).mean(1) / max(float(level.mean()), 1e-6)
+        favour = np.array([parts[1] - parts[2], parts[3] - parts[4]])
+        strength = float(np.linalg.norm(favour))
+        around = float(parts[0] + parts[1:].sum() / np.pi)
+        share = float(np.clip((_POLE + strength / np.pi - around) / _POLE, 0.0, _MOST_SUN))
+        cotangent = min(strength / max(share, 1e-3), _LOWEST_SUN)
+        toward = np.append(favour / max(strength, 1e-9) * cotangent, 1.0)
+        return share, toward / np.linalg.norm(toward)
+
+
+def _basis(normals: Array) -> Array:
+    """How much normals (n, 3) do not face up, and the cosines to `SIDES`, shape (n, 5)."""
+    return np.column_stack([1.0 - np.maximum(normals[:, 2], 0.0), np.maximum(normals @ SIDES.T, 0.0)])
 
 
 class FieldLight:
@@ -79,62 +108,65 @@ class FieldLight:
         Args:
             field: Looked at from along the route, once.
             route: On the ground [m], shape (m, 3).
+
+        Raises:
+            InputError: no ground is seen there.
         """
         self._field = field
         self._kept: OrderedDict[bytes, Light] = OrderedDict()
         found = _look(field, route)
         height, lateral = _above(found.points, route)
-        depth = found.depth
         flat = found.normals[:, 2] > 0.9
-        ground = (np.abs(height) < _GROUND_SKIN + 0.05 * np.abs(lateral)) & (depth < _GROUND_REACH) & flat
-        standing = (height > _STANDING) & (depth < _WALL_REACH) & (found.facing > 0.25)
+        ground = (np.abs(height) < _GROUND_SKIN + 0.05 * np.abs(lateral)) & (found.depth < _GROUND_REACH) & flat
+        standing = (height > _STANDING) & (found.facing > 0.25)
         rng = np.random.default_rng(0)
-        self._ground = found.pick(_some(rng, ground))
-        self._standing = found.pick(_some(rng, standing))
+        self._ground, self._standing = found.pick(_some(rng, ground)), found.pick(_some(rng, standing))
+        if len(self._ground.points) < _FEW:
+            raise InputError(
+                "no ground is seen along the route, and so nothing to tell the light from; was the field built with "
+                "this scene? Overlay(..., shaded=False) does without"
+            )
+        self._xy = self._ground.points[:, :2]
+        self._beside = _nearest_of(self._xy, self._standing.points[:, :2])
         names = field.lightings
-        self._mean_ground = _balanced([self._ground.probes.picture(field.embedding(n)) for n in names])
-        self._mean_standing = _balanced(
-            [self._standing.probes.picture(field.embedding(n)) for n in names],
-            [self._ground.probes.picture(field.embedding(n)) for n in names],
-        )
+        grounds = [self._ground.probes.picture(field.embedding(name)).astype(np.float64) for name in names]
+        standings = [self._standing.probes.picture(field.embedding(name)).astype(np.float64) for name in names]
+        # Lightings are brought to one brightness of the ground before their mean is taken.
+        mean_ground = np.mean([picture / picture.mean(0) for picture in grounds], 0)
+        self._mean = np.mean([p / ground.mean(0) for p, ground in zip(standings, grounds, strict=True)], 0)
+        # What the mean lighting's irradiance is there, over albedo.
+        sky = _uniform_sky(self._standing.normals)[:, None]
+        self._reference = sky * mean_ground[self._beside].mean(1) / GROUND_ALBEDO
+        self._rows = _basis(self._standing.normals)
 
     def under(self, lighting: str | NDArray) -> Light:
         """The light of a lighting, by name or embedding (dim,)."""
         embedding = self._field.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         key = embedding.tobytes()
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
-        light = self._estimate(embedding)
-        self._kept[key] = light
-        if len(self._kept) > _KEPT:
-            self._kept.popitem(last=False)
-        return light
+        if key not in self._kept:
+            self._kept[key] = self._estimate(embedding)
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[key]
 
     def _estimate(self, embedding: NDArray) -> Light:
-        xy = self._ground.points[:, :2]
-        irradiance = self._ground.probes.picture(embedding).astype(np.float64) / GROUND_ALBEDO
-        constant, lights = self._shape(embedding, irradiance)
-        return Light(xy, irradiance, constant, lights)
-
-    def _shape(self, embedding: NDArray, irradiance: Array) -> tuple[Array, Array]:
         from scipy.optimize import nnls
 
-        normals, mean = self._standing.normals, self._mean_standing
+        up = self._ground.probes.picture(embedding).astype(np.float64) / GROUND_ALBEDO
+        level = up[self._beside].mean(1)
         colours = self._standing.probes.picture(embedding).astype(np.float64)
-        level = irradiance.mean(0) * GROUND_ALBEDO
-        sky = _uniform_sky(normals)
-        basis = np.column_stack([np.ones(len(normals)), np.maximum(normals @ DIRECTIONS.T, 0.0)])
-        # What faces up is known: its level.
-        anchor, weight = np.zeros((1, 6)), float(len(normals))
-        anchor[0, :2] = 1.0
-        out = np.empty((6, 3))
+        seen = colours / np.maximum(self._mean, _DARK) * self._reference
+        over = seen - np.maximum(self._standing.normals[:, 2:], 0.0) * level
+        if len(self._rows) < _FEW:  # nothing stands here to tell by: a uniform sky
+            return Light(self._xy, up, np.zeros((5, 3)), np.array([_POLE, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3))
+        found = np.empty((10, 3))
         for c in range(3):
-            usable = mean[:, c] > _DARK
-            seen = colours[usable, c] / mean[usable, c] / level[c] * sky[usable]
-            rows = np.concatenate([basis[usable], weight * anchor])
-            out[:, c], _ = nnls(rows, np.append(np.clip(seen, 0.0, 3.0), weight))
-        return out[0], out[1:]
+            usable = (self._mean[:, c] > _DARK) & (seen[:, c] < _MOST * up[:, c].max())
+            rows = np.concatenate([self._rows, self._rows * level[:, c : c + 1]], 1)[usable]
+            # The same minimum as that of all rows, from their normal equations.
+            square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
+            found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ over[usable, c]))
+        return Light(self._xy, up, found[:5], found[5:])
 
 
 @dataclass(frozen=True)
@@ -157,7 +189,7 @@ def _look(field: BakedField, route: Array) -> _Found:
     width, height = _VIEW
     poses = []
     for s in np.arange(0.0, arc_lengths(route)[-1], _EYE_STEP):
-        eye = point_at(route, s) + [0.0, 0.0, _EYE_HEIGHT]
+        eye = point_at(route, s) + np.array([0.0, 0.0, _EYE_HEIGHT])
         yaw, pitch = float(heading_at(route, s)), np.deg2rad(_PITCH)
         ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
         poses.append(look_at(eye, eye + ahead))
@@ -182,7 +214,7 @@ def _look(field: BakedField, route: Array) -> _Found:
         z = depth[1:-1, 1:-1]
         # At a rim the neighbours are of different things.
         whole = (np.abs(around - z) < 0.15 * z).all(0) & (out.opacity[0, 1:-1, 1:-1] > 0.97) & (facing > 0.05)
-        whole &= z < _WALL_REACH
+        whole &= z < _REACH
         directions = (inner - pose[:3, 3])[whole]
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         for kept, value in zip(
@@ -224,10 +256,12 @@ def _some(rng: np.random.Generator, which: NDArray[np.bool_]) -> NDArray[np.int6
     return np.sort(rng.choice(index, min(_MOST_PROBES, len(index)), replace=False))
 
 
-def _balanced(pictures: list[NDArray], references: list[NDArray] | None = None) -> Array:
-    """Mean over lightings of pictures (k, 3), each brought to the same mean colour (of its reference) first."""
-    levels = [picture.mean(0) for picture in (references or pictures)]
-    return np.mean([picture / level for picture, level in zip(pictures, levels, strict=True)], 0)
+def _nearest_of(places: Array, xy: Array) -> NDArray[np.int64]:
+    """Indices of the places (k, 2) nearest to points (n, 2), shape (n, `_NEIGHBOURS`)."""
+    from scipy.spatial import cKDTree
+
+    _, index = cKDTree(places).query(xy, min(_NEIGHBOURS, len(places)))
+    return index.reshape(len(xy), -1)
 
 
 def _uniform_sky(normals: Array) -> Array:

@@ -1,10 +1,12 @@
 """What of a MuJoCo model a camera sees besides the field: obstacles, other robots, the robot's own body.
 
-`mujoco_warp`'s ray caster draws them, without OpenGL, from a small model of their geoms alone. It is given only the rays
-it needs: of the pixels that some geom's box may cover, one each, and at edges four more each, so that outlines come out
-smooth. *Coverage* is the share of a pixel that is covered, *colour* that of its covered share.
+`mujoco_warp`'s ray caster draws them, without OpenGL, from a small model of their geoms alone. It is given only the
+rays it needs: of the pixels that some geom's box may cover, one each, and at edges four more each, so that outlines
+come out smooth. Its lights are set so that the colour it draws is the surface's normal; what a surface looks like is
+then its own colour times the irradiance of that normal there. *Coverage* is the share of a pixel that is covered.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -12,7 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from twin.env.light import DIRECTIONS, Light
+from twin.env.light import Light
 from twin.env.obstacle_shapes import OBSTACLE_GROUP
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.mjcf.husky_look import LOOK_GROUP
@@ -70,9 +72,11 @@ class ObstacleView:
         import mujoco_warp as mjw  # slow to import
 
         self._mjw, self.size, self._intrinsics = mjw, size, intrinsics
-        self.geoms = np.flatnonzero(np.isin(model.geom_group, (OBSTACLE_GROUP, LOOK_GROUP)) & (_alpha(model) > 0.0))
-        self.owners = model.body_rootid[model.geom_bodyid[self.geoms]]
-        """Body that each drawn geom belongs to."""
+        self.geoms = np.flatnonzero(
+            np.isin(model.geom_group, (OBSTACLE_GROUP, LOOK_GROUP)) & (_rgba(model)[:, 3] > 0.0)
+        )
+        self._owners = model.body_rootid[model.geom_bodyid[self.geoms]]
+        self._colors = _rgba(model)[self.geoms, :3]
         low, half = model.geom_aabb[self.geoms, :3], model.geom_aabb[self.geoms, 3:]
         self._boxes = low[:, None] + half[:, None] * _CORNERS
         if len(self.geoms) == 0:
@@ -145,29 +149,27 @@ class ObstacleView:
         self._data.geom_xmat.numpy()[0] = turns @ self._turn
         camera = opencv_to_mujoco(pose)
         self._data.cam_xpos.numpy()[0, 0], self._data.cam_xmat.numpy()[0, 0] = camera[:3, 3], camera[:3, :3]
-        gains = self._light(data, light)
+        lit = self._lit(data, light)
         with wp.ScopedDevice("cpu"):
             self._mjw.refit_bvh(self._model, self._data, self._context)
             pixels = np.flatnonzero(mask)
-            geom, rgb, depth = self._cast(self._middles[pixels])
+            geom, normals, depth = self._cast(self._middles[pixels])
             if not (geom >= 0).any():
                 return None
-            rgb *= gains[geom]
             width, height = self.size
             ids = np.full((height, width), -1, np.int32)
             ids.ravel()[pixels] = geom
             coverage, color, z = (np.zeros((height, width, *rest), np.float32) for rest in ((), (3,), ()))
             coverage.ravel()[pixels] = geom >= 0
-            color.reshape(-1, 3)[pixels], z.ravel()[pixels] = rgb, depth
+            color.reshape(-1, 3)[pixels], z.ravel()[pixels] = lit(geom, normals), depth
             edges = np.flatnonzero(_edges(ids) & mask)
             if len(edges):
-                geom, rgb, depth = self._cast(self._quarters[edges].reshape(-1, 3))
+                geom, normals, depth = self._cast(self._quarters[edges].reshape(-1, 3))
                 hits = (geom >= 0).reshape(-1, 4)
                 share = hits.sum(1) / 4.0
                 over = 1.0 / np.maximum(4.0 * share, 1.0)
-                rgb = (rgb * gains[geom]).reshape(-1, 4, 3)
                 coverage.ravel()[edges] = share
-                color.reshape(-1, 3)[edges] = rgb.sum(1) * over[:, None]
+                color.reshape(-1, 3)[edges] = lit(geom, normals).reshape(-1, 4, 3).sum(1) * over[:, None]
                 z.ravel()[edges] = depth.reshape(-1, 4).sum(1) * over
         rows, columns = np.flatnonzero(coverage.any(1)), np.flatnonzero(coverage.any(0))
         if len(rows) == 0:
@@ -183,42 +185,49 @@ class ObstacleView:
         return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
 
     def _cast(self, rays: Floats) -> tuple[NDArray[np.int32], Floats, Floats]:
-        """Geom (−1: none), colour and z-depth [m] (0: none) of rays (n, 3)."""
+        """Drawn geom (−1: none), unit normal and z-depth [m] (0: none) that rays (n, 3) meet."""
         context, count = self._context, len(rays)
         most = context.ray.shape[0]
         if count > most:  # more edges than fit: in turns
             parts = [self._cast(rays[k : k + most]) for k in range(0, count, most)]
-            geom, rgb, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
-            return geom, rgb, depth
+            geom, normals, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
+            return geom, normals, depth
         # The context's own rays are those of a whole picture; it casts as many of them as it is told to.
         context.ray.numpy()[:count] = rays
         context.total_rays = count
         self._mjw.render(self._model, self._data, context)
         packed = context.rgb_data.numpy()[0, :count]
         geom = context.seg_data.numpy()[0, :count, 0].copy()
-        rgb = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], -1).astype(np.float32) / 255.0
-        rgb[geom < 0] = 0.0
-        return geom, rgb, context.depth_data.numpy()[0, :count].copy()
+        normals = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], -1).astype(np.float32) / 127.5 - 1.0
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+        return geom, normals, context.depth_data.numpy()[0, :count].copy()
 
-    def _light(self, data: mujoco.MjData, light: Light | None) -> Floats:
-        """Sets the model's lights; gains (geoms, 3) that colours are to be multiplied by."""
-        ambient, diffuse = self._model.light_ambient.numpy()[0], self._model.light_diffuse.numpy()[0]
-        if light is None:
-            ambient[0], diffuse[:] = 1.0, 0.0
-            return np.ones((len(self.geoms), 3), np.float32)
-        # The renderer clips colours at 1 and rounds them to bytes: make use of that range, whatever the light.
-        most = light.constant + light.lights[0] + light.lights[1:].max(0) * np.sqrt(2.0)
-        ambient[0], diffuse[:] = light.constant / most, light.lights / most
-        bodies, which = np.unique(self.owners, return_inverse=True)
-        return (light.level(data.xpos[bodies, :2])[which] * most).astype(np.float32)
+    def _lit(self, data: mujoco.MjData, light: Light | None) -> Callable[[NDArray[np.int32], Floats], Floats]:
+        """What drawn geoms (n,) with normals (n, 3) look like, (n, 3); 0 where there is none."""
+        bodies, which = np.unique(self._owners, return_inverse=True)
+        levels = light.level(data.xpos[bodies, :2])[which] if light else None
+
+        def lit(geom: NDArray[np.int32], normals: Floats) -> Floats:
+            out = np.zeros((len(geom), 3), np.float32)
+            hit = geom >= 0
+            out[hit] = self._colors[geom[hit]]
+            if light is not None and levels is not None:
+                out[hit] *= light.irradiance(levels[geom[hit]], normals[hit])
+            return out
+
+        return lit
 
 
-def _alpha(model: mujoco.MjModel) -> Array:
-    return np.where(model.geom_matid < 0, model.geom_rgba[:, 3], model.mat_rgba[model.geom_matid, 3])
+def _rgba(model: mujoco.MjModel) -> Array:
+    """Colour of every geom, shape (ngeom, 4)."""
+    out = model.geom_rgba.copy()
+    has = model.geom_matid >= 0
+    out[has] = model.mat_rgba[model.geom_matid[has]]
+    return out
 
 
 def _only(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> mujoco.MjModel:
-    """A model of these geoms alone, in plain colours, in its world body, with a camera and the lights of `Light`."""
+    """A model of these geoms alone, in its world body, with a camera; lit so that colours are (1 + normal) / 2."""
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
     meshes: set[int] = set()
@@ -230,18 +239,19 @@ def _only(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> mujoco.MjModel:
             if mesh not in meshes:
                 _add_mesh(spec, model, mesh)
             meshes.add(mesh)
-        material = model.geom_matid[i]
-        rgba = model.geom_rgba[i] if material < 0 else model.mat_rgba[material]
-        spec.worldbody.add_geom(type=int(model.geom_type[i]), size=model.geom_size[i], rgba=rgba, **settings)
+        spec.worldbody.add_geom(type=int(model.geom_type[i]), size=model.geom_size[i], rgba=(1, 1, 1, 1), **settings)
     spec.worldbody.add_camera(name="view")
-    for direction in DIRECTIONS:
-        spec.worldbody.add_light(
-            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            dir=-direction,
-            ambient=(0, 0, 0),
-            specular=(0, 0, 0),
-            castshadow=False,
-        )
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            shine = np.eye(3)[axis]
+            spec.worldbody.add_light(
+                type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+                dir=-sign * shine,
+                diffuse=0.5 * sign * shine,  # from the far side it takes light away
+                ambient=(0.5, 0.5, 0.5) if axis == 0 and sign > 0 else (0, 0, 0),
+                specular=(0, 0, 0),
+                castshadow=False,
+            )
     return spec.compile()
 
 

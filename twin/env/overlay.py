@@ -12,11 +12,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.env.camera_effects import CameraEffects, rolled_off
 from twin.env.light import FieldLight
 from twin.env.obstacle_view import Drawn, ObstacleView, camera_intrinsics, camera_pose
 from twin.env.obstacles import route_of
+from twin.env.shadow import Shadows
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints
+from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
 
@@ -26,7 +28,6 @@ Lighting = str | NDArray
 
 _CAMERA = "front"
 _WINDOW_STEP = 32  # [px] windows of the second march come in multiples of this, so that few sizes are needed
-_KNEE = 0.75  # colours above roll off towards 1, as in a camera
 
 
 class Overlay:
@@ -53,22 +54,37 @@ class Overlay:
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         self._view = ObstacleView(model, self.intrinsics, size)
         self._light = FieldLight(field, route_of(model)) if shaded and len(self._view.geoms) else None
+        self._shadows = Shadows(model, self._view.geoms) if self._light else None
+        self._rays = unproject(pixel_grid(*size), self.intrinsics)
         self._fronts: dict[tuple[int, int], BakedField] = {}
 
-    def render(self, datas: Sequence[mujoco.MjData], lighting: Lighting | Sequence[Lighting]) -> Rendering:
+    def render(
+        self,
+        datas: Sequence[mujoco.MjData],
+        lighting: Lighting | Sequence[Lighting],
+        effects: Sequence[CameraEffects] | None = None,
+    ) -> Rendering:
         """What the front camera of every world sees.
 
         Args:
             datas: Of every world, with poses of geoms and cameras as of now (`mj_forward` or `mj_kinematics` and
                 `mj_camlight` after the last step).
             lighting: As `BakedField.render` takes it: one, or one per world.
+            effects: What the camera of each world adds, where it is not perfect.
 
         Raises:
             InputError: an unknown lighting, or more worlds than stated.
         """
+<<<<<<< HEAD
         if len(datas) > self.worlds:
             raise InputError(f"{len(datas)} worlds to render; expected at most {self.worlds}, as it was made for")
+=======
+        if len(datas) != self.worlds or (effects is not None and len(effects) != self.worlds):
+            raise InputError(f"{len(datas)} worlds to render; expected {self.worlds}, as the overlay was made for")
+>>>>>>> overlay
         poses = np.stack([camera_pose(data, self._camera) for data in datas])
+        if effects is not None:
+            poses = np.stack([e.shaken(p, d.time) for e, p, d in zip(effects, poses, datas, strict=True)])
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
         for k, (data, pose) in enumerate(zip(datas, poses, strict=True)):
@@ -76,11 +92,16 @@ class Overlay:
             if mask is None:
                 continue
             mine: Lighting = lighting if one else lighting[k]  # type: ignore[assignment]
-            drawn = self._view.draw(data, pose, mask, self._light.under(mine) if self._light else None)
+            light = self._light.under(mine) if self._light else None
+            if self._shadows and light:
+                self._shadows.darken(out.rgb[k], out.depth[k], self._rays, pose, data, light)
+            drawn = self._view.draw(data, pose, mask, light)
             if drawn is not None:
                 left, top, width, height = drawn.window
                 inner = np.s_[k, top : top + height, left : left + width]
                 composite(out, inner, drawn, self._front(pose, drawn, mine))
+        for k, effect in enumerate(effects or ()):
+            out.rgb[k] = effect.exposed(out.rgb[k], out.depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return out
 
     def _front(self, pose: Array, drawn: Drawn, lighting: Lighting) -> Rendering:
@@ -118,9 +139,3 @@ def composite(out: Rendering, inner: tuple, drawn: Drawn, front: Rendering) -> N
     depth = np.where(front.opacity >= 0.5, np.minimum(front.depth, drawn.depth), drawn.depth)
     out.depth[inner] = np.where(mostly, depth, out.depth[inner])
     out.opacity[inner] += drawn.coverage * (1.0 - out.opacity[inner])
-
-
-def rolled_off(rgb: Floats) -> Floats:
-    """Film colours in [0, 1] of what may be brighter: a shoulder instead of a cut."""
-    over = np.maximum(rgb - _KNEE, 0.0)
-    return np.minimum(rgb, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

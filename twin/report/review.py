@@ -103,7 +103,7 @@ def _film_chapters(
     chosen = comparison_frames(studio, int(_SHARES[0] * renders))
     turns = int(_SHARES[1] * renders) if len(field.lightings) > 1 else 0
     drives = int(_SHARES[2] * renders) if drive else 0
-    ground, parts = _surroundings(scene)
+    ground, parts = surroundings(scene)
     half_width = world.half_width if world else 0.0
 
     def plan(box: Box) -> Plan:
@@ -144,7 +144,7 @@ def _views(studio: Studio, scene: SceneDir, world: World | None) -> tuple[list[S
     return (camera_shots(studio.cameras) if model.model_path.exists() else []), model
 
 
-def _surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
+def surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
     """What the plan shows of the mesh stage: the ground, and the outlines of low parts."""
     folder = scene.stage("mesh")
     ground = Ground.load(folder) if (folder / "ground.npz").exists() else None
