@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from twin.config import ObstacleConfig
+from twin.env.camera_effects import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.lightings import TRAINING
 from twin.env.randomisation import Ranges
@@ -69,6 +70,8 @@ class Options:
     """The light changes during an episode."""
     obstacles: str | int | Sequence[ObstacleConfig] = "scene"
     """`scene`: those of scene.toml; a number: so many that stand, drawn for every episode; or these."""
+    camera: CameraOptions | None = None
+    """What makes the camera imperfect: vibration, exposure, blur. None: nothing."""
     randomise: Ranges | None = None
     """How far the robot differs from episode to episode; None: it does not. `True` stands for the default ranges."""
 

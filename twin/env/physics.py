@@ -118,8 +118,9 @@ class HuskyPhysics:
             mujoco.mj_step(self.model, self.data, some)
             left, self._until_update = left - some, self._until_update - some
             touched |= self._touching()
-            # Poses of the last small step's start, which is 2 ms too old; the last ones of all are made anew below.
-            self._views.append((self.time - self.model.opt.timestep, self.camera_to_world))
+            if self.params.camera_latency:
+                # Poses of the last small step's start, which is 2 ms too old; the last of all are made anew below.
+                self._views.append((self.time - self.model.opt.timestep, self.camera_to_world))
         # Poses and contacts of the instant that is now read, rather than of the last small step's start.
         mujoco.mj_forward(self.model, self.data)
         self._touched = touched | self._touching()
@@ -178,6 +179,8 @@ class HuskyPhysics:
     @property
     def delayed_camera_to_world(self) -> Array:
         """Of the front camera when the newest picture there is was taken, `camera_latency` ago. Shape (4, 4)."""
+        if not self.params.camera_latency:
+            return self.camera_to_world
         time = max(self.time - self.params.camera_latency, self._views[0][0])
         times = np.array([view[0] for view in self._views])
         after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0

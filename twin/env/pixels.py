@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.env.camera_effects import CameraEffects
 from twin.env.dm_physics import DrivePhysics
 from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.options import Options
 from twin.env.overlay import Overlay
-from twin.env.tasks import LIGHT, Drive
+from twin.env.tasks import CAMERA, LIGHT, Drive
 from twin.env.trust import Trust
 from twin.nerf.baked import BakedField
-from twin.nerf.rendering import Rendering
 
 Picture = NDArray[np.uint8]
 
@@ -46,6 +46,7 @@ class Pixels:
         self.stacks = np.zeros((len(self.worlds), options.stack, 3, height, width), np.uint8)
         """Shape (n, stack, 3, height, width): colours first, as networks want them."""
         self.lights: list[Light | None] = [None] * len(self.worlds)
+        self._effects: list[CameraEffects | None] = [None] * len(self.worlds)
         self.trust = np.zeros(len(self.worlds))
         """Of each world's newest picture, in [0, 1], shape (n,)."""
 
@@ -55,6 +56,8 @@ class Pixels:
         for i in which:
             task = self.worlds[i][1]
             self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
+            if o.camera:
+                self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
         if len(which):
             self.stacks[list(which)] = self._look(which)[:, None]
 
@@ -70,11 +73,10 @@ class Pixels:
         return {"lighting": light.name if light else "", "trust": float(self.trust[i])}
 
     def _look(self, which: Sequence[int]) -> Picture:
-        out = self._render(which)
-        poses = [self.worlds[i][0].camera_to_world for i in which]
-        self.trust[list(which)] = self._trust.of(np.array(poses), out)
-        return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-
-    def _render(self, which: Sequence[int]) -> Rendering:
+        physics = [self.worlds[i][0] for i in which]
+        poses = np.array([one.camera_to_world for one in physics])
         lights = [self.lights[i].at(self.worlds[i][0].time()) for i in which]  # type: ignore[union-attr]
-        return self._overlay.render([self.worlds[i][0].data.ptr for i in which], lights)
+        effects = [self._effects[i] for i in which] if self.options.camera else None
+        out = self._overlay.render([one.data.ptr for one in physics], lights, effects, poses)  # type: ignore[arg-type]
+        self.trust[list(which)] = self._trust.of(poses, out)
+        return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
