@@ -194,6 +194,9 @@ class MjcfConfig:
     """False for a capture that is no drive (an object filmed around): no route, no Husky."""
     half_width: float = 1.0
     """Half width of the drivable corridor around the route [m]."""
+    hfield_cell: float = 0.2
+    """Cell of the height field that the wheels roll on [m], at least `mesh.ground_cell`. A wheel touches several facets
+    where it rolls over an edge; fewer edges shake it less and cost less."""
     corridor_margin: float = 0.0
     """Extra clearance asked of convex parts beside the corridor [m]."""
 
@@ -349,6 +352,7 @@ def _check(config: SceneConfig, path: Path) -> None:
         ("mesh", "voxel", 1e-3),
         ("mesh", "ground_cell", 1e-3),
         ("mjcf", "half_width", 0.1),
+        ("mjcf", "hfield_cell", 1e-3),
         ("review", "fps", 1),
         ("review", "speed", 1e-2),
     ):
