@@ -194,6 +194,10 @@ class MjcfConfig:
     """False for a capture that is no drive (an object filmed around): no route, no Husky."""
     half_width: float = 1.0
     """Half width of the drivable corridor around the route [m]."""
+    hfield_cell: float = 0.3
+    """Cell of the height field that the wheels roll on [m], a multiple of `mesh.ground_cell`. Where a wheel rolls over
+    an edge it touches several facets: fewer edges shake it less and cost less, and the ground has nothing finer anyway
+    (`mesh.ground_smoothing`)."""
     corridor_margin: float = 0.0
     """Extra clearance asked of convex parts beside the corridor [m]."""
 
@@ -397,6 +401,7 @@ def _check(config: SceneConfig, path: Path) -> None:
         ("mesh", "voxel", 1e-3),
         ("mesh", "ground_cell", 1e-3),
         ("mjcf", "half_width", 0.1),
+        ("mjcf", "hfield_cell", 1e-3),
         ("review", "fps", 1),
         ("review", "speed", 1e-2),
     ):

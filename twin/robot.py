@@ -96,7 +96,7 @@ class HuskyParams:
     """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
 
     # Drivetrain.
-    servo_gain: float = 800.0
+    servo_gain: float = 1600.0
     """Torque of a side per wheel speed error [N m s/rad]; stiff, as the motor controllers close the loop on encoder
     counts."""
     servo_lag: float = 0.0

@@ -64,7 +64,8 @@ class Controller:
     @property
     def phase(self) -> float:
         """When the controller first runs [s]; then every 0.1 s. A command given at 0 reaches it just then."""
-        return self.params.command_latency % CONTROL_PERIOD
+        phase = self.params.command_latency % CONTROL_PERIOD
+        return 0.0 if phase > CONTROL_PERIOD - _TICK else phase
 
     @property
     def carried_out(self) -> Array:

@@ -93,8 +93,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
     husky.set_options(spec)
+    # Spares MuJoCo the poses of thousands of geoms that never move; what has motors, the robot, never sleeps.
+    spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_surroundings(spec)
-    _add_ground(spec, ground, assets)
+    add_ground(spec, ground, assets, config.mjcf.hfield_cell)
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
 
@@ -207,14 +209,17 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     spec.visual.map.znear, spec.visual.map.zfar = 0.005, 50.0
 
 
-def _add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path) -> None:
-    write_hfield(assets / "ground.bin", ground.height)
-    # One texel per cell, the mean of its corners, as the texture spans the field edge to edge. First row: far (+y).
-    rgb = ground.rgb.astype(np.uint16)
+def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -> None:
+    """Adds the geom `ground`, a height field of `cell` [m] in the ground's colours, its files in `assets`."""
+    coarse = ground.coarsened(cell)
+    write_hfield(assets / "ground.bin", coarse.height)
+    # A texel per fine cell, the mean of its corners, as the texture spans the field edge to edge. First row: far (+y).
+    finer = round(coarse.cell / ground.cell)
+    rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
+    rgb = ground.rgb[:rows, :columns].astype(np.uint16)
     cells = (rgb[1:, 1:] + rgb[1:, :-1] + rgb[:-1, 1:] + rgb[:-1, :-1] + 2) // 4
     write_image(assets / "ground.png", cells[::-1].astype(np.uint8))
-    rows, columns = ground.height.shape
-    low, high = float(ground.height.min()), float(ground.height.max())
+    low, high = float(coarse.height.min()), float(coarse.height.max())
     half = np.array([columns - 1, rows - 1]) * ground.cell / 2
     # MuJoCo maps the file's lowest value to 0 and its highest to size[2]; a level field is all 0 at any size.
     spec.add_hfield(name="ground", file="ground.bin", size=(*half, max(high - low, 1e-3), _HFIELD_BASE))

@@ -5,9 +5,16 @@ actuators `left` and `right`, commanded in wheel speed [rad/s]; camera `front` (
 at its native size; site `imu`; sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`,
 `<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`.
 
+`python -m twin.mjcf.husky` writes the robot alone to `twin/assets/husky/husky.xml`, for anyone's own scene:
+
+    robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
+    spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
+    husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tyres need these
+
 Contact settings: measured, see `_WHEEL_SOLIMP`.
 """
 
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -35,6 +42,8 @@ from twin.robot import (
 Array = NDArray[np.float64]
 
 TIMESTEP = 0.002  # [s]
+HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
+"""The published robot alone, no floor."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
 _WHEEL_INERTIA = (0.02467, 0.04411, 0.02467)  # [kg m²], the axle is y
@@ -43,8 +52,11 @@ _COLLISION_BOXES = (  # full size, centre in the base [m]
     ((0.78992, 0.5709, 0.10375), (0.0, 0.0, 0.175625)),
 )
 # With MuJoCo's default solimp (d0 = 0.9) scrubbing wheels hop: 12 to 17 m/s² at the body in a point turn, and the
-# effective track then depends on friction. An impedance that starts from zero over 3 mm has no jump at touchdown.
-_WHEEL_SOLIMP = (0.0, 0.95, 0.003, 0.5, 2.0)
+# effective track then depends on friction. An impedance that starts from zero has no jump at touchdown. How fast it
+# rises is a compromise: over 3 mm a wheel sinks in by 1.6 mm and touches the facets of a height field ahead of it,
+# which shakes the camera 0.9 m/s² instead of 0.5; over 1 mm scrubbing on a friction of 1.0 flutters.
+_WHEEL_SOLIMP = (0.0, 0.95, 0.0025, 0.5, 2.5)
+_WHEEL_SOLREF = (0.02, 2.0)  # damped twice as much as critically: an eighth less shaking on a height field
 _IMU_POSITION = (0.19, 0.0, 0.149)  # in the base [m]
 _TORSIONAL = 1e-4  # [m] spin friction of the contact patch; next to nothing, the scrubbing of four wheels dominates
 
@@ -60,6 +72,8 @@ def set_options(spec: mujoco.MjSpec) -> None:
     # The pyramidal cone reads the right chi with a torque 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
+    # At the default 1e-8 Newton takes twice the iterations to the same motion.
+    spec.option.tolerance = 1e-5
 
 
 def add_husky(
@@ -148,6 +162,7 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
         # A rolling friction coefficient [m] over the radius is Crr.
         friction=(params.friction, _TORSIONAL, max(params.rolling_resistance * radius, 1e-5)),
         solimp=_WHEEL_SOLIMP,
+        solref=_WHEEL_SOLREF,
         **shapes[params.wheel_shape],
     )
     return wheel
@@ -220,3 +235,40 @@ def center_of_mass(params: HuskyParams) -> Array:
     """Centre of mass of the whole robot in the base [m], shape (3,)."""
     mass, center, _ = _chassis_inertia(params)
     return (mass * center + WHEEL_MASS * wheel_centers().sum(0)) / (mass + 4 * WHEEL_MASS)
+
+
+def standalone_xml() -> str:
+    """The published robot alone, no floor, as MJCF."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "husky"
+    set_options(spec)
+    add_husky(spec)
+    spec.compile()
+    return _XML_HEAD + spec.to_xml()
+
+
+_XML_HEAD = """<!--
+  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures and licence: NOTICE.md.
+
+  body, free joint  base_link
+  joints            front_left_wheel, front_right_wheel, rear_left_wheel, rear_right_wheel
+  actuators         left, right: wheel speed [rad/s], up to 6.06; front and rear wheel of a side are belted
+  cameras           front (160 x 90), front_native (1280 x 720)
+  sensors           imu_gyro, imu_accelerometer, imu_orientation (site imu), <wheel>_wheel_position and _velocity,
+                    left_torque, right_torque [N m] at the wheels of a side
+
+  Attached to another model, this one's options are not taken over. The tyres need
+    <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10" tolerance="1e-5"/>
+  there as well: with another cone the scrubbing torque is wrong, with Euler the motors' servos are.
+-->
+"""
+
+
+def main() -> None:
+    """Writes `HUSKY_XML`."""
+    HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
+    print(f"wrote {HUSKY_XML}")
+
+
+if __name__ == "__main__":
+    main()
