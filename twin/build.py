@@ -51,7 +51,7 @@ PIPELINE = (
     Stage("field", "twin.nerf.fit", 3, ("nerf",), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 2, ("mesh", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.export", 2, ("mjcf", "robot"), ("metric", "mesh")),
-    Stage("review", "twin.report.review", 2, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
+    Stage("review", "twin.report.review", 3, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
 )
 
 

@@ -19,7 +19,7 @@ from twin.nerf.rendering import Rendering
 Array = NDArray[np.float64]
 
 _PER_TURN = 10.0  # [m]: a right angle counts as 10 m, as in `geometry.cameras.nearest_frame`
-_NEAR, _FAR = 1.5, 5.0  # [m]
+_NEAR, _FAR = 1.0, 5.0  # [m]
 _SKY = 0.5  # opacity below which a pixel shows the sky
 _SKY_WEIGHT = 5.0
 _CANDIDATES = 32  # filmed frames looked at, nearest first

@@ -36,6 +36,7 @@ from twin.report.overview import Shot, camera_shots, chase_shots, pictures_of, r
 from twin.report.panels import AMBER, GREEN, RED, Box, Layout
 from twin.report.plan import Plan, footprints
 from twin.report.studio import Studio, side_by_side, spread
+from twin.report.trust_map import trust_along, trust_metrics, trust_picture
 from twin.report.video import VideoWriter
 from twin.report.words import follower_verdict
 from twin.scene import SceneDir, write_json
@@ -78,6 +79,13 @@ def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[
         studio = Studio(config.name, field, cameras, layout, writer, out, config.review.render_width, path)
         _keep_captures(studio)
         _film_chapters(studio, scene, config, world, drive)
+        if world:
+            along = trust_along(field, cameras, world)
+            metrics["trust"] = trust_metrics(*along)
+            caption = (
+                "how far the robot's pictures can be trusted: near to what was filmed, and road where road must be"
+            )
+            studio.keep("trust", "review", caption, trust_picture(*along))
         verdict = follower_verdict(
             {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
         )
