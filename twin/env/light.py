@@ -35,19 +35,19 @@ SIDES = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0
 """Directions that light comes from besides above and everywhere, shape (4, 3)."""
 
 _EYE_HEIGHT, _PITCH = 1.0, 8.0  # [m], [°] of the views that probes are taken from
-_EYE_STEP = 1.0  # [m] of the route
+_EYE_STEP = 2.0  # [m] of the route
 _VIEW, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _GROUND_REACH, _REACH = 7.0, 12.0  # [m] depth up to which probes are taken
 _GROUND_SKIN = 0.12  # [m] from the ground
 _STANDING = 0.3  # [m] above the ground from where on a probe is none of it
-_MOST_PROBES = 4000  # of each kind
+_MOST_PROBES = 1500  # of each kind
 _NEAR = 0.7  # [m] standard deviation of the ground's weights around a place
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
 _POLE = 0.5 * (1.0 + _BOUNCE)
 _MOST_SUN, _LOWEST_SUN = 0.8, 3.0  # share of one direction at most; cotangent of its elevation at most
 _DARK = 0.02  # a probe whose mean colour is below tells nothing
 _MOST = 1.5  # times the ground's brightest: what seems brighter shines by itself
-_NEIGHBOURS = 16  # of the ground's probes, around one that stands
+_NEIGHBOURS = 8  # of the ground's probes, around one that stands
 _FEW = 50  # probes of a kind are none
 _KEPT = 64  # lightings
 

@@ -212,7 +212,7 @@ class ObstacleView:
             hit = geom >= 0
             out[hit] = self._colors[geom[hit]]
             if light is not None and levels is not None:
-                out[hit] *= light.irradiance(levels[geom[hit]], normals[hit])
+                out[hit] *= light.irradiance(levels[geom[hit]], normals[hit].astype(np.float64))
             return out
 
         return lit

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.env.camera_effects import CameraEffects, rolled_off
-from twin.env.light import FieldLight
+from twin.env.light import FieldLight, Light
 from twin.env.obstacle_view import Drawn, ObstacleView, camera_intrinsics, camera_pose
 from twin.env.obstacles import route_of
 from twin.env.shadow import Shadows
@@ -46,15 +46,16 @@ class Overlay:
             model: With a camera `front`, compiled after `add_obstacles` (be it of none).
             field: The place.
             size: Width, height of the pictures [px].
-            worlds: How many worlds a call renders.
+            worlds: How many worlds a call renders at most.
             shaded: False leaves obstacles in their own plain colours; to compare.
         """
         self.size, self.worlds, self._field = size, worlds, field
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         self._view = ObstacleView(model, self.intrinsics, size)
-        self._light = FieldLight(field, route_of(model)) if shaded and len(self._view.geoms) else None
-        self._shadows = Shadows(model, self._view.geoms) if self._light else None
+        self._shadows = Shadows(model, self._view.geoms)
+        self._route, self._shaded = route_of(model), shaded
+        self._lights = FieldLight(field, self._route) if shaded and self._shadows.bodies else None
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
         self._fronts: dict[tuple[int, int], BakedField] = {}
 
@@ -73,10 +74,10 @@ class Overlay:
             effects: What the camera of each world adds, where it is not perfect.
 
         Raises:
-            InputError: an unknown lighting, or another number of worlds than stated.
+            InputError: an unknown lighting, or more worlds than stated.
         """
-        if len(datas) != self.worlds or (effects is not None and len(effects) != self.worlds):
-            raise InputError(f"{len(datas)} worlds to render; expected {self.worlds}, as the overlay was made for")
+        if len(datas) > self.worlds:
+            raise InputError(f"{len(datas)} worlds to render; expected at most {self.worlds}, as it was made for")
         poses = np.stack([camera_pose(data, self._camera) for data in datas])
         if effects is not None:
             poses = np.stack([e.shaken(p, d.time) for e, p, d in zip(effects, poses, datas, strict=True)])
@@ -87,8 +88,8 @@ class Overlay:
             if mask is None:
                 continue
             mine: Lighting = lighting if one else lighting[k]  # type: ignore[assignment]
-            light = self._light.under(mine) if self._light else None
-            if self._shadows and light:
+            light = self._light(mine)
+            if light is not None:
                 self._shadows.darken(out.rgb[k], out.depth[k], self._rays, pose, data, light)
             drawn = self._view.draw(data, pose, mask, light)
             if drawn is not None:
@@ -98,6 +99,13 @@ class Overlay:
         for k, effect in enumerate(effects or ()):
             out.rgb[k] = effect.exposed(out.rgb[k], out.depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return out
+
+    def _light(self, lighting: Lighting) -> Light | None:
+        if not self._shaded:
+            return None
+        if self._lights is None:  # no obstacles, but the robot sees itself
+            self._lights = FieldLight(self._field, self._route)
+        return self._lights.under(lighting)
 
     def _front(self, pose: Array, drawn: Drawn, lighting: Lighting) -> Rendering:
         """What the field holds back in front of what is drawn, in its window."""

@@ -41,6 +41,11 @@ class Shadows:
             if model.body(int(body)).name.startswith(PREFIX):
                 self._boxes[int(body)] = _two_boxes(model, data, geoms[roots == body], int(body))
 
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """The obstacles' bodies."""
+        return tuple(self._boxes)
+
     def darken(self, rgb: NDArray, depth: NDArray, rays: Array, pose: Array, data: mujoco.MjData, light: Light) -> None:
         """Multiplies the colours of shaded ground, in place.
 
