@@ -5,8 +5,8 @@
 The scene was filmed without any of them. Each is put at a place along the route, once into the twin, through the
 overlay, and once into the known-truth world, in the same colours; both are seen from the same pose of the robot's front
 camera at 160×90, and developed as the film was, without noise. *The obstacle's pixels* are those it is seen in in the
-truth. *Unshaded* is the overlay with everything in its plain colours. How far the field is from what is solid is measured along a
-drive, see `twin/report/seen_touched.py`.
+truth. *Unshaded* is the overlay with everything in its plain colours. How far the field is from what is solid is
+measured along a drive, see `twin/report/seen_touched.py`.
 """
 
 import argparse

@@ -40,8 +40,8 @@ _VIEW, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _GROUND_REACH, _REACH = 7.0, 12.0  # [m] depth up to which probes are taken
 _GROUND_SKIN = 0.12  # [m] from the ground
 _STANDING = 0.3  # [m] above the ground from where on a probe is none of it
-_MOST_PROBES = 1500  # of each kind
-_NEAR = 0.7  # [m] standard deviation of the ground's weights around a place
+_MOST_GROUND, _MOST_STANDING = 3000, 1500  # probes
+_NEAR = 1.5  # [m] standard deviation of the ground's weights around a place
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
 _POLE = 0.5 * (1.0 + _BOUNCE)
 _MOST_SUN, _LOWEST_SUN = 0.8, 3.0  # share of one direction at most; cotangent of its elevation at most
@@ -120,7 +120,8 @@ class FieldLight:
         ground = (np.abs(height) < _GROUND_SKIN + 0.05 * np.abs(lateral)) & (found.depth < _GROUND_REACH) & flat
         standing = (height > _STANDING) & (found.facing > 0.25)
         rng = np.random.default_rng(0)
-        self._ground, self._standing = found.pick(_some(rng, ground)), found.pick(_some(rng, standing))
+        self._ground = found.pick(_some(rng, ground, _MOST_GROUND))
+        self._standing = found.pick(_some(rng, standing, _MOST_STANDING))
         if len(self._ground.points) < _FEW:
             raise InputError(
                 "no ground is seen along the route, and so nothing to tell the light from; was the field built with "
@@ -251,9 +252,9 @@ def _above(points: Array, route: Array) -> tuple[Array, Array]:
     return points[:, 2] - route[index, 2], distance
 
 
-def _some(rng: np.random.Generator, which: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _some(rng: np.random.Generator, which: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     index = np.flatnonzero(which)
-    return np.sort(rng.choice(index, min(_MOST_PROBES, len(index)), replace=False))
+    return np.sort(rng.choice(index, min(most, len(index)), replace=False))
 
 
 def _nearest_of(places: Array, xy: Array) -> NDArray[np.int64]:
