@@ -12,8 +12,9 @@ lamp or sun that lights the ground, too, and one does not, as that of the sky do
 Of the probes the composited features are kept, so that any embedding gives them colours in a millisecond.
 """
 
+import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ _DARK = 0.02  # a probe whose mean colour is below tells nothing
 _MOST = 1.5  # times the ground's brightest: what seems brighter shines by itself
 _NEIGHBOURS = 8  # of the ground's probes, around one that stands
 _FEW = 50  # probes of a kind are none
-_KEPT = 64  # lightings
+_KEPT, _PLACES_KEPT = 64, 1000  # lightings; places of one
 
 
 @dataclass(frozen=True)
@@ -64,13 +65,24 @@ class Light:
     """What reaches all that does not face up, and what comes from each of `SIDES`, whatever the level, shape (5, 3)."""
     growing: Array
     """The same per unit of the level, shape (5, 3)."""
+    _known: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
+    """Levels of the last places asked for, as most things stand still."""
 
     def level(self, xy: Array) -> Array:
         """Irradiance of what faces up at places (n, 2) [m], shape (n, 3)."""
-        distance2 = ((np.asarray(xy)[:, None] - self.xy) ** 2).sum(-1)
-        # Where no probe is near, the nearest ones count.
-        weight = np.exp(-0.5 * distance2 / _NEAR**2) + 1e-6 / (1.0 + distance2**2)
-        return (weight / weight.sum(1, keepdims=True)) @ self.up
+        return np.stack([self._level_at(x, y) for x, y in np.asarray(xy).tolist()])
+
+    def _level_at(self, x: float, y: float) -> Array:
+        found = self._known.get((x, y))
+        if found is None:
+            distance2 = (self.xy[:, 0] - x) ** 2 + (self.xy[:, 1] - y) ** 2
+            # Where no probe is near, the nearest ones count.
+            weight = np.exp(-0.5 * distance2 / _NEAR**2) + 1e-6 / (1.0 + distance2**2)
+            found = weight @ self.up / weight.sum()
+            if len(self._known) >= _PLACES_KEPT:
+                self._known.clear()
+            self._known[x, y] = found
+        return found
 
     def irradiance(self, level: Array, normals: Array) -> Array:
         """Of unit normals (n, 3) where the level is (n, 3), shape (n, 3)."""
@@ -103,18 +115,19 @@ def _basis(normals: Array) -> Array:
 class FieldLight:
     """Estimates the light of any lighting of a field."""
 
-    def __init__(self, field: BakedField, route: Array):
+    def __init__(self, baked: BakedField, route: Array):
         """
         Args:
-            field: Looked at from along the route, once.
+            baked: The field; looked at from along the route, once.
             route: On the ground [m], shape (m, 3).
 
         Raises:
             InputError: no ground is seen there.
         """
-        self._field = field
+        self._field = baked
+        self._lock = threading.Lock()
         self._kept: OrderedDict[bytes, Light] = OrderedDict()
-        found = _look(field, route)
+        found = _look(baked, route)
         height, lateral = _above(found.points, route)
         flat = found.normals[:, 2] > 0.9
         ground = (np.abs(height) < _GROUND_SKIN + 0.05 * np.abs(lateral)) & (found.depth < _GROUND_REACH) & flat
@@ -129,9 +142,9 @@ class FieldLight:
             )
         self._xy = self._ground.points[:, :2]
         self._beside = _nearest_of(self._xy, self._standing.points[:, :2])
-        names = field.lightings
-        grounds = [self._ground.probes.picture(field.embedding(name)).astype(np.float64) for name in names]
-        standings = [self._standing.probes.picture(field.embedding(name)).astype(np.float64) for name in names]
+        names = baked.lightings
+        grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
+        standings = [self._standing.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         # Lightings are brought to one brightness of the ground before their mean is taken.
         mean_ground = np.mean([picture / picture.mean(0) for picture in grounds], 0)
         self._mean = np.mean([p / ground.mean(0) for p, ground in zip(standings, grounds, strict=True)], 0)
@@ -144,11 +157,12 @@ class FieldLight:
         """The light of a lighting, by name or embedding (dim,)."""
         embedding = self._field.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         key = embedding.tobytes()
-        if key not in self._kept:
-            self._kept[key] = self._estimate(embedding)
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        return self._kept[key]
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = self._estimate(embedding)
+                if len(self._kept) > _KEPT:
+                    self._kept.popitem(last=False)
+            return self._kept[key]
 
     def _estimate(self, embedding: NDArray) -> Light:
         from scipy.optimize import nnls
