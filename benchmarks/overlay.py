@@ -1,11 +1,12 @@
-"""Figures of the overlay: obstacles put into the twin against the same obstacles in the true world itself.
+"""Figures of the overlay: obstacles in the twin against the same in the true world, and seen against touched.
 
     python benchmarks/overlay.py --scene BUILT_SCENE_WITH_TRUTH [--json FILE] [--pictures FOLDER]
 
 The scene was filmed without any of them. Each is put at a place along the route, once into the twin, through the
 overlay, and once into the known-truth world, in the same colours; both are seen from the same pose of the robot's front
 camera at 160×90, and developed as the film was, without noise. *The obstacle's pixels* are those it is seen in in the
-truth. *Unshaded* is the overlay with everything in its plain colours.
+truth. *Unshaded* is the overlay with everything in its plain colours. How far the field is from what is solid is
+measured along a drive, see `twin/report/seen_touched.py`.
 """
 
 import argparse
@@ -50,6 +51,9 @@ TARGETS = {
     "overlay.obstacle_psnr.night": ("≥", 18.0),
     "overlay.gain_over_unshaded.night": ("≥", 6.0),
     "overlay.mask_iou": ("≥", 0.9),
+    "seen_touched.median_m": ("≤", 0.05),
+    "seen_touched.corridor_leak_m": ("≤", 0.2),
+    "seen_touched.corridor_ghost_m": ("≤", 0.2),
 }
 
 
@@ -208,6 +212,22 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     return figures
 
 
+def seen_touched(scene_path: Path) -> dict[str, Any]:
+    """`seen_touched.*` of `twin.report.seen_touched`, along a drive of the scripted follower."""
+    from twin.assets.ground import Ground
+    from twin.env.follower import follow
+    from twin.env.physics import HuskyPhysics
+    from twin.mjcf.export import Parts
+    from twin.report.seen_touched import along_the_drive, compare, look
+
+    scene = load_scene(scene_path)
+    world, field, mesh = scene.world(), scene.field(), scene.scene.stage("mesh")
+    drive = follow(world, HuskyPhysics(world.model()))
+    looks = look(field, world, along_the_drive(drive.camera_to_world), field.lightings[0])
+    found = compare(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
+    return {f"seen_touched.{name}": value for name, value in found.items() if name != "along"}
+
+
 def error_db(errors: list[np.ndarray]) -> float:
     """PSNR [dB] of squared errors, all pixels counting alike."""
     return float(-10.0 * np.log10(max(np.concatenate(errors).mean(), 1e-12)))
@@ -234,7 +254,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="where pictures to judge by go")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     options = parser.parse_args()
-    figures = round_trip(options.scene, options.pictures, tuple(options.kinds))
+    figures = round_trip(options.scene, options.pictures, tuple(options.kinds)) | seen_touched(options.scene)
     for name, value in figures.items():
         sense, wanted = TARGETS.get(name, ("", 0.0))
         print(f"{name:40} {value:10.4g}  {f'{sense} {wanted:g}' if sense else ''}".rstrip())

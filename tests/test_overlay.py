@@ -60,16 +60,20 @@ def box():
     return scene()
 
 
-def test_before_an_opaque_wall_the_obstacle_is_itself(box):
+@pytest.mark.parametrize(
+    "depth", [2.5, 1.25]
+)  # small, sampled in one go; and large, where only edges are sampled again
+def test_before_an_opaque_wall_the_obstacle_is_itself(box, depth):
     model, data = box
-    put(model, data, 0.0, 0.0, -0.5)
+    put(model, data, depth - 2.5, 0.0, -0.5)
     field = baked(BEHIND)
     out, alone = Overlay(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
-    # Its face is at depth 2.5: 16 px wide and high.
-    inner, outside = np.s_[0, 11:25, 25:39], np.ones((1, SIZE[1], SIZE[0]), bool)
-    outside[0, 9:27, 23:41] = False
+    reach = round(0.5 * FOCAL / depth)  # of its face from the middle of the picture [px]
+    inner = np.s_[0, 18 - reach + 1 : 18 + reach - 1, 32 - reach + 1 : 32 + reach - 1]
+    outside = np.ones((1, SIZE[1], SIZE[0]), bool)
+    outside[0, 18 - reach - 1 : 18 + reach + 1, 32 - reach - 1 : 32 + reach + 1] = False
     assert np.abs(out.rgb[inner] - COLOR).max() < 0.01
-    assert np.abs(out.depth[inner] - 2.5).max() < 1e-3
+    assert np.abs(out.depth[inner] - depth).max() < 1e-3
     assert out.opacity[inner].min() > 0.999
     assert np.array_equal(out.rgb[outside], alone.rgb[outside])
     assert np.array_equal(out.depth[outside], alone.depth[outside])
@@ -163,8 +167,8 @@ def test_many_worlds_are_as_each_alone(box):
         alone = single.render([data], lighting)
         for name in ("rgb", "depth", "opacity"):
             assert np.array_equal(getattr(alone, name)[0], getattr(together, name)[k]), name
-    with pytest.raises(InputError, match="expected at most 2"):
-        Overlay(model, field, SIZE, worlds=2).render(datas, "day")
+    with pytest.raises(InputError, match="at most 3"):
+        Overlay(model, field, SIZE, worlds=3).render([*datas, datas[0]], "day")
 
 
 def test_the_camera_of_the_model_is_that_of_the_pictures():

@@ -167,6 +167,9 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
         "inputs": stamps["capture"].depends["inputs"],
     }
     report |= {name: stamp.metrics for name, stamp in stamps.items()}
+    if "review" in report:  # beside the stages, as it is about all of them
+        report["review"] = {k: v for k, v in report["review"].items() if k != "seen_touched"}
+        report["seen_touched"] = stamps["review"].metrics.get("seen_touched")
     report["truth"] = None
     if scene.truth.exists() and "mesh" in stamps:
         from twin.report.truth import compare

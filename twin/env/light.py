@@ -12,8 +12,9 @@ lamp or sun that lights the ground, too, and one does not, as that of the sky do
 Of the probes the composited features are kept, so that any embedding gives them colours in a millisecond.
 """
 
+import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,21 +36,21 @@ SIDES = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0
 """Directions that light comes from besides above and everywhere, shape (4, 3)."""
 
 _EYE_HEIGHT, _PITCH = 1.0, 8.0  # [m], [°] of the views that probes are taken from
-_EYE_STEP = 1.0  # [m] of the route
+_EYE_STEP = 2.0  # [m] of the route
 _VIEW, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _GROUND_REACH, _REACH = 7.0, 12.0  # [m] depth up to which probes are taken
 _GROUND_SKIN = 0.12  # [m] from the ground
 _STANDING = 0.3  # [m] above the ground from where on a probe is none of it
-_MOST_PROBES = 4000  # of each kind
-_NEAR = 0.7  # [m] standard deviation of the ground's weights around a place
+_MOST_GROUND, _MOST_STANDING = 3000, 1500  # probes
+_NEAR = 1.5  # [m] standard deviation of the ground's weights around a place
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
 _POLE = 0.5 * (1.0 + _BOUNCE)
 _MOST_SUN, _LOWEST_SUN = 0.8, 3.0  # share of one direction at most; cotangent of its elevation at most
 _DARK = 0.02  # a probe whose mean colour is below tells nothing
 _MOST = 1.5  # times the ground's brightest: what seems brighter shines by itself
-_NEIGHBOURS = 16  # of the ground's probes, around one that stands
+_NEIGHBOURS = 8  # of the ground's probes, around one that stands
 _FEW = 50  # probes of a kind are none
-_KEPT = 64  # lightings
+_KEPT, _PLACES_KEPT = 64, 1000  # lightings; places of one
 
 
 @dataclass(frozen=True)
@@ -64,13 +65,24 @@ class Light:
     """What reaches all that does not face up, and what comes from each of `SIDES`, whatever the level, shape (5, 3)."""
     growing: Array
     """The same per unit of the level, shape (5, 3)."""
+    _known: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
+    """Levels of the last places asked for, as most things stand still."""
 
     def level(self, xy: Array) -> Array:
         """Irradiance of what faces up at places (n, 2) [m], shape (n, 3)."""
-        distance2 = ((np.asarray(xy)[:, None] - self.xy) ** 2).sum(-1)
-        # Where no probe is near, the nearest ones count.
-        weight = np.exp(-0.5 * distance2 / _NEAR**2) + 1e-6 / (1.0 + distance2**2)
-        return (weight / weight.sum(1, keepdims=True)) @ self.up
+        return np.stack([self._level_at(x, y) for x, y in np.asarray(xy).tolist()])
+
+    def _level_at(self, x: float, y: float) -> Array:
+        found = self._known.get((x, y))
+        if found is None:
+            distance2 = (self.xy[:, 0] - x) ** 2 + (self.xy[:, 1] - y) ** 2
+            # Where no probe is near, the nearest ones count.
+            weight = np.exp(-0.5 * distance2 / _NEAR**2) + 1e-6 / (1.0 + distance2**2)
+            found = weight @ self.up / weight.sum()
+            if len(self._known) >= _PLACES_KEPT:
+                self._known.clear()
+            self._known[x, y] = found
+        return found
 
     def irradiance(self, level: Array, normals: Array) -> Array:
         """Of unit normals (n, 3) where the level is (n, 3), shape (n, 3)."""
@@ -103,24 +115,26 @@ def _basis(normals: Array) -> Array:
 class FieldLight:
     """Estimates the light of any lighting of a field."""
 
-    def __init__(self, field: BakedField, route: Array):
+    def __init__(self, baked: BakedField, route: Array):
         """
         Args:
-            field: Looked at from along the route, once.
+            baked: The field; looked at from along the route, once.
             route: On the ground [m], shape (m, 3).
 
         Raises:
             InputError: no ground is seen there.
         """
-        self._field = field
+        self._field = baked
+        self._lock = threading.Lock()
         self._kept: OrderedDict[bytes, Light] = OrderedDict()
-        found = _look(field, route)
+        found = _look(baked, route)
         height, lateral = _above(found.points, route)
         flat = found.normals[:, 2] > 0.9
         ground = (np.abs(height) < _GROUND_SKIN + 0.05 * np.abs(lateral)) & (found.depth < _GROUND_REACH) & flat
         standing = (height > _STANDING) & (found.facing > 0.25)
         rng = np.random.default_rng(0)
-        self._ground, self._standing = found.pick(_some(rng, ground)), found.pick(_some(rng, standing))
+        self._ground = found.pick(_some(rng, ground, _MOST_GROUND))
+        self._standing = found.pick(_some(rng, standing, _MOST_STANDING))
         if len(self._ground.points) < _FEW:
             raise InputError(
                 "no ground is seen along the route, and so nothing to tell the light from; was the field built with "
@@ -128,9 +142,9 @@ class FieldLight:
             )
         self._xy = self._ground.points[:, :2]
         self._beside = _nearest_of(self._xy, self._standing.points[:, :2])
-        names = field.lightings
-        grounds = [self._ground.probes.picture(field.embedding(name)).astype(np.float64) for name in names]
-        standings = [self._standing.probes.picture(field.embedding(name)).astype(np.float64) for name in names]
+        names = baked.lightings
+        grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
+        standings = [self._standing.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         # Lightings are brought to one brightness of the ground before their mean is taken.
         mean_ground = np.mean([picture / picture.mean(0) for picture in grounds], 0)
         self._mean = np.mean([p / ground.mean(0) for p, ground in zip(standings, grounds, strict=True)], 0)
@@ -143,11 +157,12 @@ class FieldLight:
         """The light of a lighting, by name or embedding (dim,)."""
         embedding = self._field.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         key = embedding.tobytes()
-        if key not in self._kept:
-            self._kept[key] = self._estimate(embedding)
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        return self._kept[key]
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = self._estimate(embedding)
+                if len(self._kept) > _KEPT:
+                    self._kept.popitem(last=False)
+            return self._kept[key]
 
     def _estimate(self, embedding: NDArray) -> Light:
         from scipy.optimize import nnls
@@ -251,9 +266,9 @@ def _above(points: Array, route: Array) -> tuple[Array, Array]:
     return points[:, 2] - route[index, 2], distance
 
 
-def _some(rng: np.random.Generator, which: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _some(rng: np.random.Generator, which: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     index = np.flatnonzero(which)
-    return np.sort(rng.choice(index, min(_MOST_PROBES, len(index)), replace=False))
+    return np.sort(rng.choice(index, min(most, len(index)), replace=False))
 
 
 def _nearest_of(places: Array, xy: Array) -> NDArray[np.int64]:

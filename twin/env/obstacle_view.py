@@ -1,8 +1,8 @@
 """What of a MuJoCo model a camera sees besides the field: obstacles, other robots, the robot's own body.
 
 `mujoco_warp`'s ray caster draws them, without OpenGL, from a small model of their geoms alone. It is given only the
-rays it needs: of the pixels that some geom's box may cover, one each, and at edges four more each, so that outlines
-come out smooth. Its lights are set so that the colour it draws is the surface's normal; what a surface looks like is
+rays it needs: of the pixels that some geom's box may cover, one each, and at edges four each, so that outlines come
+out smooth. Its lights are set so that the colour it draws is the surface's normal; what a surface looks like is
 then its own colour times the irradiance of that normal there. *Coverage* is the share of a pixel that is covered.
 """
 
@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _NEAR = 0.02  # [m] z-depth before which nothing is drawn: the camera's own housing begins behind it
+_SMALL = 800  # [px] of which all are sampled as those at edges are: a second cast would cost more than it saves
 _QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] of the samples at edges
 _CORNERS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
 
@@ -75,10 +76,13 @@ class ObstacleView:
         self.geoms = np.flatnonzero(
             np.isin(model.geom_group, (OBSTACLE_GROUP, LOOK_GROUP)) & (_rgba(model)[:, 3] > 0.0)
         )
-        self._owners = model.body_rootid[model.geom_bodyid[self.geoms]]
+        owners = model.body_rootid[model.geom_bodyid[self.geoms]]
+        self._bodies, self._owner = np.unique(owners, return_inverse=True)
         self._colors = _rgba(model)[self.geoms, :3]
-        low, half = model.geom_aabb[self.geoms, :3], model.geom_aabb[self.geoms, 3:]
-        self._boxes = low[:, None] + half[:, None] * _CORNERS
+        self._centers, self._halves = model.geom_aabb[self.geoms, :3], model.geom_aabb[self.geoms, 3:]
+        fx, fy, cx, cy = intrinsics
+        # Inward normals of the planes that bound the view, in the camera; the last one lies `_NEAR` ahead.
+        self._planes = np.array([[fx, 0, cx], [-fx, 0, size[0] - cx], [0, fy, cy], [0, -fy, size[1] - cy], [0, 0, 1.0]])
         if len(self.geoms) == 0:
             return
         small = _only(model, self.geoms)
@@ -115,24 +119,27 @@ class ObstacleView:
         if len(self.geoms) == 0:
             return None
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
-        corners = np.matmul(self._boxes, turns.transpose(0, 2, 1)) + (data.geom_xpos[self.geoms] - pose[:3, 3])[:, None]
+        middles = data.geom_xpos[self.geoms] - pose[:3, 3] + np.einsum("nij,nj->ni", turns, self._centers)
+        planes = self._planes @ pose[:3, :3].T
+        # How far a box reaches into a half space: its middle, and its half sides' shares along the normal.
+        reach = middles @ planes.T + np.einsum("npj,nj->np", np.abs(planes @ turns), self._halves)
+        reach[:, -1] -= _NEAR
+        seen = np.flatnonzero((reach > 0.0).all(1))
+        if len(seen) == 0:
+            return None
+        corners = np.matmul(self._halves[seen, None] * _CORNERS, turns[seen].transpose(0, 2, 1)) + middles[seen, None]
         x, y, z = np.moveaxis(corners @ pose[:3, :3], -1, 0)
         width, height = self.size
-        fx, fy, cx, cy = self._intrinsics
-        # Beyond one plane of the view with all corners: not seen.
-        left, right = fx * x + cx * z < 0.0, fx * x + (cx - width) * z > 0.0
-        above, below = fy * y + cy * z < 0.0, fy * y + (cy - height) * z > 0.0
-        behind = z < _NEAR
-        seen = ~np.any([side.all(1) for side in (left, right, above, below, behind)], axis=0)
-        if not seen.any():
-            return None
         mask = np.zeros((height, width), bool)
-        for k in np.flatnonzero(seen):
-            if behind[k].any():
-                mask[:] = True
-                break
-            u, v = fx * x[k] / z[k] + cx, fy * y[k] / z[k] + cy
-            mask[max(0, int(v.min()) - 1) : int(v.max()) + 2, max(0, int(u.min()) - 1) : int(u.max()) + 2] = True
+        if (z < _NEAR).any():
+            mask[:] = True
+            return mask
+        fx, fy, cx, cy = self._intrinsics
+        u, v = fx * x / z + cx, fy * y / z + cy
+        sides = np.stack([u.min(1) - 1, u.max(1) + 2, v.min(1) - 1, v.max(1) + 2], 1)
+        sides = np.clip(sides, 0, [width, width, height, height]).astype(int)
+        for left, right, top, bottom in sides.tolist():
+            mask[top:bottom, left:right] = True
         return mask if mask.any() else None
 
     def draw(self, data: mujoco.MjData, pose: Array, mask: NDArray[np.bool_], light: Light | None) -> Drawn | None:
@@ -153,16 +160,16 @@ class ObstacleView:
         with wp.ScopedDevice("cpu"):
             self._mjw.refit_bvh(self._model, self._data, self._context)
             pixels = np.flatnonzero(mask)
-            geom, normals, depth = self._cast(self._middles[pixels])
-            if not (geom >= 0).any():
-                return None
             width, height = self.size
-            ids = np.full((height, width), -1, np.int32)
-            ids.ravel()[pixels] = geom
             coverage, color, z = (np.zeros((height, width, *rest), np.float32) for rest in ((), (3,), ()))
-            coverage.ravel()[pixels] = geom >= 0
-            color.reshape(-1, 3)[pixels], z.ravel()[pixels] = lit(geom, normals), depth
-            edges = np.flatnonzero(_edges(ids) & mask)
+            edges = pixels
+            if len(pixels) > _SMALL:
+                geom, normals, depth = self._cast(self._middles[pixels])
+                coverage.ravel()[pixels] = geom >= 0
+                color.reshape(-1, 3)[pixels], z.ravel()[pixels] = lit(geom, normals), depth
+                ids = np.full((height, width), -1, np.int32)
+                ids.ravel()[pixels] = geom
+                edges = np.flatnonzero(_edges(ids) & mask)
             if len(edges):
                 geom, normals, depth = self._cast(self._quarters[edges].reshape(-1, 3))
                 hits = (geom >= 0).reshape(-1, 4)
@@ -204,15 +211,16 @@ class ObstacleView:
 
     def _lit(self, data: mujoco.MjData, light: Light | None) -> Callable[[NDArray[np.int32], Floats], Floats]:
         """What drawn geoms (n,) with normals (n, 3) look like, (n, 3); 0 where there is none."""
-        bodies, which = np.unique(self._owners, return_inverse=True)
-        levels = light.level(data.xpos[bodies, :2])[which] if light else None
+        levels = light.level(data.xpos[self._bodies, :2]) if light else None
 
         def lit(geom: NDArray[np.int32], normals: Floats) -> Floats:
             out = np.zeros((len(geom), 3), np.float32)
-            hit = geom >= 0
-            out[hit] = self._colors[geom[hit]]
+            hit = np.flatnonzero(geom >= 0)
+            mine = geom[hit]
+            color = self._colors[mine]
             if light is not None and levels is not None:
-                out[hit] *= light.irradiance(levels[geom[hit]], normals[hit])
+                color = color * light.irradiance(levels[self._owner[mine]], normals[hit].astype(np.float64))
+            out[hit] = color
             return out
 
         return lit

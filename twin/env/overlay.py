@@ -6,14 +6,17 @@ obstacle, and behind the uncovered share of a pixel at its edge, the field is as
 """
 
 import copy
+import os
+import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.env.camera_effects import CameraEffects, rolled_off
-from twin.env.light import FieldLight
+from twin.env.light import FieldLight, Light
 from twin.env.obstacle_view import Drawn, ObstacleView, camera_intrinsics, camera_pose
 from twin.env.obstacles import route_of
 from twin.env.shadow import Shadows
@@ -52,11 +55,14 @@ class Overlay:
         self.size, self.worlds, self._field = size, worlds, field
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
-        self._view = ObstacleView(model, self.intrinsics, size)
-        self._light = FieldLight(field, route_of(model)) if shaded and len(self._view.geoms) else None
-        self._shadows = Shadows(model, self._view.geoms) if self._light else None
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        # One after the other, as Warp compiles kernels when they are first used.
+        self._painters = [_Painter(model, field, self.intrinsics, size) for _ in range(min(worlds, cores))]
+        self._pool = ThreadPoolExecutor(len(self._painters)) if len(self._painters) > 1 else None
+        self._shadows = Shadows(model, self._painters[0].view.geoms)
+        self._route, self._shaded, self._lock = route_of(model), shaded, threading.Lock()
+        self._lights = FieldLight(field, self._route) if shaded and self._shadows.bodies else None
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
-        self._fronts: dict[tuple[int, int], BakedField] = {}
 
     def render(
         self,
@@ -85,36 +91,65 @@ class Overlay:
             poses = np.stack([e.shaken(p, d.time) for e, p, d in zip(effects, poses, datas, strict=True)])
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
-        for k, (data, pose) in enumerate(zip(datas, poses, strict=True)):
-            mask = self._view.in_view(data, pose)
-            if mask is None:
-                continue
-            mine: Lighting = lighting if one else lighting[k]  # type: ignore[assignment]
-            light = self._light.under(mine) if self._light else None
-            if self._shadows and light:
-                self._shadows.darken(out.rgb[k], out.depth[k], self._rays, pose, data, light)
-            drawn = self._view.draw(data, pose, mask, light)
-            if drawn is not None:
-                left, top, width, height = drawn.window
-                inner = np.s_[k, top : top + height, left : left + width]
-                composite(out, inner, drawn, self._front(pose, drawn, mine))
+        lightings: list[Lighting] = [lighting] * len(datas) if one else list(lighting)  # type: ignore[list-item]
+
+        def paint(number: int) -> None:
+            for k in range(number, len(datas), len(self._painters)):
+                self._paint(self._painters[number], datas[k], poses[k], lightings[k], out, k)
+
+        if self._pool is None:
+            paint(0)
+        else:
+            list(self._pool.map(paint, range(len(self._painters))))
         for k, effect in enumerate(effects or ()):
             out.rgb[k] = effect.exposed(out.rgb[k], out.depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return out
 
-    def _front(self, pose: Array, drawn: Drawn, lighting: Lighting) -> Rendering:
-        """What the field holds back in front of what is drawn, in its window."""
+    def _paint(
+        self, painter: "_Painter", data: mujoco.MjData, pose: Array, lighting: Lighting, out: Rendering, k: int
+    ) -> None:
+        """Puts into picture k of a rendering what is in view of its camera."""
+        mask = painter.view.in_view(data, pose)
+        if mask is None:
+            return
+        light = self._light(lighting)
+        if light is not None:
+            self._shadows.darken(out.rgb[k], out.depth[k], self._rays, pose, data, light)
+        drawn = painter.view.draw(data, pose, mask, light)
+        if drawn is not None:
+            left, top, width, height = drawn.window
+            inner = np.s_[k, top : top + height, left : left + width]
+            composite(out, inner, drawn, painter.front(pose, drawn, lighting))
+
+    def _light(self, lighting: Lighting) -> Light | None:
+        if not self._shaded:
+            return None
+        with self._lock:
+            if self._lights is None:  # no obstacles, but the robot sees itself
+                self._lights = FieldLight(self._field, self._route)
+        return self._lights.under(lighting)
+
+
+class _Painter:
+    """What one thread draws and marches with."""
+
+    def __init__(self, model: mujoco.MjModel, field: BakedField, intrinsics: Array, size: tuple[int, int]):
+        self.view = ObstacleView(model, intrinsics, size)
+        self._field, self._intrinsics = field, intrinsics
+        self._fronts: dict[tuple[int, int], BakedField] = {}
+
+    def front(self, pose: Array, drawn: Drawn, lighting: Lighting) -> Rendering:
+        """What the field holds back in front of what is drawn, in its window, arrays (height, width)."""
         left, top, width, height = drawn.window
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
         if (across, down) not in self._fronts:
-            # A field keeps the arrays of one size of picture; so each size has a shallow copy of it.
+            # A field keeps arrays of few sizes, behind a lock, and has threads of its own: so it is copied, shallowly.
             front = copy.copy(self._field)
-            front._pictures = {}
+            front._pictures, front._lock, front._pool = {}, threading.Lock(), None
             self._fronts[across, down] = front
-        intrinsics = self.intrinsics - np.array([0.0, 0.0, left, top])
-        view = Viewpoints.of(pose, intrinsics, (across, down))
+        view = Viewpoints.of(pose, self._intrinsics - np.array([0.0, 0.0, left, top]), (across, down))
         out = self._fronts[across, down].render(view, lighting, stop=stop)
         inner = np.s_[0, :height, :width]
         return Rendering(out.rgb[inner], out.depth[inner], out.opacity[inner])

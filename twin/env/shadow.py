@@ -41,6 +41,11 @@ class Shadows:
             if model.body(int(body)).name.startswith(PREFIX):
                 self._boxes[int(body)] = _two_boxes(model, data, geoms[roots == body], int(body))
 
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """The obstacles' bodies."""
+        return tuple(self._boxes)
+
     def darken(self, rgb: NDArray, depth: NDArray, rays: Array, pose: Array, data: mujoco.MjData, light: Light) -> None:
         """Multiplies the colours of shaded ground, in place.
 
@@ -58,7 +63,7 @@ class Shadows:
             if not (0.0 < away < _FAR) or abs(foot[2] - pose[2, 3]) > _FAR:
                 continue
             share, sun = light.sun(foot[:2])
-            size = float(np.linalg.norm(boxes[:, 1, :2], axis=1).max())
+            size = float(np.abs(boxes[:, :, :2]).max() * np.sqrt(2.0))
             length = min(float(boxes[:, 1, 2].max() * np.linalg.norm(sun[:2]) / sun[2]), _MOST_REACH)
             reach = size + max(length, _SKY_REACH)
             index = np.flatnonzero(np.abs(depth - away) < reach)
