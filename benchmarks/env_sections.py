@@ -21,6 +21,8 @@ def worker(*arguments: str | Path | int, cores: int = 1) -> dict[str, Any]:
     command = [sys.executable, str(_HERE / "env_workers.py"), *map(str, arguments)]
     path = os.pathsep.join(filter(None, [str(_HERE.parent), os.environ.get("PYTHONPATH", "")]))
     threads = {"OMP_NUM_THREADS": str(cores), "OPENBLAS_NUM_THREADS": str(cores)}
+    # MuJoCo chooses its OpenGL when it is imported: Mesa's, which draws in software where there is no GPU.
+    threads |= {"MUJOCO_GL": "egl", "LIBGL_ALWAYS_SOFTWARE": "1"}
     own = sorted(os.sched_getaffinity(0))[:cores]
     done = subprocess.run(
         ["taskset", "-c", ",".join(map(str, own)), *command],
@@ -37,8 +39,8 @@ def speed(scene: Path, quick: bool) -> dict[str, Any]:
     """Environment steps per second with pixels and one obstacle in view, of one world on one core and of eight on two.
 
     `ratio_to_software_gl` is one world's speed over that of the same environment whose picture is MuJoCo's own of the
-    extracted mesh, drawn by `mujoco.Renderer` with OpenGL in software (OSMesa) in the same process, alternately.
-    `load_s` is `twin.load` and the first reset, kernels cached.
+    extracted mesh, drawn by `mujoco.Renderer` with OpenGL in software (Mesa through EGL), alternately in one process.
+    `cpu_ms_per_step` is processor time, which other work on the machine disturbs less. `load_s` is `twin.load` and the first reset, kernels cached.
     """
     runs = 1 if quick else 4
     out = worker("single", scene, runs)
