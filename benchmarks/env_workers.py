@@ -16,6 +16,15 @@ import numpy as np
 _STEPS = 60  # per timed run
 
 
+def standard_tasks(scene: Path) -> list[str]:
+    """The standard tasks that a scene has, `right_turn` last; `route` where it has none."""
+    from twin.env.stretches import STANDARD, tasks
+    from twin.loading import load_scene
+
+    there = tasks(load_scene(scene).world())
+    return [name for name in STANDARD if name in there] or ["route"]
+
+
 def one_obstacle(scene: Path) -> dict[str, Any]:
     """Options with a cone that stays in view ahead for the first twenty metres."""
     from twin.config import ObstacleConfig
@@ -29,11 +38,11 @@ def single(scene: Path, runs: int) -> dict[str, Any]:
     from twin.env.drivers import RouteDriver
 
     begin = time.perf_counter()
-    environment, drive = twin.load(scene, "right_turn", 0, **one_obstacle(scene)), RouteDriver()
+    environment, drive = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene)), RouteDriver()
     environment.reset()
     out: dict[str, Any] = {"single.load_s": time.perf_counter() - begin}
     renderer, why = software_gl(scene)
-    plain = twin.load(scene, "right_turn", 0, **one_obstacle(scene), pixels=False)
+    plain = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene), pixels=False)
     own, theirs = [], []
     for _ in range(runs):
         own.append(_pace(environment, drive, lambda: None))
@@ -116,7 +125,7 @@ def physics(scene: Path, runs: int) -> dict[str, Any]:
     import twin
     from twin.env.drivers import RouteDriver
 
-    environment = twin.load(scene, "right_turn", 0, **one_obstacle(scene), pixels=False)
+    environment = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene), pixels=False)
     return {"physics.steps_per_s": max(_pace(environment, RouteDriver(), lambda: None)[0] for _ in range(2 * runs))}
 
 
@@ -137,7 +146,9 @@ def soak(scene: Path, steps: int) -> dict[str, Any]:
     from twin.env.suite import Stage
 
     count = 8
-    worlds = Worlds(Stage.open(scene, "right_turn", {"randomise": True, "obstacles": 3}), list(range(count)))
+    worlds = Worlds(
+        Stage.open(scene, standard_tasks(scene)[-1], {"randomise": True, "obstacles": 3}), list(range(count))
+    )
     worlds.begin(range(count))
     rng, sizes, episodes, bad = np.random.default_rng(0), [], 0, 0
     rounds = steps // count
@@ -174,7 +185,7 @@ def _worlds(scene: Path, count: int) -> Any:
     from twin.env.batch import Worlds
     from twin.env.suite import Stage
 
-    return Worlds(Stage.open(scene, "right_turn", one_obstacle(scene)), list(range(count)))
+    return Worlds(Stage.open(scene, standard_tasks(scene)[-1], one_obstacle(scene)), list(range(count)))
 
 
 def _onward(worlds: Any) -> np.ndarray:
