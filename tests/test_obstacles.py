@@ -23,7 +23,7 @@ ROUTE = np.column_stack([BEND, 0.02 * BEND[:, 0]])
 
 @pytest.fixture
 def world(tmp_path):
-    return World(ROUTE, 1.0, (0, 0, 0, 0), np.array([87.0, 87.0, 80.0, 45.0]), tmp_path)
+    return World(ROUTE, 1.0, (0, 0, 0, 0), tmp_path)
 
 
 def flat_spec(slope: float = 0.02) -> mujoco.MjSpec:

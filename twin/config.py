@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from twin.errors import InputError
+from twin.robot import HuskyParams
+
+ROBOT_TOML = "robot.toml"
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,10 @@ class MjcfConfig:
     """False for a capture that is no drive (an object filmed around): no route, no Husky."""
     half_width: float = 1.0
     """Half width of the drivable corridor around the route [m]."""
+    hfield_cell: float = 0.3
+    """Cell of the height field that the wheels roll on [m], a multiple of `mesh.ground_cell`. Where a wheel rolls over
+    an edge it touches several facets: fewer edges shake it less and cost less, and the ground has nothing finer anyway
+    (`mesh.ground_smoothing`)."""
     corridor_margin: float = 0.0
     """Extra clearance asked of convex parts beside the corridor [m]."""
 
@@ -240,6 +247,17 @@ class ObstacleConfig:
 
 
 @dataclass(frozen=True)
+class TaskConfig:
+    """A stretch of the route to be driven, besides the standard tasks (see `twin/env/stretches.py`)."""
+
+    name: str = ""
+    start: float = 0.0
+    """Arc length of the route at which it begins [m]."""
+    length: float = 0.0
+    """[m]"""
+
+
+@dataclass(frozen=True)
 class SceneConfig:
     """A whole `scene.toml`."""
 
@@ -252,12 +270,15 @@ class SceneConfig:
     nerf: NerfConfig = field(default_factory=NerfConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     mjcf: MjcfConfig = field(default_factory=MjcfConfig)
+    robot: HuskyParams = field(default_factory=HuskyParams)
+    """`scene.toml` before `robot.toml`, which lies beside it, before the defaults."""
     review: ReviewConfig = field(default_factory=ReviewConfig)
+    task: tuple[TaskConfig, ...] = ()
     obstacle: tuple[ObstacleConfig, ...] = ()
 
 
 def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
-    """Reads `scene.toml` and applies `section.key=value` overrides.
+    """Reads `scene.toml` and, for `[robot]`, the `robot.toml` beside it; applies `section.key=value` overrides.
 
     Raises:
         InputError: no such file, wrong TOML, unknown key, wrong type, or a value out of range.
@@ -270,11 +291,25 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
         raise InputError(f"{path}: not valid TOML: {error}") from None
     for override in overrides:
         _apply_override(table, override)
+    if isinstance(table.get("robot", {}), dict):
+        table["robot"] = read_robot(path.parent / ROBOT_TOML) | table.get("robot", {})
     config = parse(SceneConfig, table, str(path))
     if not config.name:
         config = dataclasses.replace(config, name=path.resolve().parent.name)
     _check(config, path)
     return config
+
+
+def read_robot(path: Path) -> dict[str, Any]:
+    """The table in a `robot.toml`, checked; empty where there is no such file. Raises InputError."""
+    if not path.exists():
+        return {}
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    parse(HuskyParams, table, str(path))
+    return table
 
 
 def _apply_override(table: dict[str, Any], override: str) -> None:
@@ -303,7 +338,11 @@ def parse(kind: type, table: Any, where: str) -> Any:
             near = difflib.get_close_matches(key, list(hints), n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(hints))}"
             raise InputError(f"{where}: unknown key {key!r}; {hint}")
-    return kind(**{key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()})
+    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    try:
+        return kind(**values)
+    except InputError as error:  # a dataclass that checks its own values
+        raise InputError(f"{where}: {error}") from None
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
@@ -346,6 +385,12 @@ def _check(config: SceneConfig, path: Path) -> None:
             raise InputError(f"{path}: a [[source]] has no path; give the video or the image folder")
         if source.kind not in ("auto", "video", "images", "colmap", "transforms"):
             raise InputError(f"{path}: kind = {source.kind!r}; expected auto, video, images, colmap or transforms")
+    for task in config.task:
+        if not task.name or task.start < 0.0 or not task.length > 0.0:
+            raise InputError(
+                f"{path}: a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
+                "expected a name, start ≥ 0 and length > 0 [m]"
+            )
     for section, key, low in (
         ("capture", "fps", 1e-3),
         ("capture", "held_out_every", 2),
@@ -356,6 +401,7 @@ def _check(config: SceneConfig, path: Path) -> None:
         ("mesh", "voxel", 1e-3),
         ("mesh", "ground_cell", 1e-3),
         ("mjcf", "half_width", 0.1),
+        ("mjcf", "hfield_cell", 1e-3),
         ("review", "fps", 1),
         ("review", "speed", 1e-2),
     ):

@@ -176,7 +176,8 @@ def _husky(shape: Shape, color: Color) -> None:
     wheels = {}
     for name, center in zip(husky.WHEELS, husky.wheel_centers(), strict=True):
         wheels[name] = base.add_body(name=name, pos=center)
-    add_look(spec, base, wheels, husky.HuskyParams().camera_position, husky.WHEEL_RADIUS, husky.WHEEL_WIDTH)
+    params = husky.HuskyParams()
+    add_look(spec, base, wheels, params.camera_position, params.wheel_radius, husky.WHEEL_WIDTH)
     for geom in spec.geoms:
         geom.group = shape.group
     shape.body.add_frame().attach_body(base, f"{shape.body.name}_", "")

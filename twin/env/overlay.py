@@ -69,6 +69,7 @@ class Overlay:
         datas: Sequence[mujoco.MjData],
         lighting: Lighting | Sequence[Lighting],
         effects: Sequence[CameraEffects] | None = None,
+        poses: Array | None = None,
     ) -> Rendering:
         """What the front camera of every world sees.
 
@@ -77,13 +78,15 @@ class Overlay:
                 `mj_camlight` after the last step).
             lighting: As `BakedField.render` takes it: one, or one per world.
             effects: What the camera of each world adds, where it is not perfect.
+            poses: camera_to_world of each, OpenCV axes, where the pictures are older than the datas; shape (n, 4, 4).
 
         Raises:
             InputError: an unknown lighting, or more worlds than stated.
         """
         if len(datas) > self.worlds:
             raise InputError(f"{len(datas)} worlds to render; expected at most {self.worlds}, as it was made for")
-        poses = np.stack([camera_pose(data, self._camera) for data in datas])
+        if poses is None:
+            poses = np.stack([camera_pose(data, self._camera) for data in datas])
         if effects is not None:
             poses = np.stack([e.shaken(p, d.time) for e, p, d in zip(effects, poses, datas, strict=True)])
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)

@@ -39,6 +39,7 @@ from twin.report.plan import Plan, footprints
 from twin.report.seen_section import seen_row
 from twin.report.seen_touched import along_the_drive, compare, look
 from twin.report.studio import Studio, side_by_side, spread
+from twin.report.trust_map import trust_along, trust_metrics, trust_picture
 from twin.report.video import VideoWriter
 from twin.report.words import follower_verdict
 from twin.scene import SceneDir, write_json
@@ -72,7 +73,7 @@ def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[
     """`run` with any field."""
     cameras = Cameras.load(scene.stage("metric"))
     world = World.load(scene.stage("mjcf")) if config.mjcf.route and scene.has_route else None
-    drive = follow(world, HuskyPhysics(world.model()), config.review.speed) if world else None
+    drive = follow(world, HuskyPhysics(world.model(), world.robot), config.review.speed) if world else None
     aspect = float(np.median(cameras.sizes[:, 1] / cameras.sizes[:, 0]))
     layout = Layout.for_pictures(config.review.width, aspect)
     path = world.route[:, :2] if world else _longest_path(cameras)
@@ -83,6 +84,13 @@ def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[
         studio = Studio(config.name, field, cameras, layout, writer, out, config.review.render_width, path)
         _keep_captures(studio)
         _film_chapters(studio, scene, config, world, drive)
+        if world:
+            along = trust_along(field, cameras, world)
+            metrics["trust"] = trust_metrics(*along)
+            caption = (
+                "how far the robot's pictures can be trusted: near to what was filmed, and road where road must be"
+            )
+            studio.keep("trust", "review", caption, trust_picture(*along))
         verdict = follower_verdict(
             {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
         )
@@ -110,7 +118,7 @@ def _film_chapters(
     chosen = comparison_frames(studio, int(_SHARES[0] * renders))
     turns = int(_SHARES[1] * renders) if len(field.lightings) > 1 else 0
     drives = int(_SHARES[2] * renders) if drive else 0
-    ground, parts = _surroundings(scene)
+    ground, parts = surroundings(scene)
     half_width = world.half_width if world else 0.0
 
     def plan(box: Box) -> Plan:
@@ -161,11 +169,11 @@ def _views(studio: Studio, scene: SceneDir, world: World | None) -> tuple[list[S
     if world:
         return route_shots(world.route), world
     # Only its model is drawn; there is no route to know.
-    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), np.ones(4), folder)
+    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), folder)
     return (camera_shots(studio.cameras) if model.model_path.exists() else []), model
 
 
-def _surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
+def surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
     """What the plan shows of the mesh stage: the ground, and the outlines of low parts."""
     folder = scene.stage("mesh")
     ground = Ground.load(folder) if (folder / "ground.npz").exists() else None
