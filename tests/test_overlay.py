@@ -167,8 +167,8 @@ def test_many_worlds_are_as_each_alone(box):
         alone = single.render([data], lighting)
         for name in ("rgb", "depth", "opacity"):
             assert np.array_equal(getattr(alone, name)[0], getattr(together, name)[k]), name
-    with pytest.raises(InputError, match="expected at most 2"):
-        Overlay(model, field, SIZE, worlds=2).render(datas, "day")
+    with pytest.raises(InputError, match="at most 3"):
+        Overlay(model, field, SIZE, worlds=3).render([*datas, datas[0]], "day")
 
 
 def test_the_camera_of_the_model_is_that_of_the_pictures():

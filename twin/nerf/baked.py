@@ -42,9 +42,7 @@ Floats = NDArray[np.float32]
 
 _FORMAT = 2
 _PIECES = 3  # of a picture, per core
-_SIZES_KEPT = (
-    4  # of pictures, as a vector of worlds needs those of all its worlds, and those of the ones that begin anew
-)
+_SIZES_KEPT = 4  # of pictures: a vector of worlds needs all of them, and those that begin anew
 
 
 class BakedField:
