@@ -219,7 +219,7 @@ def test_rest_pose_follows_the_slope():
     ground = tiny_ground()
     grid_x, _ = np.meshgrid(*(np.arange(n) * ground.cell for n in ground.height.shape[::-1]))
     ramp = type(ground)(0.1 * grid_x, np.zeros(2), ground.cell, ground.measured, ground.rgb)
-    position, quaternion = rest_pose(ramp, np.array([5.0, 5.0]), np.pi / 2)
+    position, quaternion = rest_pose(ramp.at, np.array([5.0, 5.0]), np.pi / 2)
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, quaternion)
     up = np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0)

@@ -217,6 +217,46 @@ class ReviewConfig:
     """Pictures of the radiance field in the whole film: more make it smoother and the build longer."""
 
 
+OBSTACLE_KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
+
+
+@dataclass(frozen=True)
+class ObstacleConfig:
+    """Something that is put on the route, standing or moving to and fro."""
+
+    name: str = ""
+    """Of its body in the model, `obstacle_<name>`; by default its kind and its place in the list."""
+    kind: str = ""
+    """cone, box, bollard, car, pedestrian, cyclist or husky."""
+    station: float = 0.0
+    """Arc length on the route [m]."""
+    lateral: float = 0.0
+    """Distance from the route, left positive [m]."""
+    yaw: float = 0.0
+    """Of its front against the route's heading [°]; one that moves faces where it goes, turned by this."""
+    to: tuple[float, ...] = ()
+    """Station and lateral [m] it moves to, and back again; empty = it stands."""
+    speed: float = 1.2
+    """Of one that moves [m/s]."""
+    delay: float = 0.0
+    """One that moves has been on its way for so long when the episode begins [s]."""
+    color: tuple[float, ...] = ()
+    """Red, green, blue of its main colour, 0 to 1; its kind's own by default."""
+    size: tuple[float, ...] = ()
+    """Length, width, height of a box [m]."""
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """A stretch of the route to be driven, besides the standard tasks (see `twin/env/stretches.py`)."""
+
+    name: str = ""
+    start: float = 0.0
+    """Arc length of the route at which it begins [m]."""
+    length: float = 0.0
+    """[m]"""
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """A whole `scene.toml`."""
@@ -233,6 +273,8 @@ class SceneConfig:
     robot: HuskyParams = field(default_factory=HuskyParams)
     """`scene.toml` before `robot.toml`, which lies beside it, before the defaults."""
     review: ReviewConfig = field(default_factory=ReviewConfig)
+    task: tuple[TaskConfig, ...] = ()
+    obstacle: tuple[ObstacleConfig, ...] = ()
 
 
 def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
@@ -343,6 +385,12 @@ def _check(config: SceneConfig, path: Path) -> None:
             raise InputError(f"{path}: a [[source]] has no path; give the video or the image folder")
         if source.kind not in ("auto", "video", "images", "colmap", "transforms"):
             raise InputError(f"{path}: kind = {source.kind!r}; expected auto, video, images, colmap or transforms")
+    for task in config.task:
+        if not task.name or task.start < 0.0 or not task.length > 0.0:
+            raise InputError(
+                f"{path}: a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
+                "expected a name, start ≥ 0 and length > 0 [m]"
+            )
     for section, key, low in (
         ("capture", "fps", 1e-3),
         ("capture", "held_out_every", 2),
@@ -360,6 +408,7 @@ def _check(config: SceneConfig, path: Path) -> None:
         value = getattr(getattr(config, section), key)
         if not value >= low:
             raise InputError(f"{path}: {section}.{key} = {value}; expected at least {low:g}")
+    _check_obstacles(config.obstacle, path)
     given = scale_sources(config.metric)
     if len(given) != 1 and not (not given and any(source.camera_height > 0.0 for source in config.source)):
         # Checked before anything runs, so that nobody waits minutes to learn it.
@@ -368,3 +417,24 @@ def _check(config: SceneConfig, path: Path) -> None:
             "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
             "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true"
         )
+
+
+def _check_obstacles(obstacles: tuple[ObstacleConfig, ...], path: Path) -> None:
+    for one in obstacles:
+        if one.kind not in OBSTACLE_KINDS:
+            near = difflib.get_close_matches(one.kind, OBSTACLE_KINDS, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"expected {', '.join(OBSTACLE_KINDS)}"
+            raise InputError(f"{path}: [[obstacle]] kind = {one.kind!r}; {hint}")
+        for key, lengths, meaning in (("to", (0, 2), "station and lateral [m]"), ("color", (0, 3), "red, green, blue")):
+            if len(getattr(one, key)) not in lengths:
+                raise InputError(f"{path}: [[obstacle]] {key} = {list(getattr(one, key))}; expected {meaning}")
+        if len(one.size) not in (0, 3) or any(not side > 0.0 for side in one.size):
+            raise InputError(f"{path}: [[obstacle]] size = {list(one.size)}; expected length, width, height > 0 [m]")
+        if not all(0.0 <= c <= 1.0 for c in one.color):
+            raise InputError(f"{path}: [[obstacle]] color = {list(one.color)}; expected values from 0 to 1")
+        if one.to and not one.speed > 0.0:
+            raise InputError(f"{path}: [[obstacle]] speed = {one.speed}; expected more than 0 where it moves")
+    names = [one.name for one in obstacles if one.name]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{path}: two [[obstacle]] are named {twice!r}; give each a name of its own")

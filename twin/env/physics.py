@@ -6,6 +6,8 @@ any part of the robot, the ground excepted. *Latency*: a command reaches the con
 given, and the newest picture there is was taken `camera_latency` ago.
 """
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -13,27 +15,35 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.geometry.cameras import opencv_to_mujoco
+from twin.mjcf.export import rest_pose
 from twin.robot import GEAR_RATIO, SIDES, WHEELS, HuskyParams
 
 Array = NDArray[np.float64]
 
 _LOOK_PERIOD = 0.01  # [s] between two looks at the contacts and at the camera's pose
+_SETTLE_TIME = 0.3  # [s] on the ground after being put there
+_RAY_START = 50.0  # [m] above the ground's highest point
 
 
 class HuskyPhysics:
     """Steps one Husky in one world."""
 
-    def __init__(self, model: mujoco.MjModel, params: HuskyParams | None = None) -> None:
+    surroundings: Callable[[float], None] | None = None
+    """Called with the time [s] that the next small steps lead to, before them: moves what moves by itself."""
+
+    def __init__(
+        self, model: mujoco.MjModel, params: HuskyParams | None = None, data: mujoco.MjData | None = None
+    ) -> None:
         """
         Args:
             model: A world made by `twin.mjcf.export`, or any with `add_husky`; a keyframe `spawn` is where it starts.
             params: The robot it was made with (`World.robot`): its controller and its latencies; by default the
                 published one.
+            data: Of the model, stepped from where it is; by default new, at the start.
         """
         self.model = model
         self.params = params or HuskyParams()
-        self.data = mujoco.MjData(model)
-        self.controller = Controller(self.params)
+        self.data = mujoco.MjData(model) if data is None else data
         self._body = model.body("base_link").id
         self._camera = model.camera("front").id
         self._actuators = np.array([model.actuator(side).id for side in SIDES])
@@ -41,15 +51,15 @@ class HuskyPhysics:
         self._wheel_angles = np.array([wheel.qposadr[0] for wheel in wheels])
         self._wheel_dofs = np.array([wheel.dofadr[0] for wheel in wheels])
         self._robot = model.body_rootid[model.geom_bodyid] == self._body
-        ground = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground")
-        self._counts = ~self._robot & (np.arange(model.ngeom) != ground)
+        self._ground = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground")
+        self._counts = ~self._robot & (np.arange(model.ngeom) != self._ground)
         self._spawn = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "spawn")
-        steps = round(CONTROL_PERIOD / model.opt.timestep)
-        # After which small steps of a control step something is looked at, and before which one the controller runs.
-        every = max(1, round(_LOOK_PERIOD / model.opt.timestep))
-        self._update_at = int(np.ceil(self.controller.phase / model.opt.timestep - 1e-6)) % steps
-        self._stops = sorted({*range(every, steps, every), steps, *([self._update_at] if self._update_at else [])})
-        self.reset()
+        self._period_steps = round(CONTROL_PERIOD / model.opt.timestep)
+        self._look_steps = max(1, round(_LOOK_PERIOD / model.opt.timestep))
+        if data is None:
+            self.reset()
+        else:
+            self.begin()
 
     def reset(self) -> None:
         """Back to the start, at rest."""
@@ -58,27 +68,59 @@ class HuskyPhysics:
         else:
             mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
-        self.controller.reset()
-        self._touched: set[int] = set()
+        self.begin()
+
+    def place(self, x: float, y: float, yaw: float) -> None:
+        """Puts it at rest on the ground, wheels down and settled, at x, y [m] and yaw [rad]; the clock starts at 0."""
+        position, quaternion = rest_pose(self._ground_height, np.array([x, y]), yaw)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:3], self.data.qpos[3:7] = position, quaternion
+        if self.surroundings:
+            self.surroundings(0.0)
+        mujoco.mj_step(self.model, self.data, round(_SETTLE_TIME / self.model.opt.timestep))
+        self.data.qvel[:], self.data.time = 0.0, 0.0
+        mujoco.mj_forward(self.model, self.data)
+        self.begin()
+
+    def begin(self) -> None:
+        """Takes the state as it is for the beginning: nothing commanded yet, and touched only what it touches now."""
+        self.controller = Controller(self.params)
+        # Small steps until the controller runs next.
+        self._until_update = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6)) % self._period_steps
+        self._touched = self._touching()
         self._views = [(self.time, self.camera_to_world)]
+
+    def _ground_height(self, xy: Array) -> Array:
+        top = self.model.geom_pos[self._ground, 2] + _RAY_START
+        down = np.array([0.0, 0.0, -1.0])
+        return np.array(
+            [
+                top - mujoco.mj_rayHfield(self.model, self.data, self._ground, np.array([*p, top]), down, None)
+                for p in xy
+            ]
+        )
 
     def command(self, v: float, yaw_rate: float) -> None:
         """Sets the wanted speed [m/s] and yaw rate [rad/s]; it lapses after 0.25 s without a new one."""
         self.controller.command(self.time, v, yaw_rate)
 
-    def step(self) -> None:
-        """One control step of 0.1 s."""
+    def step(self, period: float = CONTROL_PERIOD) -> None:
+        """Lets `period` [s] pass, the time between two commands."""
         touched: set[int] = set()
-        done = 0
-        for stop in [0, *self._stops]:
-            if stop > done:
-                mujoco.mj_step(self.model, self.data, stop - done)
-                touched |= self._touching()
-                done = stop
-                # Poses of the last small step's start, which is 2 ms too old; the last ones of all are made anew below.
-                self._views.append((self.time - self.model.opt.timestep, self.camera_to_world))
-            if stop == self._update_at and stop < self._stops[-1]:
+        left = round(period / self.model.opt.timestep)
+        while left:
+            if not self._until_update:
                 self.data.ctrl[self._actuators] = self.controller.update(self.time)
+                self._until_update = self._period_steps
+            some = min(left, self._look_steps, self._until_update)
+            if self.surroundings:
+                self.surroundings(self.time + some * self.model.opt.timestep)
+            mujoco.mj_step(self.model, self.data, some)
+            left, self._until_update = left - some, self._until_update - some
+            touched |= self._touching()
+            if self.params.camera_latency:
+                # Poses of the last small step's start, which is 2 ms too old; the last of all are made anew below.
+                self._views.append((self.time - self.model.opt.timestep, self.camera_to_world))
         # Poses and contacts of the instant that is now read, rather than of the last small step's start.
         mujoco.mj_forward(self.model, self.data)
         self._touched = touched | self._touching()
@@ -115,6 +157,21 @@ class HuskyPhysics:
         return np.array([x, y, np.arctan2(matrix[3], matrix[0])])
 
     @property
+    def uprightness(self) -> float:
+        """Cosine of the angle between the robot's up and the world's."""
+        return float(self.data.xmat[self._body, 8])
+
+    @property
+    def speed(self) -> float:
+        """Over ground along the robot's heading [m/s]."""
+        return float(self.data.qvel[:3] @ self.data.xmat[self._body, [0, 3, 6]])
+
+    @property
+    def yaw_rate(self) -> float:
+        """About the robot's up [rad/s]."""
+        return float(self.data.qvel[5])
+
+    @property
     def camera_to_world(self) -> Array:
         """Of the front camera, OpenCV axes, shape (4, 4)."""
         return opencv_to_mujoco(_pose(self.data.cam_xpos[self._camera], self.data.cam_xmat[self._camera]))
@@ -122,6 +179,8 @@ class HuskyPhysics:
     @property
     def delayed_camera_to_world(self) -> Array:
         """Of the front camera when the newest picture there is was taken, `camera_latency` ago. Shape (4, 4)."""
+        if not self.params.camera_latency:
+            return self.camera_to_world
         time = max(self.time - self.params.camera_latency, self._views[0][0])
         times = np.array([view[0] for view in self._views])
         after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0

@@ -7,6 +7,7 @@ folder may be moved, zipped, or handed to anyone who has plain MuJoCo.
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,12 +140,18 @@ def film_camera(cameras: Cameras) -> PixelCamera:
     return PixelCamera((fx, fy, cx, cy), (width, height))
 
 
-def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
-    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane that fits the ground below."""
+def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tuple[Array, Array]:
+    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane that fits the ground below.
+
+    Args:
+        height_at: Height of the ground [m] at points (n, 2), shape (n,).
+        xy: Of the base [m], shape (2,).
+        yaw: [rad]
+    """
     forward = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-forward[1], forward[0]])
     local = husky.wheel_centers()[:, :2]
-    heights = ground.at(xy + local[:, :1] * forward + local[:, 1:] * left)
+    heights = height_at(xy + local[:, :1] * forward + local[:, 1:] * left)
     (slope_x, slope_y, height), *_ = np.linalg.lstsq(np.column_stack([local, np.ones(4)]), heights, rcond=None)
     x_axis = np.array([*forward, slope_x])
     y_axis = np.array([*left, slope_y])
@@ -295,7 +302,7 @@ def _add_robot(
         raise InputError(
             f"the route starts {edge.min():.2f} m from the edge of the ground, expected at least 1 m; raise mesh.margin"
         )
-    position, quaternion = rest_pose(ground, route[0, :2], yaw)
+    position, quaternion = rest_pose(ground.at, route[0, :2], yaw)
     husky.add_husky(spec, position, quaternion, params, camera)
     model = spec.compile()
     data = mujoco.MjData(model)

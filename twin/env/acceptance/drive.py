@@ -50,7 +50,7 @@ def on_ground(
     with tempfile.TemporaryDirectory(prefix="twin-ground-") as folder:
         spec.modelfiledir = spec.meshdir = spec.texturedir = folder
         add_ground(spec, ground, Path(folder), cell)
-        position, quaternion = rest_pose(ground, np.array(start[:2]), start[2])
+        position, quaternion = rest_pose(ground.at, np.array(start[:2]), start[2])
         add_husky(spec, position, quaternion, params)
         if edit is not None:
             edit(spec)
