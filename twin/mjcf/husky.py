@@ -105,8 +105,14 @@ def add_husky(
     # What tyres wade through drags the tyres alone. MuJoCo's fluid acts on every body, unless one of its geoms is said to
     # be an ellipsoid in it: then on that geom only. So the chassis gets one too small to be felt.
     base.add_geom(
-        name="chassis_dry", size=(1e-3, 1e-3, 1e-3), mass=0, contype=0, conaffinity=0, group=ROBOT_GROUP
-    ).fluid_ellipsoid = 1.0
+        name="chassis_dry",
+        size=(1e-3, 1e-3, 1e-3),
+        mass=0,
+        contype=0,
+        conaffinity=0,
+        fluid_ellipsoid=True,
+        group=ROBOT_GROUP,
+    )
     wheels = {name: _add_wheel(base, name, i, params) for i, name in enumerate(WHEELS)}
     for side in SIDES:
         _add_drive(spec, side, params)
@@ -164,7 +170,7 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
         friction=(params.friction, params.spin_friction, max(params.rolling_resistance * radius, 1e-5)),
         solimp=_WHEEL_SOLIMP,
         solref=_WHEEL_SOLREF,
-        fluid_ellipsoid=1.0,
+        fluid_ellipsoid=True,
         **shapes[params.wheel_shape],
     )
     return wheel
