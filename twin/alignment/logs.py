@@ -210,9 +210,7 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
         if columns[name].shape != shape[:1]:
             raise InputError(f"{where}: {name} has shape {columns[name].shape}; expected {shape[:1]}, one per window")
     _finite({name: columns[name] for name in ("calib_step", *names, *ends)}, where)
-    pose = np.stack(
-        [np.concatenate([columns[p.format("")], columns[p.format("gt_")][:, None]], 1) for p in poses], -1
-    )
+    pose = np.stack([np.concatenate([columns[p.format("")], columns[p.format("gt_")][:, None]], 1) for p in poses], -1)
     pose[..., 2] = np.unwrap(pose[..., 2], axis=1)
     wheels = np.stack([columns[name] for name in WHEEL_SPEEDS], -1)
     step = columns["calib_step"].astype(np.int64)
