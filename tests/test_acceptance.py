@@ -33,7 +33,8 @@ def test_a_number_that_is_none_fails():
 
 
 def test_roughness_of_known_bumps():
-    """Gaussian bumps of a kernel σ have the autocorrelation exp(−d²/4σ²), which is 1/e at 2σ; taking out the slow rise takes a little of them."""
+    """Bumps of a Gaussian kernel σ have the autocorrelation exp(−d²/4σ²), which is 1/e at 2σ; the slow rise that is
+    taken out takes a little of them along."""
     relief = grounds.random_relief(0.02, 0.2, np.random.default_rng(3), half=40.0)
     flat = grounds.level(half=39.0)
     x = flat.origin[0] + flat.cell * np.arange(len(flat.height))

@@ -33,7 +33,7 @@ def on_a_plane(params: HuskyParams | None = None) -> HuskyPhysics:
     set_options(spec)
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1))
     add_husky(spec, params=params)
-    return HuskyPhysics(spec.compile())
+    return HuskyPhysics(spec.compile(), params)
 
 
 def test_reaches_the_goal(world, drive):
@@ -198,3 +198,48 @@ def test_pictures(world, drive):
     assert plan.shape == (120, 160, 3)
     red = (plan[..., 0] > 180) & (plan[..., 1] < 90)
     assert red.sum() > 20  # the driven path
+
+
+def test_command_latency_delays_the_motion():
+    """The same drive, later by the latency: whole control steps and the rest of one."""
+    latency = 0.14
+    prompt, late = on_a_plane(), on_a_plane(HuskyParams(command_latency=latency))
+    tracks: dict[HuskyPhysics, list] = {prompt: [], late: []}
+    for physics, track in tracks.items():
+        for _ in range(5):
+            physics.step()
+        for _ in range(15):
+            physics.command(0.5, 0.4)
+            physics.step()
+            track.append((physics.time, *physics.planar_pose))
+    prompt_track, late_track = (np.array(track) for track in tracks.values())
+    for column in (1, 2, 3):
+        expected = np.interp(late_track[3:, 0] - latency, prompt_track[:, 0], prompt_track[:, column])
+        np.testing.assert_allclose(late_track[3:, column], expected, atol=0.004)
+
+
+def test_camera_latency_shows_the_past():
+    latency = 0.13
+    physics = on_a_plane(HuskyParams(camera_latency=latency))
+    np.testing.assert_array_equal(physics.delayed_camera_to_world, physics.camera_to_world)
+    times, poses = [], []
+    for _ in range(25):
+        physics.command(0.6, 0.8)
+        physics.step()
+        times.append(physics.time)
+        poses.append(physics.camera_to_world)
+    # At constant speeds the camera moves on a circle: between two instants it is where the arc says.
+    delayed = physics.delayed_camera_to_world
+    share = (times[-1] - latency - times[-3]) / 0.1
+    positions = np.array([pose[:3, 3] for pose in poses[-3:]])
+    np.testing.assert_allclose(delayed[:3, 3], (1 - share) * positions[0] + share * positions[1], atol=2e-3)
+    np.testing.assert_allclose(delayed[:3, :3] @ delayed[:3, :3].T, np.eye(3), atol=1e-9)
+    assert np.linalg.norm(delayed[:3, 3] - positions[-1]) > 0.05
+
+
+def test_no_latency_is_now():
+    physics = on_a_plane()
+    for _ in range(3):
+        physics.command(1.0, 0.5)
+        physics.step()
+    np.testing.assert_allclose(physics.delayed_camera_to_world, physics.camera_to_world, atol=1e-12)

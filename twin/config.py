@@ -194,9 +194,10 @@ class MjcfConfig:
     """False for a capture that is no drive (an object filmed around): no route, no Husky."""
     half_width: float = 1.0
     """Half width of the drivable corridor around the route [m]."""
-    hfield_cell: float = 0.2
-    """Cell of the height field that the wheels roll on [m], at least `mesh.ground_cell`. A wheel touches several facets
-    where it rolls over an edge; fewer edges shake it less and cost less."""
+    hfield_cell: float = 0.3
+    """Cell of the height field that the wheels roll on [m], a multiple of `mesh.ground_cell`. Where a wheel rolls over
+    an edge it touches several facets: fewer edges shake it less and cost less, and the ground has nothing finer anyway
+    (`mesh.ground_smoothing`)."""
     corridor_margin: float = 0.0
     """Extra clearance asked of convex parts beside the corridor [m]."""
 

@@ -93,8 +93,8 @@ class HuskyParams:
     """Effective radius of the left and of the right tyres [m]: pressure and wear. The robot's own controller goes on
     reckoning with the nominal one."""
     spin_friction: float = 1e-4
-    """Of a tyre's contact patch turning on the spot: moment / load [m]. Next to nothing by default, for the scrubbing of
-    four wheels dominates on hard ground; tyres that sink in have a long patch."""
+    """Of a tyre's contact patch turning on the spot: moment / load [m]. Next to nothing by default, for the scrubbing
+    of four wheels dominates on hard ground; tyres that sink in have a long patch."""
     slip_stiffness: float = 10.0
     """How stiffly friction holds a tyre, against how stiffly the ground carries it (MuJoCo's `impratio`). Below 1 tyres
     creep as on soft ground: force grows with the speed of slip before they slide."""

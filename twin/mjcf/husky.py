@@ -3,12 +3,19 @@
 Names, for whoever scripts it: body and free joint `base_link`; bodies and joints `<front|rear>_<left|right>_wheel`;
 actuators `left` and `right`, commanded in wheel speed [rad/s]; camera `front` (160 × 90) and `front_native`, the same
 at its native size; site `imu`; sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`,
-`<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`; `chassis_dry`
-touches nothing.
+`<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`;
+`chassis_dry` touches nothing.
+
+`python -m twin.mjcf.husky` writes the robot alone to `twin/assets/husky/husky.xml`, for anyone's own scene:
+
+    robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
+    spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
+    husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tyres need these
 
 Contact settings: measured, see `_WHEEL_SOLIMP`.
 """
 
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -36,6 +43,8 @@ from twin.robot import (
 Array = NDArray[np.float64]
 
 TIMESTEP = 0.002  # [s]
+HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
+"""The published robot alone, no floor."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
 _WHEEL_INERTIA = (0.02467, 0.04411, 0.02467)  # [kg m²], the axle is y
@@ -68,8 +77,8 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = params.slip_stiffness
     spec.option.viscosity = params.ground_viscosity
-    # Of Newton's improvement per step, scaled; at the default 1e-8 it takes one more step to the same motion.
-    spec.option.tolerance = 1e-6
+    # At the default 1e-8 Newton takes twice the iterations to the same motion.
+    spec.option.tolerance = 1e-5
 
 
 def add_husky(
@@ -102,8 +111,8 @@ def add_husky(
             group=ROBOT_GROUP,
             rgba=(0.2, 0.2, 0.8, 0.4),
         )
-    # What tyres wade through drags the tyres alone. MuJoCo's fluid acts on every body, unless one of its geoms is said to
-    # be an ellipsoid in it: then on that geom only. So the chassis gets one too small to be felt.
+    # What tyres wade through drags the tyres alone. MuJoCo's fluid acts on every body, unless one of its geoms is said
+    # to be an ellipsoid in it: then on that geom only. So the chassis gets one too small to be felt.
     base.add_geom(
         name="chassis_dry",
         size=(1e-3, 1e-3, 1e-3),
@@ -243,3 +252,40 @@ def center_of_mass(params: HuskyParams) -> Array:
     """Centre of mass of the whole robot in the base [m], shape (3,)."""
     mass, center, _ = _chassis_inertia(params)
     return (mass * center + WHEEL_MASS * wheel_centers().sum(0)) / (mass + 4 * WHEEL_MASS)
+
+
+def standalone_xml() -> str:
+    """The published robot alone, no floor, as MJCF."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "husky"
+    set_options(spec)
+    add_husky(spec)
+    spec.compile()
+    return _XML_HEAD + spec.to_xml()
+
+
+_XML_HEAD = """<!--
+  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures and licence: NOTICE.md.
+
+  body, free joint  base_link
+  joints            front_left_wheel, front_right_wheel, rear_left_wheel, rear_right_wheel
+  actuators         left, right: wheel speed [rad/s], up to 6.06; front and rear wheel of a side are belted
+  cameras           front (160 x 90), front_native (1280 x 720)
+  sensors           imu_gyro, imu_accelerometer, imu_orientation (site imu), <wheel>_wheel_position and _velocity,
+                    left_torque, right_torque [N m] at the wheels of a side
+
+  Attached to another model, this one's options are not taken over. The tyres need
+    <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10" tolerance="1e-5"/>
+  there as well: with another cone the scrubbing torque is wrong, with Euler the motors' servos are.
+-->
+"""
+
+
+def main() -> None:
+    """Writes `HUSKY_XML`."""
+    HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
+    print(f"wrote {HUSKY_XML}")
+
+
+if __name__ == "__main__":
+    main()

@@ -39,7 +39,8 @@ def add_look(
     """
     for name, rgba, specular in (("yellow", _YELLOW, 0.4), ("black", _BLACK, 0.2), ("dark", _DARK, 0.2)):
         spec.add_material(name=f"husky_{name}", rgba=rgba, specular=specular, shininess=0.4)
-    meshes = {"hull": _hull(), "left_tyre": _tyre(radii[0], width), "right_tyre": _tyre(radii[1], width)}
+    tyres = {radius: f"tyre_{i}" for i, radius in enumerate(dict.fromkeys(radii))}
+    meshes = {"hull": _hull()} | {name: _tyre(radius, width) for radius, name in tyres.items()}
     for name, (vertices, faces) in meshes.items():
         mesh = spec.add_mesh(name=f"husky_{name}")
         mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
@@ -58,9 +59,8 @@ def add_look(
     _cylinder(base, (-0.29, 0.0, 0.29), (-0.29, 0.0, 0.318), 0.024, rgba=_RED)
     _mast(base, camera)
     for name, wheel in wheels.items():
-        side = "left" if name.endswith("left") else "right"
-        radius = radii[side == "right"]
-        _mesh(wheel, f"husky_{side}_tyre", "husky_black")
+        radius = radii[name.endswith("right")]
+        _mesh(wheel, f"husky_{tyres[radius]}", "husky_black")
         for y in (-1.0, 1.0):
             _cylinder(wheel, (0, 0.30 * width * y, 0), (0, 0.44 * width * y, 0), 0.55 * radius, rgba=_STEEL)
             _cylinder(wheel, (0, 0.40 * width * y, 0), (0, 0.47 * width * y, 0), 0.22 * radius, material="husky_yellow")
