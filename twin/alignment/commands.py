@@ -116,7 +116,7 @@ def targets(drive: Drive, windows: Windows) -> tuple[Array, Array]:
     delay = min(drive.latency / STEP, HISTORY * _PER_SAMPLE - 1.0)
     whole = int(delay)
     share = delay - whole
-    # A ramp does not care for the size of what it is told, so it is the outcome that must be blended between two delays.
+    # A ramp does not care for the size of what it is told, so the outcome must be blended between two delays instead.
     one, other = (_carried_out(drive, wanted, now, speed, late) for late in (whole, whole + 1))
     return (1 - share) * one[0] + share * other[0], (1 - share) * one[1] + share * other[1]
 

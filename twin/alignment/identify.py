@@ -1,10 +1,9 @@
 """Least squares that says how sure it is, and leaves alone what the data do not show.
 
 A *parameter* has a span: how far from its usual value it may well be, known without any log (one standard deviation).
-The *rule*: a parameter is identified if its standard error, all others being free too, is at most half its span. Of those
+The *rule*: a parameter is identified if its standard error, all others being free, is at most half its span. Of those
 that are not, the least certain one goes back to its usual value, the rest is judged anew, and what is left is fitted
-again. Before the first fit, far from the best values, only hopeless ones go: those uncertain by ten times
-their span.
+again. Before the first fit, far from the best values, only hopeless ones go: those uncertain by ten times their span.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
 any way. Residuals are bent (`kinematics.bend`), so single impossible windows neither pull nor blow them up.

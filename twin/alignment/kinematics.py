@@ -48,7 +48,7 @@ NOMINAL = Icr()
 
 
 def integrate(motion: Array) -> Array:
-    """Poses x, y [m], yaw [rad] from rest at zero, shape (n, k + 1, 3), for motions (n, k, 3) held `PERIOD` [s] each."""
+    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for motions (n, k, 3) held `PERIOD` [s] each."""
     turned = motion[..., 2] * PERIOD
     yaw = np.concatenate([np.zeros((len(motion), 1)), np.cumsum(turned, 1)], 1)
     middle = yaw[:, :-1] + turned / 2

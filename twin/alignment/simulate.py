@@ -39,7 +39,7 @@ class Drives:
     wheels: Array
     """Of the left and of the right side [rad/s], shape (n, k + AHEAD, 2)."""
     torques: Array
-    """Of the left and of the right motor, at the wheels [N m], means over each `PERIOD`, shape (n, k + AHEAD − 1, 2)."""
+    """Of the left and the right motor, at the wheels [N m], means over each `PERIOD`, shape (n, k + AHEAD − 1, 2)."""
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:

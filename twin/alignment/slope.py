@@ -5,7 +5,7 @@ than a good model's error, so a log on real ground is fitted with the slope it w
 robot tell it badly, so windows that follow each other are averaged, weights falling by `FADE` per window. What is
 constant in the robot's own frame (the IMU's mounting, a pitched chassis) is taken off by the median over the log.
 
-Only headings and speeds reckoned from the wheels (`kinematics.Icr`) are used to turn accelerations into one frame and to
+Only headings and speeds reckoned from wheels (`kinematics.Icr`) are used to turn accelerations into one frame and to
 take the motion's own off: never the poses that are to be predicted.
 """
 
@@ -40,7 +40,7 @@ def gravity(windows: Windows, model: Icr) -> Array:
 
 
 def _averaged(vector: NDArray, turn: Array, follows: NDArray[np.bool_]) -> NDArray:
-    """Each window's vector (x + iy) with its neighbours', all in its own frame; `turn` [rad] is made within a window."""
+    """Each window's vector (x + iy) with its neighbours', in its own frame; `turn` [rad] is made within a window."""
     out = np.empty_like(vector)
     for i in range(len(vector)):
         total, weight = vector[i], 1.0
