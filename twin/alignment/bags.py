@@ -40,11 +40,12 @@ def read_bag(path: Path) -> dict[str, Array]:
             chosen = _choose(reader.connections, path)
             rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
             kinds = {connection.id: kind for kind, connection in chosen.items()}
+            begin = reader.start_time  # [ns]; taken off while still a whole number, for a float would round to 0.2 µs
             for connection, stamp, raw in reader.messages(connections=list(chosen.values())):
                 kind = kinds[connection.id]
                 values = _VALUES[kind](reader.deserialize(raw, connection.msgtype))
                 if values is not None:
-                    rows[kind].append((stamp * 1e-9, *values))
+                    rows[kind].append(((stamp - begin) * 1e-9, *values))
     except InputError:
         raise
     except Exception as error:  # the reader's own errors: not a bag, a broken one, unknown messages

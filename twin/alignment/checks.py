@@ -14,7 +14,7 @@ MIN_WINDOWS = 20  # to fit to; half as many to score on
 MIN_TURNS = 10  # windows that turn by more than TURN, at least a quarter of them to either side
 TURN = 0.25  # [rad]
 
-_MOVING = 0.15  # [m/s] of the wheels' circumference: what is judged by its units must move this fast at least
+_MOVING = 0.15  # [m/s] of wheels or robot: what is judged by its units must move this fast at least
 _DEGREE = np.pi / 180
 
 
@@ -39,7 +39,7 @@ def check(windows: Windows, where: str) -> None:
 def _check_units(windows: Windows, where: str) -> None:
     mean, half = _speeds(windows.wheels)
     distance = np.hypot(windows.poses[:, -1, 0], windows.poses[:, -1, 1]) / DURATION
-    straight = (np.abs(mean) > _MOVING) & (np.abs(half) < 0.3 * np.abs(mean))
+    straight = (np.maximum(np.abs(mean), distance) > _MOVING) & (np.abs(half) < 0.3 * np.abs(mean))
     _judge(
         _median(distance[straight] / np.abs(mean[straight])),
         (0.3, 2.0),
@@ -52,7 +52,7 @@ def _check_units(windows: Windows, where: str) -> None:
         },
     )
     rate = np.abs(windows.poses[:, -1, 2]) / DURATION
-    turning = np.abs(half) > _MOVING
+    turning = np.maximum(np.abs(half), rate * TRACK / 2) > _MOVING
     _judge(
         _median(rate[turning] * TRACK / 2 / np.abs(half[turning])),
         (0.1, 1.3),

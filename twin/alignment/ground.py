@@ -42,7 +42,7 @@ _TORQUE = "motor currents or torques"
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "friction": (0.3, 0.2, 0.05, 1.5, "", _SPREAD),
     "spin_friction": (0.02, 0.03, 0.0, 0.3, "m", _SPREAD),
-    "log10_slip_stiffness": (-1.0, 0.5, -2.5, 2.0, "", "gentle bends as well as hard turns"),
+    "log10_slip_stiffness": (-1.0, 1.0, -2.5, 2.0, "", "gentle bends as well as hard turns"),
     "ground_viscosity": (5.0, 5.0, 0.0, 80.0, "Pa s", "turns while driving at several speeds"),
     "center_of_mass_x": (-0.04, 0.05, -0.2, 0.2, "m", "turns forward and backward at speed"),
     "center_of_mass_y": (0.0, 0.03, -0.1, 0.1, "m", "turns to both sides"),

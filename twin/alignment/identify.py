@@ -6,7 +6,8 @@ that are not, the least certain one goes back to its usual value, the rest is ju
 again. Before the first fit, far from the best values, only hopeless ones go: those uncertain by ten times their span.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
-any way. Residuals are bent (`kinematics.bend`), so single impossible windows neither pull nor blow them up.
+any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible windows
+neither pull nor blow them up.
 """
 
 from collections.abc import Callable
@@ -146,7 +147,10 @@ def _standard_errors(jacobian: Array, error: Array, groups: NDArray[np.int64], s
     # A direction without any slope gets next to no curvature, hence a huge error rather than a division by zero.
     bread += np.eye(len(bread)) * 1e-9 * max(1.0, float(np.trace(bread)) / len(bread))
     inverse = np.linalg.inv(bread)
-    variance = np.diag(inverse @ meat @ inverse) * count / max(1, count - 1)
+    robust = np.diag(inverse @ meat @ inverse) * count / max(1, count - 1)
+    # Two that do exactly the same have no score where they differ, so only the classical error tells on them.
+    classical = np.diag(inverse) * (error**2).sum() / max(1, error.size - len(bread))
+    variance = np.maximum(robust, classical)
     flat = np.diag(bread) < 1e-6 * max(1.0, float(np.diag(bread).max()))
     return np.where(flat, np.inf, np.sqrt(np.maximum(variance, 0.0))) * spans
 

@@ -29,8 +29,9 @@ Array = NDArray[np.float64]
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-MAX_GAP = 0.5  # [s] between two rows of a table; a window across a longer one is left out
+MAX_GAP = 0.5  # [s] between two rows of a table; a window that touches a longer one is left out
 
+_TICK = 1e-6  # [s] instants nearer than this are the same
 _GROUP_WINDOWS = 3  # of a table without groups: six seconds
 _CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change from one window to the next
 
@@ -164,9 +165,10 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
             f"{where}: time goes from {time[i]:.3f} to {time[i + 1]:.3f} s at row {i + 2}; expected it to increase; "
             "sort the rows and drop those that repeat a time"
         )
-    starts = time[0] + DURATION * np.arange(max(0, int((time[-1] - time[0]) / DURATION + 1e-9)))
+    span = time[-1] - time[0] if len(time) else 0.0
+    starts = DURATION * np.arange(int(span / DURATION + _TICK)) + (time[0] if len(time) else 0.0)
     instants = starts[:, None] + PERIOD * np.arange(SAMPLES + 1)
-    rows = np.maximum(np.searchsorted(time, instants.ravel() + 1e-9, side="right") - 1, 0).reshape(instants.shape)
+    rows = np.maximum(np.searchsorted(time, instants.ravel() + _TICK, side="right") - 1, 0).reshape(instants.shape)
     last = np.minimum(rows[:, -1] + 1, len(time) - 1) if len(rows) else np.zeros(0, int)
     whole = np.array(
         [np.diff(time[a : b + 1]).max(initial=0) <= MAX_GAP for a, b in zip(rows[:, 0], last, strict=True)], bool

@@ -19,6 +19,7 @@ from twin.alignment.commands import AHEAD, STEP
 from twin.alignment.logs import PERIOD, SAMPLES, Windows
 from twin.alignment.slope import GRAVITY
 from twin.mjcf.husky import add_husky, set_options
+from twin.mjcf.husky_look import LOOK_GROUP
 from twin.robot import WHEELS, HuskyParams
 
 Array = NDArray[np.float64]
@@ -43,13 +44,17 @@ class Drives:
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:
-    """The Husky on a plane."""
+    """The Husky on a plane, without its looks: they take a third of the time and nearly all of the memory."""
     spec = mujoco.MjSpec()
     set_options(spec, params)
     if timestep:
         spec.option.timestep = timestep
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
     add_husky(spec, params=params)
+    for geom in [geom for geom in spec.geoms if geom.group == LOOK_GROUP]:
+        spec.delete(geom)
+    for mesh in list(spec.meshes):
+        spec.delete(mesh)
     return spec.compile()
 
 
