@@ -17,7 +17,7 @@ _MADE = {
     "shade of one lane": lambda: shade.shade(shade.LANES["cuda"], 64, 32)[0].module,
 }
 """Kernels that are made for a number of lanes are in modules of their own."""
-_NO_KERNEL = {"lookup", "shade"}
+_NO_KERNEL = {"lookup", "shade", "vectorised"}
 
 
 @pytest.mark.parametrize(

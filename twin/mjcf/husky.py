@@ -8,9 +8,9 @@ at its native size; site `imu`; sensors `imu_gyro`, `imu_accelerometer`, `imu_or
 
 `python -m twin.mjcf.husky` writes the robot alone to `twin/assets/husky/husky.xml`, for anyone's own scene:
 
+    husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tyres need these
     robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
     spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
-    husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tyres need these
 
 Contact settings: measured, see `_WHEEL_SOLIMP`.
 """

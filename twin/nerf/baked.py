@@ -27,9 +27,9 @@ from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bytes
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.lookup import Bricks
-from twin.nerf.kernels.shade import HARMONICS, shade
+from twin.nerf.kernels.shade import HARMONICS, Eight, shade
 from twin.nerf.kernels.shade import LANES as SHADE_LANES
-from twin.nerf.layout import BrickLayout, brick_indices, cell_corners
+from twin.nerf.layout import BrickLayout, brick_indices, brick_leaps, density_codes
 from twin.nerf.lightings import Lightings
 from twin.nerf.plausible import Probes
 from twin.nerf.rendering import Rendering
@@ -81,12 +81,13 @@ class BakedField:
             return wp.array(np.ascontiguousarray(array), dtype=dtype, device=where)
 
         b: Any = Bricks()
+        near, near_leaps = brick_leaps(near, arrays["near_leap"])
+        far, far_leaps = brick_leaps(far, arrays["far_leap"])
         b.near_index, b.far_index = on_device(near.ravel(), wp.int32), on_device(far.ravel(), wp.int32)
-        b.near_leap = on_device(arrays["near_leap"].ravel(), wp.uint8)
-        b.far_leap = on_device(arrays["far_leap"].ravel(), wp.uint8)
+        b.leaps = on_device(np.concatenate([near_leaps, far_leaps]).ravel(), wp.uint8)
         b.near_blocks = wp.vec3i(*(BLOCKS * n for n in layout.near_shape))
         b.far_blocks = wp.vec3i(*(BLOCKS * n for n in layout.far_shape))
-        b.corners = on_device(cell_corners(arrays["features"][..., 0]), wp.uint64)
+        b.densities = on_device(density_codes(arrays["features"][..., 0]), wp.uint8)
         b.features = on_device(arrays["features"].reshape(-1, CHANNELS), Bytes)
         b.low, b.step = Channels(*arrays["low"].tolist()), Channels(*arrays["step"].tolist())
         b.centre = wp.vec3f(*layout.centre)
@@ -102,13 +103,15 @@ class BakedField:
         self._shade, weights = shade(SHADE_LANES[where], hidden, behind)
         rows = CHANNELS - 1 + HARMONICS
         w: Any = weights()
-        for name, matrix in (("head_0", p["head.0"][:rows]), ("head_1", p["head.1"])):
-            fours = matrix.reshape(len(matrix), -1, 4).transpose(1, 0, 2)
-            setattr(w, name, on_device(fours.ravel(), wp.float32))
-        for name in ("head.2", "backdrop.0", "backdrop.1"):
+
+        def eights(matrix: NDArray) -> Any:
+            """By eight hidden units (the first axis), then by what else they connect."""
+            return on_device(matrix.reshape(len(matrix) // 8, 8, -1).transpose(0, 2, 1).reshape(-1, 8), Eight)
+
+        w.head_0, w.head_1, w.head_2 = eights(p["head.0"][:rows].T), eights(p["head.1"].T), eights(p["head.2"])
+        w.head_1_bias, w.head_2_bias = eights(p["head.1.bias"]), wp.vec3f(*p["head.2.bias"].tolist())
+        for name in ("backdrop.0", "backdrop.0.bias", "backdrop.1"):
             setattr(w, name.replace(".", "_"), on_device(p[name].ravel(), wp.float32))
-        w.head_1_bias, w.head_2_bias = on_device(p["head.1.bias"], wp.float32), wp.vec3f(*p["head.2.bias"].tolist())
-        w.backdrop_0_bias = on_device(p["backdrop.0.bias"], wp.float32)
         self._weights = w
         self._bias_of = p["head.0.bias"], p["head.0"][rows:]
         load_kernels([kernels.approach, self._march, self._shade], where)
@@ -249,7 +252,7 @@ class _Picture:
         film.intrinsics = new((n,), wp.vec4f)
         film.stop = new((n, pixels) if stopped else (0, 0))
         film.width, film.height, film.across = width, height, across
-        self.film, self.bias = film, new((n, len(field._bias_of[0])))
+        self.film, self.bias = film, new((n, len(field._bias_of[0]) // 8), Eight)
         self.depth, self.opacity, self.rgb = new((n, pixels)), new((n, pixels)), new((n, pixels), wp.vec3f)
         self.features = new((n, CHANNELS, pixels))
         start = new((n, across * down))
@@ -283,7 +286,7 @@ class _Picture:
         film.rotation.assign(pose[:, :3, :3].astype(np.float32))
         film.position.assign(pose[:, :3, 3].astype(np.float32))
         film.intrinsics.assign(intrinsics.astype(np.float32))
-        self.bias.assign(np.ascontiguousarray(bias, np.float32))
+        self.bias.assign(np.ascontiguousarray(bias, np.float32).reshape(len(bias), -1, 8))
         if stop is not None:
             film.stop.assign(np.asarray(stop, np.float32).reshape(film.stop.shape))
 

@@ -1,4 +1,5 @@
-"""Where the bricks of a baked field are, and what the march must know of them; vocabulary as in `kernels/march.py`."""
+"""Where the bricks of a baked field are, and what the march must know of them; vocabulary as in
+`kernels/bricks.py` and `kernels/lookup.py`."""
 
 from dataclasses import dataclass
 
@@ -6,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS
+from twin.nerf.kernels.lookup import HALF
 
 _TRACE = 0.03  # share of light that a cell may stop and count as empty
 
@@ -48,19 +50,29 @@ def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDA
     return out[0], out[1]
 
 
-def cell_corners(codes: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Density codes (s, 729) as one number per cell, see `Bricks.corners` in `kernels/lookup.py`; shape (s · 512,)."""
-    side = [CORNERS] * 3
-    cube = codes.reshape(-1, *side)
-    out = np.empty((len(cube), CELLS, CELLS, CELLS, 8), np.uint8)
-    for n in range(8):
-        x, y, z = n >> 2, (n >> 1) & 1, n & 1
-        out[..., n] = cube[:, x : x + CELLS, y : y + CELLS, z : z + CELLS]
-    return out.reshape(-1, 8).view("<u8").ravel()
+def density_codes(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Densities of bricks (s, 729) as the march reads them, see `kernels/lookup.py`; shape (s · 810 + 8,)."""
+    cube = samples.reshape(-1, *[CORNERS] * 3)
+    halves = np.stack([cube[..., :HALF], cube[..., HALF - 1 :]], 2)
+    return np.concatenate([halves.ravel(), np.zeros(8, np.uint8)])  # the last are read eight at a time, too
+
+
+def brick_leaps(index: NDArray[np.int32], leap: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """The leaps of a grid's blocks, shape 4 · that of the index of its bricks, without those that say little.
+
+    Returns:
+        The index with −d where it has no slot, d the least leap in the brick; and the leaps of stored bricks, (k, 64),
+        by slot.
+    """
+    n0, n1, n2 = index.shape
+    blocks = leap.reshape(n0, BLOCKS, n1, BLOCKS, n2, BLOCKS).transpose(0, 2, 4, 1, 3, 5).reshape(*index.shape, -1)
+    stored = index >= 0
+    by_slot = blocks[stored][np.argsort(index[stored])]
+    return np.where(stored, index, -blocks.min(-1).astype(np.int32)), by_slot
 
 
 def leaps(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
-    """How far rays may leap from every block of the `near_leap` and the `far_leap` grid, see `kernels/march.py`."""
+    """How far rays may leap from every block of the `near_leap` and the `far_leap` grid, see `kernels/lookup.py`."""
     from scipy.ndimage import distance_transform_cdt
 
     filled = filled_blocks(layout, arrays)

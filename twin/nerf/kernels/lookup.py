@@ -1,14 +1,30 @@
-"""What the march reads of a baked field: densities by the cell, features by the sample; see `bricks.py`."""
+"""What the march reads of a baked field, in few bytes, as it mostly waits for memory; for bricks see `bricks.py`.
+
+*Leap*: of a block 0 where there is something in it, else d ≥ 1, the distance to the nearest such block, in blocks along
+the axis where it is furthest: so far a ray may go in that grid without looking.
+"""
 
 # Warp reads annotations as values.
 # mypy: ignore-errors
 import warp as wp
 
 from twin.nerf.kernels.bricks import CORNERS, SAMPLES, Bytes
-from twin.nerf.kernels.composite import CHANNELS, Channels
+from twin.nerf.kernels.composite import CHANNELS, RAW_LIMIT, Channels
+from twin.nerf.kernels.vectorised import exponential
+
+HALF = CORNERS // 2 + 1
+"""Samples along z of half a brick."""
+DENSITIES = CORNERS * 2 * CORNERS * HALF
+"""Bytes of a brick's densities: along x, then by halves along z (the sample between them twice), then y, then z. So
+the four corners of a cell's face across x lie within eight bytes, and a line of the cache holds many cells."""
 
 _SAMPLES = wp.constant(SAMPLES)
 _CORNERS = wp.constant(CORNERS)
+_HALF = wp.constant(HALF)
+_DENSITIES = wp.constant(DENSITIES)
+_ACROSS = wp.constant(2 * CORNERS * HALF)  # from one face to the next
+_NEXT_Y = wp.constant(8 * HALF)  # bits
+_RAW_LIMIT = wp.constant(RAW_LIMIT)
 _X = wp.constant(CORNERS * CORNERS)  # from one sample to the next along each axis
 _Y = wp.constant(CORNERS)
 _Z = wp.constant(1)
@@ -18,14 +34,15 @@ _Z = wp.constant(1)
 class Bricks:
     """A baked field as the march reads it. Grids are flat, the last axis fastest."""
 
-    near_leap: wp.array(dtype=wp.uint8)
-    far_leap: wp.array(dtype=wp.uint8)
     near_index: wp.array(dtype=wp.int32)
+    """Slot of a brick, or −d where none is stored: the least leap of its blocks is d."""
     far_index: wp.array(dtype=wp.int32)
+    leaps: wp.array(dtype=wp.uint8)
+    """Of the blocks of the stored bricks."""
     near_blocks: wp.vec3i
     far_blocks: wp.vec3i
-    corners: wp.array(dtype=wp.uint64)
-    """Densities on a cell's eight corners, corner 4·x + 2·y + z in the byte of that number, one cell after another."""
+    densities: wp.array(dtype=wp.uint8)
+    """See `layout.density_codes`."""
     features: wp.array(dtype=Bytes)
     low: Channels
     step: Channels
@@ -37,18 +54,61 @@ class Bricks:
     near_plane: wp.float32
 
 
+# A Warp array may have gaps between its elements; these have none, and the compiler does better where it knows.
+@wp.func_native("return array.data[i];")
+def byte_of(array: wp.array(dtype=wp.uint8), i: wp.int32) -> wp.uint8: ...
+
+
+@wp.func_native("return array.data[i];")
+def slot_of(array: wp.array(dtype=wp.int32), i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("return array.data[i];")
+def sample_of(array: wp.array(dtype=Bytes), i: wp.int32) -> Bytes: ...
+
+
+@wp.func_native("unsigned long long eight; memcpy(&eight, array.data + i, 8); return eight;")
+def eight_of(array: wp.array(dtype=wp.uint8), i: wp.int32) -> wp.uint64: ...
+
+
 @wp.func
-def interpolated(cell: wp.uint64, x: wp.float32, y: wp.float32, z: wp.float32) -> wp.float32:
-    """Density code at (x, y, z) in [0, 1]³ of a cell."""
-    low = wp.uint32(cell)
-    high = wp.uint32(cell >> wp.uint64(32))
+def brick_at(index: wp.array(dtype=wp.int32), b1: wp.int32, b2: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
+    """What an index of (.., b1, b2) blocks says of the brick that block (i0, i1, i2) is in."""
+    return slot_of(index, ((i0 >> 2) * (b1 >> 2) + (i1 >> 2)) * (b2 >> 2) + (i2 >> 2))
+
+
+@wp.func
+def leap_at(bricks: Bricks, brick: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
+    """The leap of a block, or of its brick where none is stored."""
+    at = wp.max(brick, 0) * 64 + ((i0 & 3) * 4 + (i1 & 3)) * 4 + (i2 & 3)
+    stored = int(byte_of(bricks.leaps, at))
+    return wp.where(brick < 0, -brick, stored)
+
+
+@wp.func
+def density_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, p2: wp.float32):
+    """Density [1/contracted m] at a place in blocks."""
+    i0 = int(2.0 * p0)
+    i1 = int(2.0 * p1)
+    i2 = int(2.0 * p2)
+    x = 2.0 * p0 - float(i0)
+    y = 2.0 * p1 - float(i1)
+    z = 2.0 * p2 - float(i2)
+    at = slot * _DENSITIES + (((i0 & 7) * 2 + ((i2 & 4) >> 2)) * _CORNERS + (i1 & 7)) * _HALF + (i2 & 3)
+    near = eight_of(bricks.densities, at)
+    far = eight_of(bricks.densities, at + _ACROSS)
     byte = wp.uint32(255)
     az = 1.0 - z
-    v0 = az * float(low & byte) + z * float((low >> wp.uint32(8)) & byte)
-    v1 = az * float((low >> wp.uint32(16)) & byte) + z * float(low >> wp.uint32(24))
-    v2 = az * float(high & byte) + z * float((high >> wp.uint32(8)) & byte)
-    v3 = az * float((high >> wp.uint32(16)) & byte) + z * float(high >> wp.uint32(24))
-    return (1.0 - x) * ((1.0 - y) * v0 + y * v1) + x * ((1.0 - y) * v2 + y * v3)
+    a = wp.uint32(near)
+    b = wp.uint32(near >> wp.uint64(_NEXT_Y))
+    c = wp.uint32(far)
+    d = wp.uint32(far >> wp.uint64(_NEXT_Y))
+    v0 = az * float(a & byte) + z * float((a >> wp.uint32(8)) & byte)
+    v1 = az * float(b & byte) + z * float((b >> wp.uint32(8)) & byte)
+    v2 = az * float(c & byte) + z * float((c >> wp.uint32(8)) & byte)
+    v3 = az * float(d & byte) + z * float((d >> wp.uint32(8)) & byte)
+    code = (1.0 - x) * ((1.0 - y) * v0 + y * v1) + x * ((1.0 - y) * v2 + y * v3)
+    return bricks.unit * exponential(wp.min(bricks.low[0] + bricks.step[0] * code, _RAW_LIMIT))
 
 
 @wp.func
@@ -72,12 +132,12 @@ def features_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, 
     ax = 1.0 - x
     ay = 1.0 - y
     az = 1.0 - z
-    value = codes(bricks.features[at]) * (ax * ay * az)
-    value += codes(bricks.features[at + _Z]) * (ax * ay * z)
-    value += codes(bricks.features[at + _Y]) * (ax * y * az)
-    value += codes(bricks.features[at + _Y + _Z]) * (ax * y * z)
-    value += codes(bricks.features[at + _X]) * (x * ay * az)
-    value += codes(bricks.features[at + _X + _Z]) * (x * ay * z)
-    value += codes(bricks.features[at + _X + _Y]) * (x * y * az)
-    value += codes(bricks.features[at + _X + _Y + _Z]) * (x * y * z)
+    value = codes(sample_of(bricks.features, at)) * (ax * ay * az)
+    value += codes(sample_of(bricks.features, at + _Z)) * (ax * ay * z)
+    value += codes(sample_of(bricks.features, at + _Y)) * (ax * y * az)
+    value += codes(sample_of(bricks.features, at + _Y + _Z)) * (ax * y * z)
+    value += codes(sample_of(bricks.features, at + _X)) * (x * ay * az)
+    value += codes(sample_of(bricks.features, at + _X + _Z)) * (x * ay * z)
+    value += codes(sample_of(bricks.features, at + _X + _Y)) * (x * y * az)
+    value += codes(sample_of(bricks.features, at + _X + _Y + _Z)) * (x * y * z)
     return value

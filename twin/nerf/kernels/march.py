@@ -3,10 +3,8 @@
 *Packet*: neighbouring rays, eight to a row, that march together, one per *lane*. Every loop over lanes is free of
 branches, so that the compiler turns it into vector instructions; on CUDA, where the hardware does that, a packet has
 one lane.
-*Tile*: 8 × 8 pixels; no ray of it meets anything before the tile's *start*. *Leap*: per block of a grid 0 where there
-is something in it, else d ≥ 1, the distance to the nearest such block, in blocks along the axis where it is furthest:
-so far a ray may go in that grid without looking. For bricks, blocks and the two grids see `bricks.py`, for positions
-`space.py`.
+*Tile*: 8 × 8 pixels; no ray of it meets anything before the tile's *start*. For bricks, blocks and the two grids see
+`bricks.py`, for leaps `lookup.py`, for positions `space.py`.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
@@ -17,35 +15,28 @@ from typing import Any
 
 import warp as wp
 
-from twin.nerf.kernels.bricks import CELLS
-from twin.nerf.kernels.composite import CHANNELS, RAW_LIMIT
-from twin.nerf.kernels.lookup import Bricks, features_at, interpolated
+from twin.nerf.kernels.bricks import BLOCKS
+from twin.nerf.kernels.composite import CHANNELS
+from twin.nerf.kernels.lookup import Bricks, brick_at, density_at, features_at, leap_at
 from twin.nerf.kernels.space import grid_position, max_norm
+from twin.nerf.kernels.vectorised import OPTIONS, exponential, logarithm, lowest_bit, nonzero
 
 TILE = 8
 """Pixels along a tile's side."""
 LANES = {"cpu": 16, "cuda": 1}
 """Rays of a packet."""
 
-# Loops over lanes stay loops, for the compiler to make vectors of; nothing here needs IEEE's order of additions.
-OPTIONS = {
-    "enable_backward": False,
-    "max_unroll": 0,
-    "optimization_level": 3,
-    "fast_math": False,
-    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000",
-}
 wp.set_module_options(OPTIONS)
 
 _TILE = wp.constant(TILE)
-_CELL_COUNT = wp.constant(CELLS**3)
+_BLOCKS = wp.constant(BLOCKS)
 _FAR = wp.constant(100.0)  # unit positions beyond this are one with the horizon
 _NEVER = wp.constant(1.0e30)
 _STEP = wp.constant(1.0)  # step inside a brick [cells]
 _STRIDE = wp.constant(1.0)  # nor is one shorter than this [pixel widths]
 _OPAQUE = wp.constant(0.03)  # transmittance that counts as none
 _FAINT = wp.constant(0.06)  # weight from which features are looked up
-_RAW_LIMIT = wp.constant(RAW_LIMIT)
+_PATIENCE = wp.constant(4)  # lanes alive per sampling one above which sampling waits
 _MOST_STEPS = wp.constant(1000)
 _MOST_APPROACHES = wp.constant(64)
 _LEAST_APPROACH = wp.constant(0.5)  # of the tiles' starts [cells]
@@ -67,37 +58,12 @@ class Film:
 
 
 @wp.func
-def exponential(x: wp.float32) -> wp.float32:
-    """e^x to 1e-4 of itself; unlike `wp.exp`, it is no call, so a loop with it becomes vectors."""
-    y = wp.max(x, -80.0) * 1.4426950408889634
-    n = wp.floor(y)
-    f = y - n
-    p = 1.0 + f * (0.69550201 + f * (0.22626982 + f * 0.07822817))
-    return p * wp.cast((int(n) + 127) << 23, wp.float32)
+def wall(p: wp.float32, slowness: wp.float32, first: wp.int32, size: wp.int32, leap: wp.int32):
+    """When something at p [blocks] leaves what it may leap over [m], at `slowness` metres a block.
 
-
-@wp.func
-def logarithm(x: wp.float32) -> wp.float32:
-    """Natural logarithm of x in [1, 2], to 1e-5 (Abramowitz and Stegun 1964, 4.1.43)."""
-    y = x - 1.0
-    return y * (0.99949556 + y * (-0.49190896 + y * (0.28947478 + y * (-0.13606275 + y * 0.03215845))))
-
-
-@wp.func
-def lowest_bit(bits: wp.int32) -> wp.int32:
-    """Index of the lowest bit that is set: the exponent of that bit as a float."""
-    return (wp.cast(float(bits & -bits), wp.int32) >> 23) - 127
-
-
-@wp.func
-def nonzero(x: wp.float32) -> wp.float32:
-    return wp.where(wp.abs(x) < 1.0e-9, 1.0e-9, x)
-
-
-@wp.func
-def wall(q: wp.float32, slowness: wp.float32, reach: wp.float32) -> wp.float32:
-    """When something at q in [0, 1) of a block has passed `reach` − 1 blocks more, at `slowness` metres a block [m]."""
-    return wp.where(slowness > 0.0, reach - q, 1.0 - reach - q) * slowness
+    That is `size` blocks from `first` on and leap − 1 more to both sides.
+    """
+    return (float(wp.where(slowness > 0.0, first + size + leap - 1, first + 1 - leap)) - p) * slowness
 
 
 @wp.func
@@ -152,11 +118,15 @@ def approach(bricks: Bricks, film: Film, first: wp.int32, start: wp.array2d(dtyp
         i0 = int(p[0])
         i1 = int(p[1])
         i2 = int(p[2])
-        free = float(bricks.near_leap[(i0 * bricks.near_blocks[1] + i1) * bricks.near_blocks[2] + i2]) - 1.0
-        q = p - wp.vec3f(float(i0), float(i1), float(i2))
-        margin = wp.vec3f(free, free, free) + wp.min(q, wp.vec3f(1.0, 1.0, 1.0) - q)
+        brick = brick_at(bricks.near_index, bricks.near_blocks[1], bricks.near_blocks[2], i0, i1, i2)
+        leap = leap_at(bricks, brick, i0, i1, i2)
+        size = wp.where(brick < 0, _BLOCKS, 1)
+        free = float(leap - 1)
+        q = p - wp.vec3f(float(i0 & -size), float(i1 & -size), float(i2 & -size))
+        whole = float(size)
+        margin = wp.vec3f(free, free, free) + wp.min(q, wp.vec3f(whole, whole, whole) - q)
         ahead = (wp.min(wp.cw_div(margin, per_metre)) - t * chord) / (1.0 + chord)
-        if free < 0.0 or ahead < _LEAST_APPROACH * bricks.near_cell:
+        if leap == 0 or ahead < _LEAST_APPROACH * bricks.near_cell:
             break
         t += ahead
     start[camera, tile] = t
@@ -293,14 +263,16 @@ def march(lanes: int) -> Any:
                 i0 = wp.clamp(int(wp.clamp(x, -1.0, 1.0e6)), 0, n0 - 1)
                 i1 = wp.clamp(int(wp.clamp(y, -1.0, 1.0e6)), 0, n1 - 1)
                 i2 = wp.clamp(int(wp.clamp(z, -1.0, 1.0e6)), 0, n2 - 1)
-                leap = float(bricks.near_leap[(i0 * n1 + i1) * n2 + i2])
-                w0 = wall(x - float(i0), s0[j], leap)
-                w1 = wall(y - float(i1), s1[j], leap)
-                w2 = wall(z - float(i2), s2[j], leap)
-                there = near * wp.where(leap > 0.0, 0, 1)
+                brick = brick_at(bricks.near_index, n1, n2, i0, i1, i2)
+                leap = leap_at(bricks, brick, i0, i1, i2)
+                size = wp.where(brick < 0, _BLOCKS, 1)
+                w0 = wall(x, s0[j], i0 & -size, size, leap)
+                w1 = wall(y, s1[j], i1 & -size, size, leap)
+                w2 = wall(z, s2[j], i2 & -size, size, leap)
+                there = near * wp.where(leap > 0, 0, 1)
                 sampling = sampling + there
                 dense[j] = there
-                slot[j] = wp.where(there > 0, ((i0 >> 2) * (n1 >> 2) + (i1 >> 2)) * (n2 >> 2) + (i2 >> 2), -1)
+                slot[j] = wp.where(there > 0, brick, -1)
                 p0[j] = wp.clamp(x, 0.0, near_blocks[0] - 1.0e-3)
                 p1[j] = wp.clamp(y, 0.0, near_blocks[1] - 1.0e-3)
                 p2[j] = wp.clamp(z, 0.0, near_blocks[2] - 1.0e-3)
@@ -308,7 +280,7 @@ def march(lanes: int) -> Any:
                 length[j] = stride
                 thick[j] = stride
                 go = wp.min(wp.min(wp.min(w0, w1), w2), leave[j] - tj) + 0.02 * bricks.near_cell
-                ahead[j] = wp.where(near > 0, wp.where(leap > 0.0, go, stride), 0.0)
+                ahead[j] = wp.where(near > 0, wp.where(leap > 0, go, stride), 0.0)
             if alive == 0 or note == notes:
                 for n in range(note):
                     bits = noted[n]
@@ -321,9 +293,6 @@ def march(lanes: int) -> Any:
                 note = 0
                 if alive == 0:
                     break
-            if sampling > 0:
-                for j in range(count):
-                    slot[j] = wp.where(dense[j] > 0, bricks.near_index[wp.max(slot[j], 0)], -1)
             if outside > 0:
                 for j in range(count):
                     tj = t[j]
@@ -336,50 +305,48 @@ def march(lanes: int) -> Any:
                     i0 = int(g[0])
                     i1 = int(g[1])
                     i2 = int(g[2])
-                    leap = float(bricks.far_leap[(i0 * f1 + i1) * f2 + i2])
-                    there = far * wp.where(leap > 0.0, 0, 1)
-                    at = bricks.far_index[((i0 >> 2) * (f1 >> 2) + (i1 >> 2)) * (f2 >> 2) + (i2 >> 2)]
+                    brick = brick_at(bricks.far_index, f1, f2, i0, i1, i2)
+                    leap = leap_at(bricks, brick, i0, i1, i2)
+                    size = wp.where(brick < 0, _BLOCKS, 1)
+                    there = far * wp.where(leap > 0, 0, 1)
                     c4 = far_rate(u, v, m)
                     q0 = 1.0 / nonzero(c4[0] * 0.25 * far_blocks[0])
                     q1 = 1.0 / nonzero(c4[1] * 0.25 * far_blocks[1])
                     q2 = 1.0 / nonzero(c4[2] * 0.25 * far_blocks[2])
-                    w0 = wall(g[0] - float(i0), q0, leap)
-                    w1 = wall(g[1] - float(i1), q1, leap)
-                    w2 = wall(g[2] - float(i2), q2, leap)
+                    w0 = wall(g[0], q0, i0 & -size, size, leap)
+                    w1 = wall(g[1], q1, i1 & -size, size, leap)
+                    w2 = wall(g[2], q2, i2 & -size, size, leap)
                     cell = 0.5 * wp.min(wp.min(wp.abs(q0), wp.abs(q1)), wp.abs(q2))  # what a cell is long here [m]
-                    # Outwards a ray slows down, so the wall is not passed; inwards half the way is taken at most.
-                    go = wp.min(wp.min(w0, w1), w2) * wp.where(c4[3] < 0.0, 0.5, 1.0) + 0.1 * bricks.far_cell * m
+                    # Outwards a ray slows down: its position is about linear in 1/m. Inwards half the way is taken.
+                    go = wp.min(wp.min(w0, w1), w2)
+                    slack = 1.0 - go * c4[3] / m
+                    go = wp.where(c4[3] < 0.0, 0.5 * go, wp.where(slack > 0.0, go / wp.max(slack, 1.0e-6), _NEVER))
+                    go = go + 0.1 * bricks.far_cell * m
                     stride = _STEP * wp.max(
                         wp.clamp(cell, bricks.far_cell * m, 3.0 * bricks.far_cell * m), footprint * tj
                     )
-                    go = wp.where(leap > 0.0, go, stride)
+                    go = wp.where(leap > 0, go, stride)
                     # No step jumps into the near box.
                     go = wp.where(tj < enter[j], wp.min(go, enter[j] - tj + 0.02 * bricks.near_cell), go)
                     go = wp.where(m > _FAR, _NEVER, go)
                     ahead[j] = wp.where(far > 0, go, ahead[j])
-                    slot[j] = wp.where(there > 0, at, slot[j])
+                    slot[j] = wp.where(there > 0, brick, slot[j])
                     p0[j] = wp.where(there > 0, g[0], p0[j])
                     p1[j] = wp.where(there > 0, g[1], p1[j])
                     p2[j] = wp.where(there > 0, g[2], p2[j])
                     length[j] = wp.where(there > 0, stride, length[j])
                     thick[j] = wp.where(there > 0, stride / (m * m), thick[j])
+                    dense[j] = wp.where(there > 0, 1, dense[j])
                     sampling = sampling + there
-            if sampling > 0:
+            if _PATIENCE * sampling < alive:  # those few wait for others
+                for j in range(count):
+                    ahead[j] = wp.where(dense[j] > 0, 0.0, ahead[j])
+            else:
                 bits = int(0)
                 # A step's density and features are those of its middle.
                 for j in range(count):
                     filled = wp.where(slot[j] >= 0, 1.0, 0.0)
-                    c0 = 2.0 * p0[j]
-                    c1 = 2.0 * p1[j]
-                    c2 = 2.0 * p2[j]
-                    i0 = int(c0)
-                    i1 = int(c1)
-                    i2 = int(c2)
-                    corners = bricks.corners[
-                        wp.max(slot[j], 0) * _CELL_COUNT + ((i0 & 7) * 8 + (i1 & 7)) * 8 + (i2 & 7)
-                    ]
-                    raw = interpolated(corners, c0 - float(i0), c1 - float(i1), c2 - float(i2))
-                    density = bricks.unit * exponential(wp.min(bricks.low[0] + bricks.step[0] * raw, _RAW_LIMIT))
+                    density = density_at(bricks, wp.max(slot[j], 0), p0[j], p1[j], p2[j])
                     # What of the step lies beyond the limit stops nothing.
                     before_limit = wp.clamp((limit[j] - t[j]) / length[j] + 0.5, 0.0, 1.0)
                     optical = density * thick[j] * before_limit * filled

@@ -12,7 +12,8 @@ from typing import Any
 import warp as wp
 
 from twin.nerf.kernels.composite import CHANNELS
-from twin.nerf.kernels.march import OPTIONS, Film, exponential
+from twin.nerf.kernels.march import Film
+from twin.nerf.kernels.vectorised import OPTIONS, exponential
 from twin.nerf.rendering import FAR
 
 HARMONICS = 16
@@ -21,6 +22,9 @@ LANES = {"cpu": 16, "cuda": 1}
 """Pixels a thread; see `march.py`."""
 
 wp.set_module_options(OPTIONS)
+
+Eight = wp.types.vector(length=8, dtype=wp.float32)
+"""Weights of eight hidden units."""
 
 _HARMONICS = wp.constant(HARMONICS)
 _FEATURES = wp.constant(FEATURES)
@@ -81,13 +85,13 @@ def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
 
     @wp.struct
     class Weights:
-        """Flat matrices. Those of the head's hidden layers by four outputs, then input, then output; others by input
-        and then output."""
+        """Matrices. Those of the head by eight hidden units, then by what else they connect; others flat, by input and
+        then output."""
 
-        head_0: wp.array(dtype=wp.float32)
-        head_1: wp.array(dtype=wp.float32)
-        head_1_bias: wp.array(dtype=wp.float32)
-        head_2: wp.array(dtype=wp.float32)
+        head_0: wp.array(dtype=Eight)
+        head_1: wp.array(dtype=Eight)
+        head_1_bias: wp.array(dtype=Eight)
+        head_2: wp.array(dtype=Eight)
         head_2_bias: wp.vec3f
         backdrop_0: wp.array(dtype=wp.float32)
         backdrop_0_bias: wp.array(dtype=wp.float32)
@@ -96,7 +100,7 @@ def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
     def shade_rays(
         weights: Weights,
-        bias: wp.array2d(dtype=wp.float32),
+        bias: wp.array2d(dtype=Eight),
         film: Film,
         first: wp.int32,
         last: wp.int32,
@@ -135,50 +139,78 @@ def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
                 for n in range(behind_units):
                     a += g[n] * weights.backdrop_1[n * _FEATURES + i]
                 x[i] = a
-        # Four outputs at a time, so that an input is read once for them all.
+        # Eight outputs at a time: an input is read once for them all, and so many sums keep the processor's units busy.
         h = Hidden()
-        for q in range(units // 4):
-            a = Floats(bias[camera, 4 * q])
-            b = Floats(bias[camera, 4 * q + 1])
-            c = Floats(bias[camera, 4 * q + 2])
-            d = Floats(bias[camera, 4 * q + 3])
+        for q in range(units // 8):
+            w = bias[camera, q]
+            s0 = Floats(w[0])
+            s1 = Floats(w[1])
+            s2 = Floats(w[2])
+            s3 = Floats(w[3])
+            s4 = Floats(w[4])
+            s5 = Floats(w[5])
+            s6 = Floats(w[6])
+            s7 = Floats(w[7])
             for i in range(_INPUTS):
                 row = x[i]
-                k = 4 * (q * _INPUTS + i)
-                a += row * weights.head_0[k]
-                b += row * weights.head_0[k + 1]
-                c += row * weights.head_0[k + 2]
-                d += row * weights.head_0[k + 3]
-            h[4 * q] = wp.max(a, Floats())
-            h[4 * q + 1] = wp.max(b, Floats())
-            h[4 * q + 2] = wp.max(c, Floats())
-            h[4 * q + 3] = wp.max(d, Floats())
+                w = weights.head_0[q * _INPUTS + i]
+                s0 += row * w[0]
+                s1 += row * w[1]
+                s2 += row * w[2]
+                s3 += row * w[3]
+                s4 += row * w[4]
+                s5 += row * w[5]
+                s6 += row * w[6]
+                s7 += row * w[7]
+            h[8 * q + 0] = wp.max(s0, Floats())
+            h[8 * q + 1] = wp.max(s1, Floats())
+            h[8 * q + 2] = wp.max(s2, Floats())
+            h[8 * q + 3] = wp.max(s3, Floats())
+            h[8 * q + 4] = wp.max(s4, Floats())
+            h[8 * q + 5] = wp.max(s5, Floats())
+            h[8 * q + 6] = wp.max(s6, Floats())
+            h[8 * q + 7] = wp.max(s7, Floats())
         red = Floats(weights.head_2_bias[0])
         green = Floats(weights.head_2_bias[1])
         blue = Floats(weights.head_2_bias[2])
-        for q in range(units // 4):
-            a = Floats(weights.head_1_bias[4 * q])
-            b = Floats(weights.head_1_bias[4 * q + 1])
-            c = Floats(weights.head_1_bias[4 * q + 2])
-            d = Floats(weights.head_1_bias[4 * q + 3])
+        for q in range(units // 8):
+            w = weights.head_1_bias[q]
+            s0 = Floats(w[0])
+            s1 = Floats(w[1])
+            s2 = Floats(w[2])
+            s3 = Floats(w[3])
+            s4 = Floats(w[4])
+            s5 = Floats(w[5])
+            s6 = Floats(w[6])
+            s7 = Floats(w[7])
             for i in range(units):
                 row = h[i]
-                k = 4 * (q * units + i)
-                a += row * weights.head_1[k]
-                b += row * weights.head_1[k + 1]
-                c += row * weights.head_1[k + 2]
-                d += row * weights.head_1[k + 3]
-            a = wp.max(a, Floats())
-            b = wp.max(b, Floats())
-            c = wp.max(c, Floats())
-            d = wp.max(d, Floats())
-            k = 12 * q
-            red += a * weights.head_2[k + 0] + b * weights.head_2[k + 3]
-            red += c * weights.head_2[k + 6] + d * weights.head_2[k + 9]
-            green += a * weights.head_2[k + 1] + b * weights.head_2[k + 4]
-            green += c * weights.head_2[k + 7] + d * weights.head_2[k + 10]
-            blue += a * weights.head_2[k + 2] + b * weights.head_2[k + 5]
-            blue += c * weights.head_2[k + 8] + d * weights.head_2[k + 11]
+                w = weights.head_1[q * units + i]
+                s0 += row * w[0]
+                s1 += row * w[1]
+                s2 += row * w[2]
+                s3 += row * w[3]
+                s4 += row * w[4]
+                s5 += row * w[5]
+                s6 += row * w[6]
+                s7 += row * w[7]
+            s0 = wp.max(s0, Floats())
+            s1 = wp.max(s1, Floats())
+            s2 = wp.max(s2, Floats())
+            s3 = wp.max(s3, Floats())
+            s4 = wp.max(s4, Floats())
+            s5 = wp.max(s5, Floats())
+            s6 = wp.max(s6, Floats())
+            s7 = wp.max(s7, Floats())
+            w = weights.head_2[3 * q + 0]
+            red += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
+            red += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
+            w = weights.head_2[3 * q + 1]
+            green += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
+            green += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
+            w = weights.head_2[3 * q + 2]
+            blue += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
+            blue += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
         for j in range(count):
             if start + j < last:
                 pixel = start + j
