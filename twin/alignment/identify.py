@@ -6,8 +6,8 @@ that are not, the least certain one goes back to its usual value, the rest is ju
 again. Before the first fit, far from the best values, only hopeless ones go: those uncertain by ten times their span.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
-any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible windows
-neither pull nor blow them up.
+any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible
+windows neither pull nor blow them up.
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ def fit(
         error: Residuals of every window for values by name, in units of a good model's miss, shape (n, looks, ...).
         groups: Of the windows, shape (n,).
         evaluations: At most, per round of the search; each takes one `error` per free parameter besides.
-        progress: Told one line per round.
+        progress: Told a line per round and per step of the search.
     """
     free = {p.name: p for p in table}
     values = {p.name: p.start for p in table}
@@ -128,6 +128,7 @@ def fit(
         def tilted(z: Array, origin=origin, spans=spans, names=names) -> Array:
             x = origin + z * spans
             error_now = at(x, names)
+            progress(f"  mean log(1 + s) = {(bend(error_now) ** 2).sum() / len(error_now):.4f}")
             return bent_slopes(error_now, slopes(x, names, error_now)).reshape(-1, len(names)) * spans
 
         found = least_squares(
