@@ -45,7 +45,12 @@ class PoweredMean:
 
 
 def powered_mean(
-    *, twin: ArrayLike, real: ArrayLike, twin_only: ArrayLike, power: float | None = None, confidence: float = CONFIDENCE
+    *,
+    twin: ArrayLike,
+    real: ArrayLike,
+    twin_only: ArrayLike,
+    power: float | None = None,
+    confidence: float = CONFIDENCE,
 ) -> PoweredMean:
     """PPI++ for a mean; see the module.
 

@@ -65,7 +65,7 @@ def rank_probabilities(tallies: Tallies, rng: np.random.Generator, draws: int = 
 
 
 def rank_interval(probabilities: Array, confidence: float = CONFIDENCE) -> tuple[float, int, int]:
-    """Expected rank of a policy, and the ranks between which it lies with `confidence`; probabilities (n,), rank 1 best.
+    """Expected rank of a policy, 1 is best, and the ranks between which it lies with `confidence`; probabilities (n,).
 
     From either end, ranks are left out as long as they come to no more than half of what may be missed.
     """

@@ -81,7 +81,9 @@ def rate_difference(
     real_trials: ArrayLike,
     confidence: float = CONFIDENCE,
 ) -> tuple[Array, Array, Array]:
-    """Real rate minus twin rate, and its interval: Newcombe's hybrid score, Statistics in Medicine 17 (1998), method 10.
+    """Real rate minus twin rate, and its interval: Newcombe's hybrid score (method 10).
+
+    R. G. Newcombe, Interval estimation for the difference between independent proportions, Stat. in Medicine 17 (1998).
 
     Args:
         twin_successes: Any shape; the others have the same.
@@ -123,7 +125,7 @@ def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
     A pair of policies is violated where the twin orders it otherwise than the road, by as much as their real scores
     differ: |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]; MMRV is the mean over i of the largest over j. It is not symmetric in
     its arguments, and code in circulation names them in both orders. Policies tied in the twin, but not on the road,
-    count as a violation of the worse of the two; the code published with the paper compares by > and charges the better.
+    count as a violation of the worse of the two; code published with the paper compares by > and charges the better.
 
     Raises:
         Refused: fewer than two policies.

@@ -186,7 +186,9 @@ def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> t
             f"{where}: policy {row['policy']!r} was validated on {' and '.join(tasks)}; say which in a column task"
         )
     if task and task not in tasks:
-        raise InputError(f"{where}: policy {row['policy']!r} was not validated on task {task!r}; {nearest(task, tasks)}")
+        raise InputError(
+            f"{where}: policy {row['policy']!r} was not validated on task {task!r}; {nearest(task, tasks)}"
+        )
     return row["policy"], task or tasks[0]
 
 
@@ -224,7 +226,9 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
         missing = [name for name in needed if name not in header]
         strange = [name for name in header if name not in (*needed, *optional)]
         if missing or strange or len(set(header)) != len(header):
-            what = f"no column {missing[0]}" if missing else f"{(strange or ['a column'])[0]!r} is unknown or there twice"
+            what = (
+                f"no column {missing[0]}" if missing else f"{(strange or ['a column'])[0]!r} is unknown or there twice"
+            )
             raise InputError(f"{path}: header {','.join(header)!r}: {what}; expected {wanted}")
         count = 0
         for fields in reader:
