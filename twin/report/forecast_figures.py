@@ -101,7 +101,7 @@ def _crosses(axes: Axes, x: list[Estimate], y: list[Estimate], colour: str, name
     """Points with their intervals in both directions."""
     (at_x, ends_x), (at_y, ends_y) = _ends(x), _ends(y)
     axes.errorbar(at_x, at_y, xerr=ends_x, yerr=ends_y, fmt="none", ecolor=colour, elinewidth=0.8, alpha=0.5)
-    axes.plot(at_x, at_y, "o", color=colour, ms=4.5, label=name)
+    axes.plot(at_x, at_y, "o", color=colour, ms=4.5, label=name, zorder=4)
 
 
 def _ends(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray]:

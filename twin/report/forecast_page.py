@@ -5,7 +5,7 @@ from pathlib import Path
 from twin.report import forecast_figures as draw
 from twin.report.figures import svg
 from twin.report.forecast import Estimate, Forecast, Group
-from twin.report.forecast_words import SHARES, STATISTICS, plan_words, points, show, unknowns, verdicts
+from twin.report.forecast_words import SHARES, STATISTICS, chance, plan_words, points, show, unknowns, verdicts
 from twin.report.markup import STYLE, Html, element, join, table
 from twin.report.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.report.words import Caution
@@ -77,10 +77,10 @@ def _road(forecast: Forecast) -> Html:
         class_="done",
     )
     if not forecast.groups:
-        return join(lead, element("p", "No real trials were given, so this cannot be said.", class_="na"))
+        return element("p", "No real trials were given, so this cannot be said.", class_="na")
     told = [group for group in forecast.groups if not group.missing]
     refused = [_refusal(group) for group in forecast.groups if group.missing]
-    rows = [
+    rows: list[list[str]] = [
         [
             element("b", title, class_="whole"),
             *(_show(getattr(group, name), name in SHARES) for group in told),
@@ -132,10 +132,10 @@ def _policies(forecast: Forecast) -> Html:
                 _show(c.twin, True),
                 str(c.twin.n),
                 f"{c.twin_rank.low:.0f} to {c.twin_rank.high:.0f}",
-                f"{c.twin_ranks[0]:.0%}",
+                chance(c.twin_ranks[0]),
                 _show(c.real, True),
                 str(c.real.n) if c.driven else "",
-                f"{c.real_ranks[0]:.0%}" if c.real_ranks else "",
+                chance(c.real_ranks[0]) if c.real_ranks else "",
             ]
             for c in mine
         ]
@@ -160,7 +160,7 @@ def _predictions(forecast: Forecast) -> Html:
         reasons = dict.fromkeys(c.corrected.missing for c in forecast.candidates)
         why = f"Not given: {'; '.join(reasons)}." if forecast.groups else "No real trials were given to learn it from."
         return join(lead, element("p", why, class_="na"))
-    rows = [
+    rows: list[list[str]] = [
         [
             element("code", c.policy),
             c.task,
@@ -226,9 +226,9 @@ def _cells(forecast: Forecast) -> Html:
         )
         inside = low <= 0.0 <= high
         beyond += not inside
-        chance = element("span" if inside else "b", "within chance" if inside else "beyond chance", class_="whole")
+        luck = element("span" if inside else "b", "within chance" if inside else "beyond chance", class_="whole")
         counts = _show(pair.twin, True), str(pair.twin.n), _show(pair.real, True), str(pair.real.n)
-        rows.append([element("code", pair.policy), pair.task, light, *counts, _show(pair.bias, True), chance])
+        rows.append([element("code", pair.policy), pair.task, light, *counts, _show(pair.bias, True), luck])
     heads = ["policy", "task", "lighting", "twin", "n", "road", "n", "road minus twin", ""]
     lead = f"{beyond} of {len(rows)} cells differ by more than chance; one in ten would if the twin were perfect."
     return join(element("p", lead, class_="done"), table(heads, rows, (4, 6)))

@@ -48,7 +48,15 @@ def _number(value: float, percent: bool) -> str:
 
 
 def points(share: float) -> str:
+    """Of success, without sign."""
     return f"{abs(100 * share):.1f} points"
+
+
+def chance(probability: float) -> str:
+    """In per cent; nothing that was drawn at random is certain or impossible."""
+    if probability > 0.995:
+        return ">99%"
+    return "<1%" if probability < 0.005 else f"{probability:.0%}"
 
 
 def overall(forecast: Forecast) -> Group | None:
@@ -117,7 +125,9 @@ def _predictions(group: Group) -> list[Verdict]:
 
 def _leader(forecast: Forecast, task: str) -> Verdict:
     first = forecast.of(task)[0]
-    sure = f"best there with {first.twin_ranks[0]:.0%} probability" if len(first.twin_ranks) > 1 else "the only policy"
+    sure = (
+        f"best there with {chance(first.twin_ranks[0])} probability" if len(first.twin_ranks) > 1 else "the only policy"
+    )
     return Verdict(f"In the twin, on {task}, {first.policy} leads: {show(first.twin, True)}, {sure}.")
 
 
@@ -167,9 +177,9 @@ def plan_words(forecast: Forecast, plan: Plan) -> str:
     """How many more real trials would settle the ranking of a task."""
     if plan.policies < 2:
         return f"{plan.task}: one policy; there is nothing to rank."
-    so_far = "" if plan.basis == "road" else "No real trials yet; if the road were like the twin: "
-    now = "" if plan.basis == "twin" or plan.winner_now is None else f", {plan.winner_now:.0%} sure now"
-    order = "" if plan.basis == "twin" or plan.order_now is None else f", {plan.order_now:.0%} now"
+    so_far = "" if plan.basis == "road" else "no real trials yet; if the road were like the twin: "
+    now = "" if plan.basis == "twin" or plan.winner_now is None else f", {chance(plan.winner_now)} sure now"
+    order = "" if plan.basis == "twin" or plan.order_now is None else f", {chance(plan.order_now)} now"
     return (
         f"{plan.task}, {plan.policies} policies: {so_far}{_more(plan.more_for_winner)} to find the best one{now}; "
         f"{_more(plan.more_for_order)} to put all in order{order}."
