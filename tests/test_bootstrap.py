@@ -85,7 +85,7 @@ def test_statistics_within_tasks_are_averaged() -> None:
 
 _EXPERIMENTS, _DRAWS = 150, 200
 _LEAST = 0.80 - 3 * np.sqrt(0.9 * 0.1 / _EXPERIMENTS)
-"""The least that was found in worlds of all kinds is 0.82; below that, three times the Monte-Carlo error."""
+"""The least that was found in worlds of all kinds is 0.80; below that, three times the Monte-Carlo error."""
 
 
 def world(rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, noise: float, spread: float) -> Paired:
