@@ -88,6 +88,6 @@ def route_views(bench: Bench) -> Path:
         from twin.loading import load_scene
 
         world = load_scene(bench.scene).world()
-        drive = follow(world, HuskyPhysics(world.model()), 1.0)
+        drive = follow(world, HuskyPhysics(world.model(), world.robot), 1.0)
         np.savez(file, poses=drive.camera_to_world, intrinsics=world.intrinsics)
     return file

@@ -58,3 +58,28 @@ def test_training_within_a_budget(real_data, tmp_path):
     assert figures["fox.n"] == 6 and figures["fox.steps_10s"] >= 1
     assert 5.0 < figures["fox.psnr_10s_unfitted"] < 40.0 and figures["fox.frame_size"] == "54x96"
     assert "fox.psnr_10s" in done.stdout and any(name.startswith("gpu.") for name in figures)
+
+
+def test_husky_s_table_is_printed_and_written(tmp_path):
+    file = tmp_path / "husky.json"
+    command = [sys.executable, str(BENCHMARKS / "husky.py"), "--only", "A1", "B5", "--json", str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    rows = json.loads(file.read_text())["rows"]
+    assert [row["id"] for row in rows] == ["A1", "B4", "B5", "B5"] and all(row["passed"] for row in rows)
+    assert rows[-1]["high"] is None and rows[-1]["low"] == 0.0  # an open limit
+    assert done.stdout.count(" pass\n") == 4 and "motor power / dissipated power" in done.stdout
+
+
+def test_more_bodies_are_fewer_steps_per_second(scripts):
+    import husky
+    import mujoco
+
+    def chain(bodies: int) -> mujoco.MjModel:
+        body = "<body><joint name='j{}'/><geom size='.1' contype='0' conaffinity='0'/></body>"
+        motors = "<motor joint='j0'/><motor joint='j1'/>"
+        inner = "".join(body.format(i) for i in range(bodies))
+        return mujoco.MjModel.from_xml_string(
+            f"<mujoco><worldbody>{inner}</worldbody><actuator>{motors}</actuator></mujoco>"
+        )
+
+    assert husky.steps_per_second(chain(2)) > 3 * husky.steps_per_second(chain(60))

@@ -17,6 +17,7 @@ from twin.report.panels import Layout
 from twin.report.plan import Plan
 from twin.report.studio import Studio
 from twin.report.video import VideoWriter, read_frames
+from twin.robot import PixelCamera
 
 
 def drive_along(x: np.ndarray, y: np.ndarray, yaw: np.ndarray, outcome: str = "goal", touched: tuple = ()) -> Drive:
@@ -91,8 +92,8 @@ def test_the_drive_is_filmed_within_its_budget(tmp_path: Path, outcome: str, ins
         np.column_stack([np.linspace(0, 10, 50), np.zeros((50, 2))]),
         1.0,
         (0.0, 0.0, 0.0, 0.0),
-        np.array([80.0, 80.0, 80.0, 45.0]),
         tmp_path,
+        PixelCamera((80.0, 80.0, 80.0, 45.0), (160, 90)),
     )
     layout = Layout.for_pictures(160, 9 / 16)
     route = world.route[:, :2]

@@ -13,8 +13,9 @@ from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import project
 from twin.geometry.poses import inverse_pose
 from twin.mjcf.export import run
-from twin.mjcf.husky import HuskyParams, add_husky, set_options
+from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.world import World
+from twin.robot import REAR_HEAVY, HuskyParams
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def world(tmp_path_factory) -> World:
 
 @pytest.fixture(scope="module")
 def drive(world):
-    return follow(world, HuskyPhysics(world.model()))
+    return follow(world, HuskyPhysics(world.model(), world.robot))
 
 
 def on_a_plane(params: HuskyParams | None = None) -> HuskyPhysics:
@@ -32,7 +33,7 @@ def on_a_plane(params: HuskyParams | None = None) -> HuskyPhysics:
     set_options(spec)
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1))
     add_husky(spec, params=params)
-    return HuskyPhysics(spec.compile())
+    return HuskyPhysics(spec.compile(), params)
 
 
 def test_reaches_the_goal(world, drive):
@@ -65,20 +66,20 @@ def test_front_camera_looks_ahead_and_upright(drive):
 
 
 def test_same_drive_twice(world, drive):
-    again = follow(world, HuskyPhysics(world.model()))
+    again = follow(world, HuskyPhysics(world.model(), world.robot))
     np.testing.assert_array_equal(again.qpos, drive.qpos)
 
 
-def test_rear_heavy_robot_is_followed_too(tmp_path, monkeypatch):
+def test_rear_heavy_robot_is_followed_too(tmp_path):
     """The yaw rate achieved is 1.3 times that commanded; heading feedback must absorb it."""
-    import twin.mjcf.husky as husky
-
-    rear = replace(HuskyParams(), center_of_mass=husky.REAR_HEAVY)
-    monkeypatch.setattr(husky, "HuskyParams", lambda: rear)
-    world = tiny_world(tmp_path)
-    monkeypatch.undo()
-    assert world.model().body("husky").ipos[0] == pytest.approx(-0.085)
-    drive = follow(world, HuskyPhysics(world.model()))
+    scene = tiny_scene(tmp_path)
+    out = scene.stage("mjcf")
+    out.mkdir()
+    run(scene, replace(tiny_config(), robot=HuskyParams(center_of_mass=REAR_HEAVY)), out)
+    world = World.load(out)
+    assert world.robot.center_of_mass == REAR_HEAVY
+    assert world.model().body("base_link").ipos[0] == pytest.approx(-0.085)
+    drive = follow(world, HuskyPhysics(world.model(), world.robot))
     assert drive.reached_goal and drive.max_cross_track < 0.2
 
 
@@ -88,7 +89,7 @@ def test_an_obstacle_on_the_road_ends_the_drive(tmp_path):
     out.mkdir()
     run(scene, tiny_config(), out)
     world = World.load(out)
-    drive = follow(world, HuskyPhysics(world.model()))
+    drive = follow(world, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "touched" and drive.touched == ("part_0001",)
     # The bumper of the chassis is 0.49 m ahead of the base, the box begins at 3.2 m.
     assert drive.base_to_world[-1, 0, 3] == pytest.approx(3.2 - 0.4937, abs=0.12)
@@ -96,12 +97,12 @@ def test_an_obstacle_on_the_road_ends_the_drive(tmp_path):
 
 def test_leaving_the_corridor_ends_the_drive(world):
     narrow = replace(world, half_width=0.002)
-    drive = follow(narrow, HuskyPhysics(world.model()))
+    drive = follow(narrow, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "off_corridor" and drive.max_cross_track > 0.002
 
 
 def test_time_limit(world):
-    drive = follow(world, HuskyPhysics(world.model()), timeout=1.0)
+    drive = follow(world, HuskyPhysics(world.model(), world.robot), timeout=1.0)
     assert drive.outcome == "timeout" and drive.times[-1] == pytest.approx(1.1, abs=0.11)
 
 
@@ -197,3 +198,48 @@ def test_pictures(world, drive):
     assert plan.shape == (120, 160, 3)
     red = (plan[..., 0] > 180) & (plan[..., 1] < 90)
     assert red.sum() > 20  # the driven path
+
+
+def test_command_latency_delays_the_motion():
+    """The same drive, later by the latency: whole control steps and the rest of one."""
+    latency = 0.14
+    prompt, late = on_a_plane(), on_a_plane(HuskyParams(command_latency=latency))
+    tracks: dict[HuskyPhysics, list] = {prompt: [], late: []}
+    for physics, track in tracks.items():
+        for _ in range(5):
+            physics.step()
+        for _ in range(15):
+            physics.command(0.5, 0.4)
+            physics.step()
+            track.append((physics.time, *physics.planar_pose))
+    prompt_track, late_track = (np.array(track) for track in tracks.values())
+    for column in (1, 2, 3):
+        expected = np.interp(late_track[3:, 0] - latency, prompt_track[:, 0], prompt_track[:, column])
+        np.testing.assert_allclose(late_track[3:, column], expected, atol=0.004)
+
+
+def test_camera_latency_shows_the_past():
+    latency = 0.13
+    physics = on_a_plane(HuskyParams(camera_latency=latency))
+    np.testing.assert_array_equal(physics.delayed_camera_to_world, physics.camera_to_world)
+    times, poses = [], []
+    for _ in range(25):
+        physics.command(0.6, 0.8)
+        physics.step()
+        times.append(physics.time)
+        poses.append(physics.camera_to_world)
+    # At constant speeds the camera moves on a circle: between two instants it is where the arc says.
+    delayed = physics.delayed_camera_to_world
+    share = (times[-1] - latency - times[-3]) / 0.1
+    positions = np.array([pose[:3, 3] for pose in poses[-3:]])
+    np.testing.assert_allclose(delayed[:3, 3], (1 - share) * positions[0] + share * positions[1], atol=2e-3)
+    np.testing.assert_allclose(delayed[:3, :3] @ delayed[:3, :3].T, np.eye(3), atol=1e-9)
+    assert np.linalg.norm(delayed[:3, 3] - positions[-1]) > 0.05
+
+
+def test_no_latency_is_now():
+    physics = on_a_plane()
+    for _ in range(3):
+        physics.command(1.0, 0.5)
+        physics.step()
+    np.testing.assert_allclose(physics.delayed_camera_to_world, physics.camera_to_world, atol=1e-12)

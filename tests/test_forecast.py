@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
+from twin.env.options import CAUSES
 from twin.errors import InputError
 from twin.forecast import forecast, main
 from twin.report.forecast import ALL_TASKS, Estimate, Forecast
@@ -16,7 +17,7 @@ from twin.report.forecast_page import forecast_page
 from twin.report.forecast_words import CSV_COLUMNS, STATISTICS, candidates_csv, show, summary, unknowns, verdicts
 from twin.report.forecasting import make_forecast
 from twin.report.statistics import mmrv, pearson, spearman, wilson
-from twin.report.trials import CAUSES, EPISODE_COLUMNS, Cell, Trial, csv_text
+from twin.report.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 
 LIGHTS = ("held-out", "sun")
 

@@ -10,10 +10,10 @@ from tiny_world import box, tiny_config, tiny_ground, tiny_route, tiny_scene, ti
 
 from twin.errors import InputError
 from twin.geometry.images import read_image
-from twin.mjcf.export import compacted, covered_by_ground, front_camera, rest_pose, run
+from twin.mjcf.export import add_ground, compacted, covered_by_ground, film_camera, rest_pose, run
 from twin.mjcf.files import face_tiles
-from twin.mjcf.husky import BASE_HEIGHT
 from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest, point_at, total_turn
+from twin.robot import BASE_HEIGHT, CAMERA_SIZE
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +55,30 @@ def test_heights_are_right_to_a_millimetre(exported):
     for row, column in zip(rng.integers(1, rows - 1, 40), rng.integers(1, columns - 1, 40), strict=True):
         xy = ground.origin + ground.cell * np.array([column, row]) + 1e-4
         assert ray_down(model, data, xy) == pytest.approx(ground.height[row, column], abs=1e-3)
+
+
+def test_coarse_height_field_keeps_nodes_and_colours_in_place(tmp_path):
+    """Nodes of the coarse field are nodes of the fine one; the texture has a texel per fine cell of what is left."""
+    ground = tiny_ground()
+    rgb = np.random.default_rng(5).integers(0, 255, (*ground.height.shape, 3)).astype(np.uint8)
+    ground = type(ground)(ground.height, ground.origin, ground.cell, ground.measured, rgb)
+    coarse = ground.coarsened(0.3)
+    rows, columns = coarse.height.shape
+    assert coarse.cell == pytest.approx(0.3) and (rows - 1) * 3 <= ground.height.shape[0] - 1 < rows * 3
+    nodes = ground.origin + 0.3 * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1)
+    np.testing.assert_allclose(coarse.height, ground.at(nodes), atol=1e-12)
+    spec = mujoco.MjSpec()
+    spec.modelfiledir = spec.texturedir = str(tmp_path)
+    add_ground(spec, ground, tmp_path, 0.3)
+    texture = read_image(tmp_path / "ground.png")
+    assert texture.shape[:2] == ((rows - 1) * 3, (columns - 1) * 3)
+    corners = rgb[4:6, 7:9].reshape(4, 3).astype(int)
+    np.testing.assert_array_equal(texture[-1 - 4, 7], (corners.sum(0) + 2) // 4)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for row, column in ((1, 1), (5, 9), (rows - 2, columns - 2)):
+        assert ray_down(model, data, nodes[row, column] + 1e-5) == pytest.approx(coarse.height[row, column], abs=1e-4)
 
 
 def test_level_ground_is_level(tmp_path):
@@ -110,7 +134,7 @@ def test_loads_from_a_zip_unpacked_elsewhere(exported, tmp_path):
         file.extractall(tmp_path / "there")
     world = World.load(tmp_path / "there")
     model = world.model()
-    assert model.nkey == 1 and model.nu == 4
+    assert model.nkey == 1 and model.nu == 2
     text = (tmp_path / "there" / "scene.xml").read_text()
     files = re.findall(r'file="([^"]*)"', text)
     assert files and all("/" not in name and ".." not in name for name in files)
@@ -142,7 +166,7 @@ def test_camera_of_another_shape_keeps_square_pixels(exported):
     cameras = Cameras.load(SceneDir(exported[0].parent.parent).stage("metric"))
     tall = type(cameras)(**{**vars(cameras), "sizes": np.tile([640, 480], (3, 1))})
     # 640 × 480 becomes 160 × 120, of which 15 rows go at the top and at the bottom.
-    np.testing.assert_allclose(front_camera(tall).intrinsics, [125.0, 127.5, 82.5, 42.5 - 15.0])
+    np.testing.assert_allclose(film_camera(tall).resized(CAMERA_SIZE).intrinsics, [125.0, 127.5, 82.5, 42.5 - 15.0])
 
 
 def test_without_a_route_there_is_no_robot(tmp_path):
@@ -195,7 +219,7 @@ def test_rest_pose_follows_the_slope():
     ground = tiny_ground()
     grid_x, _ = np.meshgrid(*(np.arange(n) * ground.cell for n in ground.height.shape[::-1]))
     ramp = type(ground)(0.1 * grid_x, np.zeros(2), ground.cell, ground.measured, ground.rgb)
-    position, quaternion = rest_pose(ramp, np.array([5.0, 5.0]), np.pi / 2)
+    position, quaternion = rest_pose(ramp.at, np.array([5.0, 5.0]), np.pi / 2)
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, quaternion)
     up = np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0)

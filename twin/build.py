@@ -42,14 +42,16 @@ class Stage:
     """Stages whose results it reads."""
 
 
+_MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the rest only changes stage mjcf
+
 PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.fit", 3, ("nerf",), ("cameras", "metric")),
-    Stage("mesh", "twin.assets.mesh", 2, ("mesh", "mjcf"), ("cameras", "metric", "field")),
-    Stage("mjcf", "twin.mjcf.export", 1, ("mjcf",), ("metric", "mesh")),
-    Stage("review", "twin.report.review", 2, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
+    Stage("field", "twin.nerf.stage", 3, ("nerf",), ("cameras", "metric")),
+    Stage("mesh", "twin.assets.mesh", 2, ("mesh", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
+    Stage("mjcf", "twin.mjcf.export", 2, ("mjcf", "robot"), ("metric", "mesh")),
+    Stage("review", "twin.report.review", 3, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
 )
 
 
@@ -165,6 +167,9 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
         "inputs": stamps["capture"].depends["inputs"],
     }
     report |= {name: stamp.metrics for name, stamp in stamps.items()}
+    if "review" in report:  # beside the stages, as it is about all of them
+        report["review"] = {k: v for k, v in report["review"].items() if k != "seen_touched"}
+        report["seen_touched"] = stamps["review"].metrics.get("seen_touched")
     report["truth"] = None
     if scene.truth.exists() and "mesh" in stamps:
         from twin.report.truth import compare

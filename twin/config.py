@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from twin.errors import InputError
+from twin.robot import HuskyParams
+
+ROBOT_TOML = "robot.toml"
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,10 @@ class MjcfConfig:
     """False for a capture that is no drive (an object filmed around): no route, no Husky."""
     half_width: float = 1.0
     """Half width of the drivable corridor around the route [m]."""
+    hfield_cell: float = 0.3
+    """Cell of the height field that the wheels roll on [m], a multiple of `mesh.ground_cell`. Where a wheel rolls over
+    an edge it touches several facets: fewer edges shake it less and cost less, and the ground has nothing finer anyway
+    (`mesh.ground_smoothing`)."""
     corridor_margin: float = 0.0
     """Extra clearance asked of convex parts beside the corridor [m]."""
 
@@ -210,6 +217,46 @@ class ReviewConfig:
     """Pictures of the radiance field in the whole film: more make it smoother and the build longer."""
 
 
+OBSTACLE_KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
+
+
+@dataclass(frozen=True)
+class ObstacleConfig:
+    """Something that is put on the route, standing or moving to and fro."""
+
+    name: str = ""
+    """Of its body in the model, `obstacle_<name>`; by default its kind and its place in the list."""
+    kind: str = ""
+    """cone, box, bollard, car, pedestrian, cyclist or husky."""
+    station: float = 0.0
+    """Arc length on the route [m]."""
+    lateral: float = 0.0
+    """Distance from the route, left positive [m]."""
+    yaw: float = 0.0
+    """Of its front against the route's heading [°]; one that moves faces where it goes, turned by this."""
+    to: tuple[float, ...] = ()
+    """Station and lateral [m] it moves to, and back again; empty = it stands."""
+    speed: float = 1.2
+    """Of one that moves [m/s]."""
+    delay: float = 0.0
+    """One that moves has been on its way for so long when the episode begins [s]."""
+    color: tuple[float, ...] = ()
+    """Red, green, blue of its main colour, 0 to 1; its kind's own by default."""
+    size: tuple[float, ...] = ()
+    """Length, width, height of a box [m]."""
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """A stretch of the route to be driven, besides the standard tasks (see `twin/env/stretches.py`)."""
+
+    name: str = ""
+    start: float = 0.0
+    """Arc length of the route at which it begins [m]."""
+    length: float = 0.0
+    """[m]"""
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """A whole `scene.toml`."""
@@ -223,11 +270,15 @@ class SceneConfig:
     nerf: NerfConfig = field(default_factory=NerfConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     mjcf: MjcfConfig = field(default_factory=MjcfConfig)
+    robot: HuskyParams = field(default_factory=HuskyParams)
+    """`scene.toml` before `robot.toml`, which lies beside it, before the defaults."""
     review: ReviewConfig = field(default_factory=ReviewConfig)
+    task: tuple[TaskConfig, ...] = ()
+    obstacle: tuple[ObstacleConfig, ...] = ()
 
 
 def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
-    """Reads `scene.toml` and applies `section.key=value` overrides.
+    """Reads `scene.toml` and, for `[robot]`, the `robot.toml` beside it; applies `section.key=value` overrides.
 
     Raises:
         InputError: no such file, wrong TOML, unknown key, wrong type, or a value out of range.
@@ -240,11 +291,25 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
         raise InputError(f"{path}: not valid TOML: {error}") from None
     for override in overrides:
         _apply_override(table, override)
+    if isinstance(table.get("robot", {}), dict):
+        table["robot"] = read_robot(path.parent / ROBOT_TOML) | table.get("robot", {})
     config = parse(SceneConfig, table, str(path))
     if not config.name:
         config = dataclasses.replace(config, name=path.resolve().parent.name)
     _check(config, path)
     return config
+
+
+def read_robot(path: Path) -> dict[str, Any]:
+    """The table in a `robot.toml`, checked; empty where there is no such file. Raises InputError."""
+    if not path.exists():
+        return {}
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    parse(HuskyParams, table, str(path))
+    return table
 
 
 def _apply_override(table: dict[str, Any], override: str) -> None:
@@ -273,7 +338,11 @@ def parse(kind: type, table: Any, where: str) -> Any:
             near = difflib.get_close_matches(key, list(hints), n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(hints))}"
             raise InputError(f"{where}: unknown key {key!r}; {hint}")
-    return kind(**{key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()})
+    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    try:
+        return kind(**values)
+    except InputError as error:  # a dataclass that checks its own values
+        raise InputError(f"{where}: {error}") from None
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
@@ -316,6 +385,12 @@ def _check(config: SceneConfig, path: Path) -> None:
             raise InputError(f"{path}: a [[source]] has no path; give the video or the image folder")
         if source.kind not in ("auto", "video", "images", "colmap", "transforms"):
             raise InputError(f"{path}: kind = {source.kind!r}; expected auto, video, images, colmap or transforms")
+    for task in config.task:
+        if not task.name or task.start < 0.0 or not task.length > 0.0:
+            raise InputError(
+                f"{path}: a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
+                "expected a name, start ≥ 0 and length > 0 [m]"
+            )
     for section, key, low in (
         ("capture", "fps", 1e-3),
         ("capture", "held_out_every", 2),
@@ -326,12 +401,14 @@ def _check(config: SceneConfig, path: Path) -> None:
         ("mesh", "voxel", 1e-3),
         ("mesh", "ground_cell", 1e-3),
         ("mjcf", "half_width", 0.1),
+        ("mjcf", "hfield_cell", 1e-3),
         ("review", "fps", 1),
         ("review", "speed", 1e-2),
     ):
         value = getattr(getattr(config, section), key)
         if not value >= low:
             raise InputError(f"{path}: {section}.{key} = {value}; expected at least {low:g}")
+    _check_obstacles(config.obstacle, path)
     given = scale_sources(config.metric)
     if len(given) != 1 and not (not given and any(source.camera_height > 0.0 for source in config.source)):
         # Checked before anything runs, so that nobody waits minutes to learn it.
@@ -340,3 +417,24 @@ def _check(config: SceneConfig, path: Path) -> None:
             "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
             "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true"
         )
+
+
+def _check_obstacles(obstacles: tuple[ObstacleConfig, ...], path: Path) -> None:
+    for one in obstacles:
+        if one.kind not in OBSTACLE_KINDS:
+            near = difflib.get_close_matches(one.kind, OBSTACLE_KINDS, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"expected {', '.join(OBSTACLE_KINDS)}"
+            raise InputError(f"{path}: [[obstacle]] kind = {one.kind!r}; {hint}")
+        for key, lengths, meaning in (("to", (0, 2), "station and lateral [m]"), ("color", (0, 3), "red, green, blue")):
+            if len(getattr(one, key)) not in lengths:
+                raise InputError(f"{path}: [[obstacle]] {key} = {list(getattr(one, key))}; expected {meaning}")
+        if len(one.size) not in (0, 3) or any(not side > 0.0 for side in one.size):
+            raise InputError(f"{path}: [[obstacle]] size = {list(one.size)}; expected length, width, height > 0 [m]")
+        if not all(0.0 <= c <= 1.0 for c in one.color):
+            raise InputError(f"{path}: [[obstacle]] color = {list(one.color)}; expected values from 0 to 1")
+        if one.to and not one.speed > 0.0:
+            raise InputError(f"{path}: [[obstacle]] speed = {one.speed}; expected more than 0 where it moves")
+    names = [one.name for one in obstacles if one.name]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{path}: two [[obstacle]] are named {twice!r}; give each a name of its own")

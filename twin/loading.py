@@ -10,6 +10,8 @@ from twin.errors import InputError
 from twin.scene import STAGES, SceneDir, read_json
 
 if TYPE_CHECKING:
+    from dm_control.rl.control import Environment
+
     from twin.geometry.cameras import Cameras
     from twin.mjcf.world import World
     from twin.nerf.baked import BakedField
@@ -77,3 +79,20 @@ def load_scene(path: str | Path) -> Twin:
     if not scene.config_file.exists():
         raise InputError(f"no scene.toml in {path}; give the scene's folder, such as scenes/demo")
     return Twin(scene)
+
+
+def load(scene: str | Path | Twin, task: str = "right_turn", seed: int | None = None, **options: Any) -> Environment:
+    """A task in a built scene as a dm_control environment.
+
+    Args:
+        scene: Its folder, or what `load_scene` returned.
+        task: `straight`, `right_turn`, `route`, or a [[task]] of its scene.toml.
+        seed: Of the sequence of episodes; None: unpredictable.
+        options: See `twin.env.options.Options`.
+
+    Raises:
+        InputError: the scene is not built or has no such task, or an option is not to be had.
+    """
+    from twin.env.suite import environment
+
+    return environment(scene, task, seed, **options)

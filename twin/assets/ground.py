@@ -30,6 +30,13 @@ class Ground:
             self.height, np.moveaxis(column_row[..., ::-1], -1, 0).reshape(2, -1), order=1, mode="nearest"
         ).reshape(np.shape(xy)[:-1])
 
+    def coarsened(self, cell: float) -> "Ground":
+        """Every n-th node, n = cell / own cell rounded; what is left over at the far edges is cut off."""
+        n = max(1, round(cell / self.cell))
+        rows, columns = ((size - 1) // n * n + 1 for size in self.height.shape)
+        nodes = np.s_[:rows:n, :columns:n]
+        return Ground(self.height[nodes], self.origin, self.cell * n, self.measured[nodes], self.rgb[nodes])
+
     def save(self, folder: Path) -> None:
         """Writes `ground.npz`."""
         np.savez(folder / "ground.npz", **vars(self))

@@ -270,6 +270,17 @@ def solve(data: Data, low: Array, high: Array, cell: float) -> tuple[Array, Grid
     return height, fine, weights
 
 
+def low_passed(data: Data, low: Array, high: Array, config: MeshConfig) -> tuple[Array, Grid, Array]:
+    """The fit at `ground_cell`, low-passed by `ground_smoothing`: heights, their grid, and the weight of each datum."""
+    grid = Grid.covering(low, high, config.ground_cell, _MOST_CELLS)
+    if len(data.xyz) < _FEW:
+        surface, weights = np.zeros((grid.rows, grid.columns)), np.zeros(len(data.xyz))
+    else:
+        solved, fine, weights = solve(data, low, high, grid.cell)
+        surface = fine.sample(solved, grid.nodes(), order=3)
+    return gaussian_filter(surface, config.ground_smoothing / grid.cell, mode="nearest"), grid, weights
+
+
 def build_ground(
     views: Views,
     cameras: Cameras,
@@ -311,13 +322,7 @@ def build_ground(
         bias = [bias_to_path(data, path) for data in seen]
         seen = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(seen, bias, strict=True)]
     data = Data.join([*seen, path])
-    grid = Grid.covering(low, high, config.ground_cell, _MOST_CELLS)
-    if len(data.xyz) < _FEW:
-        surface, weights = np.zeros((grid.rows, grid.columns)), np.zeros(len(data.xyz))
-    else:
-        solved, fine, weights = solve(data, low, high, grid.cell)
-        surface = fine.sample(solved, grid.nodes(), order=3)
-    surface = gaussian_filter(surface, config.ground_smoothing / grid.cell, mode="nearest")
+    surface, grid, weights = low_passed(data, low, high, config)
     used = data.xyz[weights > 0.25, :2]
     measured = np.zeros((grid.rows, grid.columns), bool)
     node, inside = grid.index(used)

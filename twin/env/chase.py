@@ -5,7 +5,7 @@ parts alone with their identities. The parts are blended over the picture, half 
 they are not hidden behind what is seen.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import ObstacleConfig
+from twin.env.obstacle_shapes import OBSTACLE_GROUP
+from twin.env.obstacles import add_obstacles, place
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World, corridor_edges
@@ -27,7 +30,7 @@ Picture = NDArray[np.uint8]
 _FOVY = 50.0  # [°]
 _BEHIND, _ABOVE, _AHEAD = 3.0, 1.6, 2.0  # [m] of the chase camera, and of the point it looks at
 _SMOOTHING = 0.15  # share of the way the camera turns after the robot per 0.1 s
-_LOOK_GROUPS = [0, 1, 2]
+_LOOK_GROUPS = [0, 1, 2, OBSTACLE_GROUP]
 _PART_GROUPS = [3]
 _PART_ALPHA = 0.45
 _EDGE_RGB = (20, 20, 30)
@@ -40,18 +43,27 @@ _MAP_HEIGHT = 60.0  # [m] above the route
 class SceneCamera:
     """Renders a world from free camera poses."""
 
-    def __init__(self, world: World, size: tuple[int, int], ortho_height: float = 0.0) -> None:
+    def __init__(
+        self,
+        world: World,
+        size: tuple[int, int],
+        ortho_height: float = 0.0,
+        obstacles: Sequence[ObstacleConfig] = (),
+    ) -> None:
         """
         Args:
             world: The scene.
             size: Width, height of the pictures [px].
             ortho_height: Height of what an orthographic camera sees [m]; 0 = perspective.
+            obstacles: What stands or moves in it besides.
         """
         import mujoco_warp as mjw  # slow to import, and only needed where pictures are made
         import warp as wp
 
         self._mjw, self._wp = mjw, wp
         spec = mujoco.MjSpec.from_file(str(world.model_path))
+        self._obstacles = tuple(obstacles)
+        add_obstacles(spec, self._obstacles, world)
         camera = spec.worldbody.add_camera(name="free", fovy=ortho_height or _FOVY)
         if ortho_height:
             camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
@@ -82,9 +94,10 @@ class SceneCamera:
             if context is not None:
                 self._draw(context)
 
-    def render(self, qpos: Array, camera_to_world: Array) -> Picture:
-        """One picture of the world with the robot at `qpos`, seen from an OpenCV pose. Shape (h, w, 3)."""
+    def render(self, qpos: Array, camera_to_world: Array, time: float = 0.0) -> Picture:
+        """One picture of the world with the robot at `qpos` at a time [s], from an OpenCV pose. Shape (h, w, 3)."""
         self.data.qpos[:] = qpos
+        place(self._obstacles, self.data, time)
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         pose = opencv_to_mujoco(camera_to_world)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.env.controller import CONTROL_PERIOD
 from twin.env.physics import HuskyPhysics
-from twin.mjcf.husky import CONTROL_PERIOD, MAX_SPEED, MAX_YAW_RATE
 from twin.mjcf.world import World, arc_lengths, heading_error, nearest, point_at
 
 Array = NDArray[np.float64]
@@ -70,6 +70,41 @@ def pursuit_curvature(pose: Array, target: Array) -> float:
     return float(2.0 * lateral / max(ahead @ ahead, 1e-9))
 
 
+class Pursuit:
+    """The driver: from one pose after the other to the commands that follow the route."""
+
+    def __init__(self, route: Array, speed: float, fastest_turn: float, start: float = 0.0) -> None:
+        """
+        Args:
+            route: Shape (m, ≥2) [m].
+            speed: [m/s]
+            fastest_turn: Largest yaw rate [rad/s].
+            start: Arc length near which it begins [m].
+        """
+        self._route, self._speed, self._fastest = route[:, :2], speed, fastest_turn
+        self._length = float(arc_lengths(route)[-1])
+        self.s = start
+        """Arc length reached so far [m]."""
+        self._gain = 1.0
+        self._last: tuple[Array, tuple[float, float]] | None = None
+
+    def look(self, pose: Array) -> tuple[float, float]:
+        """Arc length of the foot point and cross-track error [m] of a pose (x, y, yaw)."""
+        foot, error = nearest(self._route, pose[:2], (self.s - _SEARCH[0], self.s + _SEARCH[1]))
+        self.s = max(self.s, float(foot))
+        return float(foot), float(error)
+
+    def command(self, pose: Array) -> tuple[float, float]:
+        """v [m/s] and ω [rad/s] for the control step that begins at a pose (x, y, yaw)."""
+        if self._last is not None:
+            self._gain = _updated_gain(self._gain, self._last[0], pose, self._last[1])
+        target = _target(self._route, self.s + _LOOK_AHEAD, self._length)
+        wanted = np.clip(self._speed * pursuit_curvature(pose, target), -self._fastest, self._fastest)
+        command = (self._speed, float(np.clip(self._gain * wanted, -self._fastest, self._fastest)))
+        self._last = (pose, command)
+        return command
+
+
 def follow(world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: float | None = None) -> Drive:
     """Drives from the start along the route until the goal, a touch, the corridor's edge or the time limit.
 
@@ -79,39 +114,32 @@ def follow(world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: flo
         speed: [m/s]; the robot itself does at most 1 m/s at a wheel, so less in a turn.
         timeout: [s]; by default what three times the route takes, and 10 s.
     """
-    speed = min(speed, MAX_SPEED)
-    route = world.route[:, :2]
-    length = float(arc_lengths(route)[-1])
+    speed = min(speed, physics.params.max_speed)
+    length = float(arc_lengths(world.route)[-1])
     timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
     physics.reset()
 
     times, bases, cameras, positions, commands, errors, feet = [], [], [], [], [], [], []
     touched: set[str] = set()
-    gain, s = 1.0, 0.0
-    pose = physics.planar_pose
+    driver = Pursuit(world.route, speed, physics.params.max_yaw_rate)
     while True:
-        foot, error = nearest(route, pose[:2], (s - _SEARCH[0], s + _SEARCH[1]))
-        s = max(s, float(foot))
+        pose = physics.planar_pose
+        foot, error = driver.look(pose)
         times.append(physics.time)
         bases.append(physics.base_to_world)
         cameras.append(physics.camera_to_world)
         positions.append(physics.data.qpos.copy())
-        errors.append(float(error))
-        feet.append(float(foot))
-        outcome = _outcome(world, pose, s, length, abs(float(error)), touched, physics.time > timeout)
+        errors.append(error)
+        feet.append(foot)
+        outcome = _outcome(world, pose, driver.s, length, abs(error), touched, physics.time > timeout)
         if outcome:
             commands.append((0.0, 0.0))
             break
-        wanted = np.clip(
-            speed * pursuit_curvature(pose, _target(route, s + _LOOK_AHEAD, length)), -MAX_YAW_RATE, MAX_YAW_RATE
-        )
-        command = (speed, float(np.clip(gain * wanted, -MAX_YAW_RATE, MAX_YAW_RATE)))
+        command = driver.command(pose)
         commands.append(command)
         physics.command(*command)
         physics.step()
         touched |= set(physics.touched)
-        previous, pose = pose, physics.planar_pose
-        gain = _updated_gain(gain, previous, pose, command)
     return Drive(
         times=np.array(times),
         base_to_world=np.array(bases),

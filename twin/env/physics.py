@@ -2,42 +2,64 @@
 
 One *control step* is 0.1 s, the period of the robot's wheel controller. Within it MuJoCo takes many small steps;
 contacts are looked at several times in between, so that a short graze is not missed. *Touched* means in contact with
-any part of the robot, the ground excepted.
+any part of the robot, the ground excepted. *Latency*: a command reaches the controller `command_latency` after it was
+given, and the newest picture there is was taken `camera_latency` ago.
 """
+
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
+from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.geometry.cameras import opencv_to_mujoco
-from twin.mjcf.husky import COMMAND_TIMEOUT, CONTROL_PERIOD, WHEELS, limited_command, wheel_speeds
+from twin.mjcf.export import rest_pose
+from twin.robot import GEAR_RATIO, SIDES, WHEELS, HuskyParams
 
 Array = NDArray[np.float64]
 
-_LOOK_PERIOD = 0.01  # [s] between two looks at the contacts
+_LOOK_PERIOD = 0.01  # [s] between two looks at the contacts and at the camera's pose
+_SETTLE_TIME = 0.3  # [s] on the ground after being put there
+_RAY_START = 50.0  # [m] above the ground's highest point
 
 
 class HuskyPhysics:
     """Steps one Husky in one world."""
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    surroundings: Callable[[float], None] | None = None
+    """Called with the time [s] that the next small steps lead to, before them: moves what moves by itself."""
+
+    def __init__(
+        self, model: mujoco.MjModel, params: HuskyParams | None = None, data: mujoco.MjData | None = None
+    ) -> None:
         """
         Args:
             model: A world made by `twin.mjcf.export`, or any with `add_husky`; a keyframe `spawn` is where it starts.
+            params: The robot it was made with (`World.robot`): its controller and its latencies; by default the
+                published one.
+            data: Of the model, stepped from where it is; by default new, at the start.
         """
         self.model = model
-        self.data = mujoco.MjData(model)
-        self._body = model.body("husky").id
+        self.params = params or HuskyParams()
+        self.data = mujoco.MjData(model) if data is None else data
+        self._body = model.body("base_link").id
         self._camera = model.camera("front").id
-        self._actuators = np.array([model.actuator(f"{name}_wheel").id for name in WHEELS])
-        self._wheel_dofs = np.array([model.joint(f"{name}_wheel").dofadr[0] for name in WHEELS])
+        self._actuators = np.array([model.actuator(side).id for side in SIDES])
+        wheels = [model.joint(f"{name}_wheel") for name in WHEELS]
+        self._wheel_angles = np.array([wheel.qposadr[0] for wheel in wheels])
+        self._wheel_dofs = np.array([wheel.dofadr[0] for wheel in wheels])
         self._robot = model.body_rootid[model.geom_bodyid] == self._body
-        ground = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground")
-        self._counts = ~self._robot & (np.arange(model.ngeom) != ground)
+        self._ground = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground")
+        self._counts = ~self._robot & (np.arange(model.ngeom) != self._ground)
         self._spawn = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "spawn")
+        self._period_steps = round(CONTROL_PERIOD / model.opt.timestep)
         self._look_steps = max(1, round(_LOOK_PERIOD / model.opt.timestep))
-        self._looks = max(1, round(CONTROL_PERIOD / (self._look_steps * model.opt.timestep)))
-        self.reset()
+        if data is None:
+            self.reset()
+        else:
+            self.begin()
 
     def reset(self) -> None:
         """Back to the start, at rest."""
@@ -46,28 +68,65 @@ class HuskyPhysics:
         else:
             mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
-        self._wanted = np.zeros(2)
-        self._carried_out = np.zeros(2)
-        self._command_time = 0.0
-        self._touched: set[int] = set()
+        self.begin()
+
+    def place(self, x: float, y: float, yaw: float) -> None:
+        """Puts it at rest on the ground, wheels down and settled, at x, y [m] and yaw [rad]; the clock starts at 0."""
+        position, quaternion = rest_pose(self._ground_height, np.array([x, y]), yaw)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:3], self.data.qpos[3:7] = position, quaternion
+        if self.surroundings:
+            self.surroundings(0.0)
+        mujoco.mj_step(self.model, self.data, round(_SETTLE_TIME / self.model.opt.timestep))
+        self.data.qvel[:], self.data.time = 0.0, 0.0
+        mujoco.mj_forward(self.model, self.data)
+        self.begin()
+
+    def begin(self) -> None:
+        """Takes the state as it is for the beginning: nothing commanded yet, and touched only what it touches now."""
+        self.controller = Controller(self.params)
+        # Small steps until the controller runs next.
+        self._until_update = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6)) % self._period_steps
+        self._touched = self._touching()
+        self._views = [(self.time, self.camera_to_world)]
+
+    def _ground_height(self, xy: Array) -> Array:
+        top = self.model.geom_pos[self._ground, 2] + _RAY_START
+        down = np.array([0.0, 0.0, -1.0])
+        return np.array(
+            [
+                top - mujoco.mj_rayHfield(self.model, self.data, self._ground, np.array([*p, top]), down, None)
+                for p in xy
+            ]
+        )
 
     def command(self, v: float, yaw_rate: float) -> None:
         """Sets the wanted speed [m/s] and yaw rate [rad/s]; it lapses after 0.25 s without a new one."""
-        self._wanted = np.array([v, yaw_rate])
-        self._command_time = self.data.time
+        self.controller.command(self.time, v, yaw_rate)
 
-    def step(self) -> None:
-        """One control step of 0.1 s."""
-        lapsed = self.data.time - self._command_time > COMMAND_TIMEOUT - 1e-9
-        self._carried_out = limited_command(np.zeros(2) if lapsed else self._wanted, self._carried_out)
-        self.data.ctrl[self._actuators] = wheel_speeds(self._carried_out)
+    def step(self, period: float = CONTROL_PERIOD) -> None:
+        """Lets `period` [s] pass, the time between two commands."""
         touched: set[int] = set()
-        for _ in range(self._looks):
-            mujoco.mj_step(self.model, self.data, self._look_steps)
+        left = round(period / self.model.opt.timestep)
+        while left:
+            if not self._until_update:
+                self.data.ctrl[self._actuators] = self.controller.update(self.time)
+                self._until_update = self._period_steps
+            some = min(left, self._look_steps, self._until_update)
+            if self.surroundings:
+                self.surroundings(self.time + some * self.model.opt.timestep)
+            mujoco.mj_step(self.model, self.data, some)
+            left, self._until_update = left - some, self._until_update - some
             touched |= self._touching()
+            if self.params.camera_latency:
+                # Poses of the last small step's start, which is 2 ms too old; the last of all are made anew below.
+                self._views.append((self.time - self.model.opt.timestep, self.camera_to_world))
         # Poses and contacts of the instant that is now read, rather than of the last small step's start.
         mujoco.mj_forward(self.model, self.data)
         self._touched = touched | self._touching()
+        self._views[-1] = (self.time, self.camera_to_world)
+        oldest = self.time - self.params.camera_latency - _LOOK_PERIOD
+        self._views = [view for view in self._views if view[0] > oldest - _LOOK_PERIOD]
 
     def _touching(self) -> set[int]:
         pairs = self.data.contact.geom
@@ -98,19 +157,76 @@ class HuskyPhysics:
         return np.array([x, y, np.arctan2(matrix[3], matrix[0])])
 
     @property
+    def uprightness(self) -> float:
+        """Cosine of the angle between the robot's up and the world's."""
+        return float(self.data.xmat[self._body, 8])
+
+    @property
+    def speed(self) -> float:
+        """Over ground along the robot's heading [m/s]."""
+        return float(self.data.qvel[:3] @ self.data.xmat[self._body, [0, 3, 6]])
+
+    @property
+    def yaw_rate(self) -> float:
+        """About the robot's up [rad/s]."""
+        return float(self.data.qvel[5])
+
+    @property
     def camera_to_world(self) -> Array:
         """Of the front camera, OpenCV axes, shape (4, 4)."""
         return opencv_to_mujoco(_pose(self.data.cam_xpos[self._camera], self.data.cam_xmat[self._camera]))
 
     @property
+    def delayed_camera_to_world(self) -> Array:
+        """Of the front camera when the newest picture there is was taken, `camera_latency` ago. Shape (4, 4)."""
+        if not self.params.camera_latency:
+            return self.camera_to_world
+        time = max(self.time - self.params.camera_latency, self._views[0][0])
+        times = np.array([view[0] for view in self._views])
+        after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0
+        if not after:
+            return self._views[0][1]
+        pair = np.array([view[1] for view in self._views[after - 1 : after + 1]])
+        share = float(np.clip((time - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0))
+        pose = np.eye(4)
+        pose[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
+        pose[:3, 3] = (1 - share) * pair[0, :3, 3] + share * pair[1, :3, 3]
+        return pose
+
+    @property
+    def wheel_position(self) -> Array:
+        """What the encoders count [rad], shape (4,) as `twin.robot.WHEELS`."""
+        return self.data.qpos[self._wheel_angles].copy()
+
+    @property
     def wheel_velocity(self) -> Array:
-        """[rad/s], shape (4,) as `twin.mjcf.husky.WHEELS`."""
+        """[rad/s], shape (4,) as `twin.robot.WHEELS`."""
         return self.data.qvel[self._wheel_dofs].copy()
 
     @property
-    def wheel_torque(self) -> Array:
-        """[N m], shape (4,)."""
+    def motor_torque(self) -> Array:
+        """Of the left and of the right side, at the wheels [N m], shape (2,)."""
         return self.data.actuator_force[self._actuators].copy()
+
+    @property
+    def motor_current(self) -> Array:
+        """Estimated from the torque [A], shape (2,): torque / (gear ratio · `motor_constant`)."""
+        return self.motor_torque / (GEAR_RATIO * self.params.motor_constant)
+
+    @property
+    def gyro(self) -> Array:
+        """The IMU's angular velocity in the base [rad/s], shape (3,)."""
+        return self.data.sensor("imu_gyro").data.copy()
+
+    @property
+    def accelerometer(self) -> Array:
+        """The IMU's proper acceleration in the base [m/s²], shape (3,); at rest 9.81 upwards."""
+        return self.data.sensor("imu_accelerometer").data.copy()
+
+    @property
+    def orientation(self) -> Array:
+        """The IMU's attitude: quaternion w, x, y, z of base to world, shape (4,)."""
+        return self.data.sensor("imu_orientation").data.copy()
 
 
 def _pose(position: Array, matrix: Array) -> Array:

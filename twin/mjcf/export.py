@@ -7,6 +7,7 @@ folder may be moved, zipped, or handed to anyone who has plain MuJoCo.
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,7 @@ from twin.geometry.cameras import Cameras
 from twin.geometry.images import write_image
 from twin.mjcf import husky
 from twin.mjcf.files import face_tiles, write_hfield, write_obj
-from twin.mjcf.husky import PixelCamera
 from twin.mjcf.world import (
-    CAMERA_SIZE,
     SCENE_XML,
     World,
     arc_lengths,
@@ -33,6 +32,7 @@ from twin.mjcf.world import (
     point_at,
     total_turn,
 )
+from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
 from twin.scene import SceneDir
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     Args:
         scene: Reads the stages `metric` (Cameras) and `mesh` (ground.npz, parts.npz, visual.npz and, for a drive,
             route.npz).
-        config: `mjcf`.
+        config: `mjcf` and `robot`.
         out: Gets `scene.xml`, `assets/` and, for a drive, `world.json`.
 
     Returns:
@@ -93,8 +93,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
     husky.set_options(spec)
+    # Spares MuJoCo the poses of thousands of geoms that never move; what has motors, the robot, never sleeps.
+    spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_surroundings(spec)
-    _add_ground(spec, ground, assets)
+    add_ground(spec, ground, assets, config.mjcf.hfield_cell)
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
 
@@ -104,16 +106,17 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
     else:
-        camera = front_camera(Cameras.load(scene.stage("metric")))
-        spawn, blocked = _add_robot(spec, ground, route, camera)
+        camera = config.robot.camera(film_camera(Cameras.load(scene.stage("metric"))))
+        spawn, blocked = _add_robot(spec, ground, route, config.robot, camera)
         _add_route(spec, route, config.mjcf.half_width)
         (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
-        World(route, config.mjcf.half_width, spawn, np.array(camera.intrinsics), out).save()
+        world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot)
+        world.save()
         metrics |= {
             "route_length_m": float(arc_lengths(route)[-1]),
             "turn_deg": float(np.rad2deg(total_turn(route))),
             "half_width_m": config.mjcf.half_width,
-            "camera_intrinsics_px": [float(x) for x in camera.intrinsics],
+            "camera_intrinsics_px": world.intrinsics.tolist(),
         }
     metrics |= check_portable(out, with_robot=route is not None)
     if route is not None:
@@ -129,26 +132,26 @@ def load_route(path: Path) -> Array | None:
         return np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
 
 
-def front_camera(cameras: Cameras) -> PixelCamera:
-    """The real camera at CAMERA_SIZE: of the first training frame, fx scaled by the width.
-
-    Pixels keep their shape, so fy scales like fx; where the aspect ratio differs, the middle of the picture's height is
-    cut out (or, for a picture wider than 16:9, extended).
-    """
+def film_camera(cameras: Cameras) -> PixelCamera:
+    """The real camera of the first training frame."""
     training = np.flatnonzero(~cameras.held_out)
     first = int(training[0]) if len(training) else 0
-    width, height = cameras.sizes[first]
-    fx, fy, cx, cy = cameras.intrinsics[first] * (CAMERA_SIZE[0] / width)
-    cut = (height * CAMERA_SIZE[0] / width - CAMERA_SIZE[1]) / 2
-    return PixelCamera((float(fx), float(fy), float(cx), float(cy - cut)), CAMERA_SIZE)
+    (width, height), (fx, fy, cx, cy) = cameras.sizes[first].tolist(), cameras.intrinsics[first].tolist()
+    return PixelCamera((fx, fy, cx, cy), (width, height))
 
 
-def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
-    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane that fits the ground below."""
+def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tuple[Array, Array]:
+    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane that fits the ground below.
+
+    Args:
+        height_at: Height of the ground [m] at points (n, 2), shape (n,).
+        xy: Of the base [m], shape (2,).
+        yaw: [rad]
+    """
     forward = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-forward[1], forward[0]])
     local = husky.wheel_centers()[:, :2]
-    heights = ground.at(xy + local[:, :1] * forward + local[:, 1:] * left)
+    heights = height_at(xy + local[:, :1] * forward + local[:, 1:] * left)
     (slope_x, slope_y, height), *_ = np.linalg.lstsq(np.column_stack([local, np.ones(4)]), heights, rcond=None)
     x_axis = np.array([*forward, slope_x])
     y_axis = np.array([*left, slope_y])
@@ -158,7 +161,7 @@ def rest_pose(ground: Ground, xy: Array, yaw: float) -> tuple[Array, Array]:
     rotation = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1)
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    return np.array([*xy, height]) + z_axis * husky.BASE_HEIGHT, quaternion
+    return np.array([*xy, height]) + z_axis * BASE_HEIGHT, quaternion
 
 
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
@@ -206,14 +209,17 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     spec.visual.map.znear, spec.visual.map.zfar = 0.005, 50.0
 
 
-def _add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path) -> None:
-    write_hfield(assets / "ground.bin", ground.height)
-    # One texel per cell, the mean of its corners, as the texture spans the field edge to edge. First row: far (+y).
-    rgb = ground.rgb.astype(np.uint16)
+def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -> None:
+    """Adds the geom `ground`, a height field of `cell` [m] in the ground's colours, its files in `assets`."""
+    coarse = ground.coarsened(cell)
+    write_hfield(assets / "ground.bin", coarse.height)
+    # A texel per fine cell, the mean of its corners, as the texture spans the field edge to edge. First row: far (+y).
+    finer = round(coarse.cell / ground.cell)
+    rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
+    rgb = ground.rgb[:rows, :columns].astype(np.uint16)
     cells = (rgb[1:, 1:] + rgb[1:, :-1] + rgb[:-1, 1:] + rgb[:-1, :-1] + 2) // 4
     write_image(assets / "ground.png", cells[::-1].astype(np.uint8))
-    rows, columns = ground.height.shape
-    low, high = float(ground.height.min()), float(ground.height.max())
+    low, high = float(coarse.height.min()), float(coarse.height.max())
     half = np.array([columns - 1, rows - 1]) * ground.cell / 2
     # MuJoCo maps the file's lowest value to 0 and its highest to size[2]; a level field is all 0 at any size.
     spec.add_hfield(name="ground", file="ground.bin", size=(*half, max(high - low, 1e-3), _HFIELD_BASE))
@@ -276,7 +282,7 @@ def _add_parts(spec: mujoco.MjSpec, parts: Parts, assets: Path) -> None:
 
 
 def _add_robot(
-    spec: mujoco.MjSpec, ground: Ground, route: Array, camera: PixelCamera
+    spec: mujoco.MjSpec, ground: Ground, route: Array, params: HuskyParams, camera: PixelCamera
 ) -> tuple[tuple[float, float, float, float], set[str]]:
     """Puts the Husky at the route's start, lets it settle, and keeps that as keyframe `spawn`.
 
@@ -296,8 +302,8 @@ def _add_robot(
         raise InputError(
             f"the route starts {edge.min():.2f} m from the edge of the ground, expected at least 1 m; raise mesh.margin"
         )
-    position, quaternion = rest_pose(ground, route[0, :2], yaw)
-    husky.add_husky(spec, position, quaternion, camera=camera)
+    position, quaternion = rest_pose(ground.at, route[0, :2], yaw)
+    husky.add_husky(spec, position, quaternion, params, camera)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -311,7 +317,7 @@ def _add_robot(
         )
     spec.add_key(name="spawn", qpos=data.qpos)
     x, y, z = data.qpos[:3]
-    forward = data.body("husky").xmat.reshape(3, 3)[:, 0]
+    forward = data.body("base_link").xmat.reshape(3, 3)[:, 0]
     return (float(x), float(y), float(z), float(np.arctan2(forward[1], forward[0]))), blocked
 
 
@@ -373,7 +379,7 @@ def check_portable(folder: Path, with_robot: bool) -> dict[str, Any]:
 
 def robot_geoms(model: mujoco.MjModel) -> NDArray[np.bool_]:
     """Which geoms belong to the robot, shape (ngeom,)."""
-    return model.body_rootid[model.geom_bodyid] == model.body("husky").id
+    return model.body_rootid[model.geom_bodyid] == model.body("base_link").id
 
 
 def touched_names(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
@@ -388,7 +394,7 @@ def spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
     """Distance from the robot to the nearest convex part [m]; None where none is within 5 m."""
     robot = np.flatnonzero(robot_geoms(model) & (model.geom_contype > 0))
     parts = np.flatnonzero(model.geom_group == PART_GROUP)
-    center = data.body("husky").xpos
+    center = data.body("base_link").xpos
     near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + _CLEARANCE_RANGE]
     distances = [
         mujoco.mj_geomDistance(model, data, int(a), int(b), _CLEARANCE_RANGE, None) for a in robot for b in near

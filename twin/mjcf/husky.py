@@ -1,43 +1,49 @@
-"""The Clearpath Husky A200 as a wheeled MuJoCo model.
+"""The Clearpath Husky A200 as a wheeled MuJoCo model; words and figures: `twin.robot`.
 
-*Base* is the body with the free joint (Clearpath's `base_link`; x forward, y left, z up; its origin lies between the
-wheels, 0.132 m above flat ground). A *side* is the front and the rear wheel of the left or of the right, which one
-motor drives through a belt. The *track ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a differential
-drive whose wheels roll freely and larger for a skid-steered robot, whose tyres must scrub sideways.
+Names, for whoever scripts it: body and free joint `base_link`; bodies and joints `<front|rear>_<left|right>_wheel`;
+actuators `left` and `right`, commanded in wheel speed [rad/s]; camera `front` (160 × 90) and `front_native`, the same
+at its native size; site `imu`; sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`,
+`<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`.
 
-Figures: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml). Contact settings:
-measured, see `_WHEEL_SOLIMP`.
+`python -m twin.mjcf.husky` writes the robot alone to `twin/assets/husky/husky.xml`, for anyone's own scene:
+
+    husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tyres need these
+    robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
+    spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
+
+Contact settings: measured, see `_WHEEL_SOLIMP`.
 """
 
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import root
 
 from twin.mjcf.husky_look import add_look
+from twin.robot import (
+    BASE_HEIGHT,
+    CAMERA_SIZE,
+    CHASSIS_MASS,
+    HUB_HEIGHT,
+    SIDES,
+    TRACK,
+    WHEEL_MASS,
+    WHEEL_RADIUS,
+    WHEEL_WIDTH,
+    WHEELBASE,
+    WHEELS,
+    ZED2,
+    HuskyParams,
+    PixelCamera,
+)
 
 Array = NDArray[np.float64]
 
-WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-"""Order of wheel arrays everywhere; the joint and the actuator of a wheel are `<name>_wheel`."""
-
-CHASSIS_MASS = 46.034  # [kg]
-WHEEL_MASS = 2.637  # [kg]
-WHEEL_RADIUS = 0.1651  # [m]
-WHEEL_WIDTH = 0.1143  # [m]
-WHEELBASE = 0.512  # [m]
-TRACK = 0.5708  # [m]
-HUB_HEIGHT = 0.03282  # [m] above the base origin
-BASE_HEIGHT = WHEEL_RADIUS - HUB_HEIGHT  # [m] of the base origin above flat ground
-
-MAX_SPEED, MAX_ACCELERATION = 1.0, 3.0  # [m/s], [m/s²]
-MAX_YAW_RATE, MAX_YAW_ACCELERATION = 2.0, 6.0  # [rad/s], [rad/s²]
-CONTROL_PERIOD = 0.1  # [s], the wheel controller of the real robot runs at 10 Hz
-COMMAND_TIMEOUT = 0.25  # [s] without a command, then the robot stops
 TIMESTEP = 0.002  # [s]
+HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
+"""The published robot alone, no floor."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
 _WHEEL_INERTIA = (0.02467, 0.04411, 0.02467)  # [kg m²], the axle is y
@@ -46,64 +52,16 @@ _COLLISION_BOXES = (  # full size, centre in the base [m]
     ((0.78992, 0.5709, 0.10375), (0.0, 0.0, 0.175625)),
 )
 # With MuJoCo's default solimp (d0 = 0.9) scrubbing wheels hop: 12 to 17 m/s² at the body in a point turn, and the
-# effective track then depends on friction. An impedance that starts from zero over 3 mm has no jump at touchdown.
-_WHEEL_SOLIMP = (0.0, 0.95, 0.003, 0.5, 2.0)
+# effective track then depends on friction. An impedance that starts from zero has no jump at touchdown. How fast it
+# rises is a compromise: over 3 mm a wheel sinks in by 1.6 mm and touches the facets of a height field ahead of it,
+# which shakes the camera 0.9 m/s² instead of 0.5; over 1 mm scrubbing on a friction of 1.0 flutters.
+_WHEEL_SOLIMP = (0.0, 0.95, 0.0025, 0.5, 2.5)
+_WHEEL_SOLREF = (0.02, 2.0)  # damped twice as much as critically: an eighth less shaking on a height field
+_IMU_POSITION = (0.19, 0.0, 0.149)  # in the base [m]
 _TORSIONAL = 1e-4  # [m] spin friction of the contact patch; next to nothing, the scrubbing of four wheels dominates
 
 ROBOT_GROUP = 4
 """Geom group of the robot's collision shapes; its looks are in group 1."""
-
-
-@dataclass(frozen=True)
-class HuskyParams:
-    """What may differ from robot to robot, or be fitted to logs."""
-
-    center_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.062)
-    """Of the chassis, in the base [m]. The published (−.00065, −.085, .062) would lie 8.5 cm to the right of a
-    symmetric robot; read as transposed it is rear-heavy (`REAR_HEAVY`) and turns with chi = 1.43. Centred it turns with
-    1.805, which is nearer to what Clearpath's controller assumes (1.82 to 1.875) and to what logs of a real one show
-    (2.15 and more); so centred is the default."""
-    friction: float = 0.7
-    """Sliding friction of a tyre, on whatever it touches."""
-    rolling_resistance: float = 0.015
-    """Rolling resistance coefficient Crr: force / load."""
-    wheel_shape: str = "ellipsoid"
-    """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
-    servo_gain: float = 400.0
-    """Torque per wheel speed error [N m s/rad]; stiff, as the motor controllers close the loop on encoder counts."""
-    motor_inertia: float = 0.15
-    """Inertia of rotors and gears as felt at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the gear
-    ratio of 79 squared, shared by two wheels. It also keeps stiffly driven wheels from stick-slip flutter: without it a
-    point turn at 1.8 rad/s on a friction of 1.0 hops (9 m/s² rms at the camera), from 0.1 up there is none at all."""
-    wheel_torque: float = 35.0
-    """Torque limit per wheel [N m]; half of what a side's motor gives at its peak."""
-    separation_multiplier: float = 1.875
-    """Clearpath's `wheel_separation_multiplier`: the controller's own guess of chi."""
-    payload_mass: float = 0.0
-    """[kg] on the top plate."""
-    payload_position: tuple[float, float, float] = (0.0, 0.0, 0.35)
-    """Centre of the payload in the base [m]."""
-    camera_position: tuple[float, float, float] = (0.36, 0.0, 0.6 - BASE_HEIGHT)
-    """Of the front camera in the base [m]; by default 0.6 m above the ground."""
-    camera_pitch: float = 5.0
-    """How far the front camera looks down [°]."""
-
-
-@dataclass(frozen=True)
-class PixelCamera:
-    """A pinhole camera in pixels: OpenCV convention, (0, 0) is the corner of the top-left pixel."""
-
-    intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy [px]."""
-    size: tuple[int, int] = (160, 90)
-    """Width, height [px]."""
-
-
-REAR_HEAVY = (-0.085, -0.00065, 0.062)
-"""The published centre of mass of the chassis with x and y exchanged [m]."""
-
-# A ZED 2 at 1280 × 720 has fx ≈ 530 px; at 160 × 90 that is an eighth.
-ZED2 = PixelCamera((66.25, 66.25, 80.0, 45.0))
 
 
 def set_options(spec: mujoco.MjSpec) -> None:
@@ -114,6 +72,8 @@ def set_options(spec: mujoco.MjSpec) -> None:
     # The pyramidal cone reads the right chi with a torque 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
+    # At the default 1e-8 Newton takes twice the iterations to the same motion.
+    spec.option.tolerance = 1e-5
 
 
 def add_husky(
@@ -123,46 +83,38 @@ def add_husky(
     params: HuskyParams | None = None,
     camera: PixelCamera = ZED2,
 ) -> None:
-    """Adds the robot to a world.
-
-    Names: body `husky`, free joint `husky`, bodies, joints, actuators `<front|rear>_<left|right>_wheel`, collision
-    geoms `husky_chassis_0`, `husky_chassis_1`, `<wheel>_tyre`, camera `front`.
+    """Adds the robot to a world; its names are in the module's head.
 
     Args:
         spec: The world; its options are not touched (see `set_options`).
         position: Of the base origin [m], shape (3,).
         quaternion: w, x, y, z, shape (4,).
         params: The robot; the published one by default.
-        camera: Of the front camera.
+        camera: The front camera at its native size, where `params` gives no intrinsics.
     """
     params = params or HuskyParams()
-    base = spec.worldbody.add_body(name="husky", pos=position, quat=quaternion)
-    base.add_freejoint(name="husky")
+    base = spec.worldbody.add_body(name="base_link", pos=position, quat=quaternion)
+    base.add_freejoint(name="base_link")
     base.explicitinertial = True
     base.mass, base.ipos, base.fullinertia = _chassis_inertia(params)
     for i, (size, center) in enumerate(_COLLISION_BOXES):
         base.add_geom(
-            name=f"husky_chassis_{i}",
+            name=f"chassis_{i}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=np.array(size) / 2,
             pos=center,
             group=ROBOT_GROUP,
             rgba=(0.2, 0.2, 0.8, 0.4),
         )
-    wheels = {}
-    for name, center in zip(WHEELS, wheel_centers(), strict=True):
-        wheels[name] = _add_wheel(spec, base, f"{name}_wheel", center, params)
-    for side in ("left", "right"):  # the belt: rear angle = front angle
-        belt = spec.add_equality(
-            name=f"{side}_belt",
-            type=mujoco.mjtEq.mjEQ_JOINT,
-            objtype=mujoco.mjtObj.mjOBJ_JOINT,
-            name1=f"rear_{side}_wheel",
-            name2=f"front_{side}_wheel",
-        )
-        belt.data[:2] = 0.0, 1.0
-    _add_camera(base, params, camera)
-    add_look(spec, base, wheels, params.camera_position, WHEEL_RADIUS, WHEEL_WIDTH)
+    wheels = {name: _add_wheel(base, name, i, params) for i, name in enumerate(WHEELS)}
+    for side in SIDES:
+        _add_drive(spec, side, params)
+    base.add_site(name="imu", pos=_IMU_POSITION, size=(0.01, 0.01, 0.01), group=ROBOT_GROUP)
+    native = params.camera(camera)
+    _add_camera(base, "front", params, native.resized(CAMERA_SIZE))
+    _add_camera(base, "front_native", params, native)
+    _add_sensors(spec)
+    add_look(spec, base, wheels, params.camera_position, params.wheel_radius, WHEEL_WIDTH)
 
 
 def wheel_centers() -> Array:
@@ -184,50 +136,81 @@ def _chassis_inertia(params: HuskyParams) -> tuple[float, Array, Array]:
     return float(mass), center, tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
-def _add_wheel(
-    spec: mujoco.MjSpec, base: mujoco.MjsBody, name: str, center: Array, params: HuskyParams
-) -> mujoco.MjsBody:
-    wheel = base.add_body(name=name, pos=center)
+def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams) -> mujoco.MjsBody:
+    wheel = base.add_body(name=f"{name}_wheel", pos=wheel_centers()[index])
     wheel.explicitinertial = True
     # Left unsaid, MuJoCo takes the body's offset in its parent for the centre of mass.
     wheel.mass, wheel.ipos, wheel.inertia = WHEEL_MASS, (0.0, 0.0, 0.0), _WHEEL_INERTIA
-    wheel.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 1, 0), armature=params.motor_inertia)
+    wheel.add_joint(
+        name=f"{name}_wheel", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 1, 0), armature=params.motor_inertia
+    )
+    radius = params.wheel_radius[index % 2]
     shapes: dict[str, dict[str, Any]] = {
-        "ellipsoid": {
-            "type": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-            "size": (WHEEL_RADIUS, WHEEL_WIDTH / 2, WHEEL_RADIUS),
-        },
+        "ellipsoid": {"type": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "size": (radius, WHEEL_WIDTH / 2, radius)},
         "cylinder": {
             "type": mujoco.mjtGeom.mjGEOM_CYLINDER,
-            "size": (WHEEL_RADIUS, WHEEL_WIDTH / 2, 0.0),
+            "size": (radius, WHEEL_WIDTH / 2, 0.0),
             "quat": (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
         },
     }
     wheel.add_geom(
-        name=name.replace("_wheel", "_tyre"),
+        name=f"{name}_tyre",
         group=ROBOT_GROUP,
         rgba=(0.2, 0.2, 0.8, 0.4),
         condim=6,
         priority=1,
         # A rolling friction coefficient [m] over the radius is Crr.
-        friction=(params.friction, _TORSIONAL, max(params.rolling_resistance * WHEEL_RADIUS, 1e-5)),
+        friction=(params.friction, _TORSIONAL, max(params.rolling_resistance * radius, 1e-5)),
         solimp=_WHEEL_SOLIMP,
+        solref=_WHEEL_SOLREF,
         **shapes[params.wheel_shape],
     )
-    actuator = spec.add_actuator(
-        name=name,
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        target=name,
-        forcelimited=True,
-        forcerange=(-params.wheel_torque, params.wheel_torque),
-        ctrllimited=True,
-        ctrlrange=(-MAX_SPEED / WHEEL_RADIUS, MAX_SPEED / WHEEL_RADIUS),
-    )
-    actuator.set_to_velocity(kv=params.servo_gain)
     return wheel
 
 
-def _add_camera(base: mujoco.MjsBody, params: HuskyParams, camera: PixelCamera) -> None:
+def _add_drive(spec: mujoco.MjSpec, side: str, params: HuskyParams) -> None:
+    """One motor for the two wheels of a side: a servo on their mean speed, and the belt that keeps them equal."""
+    belt = spec.add_equality(
+        name=f"{side}_belt",
+        type=mujoco.mjtEq.mjEQ_JOINT,
+        objtype=mujoco.mjtObj.mjOBJ_JOINT,
+        name1=f"rear_{side}_wheel",
+        name2=f"front_{side}_wheel",
+    )
+    belt.data[:2] = 0.0, 1.0
+    shaft = spec.add_tendon(name=f"{side}_shaft")
+    for end in ("front", "rear"):
+        shaft.wrap_joint(f"{end}_{side}_wheel", 0.5)
+    limit = params.max_wheel_speed / WHEEL_RADIUS
+    actuator = spec.add_actuator(
+        name=side,
+        trntype=mujoco.mjtTrn.mjTRN_TENDON,
+        target=f"{side}_shaft",
+        forcelimited=True,
+        forcerange=(-params.motor_torque, params.motor_torque),
+        ctrllimited=True,
+        ctrlrange=(-limit, limit),
+    )
+    actuator.set_to_velocity(kv=params.servo_gain)
+    if params.servo_lag > 0:
+        actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+        actuator.dynprm[0] = params.servo_lag
+
+
+def _add_sensors(spec: mujoco.MjSpec) -> None:
+    kind, of = mujoco.mjtSensor, mujoco.mjtObj
+    for name, sensor, objtype, target in (
+        ("imu_gyro", kind.mjSENS_GYRO, of.mjOBJ_SITE, "imu"),
+        ("imu_accelerometer", kind.mjSENS_ACCELEROMETER, of.mjOBJ_SITE, "imu"),
+        ("imu_orientation", kind.mjSENS_FRAMEQUAT, of.mjOBJ_SITE, "imu"),
+        *((f"{w}_wheel_position", kind.mjSENS_JOINTPOS, of.mjOBJ_JOINT, f"{w}_wheel") for w in WHEELS),
+        *((f"{w}_wheel_velocity", kind.mjSENS_JOINTVEL, of.mjOBJ_JOINT, f"{w}_wheel") for w in WHEELS),
+        *((f"{side}_torque", kind.mjSENS_ACTUATORFRC, of.mjOBJ_ACTUATOR, side) for side in SIDES),
+    ):
+        spec.add_sensor(name=name, type=sensor, objtype=objtype, objname=target)
+
+
+def _add_camera(base: mujoco.MjsBody, name: str, params: HuskyParams, camera: PixelCamera) -> None:
     fx, fy, cx, cy = camera.intrinsics
     width, height = camera.size
     pitch = np.deg2rad(params.camera_pitch)
@@ -236,7 +219,7 @@ def _add_camera(base: mujoco.MjsBody, params: HuskyParams, camera: PixelCamera) 
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, axes.ravel())
     base.add_camera(
-        name="front",
+        name=name,
         pos=params.camera_position,
         quat=quaternion,
         resolution=(width, height),
@@ -248,57 +231,44 @@ def _add_camera(base: mujoco.MjsBody, params: HuskyParams, camera: PixelCamera) 
     )
 
 
-def limited_command(command: Array, previous: Array, period: float = CONTROL_PERIOD) -> Array:
-    """What the robot's controller makes of a command (v [m/s], ω [rad/s]) after its limits of speed and acceleration.
-
-    Args:
-        command: Wanted v, ω, shape (2,).
-        previous: What it carried out one `period` [s] ago, shape (2,).
-    """
-    limit = np.array([MAX_SPEED, MAX_YAW_RATE])
-    step = np.array([MAX_ACCELERATION, MAX_YAW_ACCELERATION]) * period
-    return np.clip(np.clip(command, -limit, limit), previous - step, previous + step)
-
-
-def wheel_speeds(command: Array, separation_multiplier: float = HuskyParams.separation_multiplier) -> Array:
-    """Wheel speeds [rad/s], shape (4,) as WHEELS, for v [m/s] and ω [rad/s]; both sides shrink alike above 1 m/s."""
-    v, yaw_rate = command
-    half = yaw_rate * separation_multiplier * TRACK / 2
-    sides = np.array([v - half, v + half])
-    sides = sides / max(1.0, np.abs(sides).max() / MAX_SPEED)
-    return np.tile(sides, 2) / WHEEL_RADIUS
-
-
 def center_of_mass(params: HuskyParams) -> Array:
     """Centre of mass of the whole robot in the base [m], shape (3,)."""
     mass, center, _ = _chassis_inertia(params)
     return (mass * center + WHEEL_MASS * wheel_centers().sum(0)) / (mass + 4 * WHEEL_MASS)
 
 
-def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
-    """Quasi-static chi of four point contacts under Coulomb friction, whatever the coefficient.
+def standalone_xml() -> str:
+    """The published robot alone, no floor, as MJCF."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "husky"
+    set_options(spec)
+    add_husky(spec)
+    spec.compile()
+    return _XML_HEAD + spec.to_xml()
 
-    With slip velocity s at each wheel the friction force is −μN s/|s|; forces and moment about the centre of mass must
-    vanish. A centred mass in a point turn gives 1 + (wheelbase / track)² exactly.
 
-    Args:
-        center: Centre of mass in the base, x and y used [m], shape (≥2,).
-        curvature_radius: v / yaw rate of the mean of both sides, in units where the yaw rate of the wheels counts [m].
-    """
-    arm = wheel_centers()[:, :2] - np.asarray(center)[:2]
-    share_x = 0.5 + np.sign(arm[:, 0]) * center[0] / WHEELBASE
-    share_y = 0.5 + np.sign(arm[:, 1]) * center[1] / TRACK
-    load = share_x * share_y
+_XML_HEAD = """<!--
+  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures and licence: NOTICE.md.
 
-    def residual(unknown: Array) -> Array:
-        vx, vy, chi = unknown  # body velocity at the centre of mass for unit yaw rate
-        rolling = curvature_radius + np.array([-1.0, 1.0, -1.0, 1.0]) * chi * TRACK / 2
-        slip = np.stack([vx - arm[:, 1] - rolling, vy + arm[:, 0]], 1)
-        force = -load[:, None] * slip / np.linalg.norm(slip, axis=1, keepdims=True)
-        moment = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
-        return np.array([force[:, 0].sum(), force[:, 1].sum(), moment.sum()])
+  body, free joint  base_link
+  joints            front_left_wheel, front_right_wheel, rear_left_wheel, rear_right_wheel
+  actuators         left, right: wheel speed [rad/s], up to 6.06; front and rear wheel of a side are belted
+  cameras           front (160 x 90), front_native (1280 x 720)
+  sensors           imu_gyro, imu_accelerometer, imu_orientation (site imu), <wheel>_wheel_position and _velocity,
+                    left_torque, right_torque [N m] at the wheels of a side
 
-    solution = root(residual, np.array([curvature_radius, -center[0] * 0.5, 1.0 + (WHEELBASE / TRACK) ** 2]))
-    if not solution.success:
-        raise ArithmeticError(f"no quasi-static balance for a centre of mass at {center}: {solution.message}")
-    return float(solution.x[2])
+  Attached to another model, this one's options are not taken over. The tyres need
+    <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10" tolerance="1e-5"/>
+  there as well: with another cone the scrubbing torque is wrong, with Euler the motors' servos are.
+-->
+"""
+
+
+def main() -> None:
+    """Writes `HUSKY_XML`."""
+    HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
+    print(f"wrote {HUSKY_XML}")
+
+
+if __name__ == "__main__":
+    main()

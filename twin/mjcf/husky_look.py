@@ -27,19 +27,21 @@ def add_look(
     base: mujoco.MjsBody,
     wheels: dict[str, mujoco.MjsBody],
     camera: tuple[float, float, float],
-    radius: float,
+    radii: tuple[float, float],
     width: float,
 ) -> None:
     """Dresses the base and its wheels.
 
     Args:
         camera: Position of the front camera in the base [m]; a small housing and its mast stand there.
-        radius: Of a wheel [m].
+        radii: Of the left and of the right wheels [m].
         width: Of a wheel [m].
     """
     for name, rgba, specular in (("yellow", _YELLOW, 0.4), ("black", _BLACK, 0.2), ("dark", _DARK, 0.2)):
         spec.add_material(name=f"husky_{name}", rgba=rgba, specular=specular, shininess=0.4)
-    for name, (vertices, faces) in {"hull": _hull(), "tyre": _tyre(radius, width)}.items():
+    tyres = {radius: f"tyre_{i}" for i, radius in enumerate(dict.fromkeys(radii))}
+    meshes = {"hull": _hull()} | {name: _tyre(radius, width) for radius, name in tyres.items()}
+    for name, (vertices, faces) in meshes.items():
         mesh = spec.add_mesh(name=f"husky_{name}")
         mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -56,8 +58,9 @@ def add_look(
     _box(base, (0.16, 0.11, 0.05), (-0.29, 0.0, 0.267), material="husky_black")  # user panel and emergency stop
     _cylinder(base, (-0.29, 0.0, 0.29), (-0.29, 0.0, 0.318), 0.024, rgba=_RED)
     _mast(base, camera)
-    for wheel in wheels.values():
-        _mesh(wheel, "husky_tyre", "husky_black")
+    for name, wheel in wheels.items():
+        radius = radii[name.endswith("right")]
+        _mesh(wheel, f"husky_{tyres[radius]}", "husky_black")
         for y in (-1.0, 1.0):
             _cylinder(wheel, (0, 0.30 * width * y, 0), (0, 0.44 * width * y, 0), 0.55 * radius, rgba=_STEEL)
             _cylinder(wheel, (0, 0.40 * width * y, 0), (0, 0.47 * width * y, 0), 0.22 * radius, material="husky_yellow")

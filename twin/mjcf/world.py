@@ -5,20 +5,20 @@ at its start. *Cross-track error*: distance from the route in the plane, positiv
 route from the x axis, positive towards y. *Corridor*: what lies within `half_width` of the route.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import parse
+from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
 from twin.scene import read_json, write_json
 
 Array = NDArray[np.float64]
 
 SCENE_XML = "scene.xml"
-CAMERA_SIZE = (160, 90)
-"""Width, height of the front camera's picture [px]."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,21 @@ class World:
     """Half width of the drivable corridor [m]."""
     spawn: tuple[float, float, float, float]
     """x, y, z of the robot's base origin [m] at rest at the start, and its yaw [rad]."""
-    intrinsics: Array
-    """fx, fy, cx, cy [px] of the front camera at CAMERA_SIZE, shape (4,)."""
     folder: Path
     """Holds `scene.xml`, `assets/` and `world.json`."""
+    camera: PixelCamera = ZED2
+    """The front camera at its native size."""
+    robot: HuskyParams = field(default_factory=HuskyParams)
+    """What was built into the scene, and what its controller and its camera go by."""
     names: dict[str, str] = field(
-        default_factory=lambda: {"body": "husky", "camera": "front", "ground": "ground", "keyframe": "spawn"}
+        default_factory=lambda: {"body": "base_link", "camera": "front", "ground": "ground", "keyframe": "spawn"}
     )
     """What the things in the MJCF are called."""
+
+    @property
+    def intrinsics(self) -> Array:
+        """fx, fy, cx, cy [px] of the front camera at CAMERA_SIZE, shape (4,)."""
+        return np.array(self.camera.resized(CAMERA_SIZE).intrinsics)
 
     @property
     def goal(self) -> Array:
@@ -61,7 +68,13 @@ class World:
                 "half_width": self.half_width,
                 "goal": self.goal.tolist(),
                 "spawn": list(self.spawn),
-                "camera": {"intrinsics": self.intrinsics.tolist(), "size": list(CAMERA_SIZE)},
+                "camera": {
+                    "intrinsics": self.intrinsics.tolist(),
+                    "size": list(CAMERA_SIZE),
+                    "native_intrinsics": list(self.camera.intrinsics),
+                    "native_size": list(self.camera.size),
+                },
+                "robot": asdict(self.robot),
                 "names": self.names,
                 "model": SCENE_XML,
             },
@@ -71,11 +84,13 @@ class World:
     def load(folder: Path) -> "World":
         head = read_json(folder / "world.json")
         x, y, z, yaw = head["spawn"]
+        (fx, fy, cx, cy), (width, height) = head["camera"]["native_intrinsics"], head["camera"]["native_size"]
         return World(
             route=np.array(head["route"]),
             half_width=float(head["half_width"]),
             spawn=(x, y, z, yaw),
-            intrinsics=np.array(head["camera"]["intrinsics"]),
+            camera=PixelCamera((fx, fy, cx, cy), (width, height)),
+            robot=parse(HuskyParams, head["robot"], str(folder / "world.json")),
             folder=folder,
             names=head["names"],
         )

@@ -42,6 +42,7 @@ Floats = NDArray[np.float32]
 
 _FORMAT = 2
 _PIECES = 3  # of a picture, per core
+_SIZES_KEPT = 4  # of pictures: a vector of worlds needs all of them, and those that begin anew
 
 
 class BakedField:
@@ -190,11 +191,13 @@ class BakedField:
         return np.broadcast_to(bias + vectors @ matrix, (n, len(bias)))
 
     def _picture(self, n: int, width: int, height: int, stopped: bool) -> "_Picture":
-        """Arrays for pictures of this size; the last ones are kept, as the next picture is likely of the same size."""
+        """Arrays for pictures of this size; the last few are kept, as the next is likely of a size there was before."""
         key = n, width, height, stopped
-        if key not in self._pictures:
-            self._pictures = {key: _Picture(self, *key)}
-        return self._pictures[key]
+        picture = self._pictures.pop(key, None) or _Picture(self, *key)
+        self._pictures[key] = picture
+        while len(self._pictures) > _SIZES_KEPT:
+            del self._pictures[next(iter(self._pictures))]
+        return picture
 
     # ---- files
 

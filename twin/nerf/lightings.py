@@ -29,6 +29,8 @@ class Lightings:
     """What a random lighting is judged on; a baked field has them."""
     stale: tuple[str, ...] = ()
     """Lightings that were added to another build of the field, and mean nothing to this one."""
+    count_added: int = 0
+    """How many of the last ones were added."""
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """The embedding of a lighting, a frame or a mixture, shape (dim,).
@@ -76,4 +78,15 @@ class Lightings:
     def added(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> "Lightings":
         """With more lightings, embeddings (dim,) by name, and the names of those that are not to be used."""
         vectors = np.concatenate([self.vectors, *(vector[None] for vector in more.values())])
-        return replace(self, names=(*self.names, *more), vectors=vectors, stale=(*self.stale, *stale))
+        return replace(
+            self,
+            names=(*self.names, *more),
+            vectors=vectors,
+            stale=(*self.stale, *stale),
+            count_added=self.count_added + len(more),
+        )
+
+    def filmed(self) -> "Lightings":
+        """Without those that were added."""
+        count = len(self.names) - self.count_added
+        return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0)

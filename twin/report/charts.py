@@ -1,5 +1,6 @@
 """Which figures a finished build can have: reads the artifacts that exist and the report, and draws each section's."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ class Chart:
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     """Every figure that the build's artifacts and numbers allow."""
-    return [*_place(scene, report), *_points(scene), *_field(report), *_drive(report), *_truth(scene)]
+    return [*_place(scene, report), *_points(scene), *_field(report), *_drive(report), *_seen(report), *_truth(scene)]
 
 
 def _place(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
@@ -115,6 +116,19 @@ def _drive(report: dict[str, Any]) -> list[Chart]:
     speed = figures.along_the_path(trace["progress_m"], {"speed": trace["speed_m_s"]}, "speed [m/s]", lowest=0.0)
     title = "How far off the route it drove" + ("" if limit is None else "; dashed: the corridor")
     return [Chart("review", title, figures.svg(off)), Chart("review", "How fast it drove", figures.svg(speed))]
+
+
+def _seen(report: dict[str, Any]) -> list[Chart]:
+    """Leaks, ghosts and the ground's error along the route."""
+    along = pick(report, "seen_touched.along")
+    if not isinstance(along, dict) or len(along.get("station_m") or []) < 2:
+        return []
+    known: dict[str, Sequence[float]] = {
+        name: [float("nan") if value is None else float(value) for value in along[key]]
+        for name, key in (("largest leak", "leak_m"), ("largest ghost", "ghost_m"), ("ground, median", "ground_m"))
+    }
+    drawn = figures.along_the_path(along["station_m"], known, "in the corridor [m]", lowest=0.0)
+    return [Chart("seen_touched", "Seen but not solid, solid but not seen, along the route", figures.svg(drawn))]
 
 
 def _truth(scene: SceneDir) -> list[Chart]:

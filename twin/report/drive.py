@@ -10,12 +10,13 @@ from tqdm import tqdm
 
 from twin.env.chase import frame_indices
 from twin.env.follower import Drive
-from twin.mjcf.world import CAMERA_SIZE, World, arc_lengths
+from twin.mjcf.world import World, arc_lengths
 from twin.report.chapters import title_card
 from twin.report.panels import ACCENT, AMBER, GREEN, INK, RED, Colour, Picture, facts, place, plate
 from twin.report.plan import Plan
 from twin.report.studio import Studio, as_picture, side_by_side
 from twin.report.words import listing
+from twin.robot import CAMERA_SIZE
 
 Array = NDArray[np.float64]
 T = TypeVar("T")

@@ -11,6 +11,7 @@ from twin.report.against_truth import truth_section
 from twin.report.charts import Chart, charts
 from twin.report.markup import STYLE, Html, data_url, element, join, picture, table
 from twin.report.sections import SECTIONS, general_cautions
+from twin.report.seen_section import seen_section
 from twin.report.words import NOT_MEASURED, Caution, Section, duration, flat, number, pick, verdicts
 from twin.scene import SceneDir, read_json
 
@@ -34,7 +35,7 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
     """The whole page."""
     drawn, kept = charts(scene, report), _pictures(scene)
     name = str(report.get("scene") or scene.root.name)
-    sections = [make(report) for make in SECTIONS.values()] + [truth_section(report)]
+    sections = [make(report) for make in SECTIONS.values()] + [seen_section(report), truth_section(report)]
     body = element(
         "main",
         _header(name, report),
@@ -108,9 +109,9 @@ def _pictures(scene: SceneDir) -> list[tuple[str, Path, str]]:
 def _section(
     position: int, section: Section, report: dict[str, Any], drawn: list[Chart], kept: list[tuple[str, Path, str]]
 ) -> Html:
-    title = element("h2", element("small", str(position)) if section.name != "truth" else "", section.title)
+    title = element("h2", element("small", str(position)) if section.name in SECTIONS else "", section.title)
     ran = section.name in report or section.name in (report.get("stages") or {})
-    if not ran and section.name != "truth":
+    if not ran and section.name in SECTIONS:
         return element("section", title, element("p", "This stage has not run.", class_="na"), id=section.name)
     if section.not_applicable and not section.done:
         return element("section", title, _not_applicable(section), id=section.name)

@@ -17,6 +17,7 @@ from twin.config import SceneConfig
 from twin.env.follower import Drive, follow
 from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import Cameras
+from twin.mjcf.export import Parts
 from twin.mjcf.world import World, arc_lengths
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Field
@@ -35,7 +36,10 @@ from twin.report.drive import DRIVE_STRIP, drive_metrics, film_drive, rendered_i
 from twin.report.overview import Shot, camera_shots, chase_shots, pictures_of, route_shots
 from twin.report.panels import AMBER, GREEN, RED, Box, Layout
 from twin.report.plan import Plan, footprints
+from twin.report.seen_section import seen_row
+from twin.report.seen_touched import along_the_drive, compare, look
 from twin.report.studio import Studio, side_by_side, spread
+from twin.report.trust_map import trust_along, trust_metrics, trust_picture
 from twin.report.video import VideoWriter
 from twin.report.words import follower_verdict
 from twin.scene import SceneDir, write_json
@@ -44,6 +48,7 @@ Array = NDArray[np.float64]
 
 _SHARES = (0.25, 0.2, 0.55)  # of `review.renders`, per chapter
 _WAITING = 64 * 2**20  # [bytes] of MuJoCo's pictures that wait to be shown
+_SEEN_ROWS = 3  # looks whose gap is shown
 _CRF = 24  # the demo's film stays near 5 MB
 _MOODS = {"good": GREEN, "mixed": AMBER, "bad": RED, "plain": AMBER}
 
@@ -58,7 +63,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns:
         Metrics for the report: `follower` (None where there is no route, and then `not_applicable` says why),
-        `frames`, `duration_s`, `renders`, `render_seconds_per_frame`.
+        `seen_touched` (see `twin.report.seen_touched.compare`), `frames`, `duration_s`, `renders`,
+        `render_seconds_per_frame`.
     """
     return film(scene, config, out, BakedField.load(scene.stage("field")))
 
@@ -67,7 +73,7 @@ def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[
     """`run` with any field."""
     cameras = Cameras.load(scene.stage("metric"))
     world = World.load(scene.stage("mjcf")) if config.mjcf.route and scene.has_route else None
-    drive = follow(world, HuskyPhysics(world.model()), config.review.speed) if world else None
+    drive = follow(world, HuskyPhysics(world.model(), world.robot), config.review.speed) if world else None
     aspect = float(np.median(cameras.sizes[:, 1] / cameras.sizes[:, 0]))
     layout = Layout.for_pictures(config.review.width, aspect)
     path = world.route[:, :2] if world else _longest_path(cameras)
@@ -78,12 +84,21 @@ def film(scene: SceneDir, config: SceneConfig, out: Path, field: Field) -> dict[
         studio = Studio(config.name, field, cameras, layout, writer, out, config.review.render_width, path)
         _keep_captures(studio)
         _film_chapters(studio, scene, config, world, drive)
+        if world:
+            along = trust_along(field, cameras, world)
+            metrics["trust"] = trust_metrics(*along)
+            caption = (
+                "how far the robot's pictures can be trusted: near to what was filmed, and road where road must be"
+            )
+            studio.keep("trust", "review", caption, trust_picture(*along))
         verdict = follower_verdict(
             {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
         )
         studio.writer.write(layout.card(verdict.text, [], _MOODS[verdict.mood]), 3 * studio.fps)
     metrics |= {"frames": writer.frames, "duration_s": writer.frames / writer.fps, "renders": studio.renders}
     metrics |= {"trace": trace(drive)} if drive else {}
+    if world and drive:
+        metrics["seen_touched"] = _seen_and_touched(studio, scene, world, drive)
     # Times stay out of the file, so that the same build writes the same bytes.
     write_json(out / "review.json", metrics | {"pictures": [asdict(picture) for picture in studio.kept]})
     return metrics | {"render_seconds_per_frame": studio.render_seconds / max(1, studio.renders)}
@@ -103,7 +118,7 @@ def _film_chapters(
     chosen = comparison_frames(studio, int(_SHARES[0] * renders))
     turns = int(_SHARES[1] * renders) if len(field.lightings) > 1 else 0
     drives = int(_SHARES[2] * renders) if drive else 0
-    ground, parts = _surroundings(scene)
+    ground, parts = surroundings(scene)
     half_width = world.half_width if world else 0.0
 
     def plan(box: Box) -> Plan:
@@ -134,17 +149,31 @@ def _film_chapters(
             title_card(studio, "No drive", [f"Nothing is driven here: {no_drive_reason(config)}."])
 
 
+def _seen_and_touched(studio: Studio, scene: SceneDir, world: World, drive: Drive) -> dict[str, Any] | None:
+    """Whether the robot touches what its camera sees, with pictures; None where the mesh stage left no ground."""
+    folder = scene.stage("mesh")
+    if not (folder / "ground.npz").exists():
+        return None
+    looks = look(studio.field, world, along_the_drive(drive.camera_to_world), studio.field.lightings[0])
+    for number, k in enumerate(spread(range(len(looks.seen)), _SEEN_ROWS + 2)[1:-1]):
+        row = seen_row(looks, k)
+        studio.keep(
+            f"seen_{number}", "seen_touched", "the field, and the solid scene from the same place", row, row.shape[1]
+        )
+    return compare(looks, world, studio.cameras, Ground.load(folder), Parts.load(folder / "parts.npz"))
+
+
 def _views(studio: Studio, scene: SceneDir, world: World | None) -> tuple[list[Shot], World]:
     """What is shown of the scene itself, and the world to show it in."""
     folder = scene.stage("mjcf")
     if world:
         return route_shots(world.route), world
     # Only its model is drawn; there is no route to know.
-    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), np.ones(4), folder)
+    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), folder)
     return (camera_shots(studio.cameras) if model.model_path.exists() else []), model
 
 
-def _surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
+def surroundings(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
     """What the plan shows of the mesh stage: the ground, and the outlines of low parts."""
     folder = scene.stage("mesh")
     ground = Ground.load(folder) if (folder / "ground.npz").exists() else None

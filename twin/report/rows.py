@@ -56,10 +56,10 @@ def judged_row(studio: Studio, i: int) -> tuple[Picture, float]:
     errors.append((1.0, f"{100 * MOST_ERROR:.0f} %+"))
     unseen = ("never trained on", AMBER) if cameras.held_out[i] else ("trained on", MUTED)
     panels = [
-        _panel(fit(studio.real(i), (width, height)), "filmed", cameras.names[i], _words(width, *unseen)),
-        _panel(as_picture(rgb), "rendered", f"{score:.1f} dB PSNR", _words(width, "light as learnt, nothing fitted")),
-        _panel(depth, "depth", "grey: nothing solid", scale_bar(width, depth_colours(ramp[None]), far)),
-        _panel(
+        panel(fit(studio.real(i), (width, height)), "filmed", cameras.names[i], under(width, *unseen)),
+        panel(as_picture(rgb), "rendered", f"{score:.1f} dB PSNR", under(width, "light as learnt, nothing fitted")),
+        panel(depth, "depth", "grey: nothing solid", scale_bar(width, depth_colours(ramp[None]), far)),
+        panel(
             wrong,
             "error",
             "of full brightness",
@@ -97,13 +97,14 @@ def scale_bar(width: int, ramp: Picture, labels: list[tuple[float, str]]) -> Pic
     return out
 
 
-def _words(width: int, text: str, colour: Colour = MUTED) -> Picture:
+def under(width: int, text: str, colour: Colour = MUTED) -> Picture:
+    """A line of words as tall as a scale."""
     out = np.full((2 * _EDGE - 10, width, 3), GROUND, np.uint8)
     draw_text(out, shorten(text, width - 8, _TEXT), 4, 8, _TEXT, colour)
     return out
 
 
-def _panel(picture: Picture, title: str, note: str, below: Picture) -> Picture:
+def panel(picture: Picture, title: str, note: str, below: Picture) -> Picture:
     """A picture between its title and what stands below."""
     width = picture.shape[1]
     head = np.full((_EDGE, width, 3), GROUND, np.uint8)

@@ -360,6 +360,11 @@ def review_section(report: dict[str, Any]) -> Section:
             Fact("farthest off the route", number(follower.get("max_cross_track_m"), "{:.2f} m"), "cross-track"),
             Fact("driven", number(follower.get("distance_m"), "{:.1f} m"), duration(follower.get("seconds"))),
             Fact("turned", number(follower.get("turn_deg"), "{:+.0f}°"), "right is negative"),
+            Fact(
+                "trust in its pictures",
+                number((review.get("trust") or {}).get("mean"), "{:.2f}"),
+                "0 to 1, in the corridor",
+            ),
         ]
     facts += [
         Fact("film", duration(review.get("duration_s")), number(review.get("frames"), "{} frames")),

@@ -1,0 +1,72 @@
+"""Figures of the environment: a table on standard output, and as JSON where asked.
+
+    python benchmarks/env.py --scene BUILT_SCENE [--only SECTION ...] [--json FILE]
+
+Needs a built scene; of one that has neither `straight` nor `right_turn` the whole route is driven. What each figure is,
+is said where it is measured: `env_sections.py`. Speeds are of 160×90 pictures, 10 Hz control and 2 ms physics; each is
+the best of several short runs in processes that have the cores they are said to have and nothing else in them.
+"""
+
+import argparse
+import json
+import platform
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from field import shown
+
+TARGETS: dict[str, tuple[str, float]] = {
+    "single.steps_per_s": ("≥", 60.0),
+    "batch8.steps_per_s": ("≥", 130.0),
+    "worlds64.bytes": ("≤", 3e9),
+    "driver.success.straight": ("≥", 0.99),
+    "driver.success.right_turn": ("≥", 0.99),
+    "audit.false_successes": ("≤", 0.0),
+    "soak.growth_bytes": ("≤", 32 * 2**20),
+    "seen_touched.median_m": ("≤", 0.05),
+    "overlay.obstacle_psnr.sun": ("≥", 18.0),
+    "overlay.obstacle_psnr.overcast": ("≥", 18.0),
+    "overlay.obstacle_psnr.night": ("≥", 18.0),
+    "overlay.mask_iou": ("≥", 0.9),
+    "gpu.steps_per_s": ("≥", 10_000.0),
+}
+"""What is wanted of a figure."""
+
+
+def judge(name: str, value: Any) -> tuple[str, str]:
+    """A figure's target and whether it is met, in words; empty where nothing is wanted of it."""
+    if name not in TARGETS:
+        return "", ""
+    sense, wanted = TARGETS[name]
+    met = isinstance(value, int | float) and (value <= wanted if sense == "≤" else value >= wanted)
+    return f"{sense} {wanted:,.4g}" if wanted < 1e6 else f"{sense} {wanted:,.0f}", "yes" if met else "no"
+
+
+def main() -> None:
+    from env_sections import SECTIONS
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, required=True, help="a built scene, such as scenes/demo")
+    parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean little")
+    options = parser.parse_args()
+    figures: dict[str, Any] = {}
+    print(f"{'figure':36} {'value':>16} {'target':>14}  met")
+    for section in options.only or list(SECTIONS):
+        found = SECTIONS[section](options.scene, options.quick)
+        figures |= found
+        for name, value in found.items():
+            wanted, met = judge(name, value)
+            print(f"{name:36} {shown(value):>16} {wanted:>14}  {met}".rstrip(), flush=True)
+        if options.json:  # after every section, as a run is long
+            versions = {
+                name: metadata.version(name) for name in ("twin", "mujoco", "mujoco-warp", "warp-lang", "numpy")
+            }
+            about = {"machine": platform.machine(), "versions": versions, "quick": options.quick}
+            options.json.write_text(json.dumps(figures | {"about": about}, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""The Husky's acceptance table, its negative controls and its steps per second; as JSON where asked.
+
+    python benchmarks/husky.py [--scene BUILT_SCENE] [--only A1 B6 ...] [--json FILE]
+
+With `--scene` also chi on that scene's ground, of that scene's robot, and the steps per second in it. The whole takes
+about a minute and a half. Exit status 1 where a row fails that should pass, or a control passes that should fail.
+"""
+
+import argparse
+import json
+import math
+import platform
+import sys
+import time
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from twin.assets.ground import Ground
+from twin.env.acceptance import grounds
+from twin.env.acceptance.drive import on_ground, on_plane
+from twin.env.acceptance.ground import chi_on
+from twin.env.acceptance.rows import Row, Subject
+from twin.env.acceptance.table import CONTROLS, MEASURES
+from twin.loading import load_scene
+
+_STEPS, _PIECES, _REPEATS = 5000, 50, 7
+_SPEED = (4.0, 4.5)  # [rad/s] of the left and of the right wheels, a gentle bend at 0.7 m/s
+
+
+def steps_per_second(model: mujoco.MjModel) -> float:
+    """`mj_step` on one core over one drive of 10 s. Each fifth of a second counts with the fastest of its repeats, as
+    what else runs on the machine only ever slows it down; asked of MuJoCo in one call, so that Python takes no part."""
+    seconds = np.full(_PIECES, np.inf)
+    for _ in range(_REPEATS):
+        data = mujoco.MjData(model)
+        if model.nkey:
+            mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.ctrl[:] = _SPEED
+        mujoco.mj_step(model, data, 500)
+        for i in range(_PIECES):
+            start = time.perf_counter()
+            mujoco.mj_step(model, data, _STEPS // _PIECES)
+            seconds[i] = min(seconds[i], time.perf_counter() - start)
+    return _STEPS / float(seconds.sum())
+
+
+def speeds(scene: Path | None) -> list[Row]:
+    """Steps per second, and what is wanted of them."""
+    bumps = grounds.reconstructed(np.random.default_rng(0))
+    models = {"a plane": (on_plane(), 30e3), "a reconstructed flat road": (on_ground(bumps, start=(-7, 0, 0)), 20e3)}
+    if scene is not None:
+        models[f"{scene.name}'s ground, with its convex parts"] = (load_scene(scene).world().model(), 20e3)
+    return [
+        Row("speed", f"steps of {1000 * m.opt.timestep:g} ms on {label}", steps_per_second(m), wanted, math.inf, "1/s")
+        for label, (m, wanted) in models.items()
+    ]
+
+
+def scene_rows(path: Path) -> list[Row]:
+    """E3 on a built scene."""
+    scene = load_scene(path)
+    world = scene.world()
+    x, y, _, yaw = world.spawn
+    ground = Ground.load(scene.scene.stage("mesh"))
+    return chi_on(Subject(world.robot), ground, (x, y, yaw), world.route, f"{path.name}'s ground")
+
+
+def line(row: Row) -> str:
+    limits = f"{row.low:.5g} to {row.high:.5g}"
+    if math.isinf(row.high):
+        limits = f"≥ {row.low:.5g}"
+    elif math.isinf(row.low):
+        limits = f"≤ {row.high:.5g}"
+    verdict = "pass" if row.passed else "FAIL"
+    return f"{row.id:<5} {row.quantity:<84} {row.value:>10.4g} {row.unit:<6} {limits:<18} {verdict}"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, help="a built scene")
+    parser.add_argument("--only", nargs="+", metavar="ID", help="rows such as B6, or: controls, speed")
+    parser.add_argument("--json", type=Path, help="file to write")
+    arguments = parser.parse_args()
+
+    def wanted(*names: str) -> bool:
+        return not arguments.only or bool(set(names) & set(arguments.only))
+
+    rows: list[Row] = []
+
+    def show(more: list[Row]) -> None:
+        for row in more:
+            print(line(row), flush=True)
+        rows.extend(more)
+
+    print(f"{'':<5} {'quantity':<84} {'measured':>10} {'':<6} {'wanted':<18}")
+    for key, measure in MEASURES.items():
+        if wanted(*key.split()):
+            show(measure(Subject()))
+    if arguments.scene and wanted("E3"):
+        show(scene_rows(arguments.scene))
+    if wanted("speed"):
+        show(speeds(arguments.scene))
+    controls: dict[str, Any] = {}
+    for control in CONTROLS if wanted("controls") else ():
+        measured = [row for key in control.fails for row in MEASURES[key](control.subject)]
+        failed = sorted({row.id for row in measured if not row.passed})
+        caught = all(any(row.id in failed for row in measured if row.id in key.split()) for key in control.fails)
+        controls[control.name] = {"fails": failed, "caught": caught, "rows": [asdict(row) for row in measured]}
+        worst = ", ".join(f"{row.quantity} {row.value:.3g}" for row in measured if not row.passed and row.id != "A1")
+        print(f"control: {control.name}: {'fails ' + ', '.join(failed) if caught else 'PASSES'} ({worst})", flush=True)
+    if arguments.json:
+        report = {
+            "rows": [asdict(row) | {"passed": row.passed} for row in rows],
+            "controls": controls,
+            "machine": platform.processor() or platform.machine(),
+            "mujoco": metadata.version("mujoco"),
+        }
+        # JSON knows no infinity: an open limit is null.
+        open_limits = {math.inf: None, -math.inf: None}
+        for row in [*report["rows"], *(row for control in controls.values() for row in control["rows"])]:
+            row |= {k: open_limits.get(row[k], row[k]) for k in ("value", "low", "high")}
+        arguments.json.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return int(not all(row.passed for row in rows) or not all(c["caught"] for c in controls.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

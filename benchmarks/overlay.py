@@ -1,0 +1,286 @@
+"""Figures of the overlay: obstacles in the twin against the same in the true world, and seen against touched.
+
+    python benchmarks/overlay.py --scene BUILT_SCENE_WITH_TRUTH [--json FILE] [--pictures FOLDER]
+
+The scene was filmed without any of them. Each is put at a place along the route, once into the twin, through the
+overlay, and once into the known-truth world, in the same colours; both are seen from the same pose of the robot's front
+camera at 160×90, and developed as the film was, without noise. *The obstacle's pixels* are those it is seen in in the
+truth. *Unshaded* is the overlay with everything in its plain colours. How far the field is from what is solid is
+measured along a drive, see `twin/report/seen_touched.py`.
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import warp as wp
+
+from twin.config import ObstacleConfig
+from twin.env.obstacle_shapes import Shape, add_shape
+from twin.env.obstacle_view import camera_pose
+from twin.env.obstacles import add_obstacles, place
+from twin.env.overlay import Overlay
+from twin.geometry.cameras import Cameras, opencv_to_mujoco
+from twin.geometry.poses import Similarity
+from twin.loading import load_scene
+from twin.mjcf.world import World, arc_lengths, heading_at, point_at
+from twin.reality import world as reality
+from twin.reality.film import develop
+from twin.reality.lighting import LIGHTINGS
+from twin.reality.truth import Truth
+from twin.report.truth import align_rigid, matched_poses
+
+SIZE = (160, 90)
+KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
+PLACES = tuple(  # station, lateral [m], yaw [°], distance before it [m] the camera is at
+    (float(s), lateral, yaw, ahead)
+    for s, lateral, yaw, ahead in (
+        *((7.0, 0.3, 20.0, 3.0), (13.0, -0.7, -70.0, 5.0), (19.0, 0.9, 130.0, 4.0), (25.0, 0.0, 0.0, 6.5)),
+        *((32.0, -0.4, 45.0, 4.0), (39.0, 0.8, -20.0, 3.5), (47.0, -0.9, 160.0, 5.0), (55.0, 0.2, -110.0, 4.5)),
+    )
+)
+TARGETS = {
+    "overlay.obstacle_psnr.sun": ("≥", 18.0),
+    "overlay.obstacle_psnr.overcast": ("≥", 18.0),
+    "overlay.obstacle_psnr.night": ("≥", 18.0),
+    "overlay.gain_over_unshaded.night": ("≥", 6.0),
+    "overlay.mask_iou": ("≥", 0.9),
+    "seen_touched.median_m": ("≤", 0.05),
+    "seen_touched.corridor_leak_m": ("≤", 0.2),
+    "seen_touched.corridor_ghost_m": ("≤", 0.2),
+}
+
+
+class TrueWorld:
+    """The known-truth world under one lighting, with one obstacle of every kind that can be put anywhere."""
+
+    def __init__(self, truth: Truth, lighting: str, intrinsics: np.ndarray) -> None:
+        spec = reality.spec(lighting, truth.place)
+        for kind in KINDS:
+            body = spec.worldbody.add_body(name=f"added_{kind}", mocap=True, pos=(0, 0, -100.0))
+            add_shape(Shape(spec, body, group=1, solid=False), kind)
+        height = SIZE[1]
+        spec.camera("film").fovy = float(np.rad2deg(2 * np.arctan(height / 2 / intrinsics[1])))
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_forward(self.model, self.data)
+        self.light = replace(LIGHTINGS[lighting], noise=0.0)
+        shadows = any(shadow for _, _, shadow in self.light.suns)
+        with wp.ScopedDevice("cpu"):
+            self.device_model = mujoco_warp.put_model(self.model)
+            self.device = mujoco_warp.put_data(self.model, self.data)
+            # As `twin.reality.film.Renderer`; a second one through pixels' middles, for the mask.
+            self.contexts = [
+                mujoco_warp.create_render_context(
+                    self.model,
+                    cam_res=SIZE,
+                    render_rgb=True,
+                    render_depth=True,
+                    use_shadows=shadows,
+                    enabled_geom_groups=[0, 1],
+                    render_skybox=True,
+                    enable_backface_culling=False,
+                    shadow_light_fraction=0.0,
+                    samples_per_pixel=samples,
+                    enable_specular=False,
+                )
+                for samples in (2, 1)
+            ]
+
+    def show(self, camera_to_world: np.ndarray, kind: str | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Film colours (h, w, 3) and z-depth of pixels' middles [m], with an obstacle of a kind at a pose (4, 4)."""
+        for name in KINDS:
+            mocap = self.model.body(f"added_{name}").mocapid[0]
+            self.data.mocap_pos[mocap] = pose[:3, 3] if name == kind else (0, 0, -100.0)
+            mujoco.mju_mat2Quat(self.data.mocap_quat[mocap], pose[:3, :3].ravel())
+        mujoco.mj_kinematics(self.model, self.data)
+        camera = opencv_to_mujoco(camera_to_world)
+        with wp.ScopedDevice("cpu"):
+            self.device.geom_xpos.assign(self.data.geom_xpos[None].astype(np.float32))
+            self.device.geom_xmat.assign(self.data.geom_xmat.reshape(1, -1, 3, 3).astype(np.float32))
+            self.device.cam_xpos.assign(camera[None, None, :3, 3].astype(np.float32))
+            self.device.cam_xmat.assign(camera[None, None, :3, :3].astype(np.float32))
+            for context in self.contexts:
+                mujoco_warp.refit_bvh(self.device_model, self.device, context)
+                mujoco_warp.render(self.device_model, self.device, context)
+            packed = self.contexts[0].rgb_data.numpy()[0].reshape(SIZE[::-1])
+            depth = self.contexts[1].depth_data.numpy()[0].reshape(SIZE[::-1]).copy()
+        light = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], -1).astype(np.float32) / 255.0
+        return develop(np.random.default_rng(0), light, self.light, 1.0) / 255.0, np.where(depth > 0.0, depth, 1e4)
+
+
+def robot_at(world: World, model: mujoco.MjModel, data: mujoco.MjData, station: float) -> np.ndarray:
+    """Puts the robot on the route as it stands at its start; camera_to_world of its front camera."""
+    mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
+    turn = float(heading_at(world.route, station) - world.spawn[3])
+    rest = data.qpos[3:7].copy()
+    about_z = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
+    mujoco.mju_mulQuat(data.qpos[3:7], about_z, rest)
+    data.qpos[:2] = point_at(world.route[:, :2], station)
+    data.qpos[2] += float(point_at(world.route, station)[2] - world.route[0, 2])
+    mujoco.mj_forward(model, data)
+    return camera_pose(data, model.camera("front").id)
+
+
+def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str, ...] = KINDS) -> dict[str, Any]:
+    """Compares the overlay with the truth.
+
+    Returns:
+        Figures by name: `overlay.obstacle_psnr.<lighting>`, `overlay.unshaded_psnr.<lighting>` [dB],
+        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and its pieces;
+        `overlay.shadow_rms.<lighting>`, how wrong the share is to which pixels beside the obstacle are dimmed by it
+        (those dimmed by 5 % in the twin or in truth), and `overlay.no_shadow_rms.<lighting>`, without any dimming.
+    """
+    scene = load_scene(scene_path)
+    world, field = scene.world(), scene.field()
+    truth = Truth.load(scene.scene.truth)
+    cameras: Cameras = scene.cameras()
+    to_truth: Similarity = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    spec = mujoco.MjSpec.from_file(str(world.model_path))
+    pool = tuple(ObstacleConfig(kind, kind) for kind in kinds)
+    add_obstacles(spec, pool, world)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    overlays = {"shaded": Overlay(model, field, SIZE), "unshaded": Overlay(model, field, SIZE, shaded=False)}
+    errors: dict[str, list[np.ndarray]] = defaultdict(list)
+    ious: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    length = float(arc_lengths(world.route)[-1])
+    for lighting in (name for name in field.lightings if name in LIGHTINGS):
+        true_world = TrueWorld(truth, lighting, world.intrinsics)
+        rows = []
+        for kind in kinds:
+            for station, lateral, yaw, ahead in PLACES:
+                if station > length:
+                    continue
+                if kind == "car":  # it needs more room
+                    lateral, ahead = lateral + 1.8, ahead + 3.0
+                here = (ObstacleConfig(kind, kind, station, lateral, yaw),)
+                eye = robot_at(world, model, data, max(0.0, station - ahead))
+                place((), data, 0.0)
+                mujoco.mj_forward(model, data)
+                empty = overlays["shaded"].render([data], lighting)
+                place(here, data, 0.0)
+                mujoco.mj_forward(model, data)
+                pose = np.eye(4)
+                pose[:3, :3], pose[:3, 3] = (
+                    data.body(f"obstacle_{kind}").xmat.reshape(3, 3),
+                    data.body(f"obstacle_{kind}").xpos,
+                )
+                true_eye, true_pose = to_truth.poses(eye), to_truth.poses(pose)
+                bare, bare_depth = true_world.show(true_eye, None, true_pose)
+                wanted, depth = true_world.show(true_eye, kind, true_pose)
+                seen = depth < bare_depth - 1e-3
+                if seen.sum() < 20:
+                    continue
+                shown = {}
+                for name, overlay in overlays.items():
+                    out = overlay.render([data], lighting)
+                    shown[name] = out.rgb[0]
+                    error = ((out.rgb[0] - wanted)[seen] ** 2).ravel()
+                    errors[f"{name}.{lighting}"].append(error)
+                    if name == "shaded":
+                        dimmed = [
+                            luminance(a) / np.maximum(luminance(b), 0.02)
+                            for a, b in ((wanted, bare), (out.rgb[0], empty.rgb[0]))
+                        ]
+                        ground = (
+                            ~seen & (out.depth[0] > empty.depth[0] - 1e-3) & ((dimmed[0] < 0.95) | (dimmed[1] < 0.95))
+                        )
+                        errors[f"shadow.{lighting}"].append((dimmed[1] - dimmed[0])[ground])
+                        errors[f"no_shadow.{lighting}"].append((1.0 - dimmed[0])[ground])
+                        errors[f"kind.{kind}"].append(error)
+                        mine = out.depth[0] < empty.depth[0] - 1e-3
+                        ious[lighting].append((int((mine & seen).sum()), int((mine | seen).sum())))
+                rows.append(
+                    (
+                        kind,
+                        np.concatenate([wanted, shown["shaded"], shown["unshaded"]], 1),
+                        error_db(errors[f"shaded.{lighting}"][-1:]),
+                    )
+                )
+        if pictures:
+            save_pictures(pictures, lighting, rows)
+    figures: dict[str, Any] = {}
+    for lighting in ious:
+        shaded, unshaded = error_db(errors[f"shaded.{lighting}"]), error_db(errors[f"unshaded.{lighting}"])
+        figures[f"overlay.obstacle_psnr.{lighting}"] = shaded
+        figures[f"overlay.unshaded_psnr.{lighting}"] = unshaded
+        figures[f"overlay.gain_over_unshaded.{lighting}"] = shaded - unshaded
+        both, either = np.sum(ious[lighting], 0)
+        figures[f"overlay.mask_iou.{lighting}"] = float(both / either)
+        # The true world's sky is light without direction, which nothing hides: only its sun throws shadows.
+        casts = any(shadow for _, _, shadow in LIGHTINGS[lighting].suns)
+        for name in ("shadow", "no_shadow") if casts else ():
+            off = np.concatenate(errors[f"{name}.{lighting}"])
+            figures[f"overlay.{name}_rms.{lighting}"] = float(np.sqrt((off**2).mean()))
+        figures[f"overlay.places.{lighting}"] = len(ious[lighting])
+    for kind in kinds:
+        if errors[f"kind.{kind}"]:
+            figures[f"overlay.psnr_of.{kind}"] = error_db(errors[f"kind.{kind}"])
+    both, either = np.sum([pair for pairs in ious.values() for pair in pairs], 0)
+    figures["overlay.mask_iou"] = float(both / either)
+    return figures
+
+
+def seen_touched(scene_path: Path) -> dict[str, Any]:
+    """`seen_touched.*` of `twin.report.seen_touched`, along a drive of the scripted follower."""
+    from twin.assets.ground import Ground
+    from twin.env.follower import follow
+    from twin.env.physics import HuskyPhysics
+    from twin.mjcf.export import Parts
+    from twin.report.seen_touched import along_the_drive, compare, look
+
+    scene = load_scene(scene_path)
+    world, field, mesh = scene.world(), scene.field(), scene.scene.stage("mesh")
+    drive = follow(world, HuskyPhysics(world.model()))
+    looks = look(field, world, along_the_drive(drive.camera_to_world), field.lightings[0])
+    found = compare(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
+    return {f"seen_touched.{name}": value for name, value in found.items() if name != "along"}
+
+
+def luminance(rgb: np.ndarray) -> np.ndarray:
+    return rgb @ np.array([0.299, 0.587, 0.114])
+
+
+def error_db(errors: list[np.ndarray]) -> float:
+    """PSNR [dB] of squared errors, all pixels counting alike."""
+    return float(-10.0 * np.log10(max(np.concatenate(errors).mean(), 1e-12)))
+
+
+def save_pictures(folder: Path, lighting: str, rows: list[tuple[str, np.ndarray, float]]) -> None:
+    """Truth, overlay, unshaded overlay side by side, one row per place."""
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind in dict.fromkeys(name for name, _, _ in rows):
+        stack = np.concatenate([row for name, row, _ in rows if name == kind])
+        picture = (np.clip(stack, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+        big = cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+        for k, (_, _, score) in enumerate(row for row in rows if row[0] == kind):
+            cv2.putText(big, f"{score:.1f} dB", (650, 360 * k + 30), 0, 0.8, (255, 255, 0), 2)
+        cv2.imwrite(str(folder / f"{lighting}_{kind}.jpg"), big[..., ::-1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, required=True, help="a built scene with its truth, such as scenes/demo")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="where pictures to judge by go")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    options = parser.parse_args()
+    figures = round_trip(options.scene, options.pictures, tuple(options.kinds)) | seen_touched(options.scene)
+    for name, value in figures.items():
+        sense, wanted = TARGETS.get(name, ("", 0.0))
+        print(f"{name:40} {value:10.4g}  {f'{sense} {wanted:g}' if sense else ''}".rstrip())
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""The Husky's acceptance table row by row, and the wrong robots that must not pass it."""
+
+import numpy as np
+import pytest
+
+from twin.env.acceptance import grounds
+from twin.env.acceptance.rows import Row, Subject
+from twin.env.acceptance.table import CONTROLS, MEASURES
+
+_TABLE = {f"{letter}{n + 1}" for letter, count in zip("ABCDE", (2, 8, 3, 6, 4), strict=True) for n in range(count)}
+
+
+@pytest.mark.parametrize("key", MEASURES)
+def test_row(key):
+    rows = MEASURES[key](Subject())
+    assert {row.id for row in rows} == set(key.split())
+    assert not [row for row in rows if not row.passed]
+
+
+def test_no_row_is_left_out():
+    assert {name for key in MEASURES for name in key.split()} >= _TABLE
+
+
+@pytest.mark.parametrize("control", CONTROLS, ids=lambda control: control.name)
+def test_negative_control(control):
+    for key in control.fails:
+        assert not all(row.passed for row in MEASURES[key](control.subject)), key
+
+
+def test_a_number_that_is_none_fails():
+    assert not Row("X", "", float("nan"), -1e9, 1e9).passed
+    assert Row("X", "", 1.0, 1.0, 1.0).passed
+
+
+def test_roughness_of_known_bumps():
+    """Bumps of a Gaussian kernel σ have the autocorrelation exp(−d²/4σ²), which is 1/e at 2σ; the slow rise that is
+    taken out takes a little of them along."""
+    relief = grounds.random_relief(0.02, 0.2, np.random.default_rng(3), half=40.0)
+    flat = grounds.level(half=39.0)
+    x = flat.origin[0] + flat.cell * np.arange(len(flat.height))
+    bumps = type(flat)(relief(np.stack(np.meshgrid(x, x), -1)), flat.origin, flat.cell, flat.measured, flat.rgb)
+    values = [grounds.roughness(bumps, np.array([[-38.0, y], [38.0, y]])) for y in range(-30, 31, 3)]
+    rms, length = np.mean(values, axis=0)
+    assert rms == pytest.approx(0.02, rel=0.15) and length == pytest.approx(0.4, rel=0.15)
+
+
+def test_reconstruction_removes_noise_and_keeps_relief():
+    rng = np.random.default_rng(4)
+    flat = grounds.reconstructed(rng)
+    assert np.abs(flat.at(np.stack([np.linspace(-7, 7, 200), np.zeros(200)], 1))).max() < 0.02
+    hill = grounds.reconstructed(rng, lambda xy: 0.1 * np.sin(xy[:, 0] / 2))
+    x = np.linspace(-7, 7, 200)
+    np.testing.assert_allclose(hill.at(np.stack([x, np.zeros(200)], 1)), 0.1 * np.sin(x / 2), atol=0.03)

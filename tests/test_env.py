@@ -1,0 +1,297 @@
+"""The environment: what dm_env, Gymnasium and stable-baselines3 may expect of it, and what an episode is."""
+
+import gc
+import json
+import warnings
+
+import gymnasium
+import numpy as np
+import psutil
+import pytest
+from dm_env import StepType
+from gymnasium.utils.env_checker import check_env
+from tiny_twin import tiny_twin
+
+import twin
+from twin import progress
+from twin.config import ObstacleConfig
+from twin.env.batch import Worlds
+from twin.env.drivers import BlindDriver, RouteDriver
+from twin.env.options import CAUSES
+from twin.env.randomisation import Ranges
+from twin.env.suite import Stage
+from twin.errors import InputError
+
+SMALL = {"size": (32, 18)}
+OPTION_SETS = {
+    "paper": SMALL,
+    "steering": SMALL | {"action": "steering", "stack": 1, "lighting": "day"},
+    "night": SMALL | {"lighting": "day:night:0.7", "lighting_drift": True, "randomise": True},
+    "crowded": SMALL | {"obstacles": 2, "lighting": ("day", "night"), "control_timestep": 0.05},
+    "state": {"pixels": False, "randomise": True, "rewards": {"progress": 1.0, "cross_track": -0.1}},
+}
+TASKS = ("ahead", "bend", "route")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
+
+
+def rollout(environment, seed: int, steps: int = 25) -> tuple[list, np.ndarray]:
+    """Time steps under random actions, and the poses."""
+    environment.task.seed(seed)
+    rng = np.random.default_rng(seed)
+    spec = environment.action_spec()
+    out, poses = [environment.reset()], []
+    for _ in range(steps):
+        out.append(environment.step(rng.uniform(spec.minimum, spec.maximum)))
+        poses.append(np.array(environment.physics.data.qpos))
+    return out, np.array(poses)
+
+
+def driven(environment, driver, seed: int | None = None):
+    """The last time step of an episode."""
+    if seed is not None:
+        environment.task.seed(seed)
+    step = environment.reset()
+    while not step.last():
+        step = environment.step(driver(environment, step))
+    return step
+
+
+@pytest.mark.parametrize(
+    ("task", "name"),
+    # `ahead` is too short for two obstacles.
+    [(task, name) for task in TASKS for name in OPTION_SETS if (task, name) != ("ahead", "crowded")],
+)
+def test_specs_hold_and_seeds_repeat(scene, task, name):
+    environment = twin.load(scene, task, **OPTION_SETS[name])
+    spec = environment.observation_spec()
+    first, poses = rollout(environment, 3)
+    assert first[0].step_type is StepType.FIRST and first[0].reward is None and first[0].discount is None
+    for step in first:
+        assert set(step.observation) == set(spec)
+        for key, value in step.observation.items():
+            spec[key].validate(value)
+        if step.step_type is not StepType.FIRST:
+            environment.discount_spec().validate(np.float64(step.discount))
+            assert np.isfinite(step.reward)
+    again, poses_again = rollout(environment, 3)
+    np.testing.assert_array_equal(poses, poses_again)
+    for a, b in zip(first, again, strict=True):
+        assert a.step_type == b.step_type and a.reward == b.reward and a.discount == b.discount
+        for key in spec:
+            np.testing.assert_array_equal(a.observation[key], b.observation[key])
+    _, poses_other = rollout(environment, 4)
+    assert not np.array_equal(poses, poses_other)
+
+
+@pytest.mark.parametrize("name", OPTION_SETS)
+def test_gymnasium_and_sb3_accept_it(scene, name):
+    from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+    environment = gymnasium.make(
+        "twin/Drive-v0", scene=scene, task="bend", render_mode="rgb_array", **OPTION_SETS[name]
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "The environment .* is different from the unwrapped version")
+        warnings.filterwarnings("ignore", "The minimal resolution for an image is 36x36.*")
+        # A state of metres and radians has no bounds.
+        warnings.filterwarnings("ignore", ".*A Box observation space (minimum|maximum) value is.*")
+        check_env(environment.unwrapped, skip_render_check=name == "state")
+        sb3_check_env(environment.unwrapped, skip_render_check=True)
+    _, info = environment.reset(seed=1)
+    for _ in range(3):
+        *_, info = environment.step(environment.action_space.sample())
+    wanted = {"cause", "is_success", "progress", "cross_track", "randomisation"}
+    assert wanted | (set() if name == "state" else {"lighting", "trust"}) <= set(info)
+    json.dumps(info)
+    assert name == "state" or environment.render().shape == (18, 32, 3)
+
+
+@pytest.mark.parametrize("name", OPTION_SETS)
+def test_one_world_of_many_is_the_single_environment(scene, name):
+    """Step for step, pixels and all, through the ends of episodes."""
+    options = OPTION_SETS[name] | {"time_limit": 1.5}
+    worlds = Worlds(Stage.open(scene, "bend", options), [5, 6, 7])
+    single = twin.load(scene, "bend", seed=6, **options)
+    rng = np.random.default_rng(0)
+    spec = single.action_spec()
+    worlds.begin(range(3))
+    step = single.reset()
+    for _ in range(40):
+        if worlds.pixels:
+            np.testing.assert_array_equal(worlds.pixels.stacks[1].transpose(0, 2, 3, 1), step.observation["pixels"])
+        else:
+            np.testing.assert_array_equal(worlds.observation()[1], np.concatenate(list(step.observation.values())))
+        actions = rng.uniform(-1, 1, (3, worlds.actions))
+        out = worlds.step(actions)
+        step = single.step(spec.minimum + (actions[1] + 1) / 2 * (spec.maximum - spec.minimum))
+        assert out.reward[1] == step.reward and out.over[1] == step.last()
+        assert out.truncated[1] == (step.last() and step.discount == 1.0)
+        np.testing.assert_array_equal(worlds.physics[1].data.qpos, single.physics.data.qpos)
+        if out.over.any():
+            worlds.begin(np.flatnonzero(out.over).tolist())
+        if step.last():
+            step = single.reset()
+    worlds.close()
+
+
+def test_vectors_begin_anew_by_themselves(scene):
+    from stable_baselines3 import SAC
+
+    from twin.learn.vectors import DriveVecEnv
+
+    options = SMALL | {"time_limit": 0.5, "lighting": "day"}
+    many = gymnasium.make_vec(
+        "twin/Drive-v0", 2, vectorization_mode="vector_entry_point", scene=scene, task="bend", **options
+    )
+    first, _ = many.reset(seed=1)
+    assert first.shape == (2, 12, 18, 32) and first.dtype == np.uint8
+    for k in range(5):
+        out, _, terminated, truncated, info = many.step(np.zeros((2, 2), np.float32))
+        assert not terminated.any() and truncated.all() == (k == 4)
+    assert info["final_info"]["cause"].tolist() == ["timeout", "timeout"] and info["final_obs"][0].shape == (12, 18, 32)
+    assert (info["cause"] == "").all() and not np.array_equal(info["final_obs"][0], out[0])
+    many.close()
+    vectors = DriveVecEnv(scene, "bend", 2, seed=1, **options)
+    np.testing.assert_array_equal(vectors.reset(), first)
+    for _ in range(5):
+        out, _, done, infos = vectors.step(np.zeros((2, 2), np.float32))
+    assert done.all() and infos[0]["TimeLimit.truncated"] and infos[0]["terminal_observation"].shape == (12, 18, 32)
+    assert infos[0]["episode"]["l"] == 5 and infos[0]["episode"]["r"] == pytest.approx(4 * 0.1 - 5.0)
+    small = SAC("CnnPolicy", DriveVecEnv(scene, "bend", 2, **(options | {"size": (40, 40)})), buffer_size=200)
+    small.learn(8)
+
+
+def test_every_cause_ends_an_episode_with_its_reward_and_discount(scene, tmp_path):
+    ends = {}
+
+    def ended(name: str, action, options, where=scene, before=None):
+        environment = twin.load(where, "bend", seed=0, pixels=False, start_offset=0.0, start_heading=0.0, **options)
+        step = environment.reset()
+        while not step.last():
+            if before:
+                before(environment)
+            last, step = step, environment.step(np.array(action))
+        assert environment.task.cause == name, environment.task.info(environment.physics)
+        assert last.reward is None or last.reward == pytest.approx(0.1)
+        ends[name] = step.reward, step.discount
+
+    def tip(environment):
+        environment.physics.data.qvel[3] = 8.0
+
+    ended("collision", [1.0, 0.0], {"obstacles": (ObstacleConfig("it", "box", station=3.0),)})
+    ended("out_of_bounds", [1.0, 0.5], {})
+    ended("timeout", [0.5, 0.0], {"time_limit": 2.0})
+    ended("stuck", [0.0, 0.0], {})
+    ended("rollover", [0.0, 0.0], {}, before=tip)
+    environment = twin.load(scene, "bend", seed=0, pixels=False)
+    step = driven(environment, RouteDriver())
+    ends["goal"] = step.reward, step.discount
+    assert environment.task.cause == "goal" and environment.task.progress >= 9.5
+    assert set(ends) == set(CAUSES)
+    assert ends == {
+        "collision": (-4.0, 0.0),
+        "out_of_bounds": (-5.0, 0.0),
+        "timeout": (-5.0, 1.0),
+        "stuck": (-5.0, 0.0),
+        "rollover": (-5.0, 0.0),
+        "goal": (pytest.approx(0.1), 0.0),
+    }
+
+
+def test_a_driver_told_the_poses_arrives_and_a_blind_one_does_not(scene):
+    environment = twin.load(scene, "bend", pixels=False, randomise=True)
+    causes = []
+    for seed in range(10):
+        driven(environment, RouteDriver(), seed)
+        causes.append(environment.task.cause)
+    assert causes == ["goal"] * 10
+    for seed in range(3):
+        driven(environment, BlindDriver(), seed)
+        assert environment.task.cause == "out_of_bounds"
+
+
+def test_starts_are_spread_as_stated(scene):
+    environment = twin.load(scene, "ahead", pixels=False, start_offset=0.25, start_heading=8.0)
+    route = environment.task.world.route
+    offsets, turns, along = [], [], []
+    for seed in range(200):
+        environment.task.seed(seed)
+        step = environment.reset()
+        offsets.append(step.observation["cross_track"][0])
+        turns.append(np.rad2deg(step.observation["heading_error"][0]))
+        along.append(environment.physics.planar_pose[0] - route[0, 0])
+    assert np.abs(offsets).max() < 0.27 and np.abs(turns).max() < 8.5
+    assert np.std(offsets) == pytest.approx(0.25 / np.sqrt(3), rel=0.1)
+    assert np.std(turns) == pytest.approx(8.0 / np.sqrt(3), rel=0.1)
+    assert np.allclose(along, 0.5, atol=0.1)
+
+
+def test_light_and_robot_do_not_move_the_start(scene):
+    """Two policies, or two lightings, can be compared on the same episodes."""
+    poses = []
+    for options in ({}, {"lighting": "night"}, {"randomise": Ranges(payload=(0.0, 0.0))}, {"obstacles": 1}):
+        environment = twin.load(scene, "bend", seed=9, **SMALL, **options)
+        environment.reset()
+        poses.append(environment.physics.planar_pose)
+    for pose in poses[1:]:
+        np.testing.assert_allclose(pose, poses[0], atol=0.02)
+
+
+def test_scene_obstacles_are_there_and_move(tmp_path):
+    more = '[[obstacle]]\nname = "walker"\nkind = "pedestrian"\nstation = 5.0\nlateral = -0.8\nto = [5.0, 0.8]\n'
+    environment = twin.load(tiny_twin(tmp_path, more=more), "bend", seed=0, pixels=False)
+    environment.reset()
+    body = environment.physics.data.ptr.body("obstacle_walker")
+    before = body.xpos.copy()
+    for _ in range(5):
+        environment.step([0.0, 0.0])
+    assert np.linalg.norm(body.xpos - before) == pytest.approx(0.5 * 1.2, rel=0.1)
+    assert environment.task.obstacles[0].name == "walker"
+    none = twin.load(tmp_path, "bend", seed=0, pixels=False, obstacles=())
+    none.reset()
+    assert none.task.obstacles == ()
+
+
+def test_what_cannot_be_had_is_an_input_error(scene):
+    with pytest.raises(InputError, match=r"'straight': the route .* no such stretch of 30 m; .* there are .*bend \(10"):
+        twin.load(scene, "straight")
+    with pytest.raises(InputError, match="did you mean 'lighting'"):
+        twin.load(scene, "bend", lightning="day")
+    with pytest.raises(InputError, match="unknown; the field has day, night"):
+        twin.load(scene, "bend", lighting="noon").reset()
+    for options in ({"action": "jump"}, {"stack": 0}, {"control_timestep": 0.5}, {"rewards": {"fame": 1.0}}):
+        with pytest.raises(InputError):
+            twin.load(scene, "bend", **options)
+
+
+def test_the_environment_needs_no_torch():
+    import subprocess
+    import sys
+
+    code = "import sys, twin.env.suite, twin.env.gym, twin.env.batch; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_steps(scene):
+    """No NaN, no memory growth."""
+    worlds = Worlds(Stage.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1])
+    rng = np.random.default_rng(0)
+    worlds.begin([0, 1])
+    process, sizes = psutil.Process(), []
+    for k in range(50_000):
+        out = worlds.step(rng.uniform(-1, 1, (2, 2)))
+        assert np.isfinite(out.reward).all() and np.isfinite(worlds.observation()).all()
+        if out.over.any():
+            worlds.begin(np.flatnonzero(out.over).tolist())
+        if k % 10_000 == 9_999:
+            gc.collect()
+            sizes.append(process.memory_info().rss)
+    assert sizes[-1] < sizes[0] + 8 * 2**20
+    worlds.close()

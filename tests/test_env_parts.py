@@ -1,0 +1,316 @@
+"""Parts of the environment: stretches of a route, lightings and their sets, randomisation, trust, the scene's model,
+recorded episodes, the audit and the film."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from tiny_twin import tiny_field, tiny_twin
+from tiny_world import tiny_world
+
+import twin
+from twin import progress
+from twin.config import TaskConfig
+from twin.env.audit import EVENTS, Findings, Seen, audit
+from twin.env.drivers import RouteDriver, load_policy
+from twin.env.episode import Episode, record
+from twin.env.lightings import HELD_OUT, TRAINING, Light, LightSets, draw_light
+from twin.env.physics import HuskyPhysics
+from twin.env.randomisation import Draw, Nominal, Ranges
+from twin.env.scene_model import episode_spec
+from twin.env.stretches import find_task, tasks
+from twin.env.suite import Stage
+from twin.env.trust import Trust
+from twin.errors import InputError
+from twin.film import main
+from twin.geometry.cameras import Viewpoints
+from twin.geometry.poses import look_at
+from twin.mjcf.world import World
+from twin.nerf.rendering import Rendering
+from twin.report.video import describe
+
+SMALL = {"size": (32, 18)}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
+
+
+@pytest.fixture(scope="module")
+def field():
+    return tiny_field(())
+
+
+# ---- stretches
+
+
+def route_world(*pieces: tuple[float, float]) -> World:
+    """A route of pieces (length [m], turn [rad], left positive)."""
+    points, heading = [np.zeros(2)], 0.0
+    for length, turn in pieces:
+        count = max(1, round(length / 0.25))
+        for _ in range(count):
+            heading += turn / count
+            points.append(points[-1] + length / count * np.array([np.cos(heading), np.sin(heading)]))
+    return World(np.column_stack([points, np.zeros(len(points))]), 1.0, (0, 0, 0, 0), Path())
+
+
+def test_standard_tasks_are_found_where_they_are():
+    world = route_world((20.0, 1.2), (40.0, 0.0), (12.0, -np.pi / 2), (40.0, 0.0))
+    found = tasks(world)
+    assert set(found) == {"route", "straight", "right_turn"}
+    assert 14.0 < found["straight"].start < 30.0 and found["straight"].length == 30.0
+    turn = found["right_turn"]
+    assert turn.length == 60.0 and turn.start + 30.0 == pytest.approx(66.0, abs=1.0)  # the turn is in its middle
+    assert found["route"].length == pytest.approx(112.0, abs=0.1)
+
+
+def test_a_left_turn_is_no_right_turn_and_it_says_what_there_is():
+    world = route_world((20.0, 0.0), (12.0, np.pi / 2), (40.0, 0.0))
+    with pytest.raises(InputError, match=r"'right_turn': .*no such stretch of 60 m; there are .*straight \(30.0 m"):
+        find_task("right_turn", world)
+    short = route_world((17.0, 0.0))
+    with pytest.raises(InputError, match=r"the longest is 17.0 m from 0.0 m; there are route"):
+        find_task("straight", short)
+    assert find_task("straight", route_world((29.0, 0.0))).length == pytest.approx(29.0, abs=0.01)
+
+
+def test_own_tasks_are_named_in_the_scene_and_must_fit():
+    world = route_world((17.0, 0.0))
+    assert find_task("mine", world, (TaskConfig("mine", 3.0, 5.0),)).end == 8.0
+    assert find_task("straight", world, (TaskConfig("straight", 1.0, 9.0),)).start == 1.0
+    with pytest.raises(InputError, match=r"from 10 m to 20 m, but the route is 17\.00 m long"):
+        find_task("mine", world, (TaskConfig("mine", 10.0, 10.0),))
+
+
+# ---- lightings
+
+
+def test_training_and_held_out_lights_never_mix(field):
+    sets, rng = LightSets(field), np.random.default_rng(5)
+    for which in (TRAINING, HELD_OUT):
+        for _ in range(20):
+            assert sets.set_of(sets.sample(which, rng)) == which
+    assert all(sets.set_of(field.embedding(name)) == TRAINING for name in field.lightings)
+    # Nearer to each other than to their own set is nobody.
+    train, held = ([sets._picture(sets.sample(w, rng)) for _ in range(15)] for w in (TRAINING, HELD_OUT))
+    gap = min(float(np.sqrt(((a - b) ** 2).mean())) for a in train for b in held)
+    assert gap > 0.0
+
+
+def test_a_photo_added_later_moves_no_set():
+    plain, added = tiny_field(()), tiny_field(())
+    rng = np.random.default_rng(0)
+    lights = [plain.sample_lighting(rng) for _ in range(30)]
+    added.add_lightings({"photo": np.array([0.4, 0.5, 0.3, 0.0], np.float32)})
+    before, after = LightSets(plain), LightSets(added)
+    assert [before.set_of(light) for light in lights] == [after.set_of(light) for light in lights]
+
+
+def test_lights_are_drawn_as_asked(field):
+    sets, rng = LightSets(field), np.random.default_rng(1)
+    assert np.array_equal(draw_light("day", False, 1.0, sets, rng).at(9.0), field.embedding("day"))
+    mixed = draw_light("day:night:0.25", False, 1.0, sets, rng).at(0.0)
+    np.testing.assert_allclose(mixed, 0.75 * field.embedding("day") + 0.25 * field.embedding("night"), atol=1e-6)
+    names = {draw_light(("day", "night"), False, 1.0, sets, rng).name for _ in range(30)}
+    assert names == {"day", "night"}
+    drifting = draw_light("day", True, 10.0, sets, rng)
+    assert drifting.name == "day → night"
+    np.testing.assert_allclose(drifting.at(5.0), 0.5 * (field.embedding("day") + field.embedding("night")), atol=1e-6)
+    assert np.array_equal(drifting.at(99.0), field.embedding("night"))
+    assert isinstance(draw_light("any", False, 1.0, sets, rng), Light)
+
+
+# ---- randomisation
+
+
+def test_a_draw_does_to_the_model_what_it_says(scene):
+    stage = Stage.open(scene, "bend", {"pixels": False})
+    physics, _ = stage.drive(0)
+    model, nominal = physics.model.ptr, Nominal(stage.model)
+    plain = model.geom_size[model.geom("front_left_tyre").id].copy()
+    draw = Draw(1.2, 12.0, 0.05, (0.01, 0.0, -0.01), (0.0, 2.0, 0.0), 0.97)
+    nominal.apply(draw, model)
+    tyre = model.geom("front_left_tyre")
+    assert tyre.friction[0] == pytest.approx(1.2 * world_friction(stage))
+    np.testing.assert_allclose(tyre.size, plain * [0.97, 1.0, 0.97])
+    assert model.body_subtreemass[model.body("base_link").id] == pytest.approx(
+        stage.model.body_subtreemass[stage.model.body("base_link").id] + 12.0
+    )
+    camera, before = model.camera("front"), stage.model.camera("front")
+    assert np.linalg.norm(camera.pos - before.pos) == pytest.approx(np.hypot(0.01, 0.01))
+    turn = 2 * np.arccos(abs(camera.quat @ before.quat))
+    assert np.rad2deg(turn) == pytest.approx(2.0, abs=1e-6)
+    nominal.apply(Draw(), model)
+    for name in ("geom_friction", "geom_size", "body_mass", "cam_pos", "cam_quat", "body_invweight0"):
+        np.testing.assert_allclose(getattr(model, name), getattr(stage.model, name), atol=1e-12, err_msg=name)
+
+
+def world_friction(stage: Stage) -> float:
+    return float(stage.world.robot.friction)
+
+
+def test_smaller_wheels_drive_slower_and_latency_later(scene):
+    def after_two_seconds(**ranges) -> float:
+        fixed = {name: (value, value) for name, value in ranges.items()}
+        still = {"friction": (1.0, 1.0), "payload": (0.0, 0.0), "latency": (0.0, 0.0), "wheel_radius": (1.0, 1.0)}
+        environment = twin.load(
+            scene, "bend", 0, pixels=False, start_heading=0.0, randomise=Ranges(**(still | fixed)), time_limit=9.0
+        )
+        environment.reset()
+        start = environment.physics.planar_pose[:2]
+        for _ in range(20):
+            environment.step([1.0, 0.0])
+        return float(np.linalg.norm(environment.physics.planar_pose[:2] - start))
+
+    plain = after_two_seconds()
+    assert after_two_seconds(wheel_radius=0.9) == pytest.approx(0.9 * plain, rel=0.01)
+    assert plain - after_two_seconds(latency=0.1) == pytest.approx(0.1, rel=0.15)
+    assert after_two_seconds(payload=40.0) == pytest.approx(plain, rel=0.02)
+
+
+def test_ranges_that_make_no_sense_are_refused():
+    for ranges in ({"friction": (0.0, 1.0)}, {"payload": (-1.0, 0.0)}, {"latency": (0.2, 0.1)}):
+        with pytest.raises(InputError):
+            Ranges(**ranges)
+
+
+# ---- the model of an episode
+
+
+def test_leaving_out_what_is_out_of_reach_changes_no_number(tmp_path):
+    world = tiny_world(tmp_path)
+    whole = HuskyPhysics(world.model())
+    spec = episode_spec(world, 0.0, 3.0, 0.5)
+    small = HuskyPhysics(spec.compile())
+    assert small.model.ngeom < whole.model.ngeom and small.model.ntex == 0
+    for physics in (whole, small):
+        physics.place(0.0, 0.1, 0.05)
+        for _ in range(20):
+            physics.command(0.8, 0.1)
+            physics.step()
+    np.testing.assert_array_equal(whole.data.qpos, small.data.qpos)
+
+
+def test_parts_within_reach_stay(tmp_path):
+    """Everything whose distance from the corridor is less than the robot's length."""
+    world = tiny_world(tmp_path)
+    kept = {geom.name for geom in episode_spec(world, 0.0, 10.0, 1.0).geoms}
+    assert {"part_0000", "part_0001"} <= kept
+    assert "part_0001" not in {geom.name for geom in episode_spec(world, 0.0, 1.0, 0.2).geoms}
+
+
+# ---- trust
+
+
+def test_trust_falls_with_distance_turn_and_missing_road():
+    filmed = np.stack([look_at(np.array([x, 0.0, 1.0]), np.array([x + 1, 0.0, 1.0])) for x in np.arange(0, 10, 1.0)])
+    trust = Trust(Viewpoints.of(filmed, np.ones(4), (16, 9)))
+
+    def of(pose, opacity=1.0, lower=None):
+        o = np.full((1, 18, 32), opacity, np.float32)
+        if lower is not None:
+            o[0, 9:, :lower] = 0.0
+        return float(trust.of(pose[None], Rendering(np.zeros((1, 18, 32, 3), np.float32), o, o))[0])
+
+    def at(y, yaw=0.0):
+        eye = np.array([5.0, y, 1.0])
+        return look_at(eye, eye + np.array([np.cos(yaw), np.sin(yaw), 0.0]))
+
+    assert of(at(0.0)) == of(at(0.9)) == 1.0
+    falling = [of(at(y)) for y in (1.5, 2.5, 4.0, 6.0)]
+    assert falling == sorted(falling, reverse=True) and falling[0] < 1.0 and falling[-1] == 0.0
+    assert of(at(0.0, np.pi)) == 0.0 and 0.0 < of(at(0.0, 0.6)) < 1.0
+    assert of(at(0.0), opacity=0.7) == pytest.approx(0.7)
+    assert of(at(0.0), lower=2) < 0.95 and of(at(0.0), lower=8) == 0.0
+    assert trust.offset(at(2.0)[None])[0] == pytest.approx(2.0)
+
+
+# ---- episodes, drivers, films
+
+
+def test_an_episode_comes_back_from_its_files(scene, tmp_path):
+    environment = twin.load(scene, "ahead", 0, obstacles=0, lighting="night", **SMALL)
+    episode = record(environment, RouteDriver())
+    assert episode.success and episode.lighting == "night" and episode.progress[-1] == pytest.approx(3.5, abs=0.15)
+    assert len(episode.times) == len(episode.actions) == len(episode.trust)
+    assert episode.rewards.sum() == pytest.approx(0.1 * (len(episode.times) - 1))
+    episode.save(tmp_path)
+    back = Episode.load(tmp_path)
+    for name in ("times", "qpos", "actions", "rewards"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(episode, name))
+    assert replace(back, **{n: getattr(episode, n) for n in ("times",)}).cause == episode.cause
+    assert back.obstacles == episode.obstacles and back.randomisation["payload"] == 0.0
+
+
+def test_a_policy_is_a_function_by_name(scene, tmp_path, monkeypatch):
+    (tmp_path / "my_policy.py").write_text(
+        "def act(pixels):\n    assert pixels.shape == (12, 18, 32)\n    return [1.0, 0.0]\n"
+        "def bad(pixels):\n    return [1]\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    environment = twin.load(scene, "bend", 0, **SMALL)
+    episode = record(environment, load_policy("my_policy:act"), most=5)
+    np.testing.assert_array_equal(episode.actions[:5], np.tile([1.0, 0.0], (5, 1)))
+    assert episode.cause == ""
+    with pytest.raises(InputError, match="expected 2 numbers"):
+        record(environment, load_policy("my_policy:bad"), most=1)
+    for name in ("my_policy", "my_policy:nothing", "no_such_module:act"):
+        with pytest.raises(InputError):
+            load_policy(name)
+
+
+@pytest.mark.slow
+def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
+    """Slow: the chase camera's kernels compile on first use."""
+    out = tmp_path / "drive.mp4"
+    arguments = [str(scene.scene.root), "--task", "ahead", "--lighting", "night", "--out", str(out)]
+    assert main(arguments) == 0
+    assert "goal after 3." in capsys.readouterr().out
+    told = describe(out)
+    assert told["codec"] == "h264" and 20 < told["frames"] < 60
+    assert main([str(scene.scene.root), "--task", "moon", "--quiet"]) == 2
+    assert "task 'moon': unknown; there are route" in capsys.readouterr().err
+
+
+# ---- audit
+
+
+def test_the_audit_finds_holes_and_finds_none_where_there_are_none(scene, tmp_path):
+    stage = Stage.open(scene, "bend", {"pixels": False})
+    found = audit(stage, hours=0.02)
+    assert found.seconds >= 72.0 and found.touching > 0
+    assert found.false_successes == 0 and found.events["episode_tunnelling"] == found.events["tunnelling"] == 0
+    assert found.events["episode_wall_sliding"] == found.events["gap"] == found.events["climbing"] == 0
+    assert set(found.summary()["steps_with"]) == {*EVENTS, *(f"episode_{name}" for name in EVENTS)}
+    # A visual mesh across the road that nothing solid stands for is a gap.
+    from twin.env import audit as module
+
+    seen = Seen(stage.world)
+    seen._points = np.array([[3.0, y, z] for y in np.arange(-2, 2, 0.1) for z in np.arange(0.3, 1.0, 0.05)])
+    seen._tree = module.cKDTree(seen._points[:, :2])
+    holes = Findings()
+    module._episodes(stage, holes, seen, True, 20.0, np.random.default_rng(0), progress.bar("", 1))
+    assert holes.events["episode_gap"] > 0 and holes.false_successes == holes.episodes["goal"] > 0
+
+
+def test_the_examiner_knows_tunnelling_climbing_and_sliding(scene):
+    from twin.env.audit import Examiner
+
+    stage = Stage.open(scene, "bend", {"pixels": False})
+    robot = HuskyPhysics(episode_spec(stage.world, 0.0, 10.0, 5.0).compile(), stage.world.robot)
+    examiner = Examiner(robot, Seen(stage.world))
+    robot.place(1.0, 0.0, 0.0)
+    assert examiner.events() == []
+    robot.data.qpos[2] += 0.15
+    mujoco.mj_forward(robot.model, robot.data)
+    assert examiner.events() == ["climbing"]
+    robot.place(3.0, 1.5, 0.0)
+    robot.data.qpos[1] += 0.3  # into the box beside the road
+    robot.data.qvel[0] = 0.5
+    mujoco.mj_forward(robot.model, robot.data)
+    assert {"tunnelling", "wall_sliding"} <= set(examiner.events())

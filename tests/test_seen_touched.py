@@ -1,0 +1,136 @@
+"""Seen equals touched: a field that shows the solid scene itself, and fields that do not."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from tiny_world import tiny_world
+
+from twin.assets.ground import Ground
+from twin.geometry.cameras import Cameras, pixel_grid, resized, unproject
+from twin.geometry.poses import look_at
+from twin.mjcf.export import Parts
+from twin.mjcf.world import point_at
+from twin.nerf.rendering import FAR, Rendering
+from twin.report.page import page
+from twin.report.seen_section import seen_row, seen_section
+from twin.report.seen_touched import Looks, along_the_drive, compare, look
+from twin.scene import SceneDir
+
+STATIONS = (0.0, 1.0, 2.0)
+
+
+class SolidField:
+    """What MuJoCo's own rays find, one by one."""
+
+    lightings = ("day",)
+
+    def __init__(self, model: mujoco.MjModel):
+        self.model, self.data = model, mujoco.MjData(model)
+        mujoco.mj_forward(model, self.data)
+
+    def render(self, cameras, lighting, size):
+        intrinsics, size = resized(cameras, size)
+        rays = unproject(pixel_grid(*size), intrinsics[0])
+        pose = cameras.camera_to_world[0]
+        lengths = np.linalg.norm(rays, axis=-1)
+        world = (rays / lengths[..., None]) @ pose[:3, :3].T
+        found, geom = np.empty(rays.shape[:2]), np.zeros(1, np.int32)
+        groups = np.array([1, 0, 0, 1, 0, 0], np.uint8)
+        for at in np.ndindex(found.shape):
+            found[at] = mujoco.mj_ray(self.model, self.data, pose[:3, 3], world[at], groups, 1, -1, geom)
+        depth = np.where(found >= 0.0, found / lengths, FAR).astype(np.float32)
+        return Rendering(np.zeros((1, *depth.shape, 3), np.float32), depth[None], (depth < FAR)[None] * np.float32(1.0))
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    root = tmp_path_factory.mktemp("seen") / "tiny"
+    world = tiny_world(root)
+    mesh = SceneDir(root).stage("mesh")
+    eyes = np.array([point_at(world.route, s) + np.array([0.0, 0.013, 0.6]) for s in STATIONS])
+    poses = np.array([look_at(eye, eye + np.array([1.0, 0.007, -0.1])) for eye in eyes])
+    looks = look(SolidField(world.model()), world, poses, "day")
+    above = look_at(np.array([3.0, 0.0, 12.0]), np.array([3.01, 0.0, 0.0]))
+    cameras = replace(
+        Cameras.load(SceneDir(root).stage("metric")).select(np.array([1])),
+        camera_to_world=above[None],
+        intrinsics=np.array([[300.0, 300.0, 320.0, 180.0]]),
+    )
+    return world, looks, cameras, Ground.load(mesh), Parts.load(mesh / "parts.npz")
+
+
+def test_what_shows_the_solid_scene_has_no_gap(place):
+    world, looks, cameras, ground, parts = place
+    found = compare(looks, world, cameras, ground, parts)
+    assert found["pixels"] > 5000 and found["views"] == 3
+    assert found["median_m"] < 1e-3 and found["p90_m"] < 5e-3
+    assert found["ground_p95_m"] < 0.01 and found["standing_median_m"] < 1e-3
+    assert found["corridor_leak_m"] < 0.02 and found["corridor_ghost_m"] < 0.02
+    assert found["leak_share"] == 0.0 and found["ghost_share"] == 0.0
+
+
+def test_what_is_seen_above_the_corridor_is_a_leak(place):
+    world, looks, cameras, ground, parts = place
+    points = looks.points(looks.solid, world.intrinsics)
+    s_near = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
+    assert s_near.sum() > 30
+    # The ground there is seen as if it were 0.35 m higher, along the same rays.
+    eye = looks.camera_to_world[:, None, None, 2, 3]
+    share = (eye - points[..., 2] - 0.35) / (eye - points[..., 2])
+    raised = replace(looks, seen=np.where(s_near, looks.seen * share, looks.seen))
+    found = compare(raised, world, cameras, ground, parts)
+    assert found["corridor_leak_m"] == pytest.approx(0.35, abs=0.1)
+    assert found["corridor_ghost_m"] < 0.02
+    assert max(found["along"]["leak_m"][:3]) > 0.3 and max(found["along"]["leak_m"][4:]) < 0.05
+
+
+def test_what_is_solid_but_seen_through_is_a_ghost_and_unfilmed_ones_are_told_apart(place):
+    world, looks, cameras, ground, parts = place
+    points = looks.points(looks.solid, world.intrinsics)
+    hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
+    eye = looks.camera_to_world[:, None, None, 2, 3]
+    share = (eye - points[..., 2] + 0.28) / (eye - points[..., 2])
+    sunk = replace(looks, seen=np.where(hole, looks.seen * share, looks.seen))
+    found = compare(sunk, world, cameras, ground, parts)
+    assert found["corridor_ghost_m"] == pytest.approx(0.28, abs=0.06)
+    assert found["corridor_leak_m"] < 0.02 and found["unfilmed_ghost_m"] < 0.02
+    elsewhere = cameras.camera_to_world.copy()
+    elsewhere[:, 0, 3] += 100.0
+    unfilmed = compare(sunk, world, replace(cameras, camera_to_world=elsewhere), ground, parts)
+    assert unfilmed["corridor_ghost_m"] == 0.0 and unfilmed["unfilmed_ghost_m"] == pytest.approx(0.28, abs=0.06)
+
+
+def test_a_part_that_is_not_seen_is_a_ghost_and_one_that_is_not_solid_a_leak(place):
+    world, looks, cameras, ground, parts = place
+    part = ~looks.is_ground & (looks.solid < 8.0)
+    assert part.sum() > 50
+    unseen = compare(replace(looks, seen=np.where(part, FAR, looks.seen)), world, cameras, ground, parts)
+    assert unseen["ghost_share"] > 0.5 and unseen["leak_share"] in (None, 0.0)
+    none = Parts([], [])
+    leaky = compare(replace(looks, solid=np.where(part, FAR, looks.solid)), world, cameras, ground, none)
+    assert leaky["leak_share"] is None or leaky["leak_share"] > 0.3
+    far_off = replace(looks, seen=np.where(part, looks.seen - 0.6, looks.seen))
+    assert compare(far_off, world, cameras, ground, parts)["leak_share"] > 0.5
+
+
+def test_a_drive_is_looked_at_every_two_metres():
+    poses = np.tile(np.eye(4), (101, 1, 1))
+    poses[:, 0, 3] = np.linspace(0.0, 10.0, 101)
+    assert along_the_drive(poses)[:, 0, 3] == pytest.approx([0.0, 2.0, 4.0, 6.0, 8.0])
+
+
+def test_the_page_tells_it(place, tmp_path):
+    world, looks, cameras, ground, parts = place
+    found = compare(looks, world, cameras, ground, parts)
+    report = {"scene": "tiny", "seen_touched": found, "review": {"follower": None}}
+    section = seen_section(report)
+    assert not section.cautions and any(fact.name == "largest ghost in the corridor" for fact in section.facts)
+    told = page(SceneDir(tmp_path), report)
+    assert "Seen and touched" in told and "Seen but not solid" in told
+    large = seen_section({"seen_touched": found | {"corridor_leak_m": 0.4, "unfilmed_ghost_m": 0.9}})
+    assert large.cautions[0].what.startswith("Something in the corridor") and len(large.cautions) == 2
+    assert seen_section({}).not_applicable
+    assert seen_row(looks, 0).shape[1] > 4 * 300
+    assert isinstance(looks, Looks)

@@ -1,0 +1,82 @@
+"""A small built scene that every stage of an environment can be loaded from: `tiny_world`'s, with a field made up by
+formula and two lightings."""
+
+from pathlib import Path
+
+import numpy as np
+from test_baked import LOW, STEP, networks, places
+from tiny_world import tiny_config, tiny_ground, tiny_scene
+
+from twin.mjcf.export import run
+from twin.nerf.baked import BakedField
+from twin.nerf.layout import BrickLayout, leaps
+from twin.nerf.lightings import Lightings
+from twin.scene import write_json
+
+LAYOUT = BrickLayout((4.5, -2.5, 1.0), (8.0, 6.0, 2.0), 0.1, 0.5, (12, 9, 5), (8, 8, 4))
+
+SCENE_TOML = """
+name = "tiny"
+[[source]]
+path = "input/day.mp4"
+[metric]
+camera_height = 1.2
+[[task]]
+name = "ahead"
+start = 0.5
+length = 4.0
+[[task]]
+name = "bend"
+start = 0.0
+length = 10.0
+"""
+
+
+def tiny_twin(root: Path, boxes=((3.0, 2.2, 0.8), (4.0, -3.0, 0.8)), more: str = "") -> Path:
+    """Writes the scene folder; `more` goes to the end of its scene.toml."""
+    scene = tiny_scene(root, boxes)
+    (root / "scene.toml").write_text(SCENE_TOML + more)
+    scene.stage("mjcf").mkdir()
+    run(scene, tiny_config(), scene.stage("mjcf"))
+    scene.stage("field").mkdir()
+    tiny_field(boxes).save(scene.stage("field"))
+    for stage in ("metric", "mesh", "mjcf", "field"):
+        write_json(scene.stage(stage) / "stamp.json", {"result": "made up"})
+    return root
+
+
+def tiny_field(boxes) -> BakedField:
+    """Solid below the ground and in boxes of 0.6 × 0.6 × 0.8 m; brighter by day than by night."""
+    ground, layout = tiny_ground(), LAYOUT
+    near = np.argwhere(np.ones(layout.near_shape, bool)).astype(np.int32)
+    far = np.argwhere(np.ones(layout.far_shape, bool)).astype(np.int32)
+    inside = ((far / layout.far_shape >= 0.25) & ((far + 1) / layout.far_shape <= 0.75)).all(1)
+    far = far[~inside]
+    at = places(layout, near, far)
+    solid = at[..., 2] < ground.at(at[..., :2])
+    for center in boxes:
+        solid |= (np.abs(at - np.array(center)) < [0.3, 0.3, 0.4]).all(-1)
+    values = np.empty((*at.shape[:2], 16))
+    values[..., 0] = np.where(solid, LOW + 255 * STEP, LOW)
+    for c in range(15):
+        values[..., c + 1] = np.sin(at @ np.array([1.0 + 0.2 * c, 0.7 - 0.1 * c, 0.5]))
+    low, step = np.r_[LOW, np.full(15, -1.0)], np.r_[STEP, np.full(15, 2.0 / 255)]
+    rng = np.random.default_rng(0)
+    weights = networks(rng)
+    weights["network.head.0"][31, :3], weights["network.head.0"][32, :3] = 0.6, 0.1  # day and night
+    weights["network.head.0"][33, 0], weights["network.head.0"][34, 2] = 0.1, 0.1
+    probes = rng.uniform(-1, 1, (300, 15)), rng.uniform(-1, 1, (300, 16))
+    arrays = {
+        "near": near,
+        "far": far,
+        "features": np.rint((values - low) / step).astype(np.uint8),
+        "low": low.astype(np.float32),
+        "step": step.astype(np.float32),
+        "probes.features": probes[0].astype(np.float32),
+        "probes.harmonics": probes[1].astype(np.float32),
+        **weights,
+    }
+    vectors = np.eye(2, 4, dtype=np.float32)
+    frames = np.repeat(vectors, 4, 0) + rng.normal(0, 0.1, (8, 4)).astype(np.float32)
+    names = Lightings(("day", "night"), vectors, tuple(f"{n}/{k}" for n in ("day", "night") for k in range(4)), frames)
+    return BakedField(layout, names, arrays | leaps(layout, arrays), "cpu")

@@ -1,0 +1,127 @@
+"""Many worlds at once: physics on a thread pool, pictures of all of them in one call of the renderer.
+
+A *world* is one robot in a model of its own, with its own sequence of episodes. Nothing here decides what happens in an
+episode: every world is the dm_control environment that `twin.load` gives, stepped by the same code, so one of many goes
+through exactly what it would alone.
+
+`mujoco.batch.Batch` would step faster by what Python does between the looks at the contacts; it has no contacts to look
+at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import dm_env
+import numpy as np
+from dm_control.rl import control
+from numpy.typing import NDArray
+
+from twin.env.suite import Stage
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a step of n worlds led to; each shape (n,)."""
+
+    reward: Array
+    terminated: NDArray[np.bool_]
+    """The episode is over, and failed or arrived."""
+    truncated: NDArray[np.bool_]
+    """The episode is over, and would have gone on but for the time limit."""
+
+    @property
+    def over(self) -> NDArray[np.bool_]:
+        return self.terminated | self.truncated
+
+
+class Worlds:
+    """n worlds of one scene and task."""
+
+    def __init__(self, stage: Stage, seeds: Sequence[int | None]) -> None:
+        """
+        Args:
+            stage: Scene, task and options.
+            seeds: One per world, of its sequence of episodes; None: unpredictable.
+        """
+        parts = [stage.drive(seed) for seed in seeds]
+        self.physics, self.tasks = [p for p, _ in parts], [t for _, t in parts]
+        self.pixels = stage.pixels(parts)
+        self.options = stage.options
+        step = stage.options.control_timestep
+        self._environments = [control.Environment(p, t, control_timestep=step) for p, t in parts]
+        self._steps: list[dm_env.TimeStep | None] = [None] * len(parts)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = min(cores, len(parts))
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        spec = self._environments[0].action_spec()
+        self._low, self._high = spec.minimum, spec.maximum
+
+    def __len__(self) -> int:
+        return len(self._environments)
+
+    @property
+    def actions(self) -> int:
+        """Numbers in an action."""
+        return len(self._low)
+
+    @property
+    def states(self) -> int:
+        """Numbers in a driver's state."""
+        return sum(int(np.prod(spec.shape)) for spec in self._environments[0].observation_spec().values())
+
+    def seed(self, i: int, seed: int | None) -> None:
+        """Starts another sequence of episodes in world i, from its next episode on."""
+        self.tasks[i].seed(seed)
+
+    def begin(self, which: Sequence[int]) -> None:
+        """Starts new episodes in some worlds."""
+
+        def reset(i: int) -> None:
+            self._steps[i] = self._environments[i].reset()
+
+        self._each(reset, which)
+        if self.pixels:
+            self.pixels.begin(which)
+
+    def step(self, actions: NDArray) -> Outcome:
+        """One control step of all worlds, none of which may be at its episode's end.
+
+        Args:
+            actions: Of each world, every number in [-1, 1], which spans what `action_spec` allows; shape (n, actions).
+        """
+        wanted = self._low + (np.clip(actions, -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
+
+        def advance(i: int) -> dm_env.TimeStep:
+            return self._environments[i].step(wanted[i])
+
+        steps = self._each(advance, range(len(self)))
+        self._steps = list(steps)
+        if self.pixels:
+            self.pixels.look(range(len(self)))
+        last = np.array([step.last() for step in steps])
+        goes_on = np.array([step.discount for step in steps]) > 0.0
+        return Outcome(np.array([step.reward for step in steps]), last & ~goes_on, last & goes_on)
+
+    def observation(self) -> NDArray:
+        """Pictures uint8 (n, 3 · stack, height, width), the newest last; or the states, float32 (n, k)."""
+        if self.pixels:
+            n, stack, three, height, width = self.pixels.stacks.shape
+            return self.pixels.stacks.reshape(n, stack * three, height, width).copy()
+        return np.stack([np.concatenate(list(step.observation.values())) for step in self._steps])  # type: ignore[union-attr]
+
+    def info(self, i: int) -> dict[str, Any]:
+        """Of world i's episode so far, JSON-able."""
+        return self.tasks[i].info(self.physics[i]) | (self.pixels.info(i) if self.pixels else {})
+
+    def close(self) -> None:
+        if self._pool:
+            self._pool.shutdown()
+
+    def _each(self, function: Callable[[int], T], which: Iterable[int]) -> list[T]:
+        return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]

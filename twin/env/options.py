@@ -1,0 +1,128 @@
+"""What may be asked of an environment; the defaults are the paper's (DriveEnv-NeRF, arXiv 2403.15791) where it says."""
+
+import dataclasses
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from twin.config import ObstacleConfig
+from twin.env.camera_effects import CameraOptions
+from twin.env.controller import COMMAND_TIMEOUT
+from twin.env.lightings import TRAINING
+from twin.env.randomisation import Ranges
+from twin.errors import InputError
+
+CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
+"""Why an episode ends."""
+
+TWIST, STEERING = "twist", "steering"
+
+
+@dataclass(frozen=True)
+class Rewards:
+    """What a step and an end are worth. The last step of an episode brings its cause's term, and `step` at the goal."""
+
+    step: float = 0.1
+    """A step that the episode survives."""
+    collision: float = -4.0
+    out_of_bounds: float = -5.0
+    timeout: float = -5.0
+    rollover: float = -5.0
+    stuck: float = -5.0
+    goal: float = 0.0
+    progress: float = 0.0
+    """Per metre along the route, backwards negative."""
+    cross_track: float = 0.0
+    """Per step, times the distance from the route as a share of the corridor's half width; negative punishes."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Everything about an environment but its scene and its task."""
+
+    rewards: Rewards = dataclasses.field(default_factory=Rewards)
+    control_timestep: float = 0.1
+    """Between two actions [s]."""
+    size: tuple[int, int] = (160, 90)
+    """Width, height of the pictures [px]."""
+    stack: int = 4
+    """Pictures in an observation, the newest last."""
+    pixels: bool = True
+    """Observe pictures; otherwise what `Drive.get_observation` says, which is fast and needs no field."""
+    action: str = TWIST
+    """twist (v [m/s], ω [rad/s]) or steering (ω [rad/s] at fixed speed)."""
+    speed: float = 1.0
+    """Highest speed of a twist; the speed when steering [m/s]."""
+    yaw_rate: float = 1.0
+    """Largest yaw rate to either side [rad/s]."""
+    half_width: float | None = None
+    """Of the corridor [m]; the scene's unless given."""
+    time_limit: float | None = None
+    """[s]; twice what the stretch takes at `speed` unless given."""
+    start_offset: float = 0.3
+    """The robot starts beside the route by a distance uniform within ± this [m]..."""
+    start_heading: float = 10.0
+    """... and turned away from its heading by an angle uniform within ± this [°]."""
+    lighting: str | Sequence[str] = TRAINING
+    """See `lightings.py`."""
+    lighting_drift: bool = False
+    """The light changes during an episode."""
+    obstacles: str | int | Sequence[ObstacleConfig] = "scene"
+    """`scene`: those of scene.toml; a number: so many that stand, drawn for every episode; or these."""
+    camera: CameraOptions | None = None
+    """What makes the camera imperfect: vibration, exposure, blur. None: nothing."""
+    randomise: Ranges | None = None
+    """How far the robot differs from episode to episode; None: it does not. `True` stands for the default ranges."""
+
+
+def parse_options(given: dict[str, Any]) -> Options:
+    """Options from keywords.
+
+    Raises:
+        InputError: an unknown keyword, or a value out of range.
+    """
+    names = [f.name for f in dataclasses.fields(Options)]
+    for name in given:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
+            raise InputError(
+                f"unknown option {name!r}; "
+                + (f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}")
+            )
+    given = dict(given)
+    if isinstance(given.get("randomise"), bool):
+        given["randomise"] = Ranges() if given["randomise"] else None
+    if isinstance(given.get("rewards"), dict):
+        given["rewards"] = _rewards(given["rewards"])
+    options = Options(**given)
+    if options.action not in (TWIST, STEERING):
+        raise InputError(f"action = {options.action!r}; expected {TWIST!r} or {STEERING!r}")
+    for name, low in (("control_timestep", 0.01), ("speed", 0.01), ("yaw_rate", 0.01), ("stack", 1)):
+        if not getattr(options, name) >= low:
+            raise InputError(f"{name} = {getattr(options, name)}; expected at least {low:g}")
+    if not options.control_timestep <= COMMAND_TIMEOUT:
+        raise InputError(
+            f"control_timestep = {options.control_timestep}; expected at most {COMMAND_TIMEOUT} s: the robot stops "
+            "where it hears nothing for so long"
+        )
+    for name in ("half_width", "time_limit"):
+        value = getattr(options, name)
+        if value is not None and not value > 0.0:
+            raise InputError(f"{name} = {value}; expected more than 0")
+    for name in ("start_offset", "start_heading"):
+        if not getattr(options, name) >= 0.0:
+            raise InputError(f"{name} = {getattr(options, name)}; expected at least 0")
+    if options.obstacles != "scene" and isinstance(options.obstacles, str):
+        raise InputError(f"obstacles = {options.obstacles!r}; expected 'scene', a number, or ObstacleConfigs")
+    if len(options.size) != 2 or min(options.size) < 8:
+        raise InputError(f"size = {options.size}; expected (width, height) of at least 8 px")
+    return options
+
+
+def _rewards(given: dict[str, float]) -> Rewards:
+    names = [f.name for f in dataclasses.fields(Rewards)]
+    for name in given:
+        if name not in names:
+            raise InputError(f"unknown reward {name!r}; there are {', '.join(names)}")
+    return Rewards(**given)

@@ -1,0 +1,82 @@
+"""What the robots' cameras see: one call renders the pictures of n worlds, each in its own light.
+
+A *stack* is the last few pictures of an episode, the newest last; at its beginning the first picture fills it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.env.camera_effects import CameraEffects
+from twin.env.dm_physics import DrivePhysics
+from twin.env.lightings import Light, LightSets, draw_light
+from twin.env.options import Options
+from twin.env.overlay import Overlay
+from twin.env.tasks import CAMERA, LIGHT, Drive
+from twin.env.trust import Trust
+from twin.nerf.baked import BakedField
+
+Picture = NDArray[np.uint8]
+
+
+class Pixels:
+    """Observes n worlds."""
+
+    def __init__(
+        self,
+        overlay: Overlay,
+        field: BakedField,
+        trust: Trust,
+        options: Options,
+        worlds: Sequence[tuple[DrivePhysics, Drive]],
+    ) -> None:
+        """
+        Args:
+            overlay: Renders the worlds.
+            field: Of the place; knows its lightings.
+            trust: What was filmed of it.
+            options: Size, stack, lighting.
+            worlds: Whose episodes are observed.
+        """
+        self._overlay, self.options, self.worlds = overlay, options, list(worlds)
+        self._trust, self._sets = trust, LightSets(field)
+        width, height = options.size
+        self.stacks = np.zeros((len(self.worlds), options.stack, 3, height, width), np.uint8)
+        """Shape (n, stack, 3, height, width): colours first, as networks want them."""
+        self.lights: list[Light | None] = [None] * len(self.worlds)
+        self._effects: list[CameraEffects | None] = [None] * len(self.worlds)
+        self.trust = np.zeros(len(self.worlds))
+        """Of each world's newest picture, in [0, 1], shape (n,)."""
+
+    def begin(self, which: Sequence[int]) -> None:
+        """Draws the lights of episodes that have just begun, and fills their stacks."""
+        o = self.options
+        for i in which:
+            task = self.worlds[i][1]
+            self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
+            if o.camera:
+                self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
+        if len(which):
+            self.stacks[list(which)] = self._look(which)[:, None]
+
+    def look(self, which: Sequence[int]) -> None:
+        """Adds a new picture to the stacks of some worlds."""
+        if len(which):
+            index = list(which)
+            self.stacks[index] = np.concatenate([self.stacks[index][:, 1:], self._look(which)[:, None]], 1)
+
+    def info(self, i: int) -> dict[str, Any]:
+        """What is to be told of world i's picture: `lighting`, `trust`."""
+        light = self.lights[i]
+        return {"lighting": light.name if light else "", "trust": float(self.trust[i])}
+
+    def _look(self, which: Sequence[int]) -> Picture:
+        physics = [self.worlds[i][0] for i in which]
+        poses = np.array([one.camera_to_world for one in physics])
+        lights = [self.lights[i].at(self.worlds[i][0].time()) for i in which]  # type: ignore[union-attr]
+        effects = [self._effects[i] for i in which] if self.options.camera else None
+        out = self._overlay.render([one.data.ptr for one in physics], lights, effects, poses)  # type: ignore[arg-type]
+        self.trust[list(which)] = self._trust.of(poses, out)
+        return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -1,0 +1,122 @@
+"""What of the robot differs from episode to episode: tyre friction, payload, latency, camera pose and wheel radius.
+
+*Ranges* say how far each may be from the robot as it was built; a *draw* is what one episode got, every value uniform
+in its range and independent of the others. A draw is applied to the episode's own copy of the MuJoCo model.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.env.scene_model import PAYLOAD
+from twin.errors import InputError
+
+Array = NDArray[np.float64]
+Range = tuple[float, float]
+
+_PAYLOAD_SIDE = 0.3  # [m] of the cube that the payload's inertia is of
+_TYRE = "_tyre"
+_FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """Lowest and highest value of each quantity. Equal ones hold it fixed."""
+
+    friction: Range = (0.7, 1.3)
+    """Of the tyres, as a share of the robot's own."""
+    payload: Range = (0.0, 20.0)
+    """On the top plate [kg]."""
+    latency: Range = (0.0, 0.1)
+    """From a command to its taking effect, added to the robot's own [s]."""
+    camera_shift: Range = (-0.02, 0.02)
+    """Of the front camera along each of its axes [m]."""
+    camera_turn: Range = (-1.0, 1.0)
+    """Of the front camera about each of its axes [°]."""
+    wheel_radius: Range = (0.98, 1.02)
+    """As a share of the robot's own; its controller does not know."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in asdict(self).items():
+            if not low <= high:
+                raise InputError(f"randomise: {name} = ({low}, {high}); expected (lowest, highest)")
+        for name in ("friction", "wheel_radius"):
+            if not getattr(self, name)[0] > 0.0:
+                raise InputError(f"randomise: {name} = {getattr(self, name)}; expected more than 0")
+        for name in ("payload", "latency"):
+            if not getattr(self, name)[0] >= 0.0:
+                raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
+
+    def draw(self, rng: np.random.Generator) -> "Draw":
+        """One episode's values."""
+        return Draw(
+            friction=float(rng.uniform(*self.friction)),
+            payload=float(rng.uniform(*self.payload)),
+            latency=float(rng.uniform(*self.latency)),
+            camera_shift=tuple(rng.uniform(*self.camera_shift, 3).tolist()),
+            camera_turn=tuple(rng.uniform(*self.camera_turn, 3).tolist()),
+            wheel_radius=float(rng.uniform(*self.wheel_radius)),
+        )
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What one episode got; units as in `Ranges`. The default is the robot as built."""
+
+    friction: float = 1.0
+    payload: float = 0.0
+    latency: float = 0.0
+    camera_shift: tuple[float, ...] = (0.0, 0.0, 0.0)
+    camera_turn: tuple[float, ...] = (0.0, 0.0, 0.0)
+    wheel_radius: float = 1.0
+
+    def record(self) -> dict[str, Any]:
+        """For the episode's record, JSON-able."""
+        return asdict(self)
+
+
+class Nominal:
+    """The robot as built, to which draws are applied; remembers the fields they change."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """
+        Args:
+            model: Of `episode_spec`, as compiled.
+        """
+        self._tyres = np.array([i for i in range(model.ngeom) if model.geom(i).name.endswith(_TYRE)])
+        self._payload = model.body(PAYLOAD).id
+        self._camera = model.camera("front").id
+        self._fields = {name: np.array(getattr(model, name)) for name in _FIELDS}
+        bodies = model.geom_bodyid[self._tyres]
+        first, count = model.body_bvhadr[bodies], model.body_bvhnum[bodies]
+        self._boxes = np.concatenate([np.arange(a, a + n) for a, n in zip(first, count, strict=True)])
+        self._scratch = mujoco.MjData(model)
+
+    def apply(self, draw: Draw, model: mujoco.MjModel) -> None:
+        """Makes a copy of the model that of an episode."""
+        tyres, camera, was = self._tyres, self._camera, self._fields
+        model.geom_friction[tyres, 0] = was["geom_friction"][tyres, 0] * draw.friction
+        model.geom_size[tyres] = was["geom_size"][tyres] * [draw.wheel_radius, 1.0, draw.wheel_radius]
+        # What MuJoCo bounds a geom by may be too large, but never too small.
+        grown = max(1.0, draw.wheel_radius)
+        model.geom_rbound[tyres] = was["geom_rbound"][tyres] * grown
+        model.geom_aabb[tyres] = was["geom_aabb"][tyres] * grown
+        model.bvh_aabb[self._boxes] = was["bvh_aabb"][self._boxes] * [1.0, 1.0, 1.0, grown, grown, grown]
+        model.cam_pos[camera] = was["cam_pos"][camera] + _turned(draw.camera_shift, was["cam_quat"][camera])
+        turn, quaternion = np.zeros(4), np.zeros(4)
+        mujoco.mju_euler2Quat(turn, np.deg2rad(draw.camera_turn), "xyz")
+        mujoco.mju_mulQuat(quaternion, was["cam_quat"][camera], turn)
+        model.cam_quat[camera] = quaternion
+        if model.body_mass[self._payload] != draw.payload:
+            model.body_mass[self._payload] = draw.payload
+            model.body_inertia[self._payload] = draw.payload * _PAYLOAD_SIDE**2 / 6.0
+            mujoco.mj_setConst(model, self._scratch)
+
+
+def _turned(vector: tuple[float, ...], quaternion: Array) -> Array:
+    out = np.zeros(3)
+    mujoco.mju_rotVecQuat(out, np.array(vector), quaternion)
+    return out

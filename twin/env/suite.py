@@ -1,0 +1,111 @@
+"""`twin.load`: a built scene and a task as a dm_control environment.
+
+Physics and task know nothing of pictures; `SeenDrive` adds them. Both are `dm_control.rl.control.Environment`s.
+"""
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dm_env
+import mujoco
+import numpy as np
+from dm_control.rl import control
+from dm_env import specs
+
+from twin.config import load_config
+from twin.env.dm_physics import DrivePhysics
+from twin.env.episode_obstacles import EpisodeObstacles
+from twin.env.obstacles import add_obstacles
+from twin.env.options import Options, parse_options
+from twin.env.overlay import Overlay
+from twin.env.pixels import Pixels
+from twin.env.scene_model import episode_spec
+from twin.env.stretches import Stretch, find_task
+from twin.env.tasks import Drive
+from twin.env.trust import Trust
+from twin.errors import InputError
+from twin.loading import Twin, load_scene
+from twin.mjcf.world import World
+from twin.nerf.baked import BakedField
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A scene and a task, ready for any number of worlds."""
+
+    world: World
+    stretch: Stretch
+    options: Options
+    obstacles: EpisodeObstacles
+    model: mujoco.MjModel
+    field: BakedField | None
+    """None where no pictures are wanted."""
+    trust: Trust | None
+
+    @staticmethod
+    def open(scene: str | Path | Twin, task: str, options: dict[str, Any]) -> "Stage":
+        """Reads a built scene. Raises InputError: not built, no route, no such task, or unknown options."""
+        parsed = parse_options(options)
+        twin = scene if isinstance(scene, Twin) else load_scene(scene)
+        if not twin.scene.has_route:
+            raise InputError(f"{twin.scene.root}: nothing to drive, as its build has no route (mjcf.route)")
+        world = twin.world()
+        config = load_config(twin.scene.config_file)
+        stretch = find_task(task, world, config.task)
+        wanted = config.obstacle if isinstance(parsed.obstacles, str) else parsed.obstacles
+        obstacles = EpisodeObstacles(wanted, world, stretch)
+        spec = episode_spec(world, stretch.start, stretch.end, parsed.half_width or world.half_width)
+        add_obstacles(spec, obstacles.pool, world)
+        field, trust = (twin.field(), Trust(twin.cameras())) if parsed.pixels else (None, None)
+        return Stage(world, stretch, parsed, obstacles, spec.compile(), field, trust)
+
+    def drive(self, seed: int | None) -> tuple[DrivePhysics, Drive]:
+        """One more world, with a model of its own."""
+        physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
+        return physics, Drive(self.world, self.stretch, self.options, self.obstacles, self.model, seed)
+
+    def pixels(self, worlds: list[tuple[DrivePhysics, Drive]]) -> Pixels | None:
+        if self.field is None or self.trust is None:
+            return None
+        overlay = Overlay(self.model, self.field, self.options.size, len(worlds))
+        return Pixels(overlay, self.field, self.trust, self.options, worlds)
+
+
+class SeenDrive(control.Environment):
+    """A drive whose observations are pictures: `pixels`, uint8, shape (stack, height, width, 3), the newest last."""
+
+    def __init__(self, physics: DrivePhysics, task: Drive, pixels: Pixels) -> None:
+        super().__init__(physics, task, control_timestep=task.options.control_timestep)
+        self.pixels = pixels
+
+    def reset(self) -> dm_env.TimeStep:
+        step = super().reset()
+        self.pixels.begin([0])
+        return self._with_pixels(step)
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        begins = self._reset_next_step
+        step = super().step(action)  # calls reset() where an episode begins
+        if begins:
+            return step
+        self.pixels.look([0])
+        return self._with_pixels(step)
+
+    def observation_spec(self) -> dict[str, specs.BoundedArray]:
+        _, stack, three, height, width = self.pixels.stacks.shape
+        return {"pixels": specs.BoundedArray((stack, height, width, three), np.uint8, 0, 255, name="pixels")}
+
+    def _with_pixels(self, step: dm_env.TimeStep) -> dm_env.TimeStep:
+        return step._replace(observation={"pixels": np.ascontiguousarray(self.pixels.stacks[0].transpose(0, 2, 3, 1))})
+
+
+def environment(scene: str | Path | Twin, task: str, seed: int | None, **options: Any) -> control.Environment:
+    """See `twin.load`."""
+    stage = Stage.open(scene, task, options)
+    physics, drive = stage.drive(seed)
+    pixels = stage.pixels([(physics, drive)])
+    if pixels is None:
+        return control.Environment(physics, drive, control_timestep=drive.options.control_timestep)
+    return SeenDrive(physics, drive, pixels)

@@ -1,0 +1,236 @@
+"""Seen equals touched: whether what the field shows is where MuJoCo's collision geometry is.
+
+Both are looked at by the robot's front camera along its drive. *Gap*: z-depth of the first solid thing along a pixel's
+ray less that of the field. A *leak* is seen but not solid, a *ghost* solid but not seen. On ground that is looked at
+from half a metre above, a centimetre of height is decimetres along the ray; so the size of a leak or ghost is measured
+across: in the corridor by how far above the solid ground something is seen, or below it; elsewhere by the distance of
+what is seen from the nearest solid surface, and the other way round. What no film showed has no field to compare with;
+ghosts there are counted apart.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from twin.assets.ground import Ground
+from twin.assets.obstacles import HEADROOM
+from twin.geometry.cameras import Cameras, Viewpoints, opencv_to_mujoco, pixel_grid, project, unproject
+from twin.mjcf.export import GROUND_GROUP, PART_GROUP, Parts
+from twin.mjcf.world import CAMERA_SIZE, World, arc_lengths, point_at
+from twin.nerf.rendering import FAR, Field
+from twin.progress import track
+
+Array = NDArray[np.float64]
+
+STEP = 2.0  # [m] of the drive between two looks
+REACH = 10.0  # [m] depth up to which is compared
+LARGE = 0.2  # [m] a leak or ghost beyond is large
+
+_OPAQUE = 0.5  # opacity from which the field shows something
+_CELL = 0.05  # [m] what is seen is thinned to one point per cell
+_STANDING = 0.2  # [m] above the ground from where on something stands
+_ROUTE_STEP = 0.05  # [m]
+_BIN = 1.0  # [m] of the route, for the figure
+
+
+@dataclass(frozen=True)
+class Looks:
+    """n views of both. z-depths [m], FAR where nothing is, shape (n, height, width)."""
+
+    camera_to_world: Array
+    """Shape (n, 4, 4)."""
+    seen: Array
+    solid: Array
+    is_ground: NDArray[np.bool_]
+    """Whether the first solid thing is the ground, shape (n, height, width)."""
+    rgb: NDArray[np.float32]
+    """Of the field, shape (n, height, width, 3)."""
+
+    def points(self, depth: Array, intrinsics: Array) -> Array:
+        """Where the pixels' rays are at z-depths, shape (n, height, width, 3)."""
+        rays = unproject(pixel_grid(*CAMERA_SIZE), intrinsics)
+        local = rays * depth[..., None]
+        return (
+            np.einsum("nhwi,nji->nhwj", local, self.camera_to_world[:, :3, :3])
+            + (self.camera_to_world[:, None, None, :3, 3])
+        )
+
+
+def look(field: Field, world: World, camera_to_world: Array, lighting: str) -> Looks:
+    """Renders the field and casts rays at the collision geometry from camera poses (n, 4, 4)."""
+    import mujoco_warp as mjw  # slow to import
+
+    model = world.model()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = model.camera(world.names["camera"]).id
+    on_device, state = mjw.put_model(model), mjw.put_data(model, data)
+    context = mjw.create_render_context(
+        model,
+        cam_res=CAMERA_SIZE,
+        cam_active=[world.names["camera"]],
+        render_rgb=False,
+        render_depth=True,
+        render_seg=True,
+        use_textures=False,
+        enabled_geom_groups=[GROUND_GROUP, PART_GROUP],
+    )
+    ground = model.geom(world.names["ground"]).id
+    shape = CAMERA_SIZE[::-1]
+    seen, solid, is_ground, rgb = [], [], [], []
+    positions, turns = data.cam_xpos.copy(), data.cam_xmat.reshape(-1, 3, 3).copy()
+    mjw.refit_bvh(on_device, state, context)
+    for pose in track(list(camera_to_world), "seen equals touched", unit="view"):
+        flipped = opencv_to_mujoco(pose)
+        positions[camera], turns[camera] = flipped[:3, 3], flipped[:3, :3]
+        state.cam_xpos.assign(positions[None].astype(np.float32))
+        state.cam_xmat.assign(turns[None].astype(np.float32))
+        mjw.render(on_device, state, context)
+        depth = context.depth_data.numpy()[0].reshape(shape).astype(np.float64)
+        solid.append(np.where(depth > 0.0, depth, FAR))
+        is_ground.append(context.seg_data.numpy()[0, :, 0].reshape(shape) == ground)
+        out = field.render(Viewpoints.of(pose, world.intrinsics, CAMERA_SIZE), lighting, CAMERA_SIZE)
+        seen.append(np.where(out.opacity[0] >= _OPAQUE, out.depth[0], FAR).astype(np.float64))
+        rgb.append(out.rgb[0])
+    return Looks(camera_to_world, np.stack(seen), np.stack(solid), np.stack(is_ground), np.stack(rgb))
+
+
+def along_the_drive(camera_to_world: Array) -> Array:
+    """The poses (k, 4, 4) of a drive, every `STEP` metres, the first included."""
+    way = arc_lengths(camera_to_world[:, :2, 3])
+    return camera_to_world[np.unique(np.searchsorted(way, np.arange(0.0, way[-1], STEP)))]
+
+
+def compare(looks: Looks, world: World, cameras: Cameras, ground: Ground, parts: Parts) -> dict[str, Any]:
+    """The numbers.
+
+    Args:
+        looks: Of both.
+        world: Route and corridor.
+        cameras: The filmed frames.
+        ground: Whose height field is touched.
+        parts: The convex parts.
+
+    Returns:
+        Lengths in [m]: `median_m`, `p90_m` (|gap| of pixels that see something below the parts' greatest height, up to
+        `REACH`), `ground_median_m`, `ground_p95_m` (height of the seen ground over the solid one, in the corridor),
+        `standing_median_m` (what is seen standing, to the nearest solid surface), `leak_share`, `ghost_share` (of what
+        is seen below the greatest height, further than `LARGE` from anything solid; of what is hit of the parts, as
+        far from anything seen), `corridor_leak_m`, `corridor_ghost_m` (the largest), `unfilmed_ghost_m` (the largest
+        where the ground in the corridor is in no frame), and `along`, the largest by metre of the route.
+    """
+    seen, solid = looks.points(looks.seen, world.intrinsics), looks.points(looks.solid, world.intrinsics)
+    height = np.where(looks.seen < FAR, seen[..., 2] - ground.at(seen[..., :2]), np.inf)
+    top = max([float((v[:, 2] - ground.at(v[:, :2])).max()) for v in parts.vertices], default=0.0)
+    near = (looks.seen < REACH) & (height < max(top, _STANDING))
+    gap = np.abs(looks.solid - looks.seen)
+    out: dict[str, Any] = {"views": len(looks.seen), "pixels": int(near.sum())}
+    out |= {"median_m": _quantile(gap[near], 0.5), "p90_m": _quantile(gap[near], 0.9)}
+
+    station, inside = _in_corridor(world, seen, near & (height < HEADROOM))
+    low = inside & (height < _STANDING)
+    out |= {
+        "ground_median_m": _quantile(np.abs(height[low]), 0.5),
+        "ground_p95_m": _quantile(np.abs(height[low]), 0.95),
+    }
+
+    hit_station, hit = _in_corridor(world, solid, looks.solid < REACH)
+    hit &= solid[..., 2] - np.where(hit, ground.at(solid[..., :2]), 0.0) < HEADROOM
+    # Of the ground how far below it something is seen, of a part how far behind it.
+    sunken = np.where(np.isfinite(height), -np.minimum(height, 0.0), FAR)
+    behind = np.where(looks.seen > looks.solid, np.where(looks.is_ground, sunken, gap), 0.0)
+    filmed = _filmed(cameras, solid, hit)
+    leaks, ghosts = np.where(inside, height, 0.0), np.where(hit & filmed, behind, 0.0)
+    out["corridor_leak_m"], out["corridor_ghost_m"] = float(max(leaks.max(), 0.0)), float(ghosts.max())
+    out["unfilmed_ghost_m"] = float(np.where(hit & ~filmed, behind, 0.0).max())
+
+    surface = _solid_surface(ground, parts)
+    spots, part_hits = (
+        _thinned(seen[near & (height > _STANDING)]),
+        _thinned(solid[(looks.solid < REACH) & ~looks.is_ground]),
+    )
+    away = surface.distance(spots) if len(spots) else np.zeros(0)
+    out["standing_median_m"] = _quantile(away, 0.5)
+    out["leak_share"] = float((away > LARGE).mean()) if len(away) else None
+    cloud = _thinned(seen[looks.seen < REACH + 2.0])
+    unseen = cKDTree(cloud).query(part_hits)[0] if len(part_hits) and len(cloud) else np.zeros(0)
+    out["ghost_share"] = float((unseen > LARGE).mean()) if len(unseen) else None
+
+    edges = np.arange(0.0, arc_lengths(world.route)[-1] + _BIN, _BIN)
+    out["along"] = {
+        "station_m": [float(s) for s in edges[:-1] + _BIN / 2],
+        "leak_m": _largest(edges, station, leaks, inside),
+        "ghost_m": _largest(edges, hit_station, ghosts, hit & filmed),
+        "ground_m": _medians(edges, station, np.abs(height), low),
+    }
+    return out
+
+
+def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+    """Stations [m] of points (..., 3) and which of them lie in the corridor, between the route's ends."""
+    length = float(arc_lengths(world.route)[-1])
+    stations = np.arange(0.0, length + _ROUTE_STEP, _ROUTE_STEP)
+    away, index = cKDTree(point_at(world.route[:, :2], stations)).query(points[among][:, :2])
+    station, inside = np.full(among.shape, -1.0), np.zeros(among.shape, bool)
+    station[among] = stations[index]
+    # Beyond an end the nearest point is that end.
+    inside[among] = (away <= world.half_width) & (index > 0) & (index < len(stations) - 2)
+    return station, inside
+
+
+def _filmed(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which points (..., 3) of those `among` are within the picture of some frame."""
+    mine = points[among]
+    found = np.zeros(len(mine), bool)
+    for pose, intrinsics, size in zip(cameras.camera_to_world, cameras.intrinsics, cameras.sizes, strict=True):
+        left = np.flatnonzero(~found)
+        pixels, depth = project(mine[left], pose, intrinsics)
+        found[left] = (depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= size).all(1)
+    out = np.zeros(among.shape, bool)
+    out[among] = found
+    return out
+
+
+def _solid_surface(ground: Ground, parts: Parts) -> Any:
+    from twin.reality.surface import Surface
+
+    rows, columns = ground.height.shape
+    x, y = np.meshgrid(
+        ground.origin[0] + ground.cell * np.arange(columns), ground.origin[1] + ground.cell * np.arange(rows)
+    )
+    vertices = [np.stack([x, y, ground.height], -1).reshape(-1, 3)]
+    i = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    faces = [np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])]
+    start = len(vertices[0])
+    for v, f in zip(parts.vertices, parts.faces, strict=True):
+        vertices.append(v)
+        faces.append(f + start)
+        start += len(v)
+    return Surface(np.concatenate(vertices), np.concatenate(faces))
+
+
+def _thinned(points: Array) -> Array:
+    """One of the points (n, 3) per cell."""
+    _, first = np.unique(np.floor(points / _CELL).astype(np.int64), axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def _quantile(values: Array, share: float) -> float | None:
+    return float(np.quantile(values, share)) if len(values) else None
+
+
+def _largest(edges: Array, station: Array, values: Array, among: NDArray[np.bool_]) -> list[float]:
+    out = np.zeros(len(edges) - 1)
+    np.maximum.at(out, np.clip(np.digitize(station[among], edges) - 1, 0, len(out) - 1), values[among])
+    return [round(float(v), 4) for v in out]
+
+
+def _medians(edges: Array, station: Array, values: Array, among: NDArray[np.bool_]) -> list[float | None]:
+    which, mine = np.clip(np.digitize(station[among], edges) - 1, 0, len(edges) - 2), values[among]
+    found = [mine[which == k] for k in range(len(edges) - 1)]
+    return [round(float(np.median(v)), 4) if len(v) else None for v in found]
