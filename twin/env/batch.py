@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 
 import dm_env
 import numpy as np
-from dm_control.rl import control
 from numpy.typing import NDArray
 
+from twin.env.dm import control
 from twin.env.suite import Stage
 
 Array = NDArray[np.float64]

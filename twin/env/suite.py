@@ -11,10 +11,10 @@ from typing import Any
 import dm_env
 import mujoco
 import numpy as np
-from dm_control.rl import control
 from dm_env import specs
 
 from twin.config import load_config
+from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles
 from twin.env.obstacles import add_obstacles
