@@ -23,6 +23,7 @@ from twin.geometry.cameras import Cameras
 from twin.geometry.points import SparsePoints
 from twin.nerf import compute, fit, network
 from twin.nerf.evaluate import evaluate
+from twin.nerf.stage import constant_height
 from twin.scene import SceneDir, read_json
 
 
@@ -76,7 +77,7 @@ def main() -> None:
     config = load_config(scene.config_file, tuple(options.set))
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
-    height = fit.constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
+    height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     result: dict[str, Any] = {"device": compute.device(), "cores": compute.cores()}
     if options.profile:
         trainer = fit.Trainer(cameras, points, config.nerf, config.seed, compute.device(), camera_height=height)

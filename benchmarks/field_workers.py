@@ -144,7 +144,8 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     from twin.config import load_config
     from twin.geometry.cameras import Cameras
     from twin.geometry.points import SparsePoints
-    from twin.nerf.fit import constant_height, fit
+    from twin.nerf.fit import fit
+    from twin.nerf.stage import constant_height
     from twin.progress import set_quiet
     from twin.scene import SceneDir, read_json
 

@@ -10,12 +10,13 @@ from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
-from twin.nerf.field import CameraArrays, Layout, RadianceField, Workspace, untrained
+from twin.nerf.field import RadianceField, untrained
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid
 from twin.nerf.kernels.space import contract_points
 from twin.nerf.rendering import FAR
 from twin.nerf.sampling import Space, level_cells, level_shapes, space_of_cameras, stop_grids
+from twin.nerf.workspace import CameraArrays, Layout, Workspace
 
 LAYOUT = Layout(
     (1.0, -2.0, 0.5), (8.0, 6.0, 2.0), 0.3, levels=3, growth=2.0, log2_table=11, hidden=16, appearance_dim=32

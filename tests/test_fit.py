@@ -20,7 +20,8 @@ from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
 from twin.nerf.evaluate import evaluate, fit_embedding_to_image
 from twin.nerf.field import RadianceField
-from twin.nerf.fit import Trainer, bending, constant_height, fit, free_segments, run
+from twin.nerf.fit import Trainer, bending, fit, free_segments
+from twin.nerf.stage import constant_height, run
 from twin.progress import set_quiet
 from twin.scene import SceneDir, write_json
 

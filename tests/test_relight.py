@@ -13,8 +13,9 @@ from twin.geometry.cameras import Viewpoints
 from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.added import AddedLighting, added_lightings
 from twin.nerf.appearance import initial_appearance
-from twin.nerf.field import Layout, RadianceField, untrained
+from twin.nerf.field import RadianceField, untrained
 from twin.nerf.lightings import Lightings
+from twin.nerf.workspace import Layout
 from twin.relight import fit_photo, main
 from twin.scene import SceneDir, write_json
 

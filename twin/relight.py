@@ -60,7 +60,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     from twin.nerf.compute import single_threaded_torch
     from twin.nerf.evaluate import fit_embedding
-    from twin.nerf.field import CameraArrays
+    from twin.nerf.workspace import CameraArrays
 
     height, width = photo.shape[:2]
     v, u = np.mgrid[:height, :width] + 0.5

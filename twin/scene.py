@@ -2,6 +2,7 @@
 
 scenes/<name>/
   scene.toml            the only hand-written file
+  robot.toml            where there is one: what differs on the robot, as `[robot]` of scene.toml
   input/                films or photos, never written by twin
   build/
     1_capture/ ... 6_review/   one folder per stage, written aside as `<folder>.partial` and renamed when done

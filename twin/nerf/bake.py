@@ -15,10 +15,11 @@ from twin.nerf import network
 from twin.nerf.baked import BakedField
 from twin.nerf.compute import parallel, single_threaded_torch, view
 from twin.nerf.dataset import TrainingPixels
-from twin.nerf.field import CameraArrays, RadianceField, Workspace
+from twin.nerf.field import RadianceField
 from twin.nerf.kernels import bricks as kernels
 from twin.nerf.kernels import composite as volume
 from twin.nerf.layout import BrickLayout, brick_indices, leaps
+from twin.nerf.workspace import CameraArrays, Workspace
 from twin.progress import bar
 
 _SHARDS = 4

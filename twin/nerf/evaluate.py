@@ -17,7 +17,8 @@ from twin.nerf import network
 from twin.nerf.baked import BakedField
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import load_frame
-from twin.nerf.field import CameraArrays, RadianceField
+from twin.nerf.field import RadianceField
+from twin.nerf.workspace import CameraArrays
 from twin.progress import track
 
 _FIT_STEPS = 40

@@ -7,9 +7,7 @@ points around the filmed path, where a camera was and so nothing can be.
 
 import math
 import time
-from dataclasses import asdict, dataclass
-from importlib import metadata
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from twin.config import NerfConfig, SceneConfig
+from twin.config import NerfConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras
 from twin.geometry.points import SparsePoints
@@ -25,13 +23,13 @@ from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.compute import device, parallel, single_threaded_torch
 from twin.nerf.dataset import TrainingPixels
-from twin.nerf.field import CameraArrays, Layout, RadianceField, Workspace, untrained
+from twin.nerf.field import RadianceField, untrained
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
 from twin.nerf.sampling import COARSEST, Space, space_of_cameras
 from twin.nerf.stereo import stereo_sightings
+from twin.nerf.workspace import CameraArrays, Layout, Workspace
 from twin.progress import bar
-from twin.scene import SceneDir, read_json
 
 _SHARDS = 4
 _CELL_PIXELS = 2.0  # side of the finest cell [px of a training frame, at the near end of what was seen]
@@ -46,7 +44,6 @@ _MOST_BEND = 0.5  # beyond this it is an edge of depth, whatever the colours say
 _RISE, _FALL = 0.3, 0.1  # how fast a cell of the stop grids follows what is found in it
 _LOG_OFFSET = 0.05  # of the distortion's logarithmic distance [share of the near box's longest half side]
 _HORIZON = 0.03  # rays this near to level are neither above nor below the horizon [sine]
-_HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 _WARM_UP = 20  # steps of rising learning rate
 _EXPLORE = 0.15  # share of the steps over which sampling narrows down
 
@@ -382,42 +379,3 @@ def fit(
         "stereo": trainer.stereo,
         "curve": curve,
     }
-
-
-def constant_height(metric: dict[str, Any]) -> float:
-    """The camera's height above the ground [m], if the metric stage found it to be known and constant; else 0."""
-    height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
-    if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
-        return 0.0
-    return 0.0 if spread is not None and spread > _HEIGHT_SPREAD * height else float(height)
-
-
-def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
-    """Stage `field`: trains on the metric cameras, scores the held-out frames, saves the field.
-
-    Raises:
-        InputError: nothing to train on, an unreadable frame, or a device that is not there.
-    """
-    from twin.nerf.bake import bake
-    from twin.nerf.crosslight import cross_lighting
-    from twin.nerf.evaluate import evaluate
-
-    cameras = Cameras.load(scene.stage("metric"))
-    points = SparsePoints.load(scene.stage("metric"))
-    height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    field, metrics = fit(cameras, points, config.nerf, config.seed, height)
-    pixels = TrainingPixels(cameras, points, config.nerf.max_width)
-    baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
-    metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
-    metrics["cross_lighting"] = cross_lighting(baked, cameras)
-    field.about = {
-        "scene": config.name,
-        "seed": config.seed,
-        "nerf": asdict(config.nerf),
-        "versions": {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")},
-        "metrics": metrics,
-    }
-    field.save(out)
-    baked.about = field.about
-    baked.save(out)
-    return metrics
