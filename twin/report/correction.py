@@ -125,13 +125,14 @@ class Correction:
         """Real scores that policies of these twin scores will show in as many trials as those fitted had.
 
         Value and ends of the interval, cut off at 0 and 1, each of the shape of `twin`. The interval is the one of
-        simple regression for a new observation (Draper and Smith, Applied Regression Analysis, section 3.1).
+        simple regression for a new observation (Draper and Smith, Applied Regression Analysis, section 3.1), about the
+        value as cut off, so that it keeps its width where the line leaves the range of rates.
         """
         f = np.asarray(twin, float)
-        middle = self.real_mean + self.slope * (f - self.twin_mean)
+        middle = np.clip(self.real_mean + self.slope * (f - self.twin_mean), 0, 1)
         lever = (f - self.twin_mean) ** 2 / self.variation if self.variation > _FLAT else np.zeros_like(f)
         half = student.ppf(0.5 + confidence / 2, self.n - 2) * self.spread * np.sqrt(1.0 + 1.0 / self.n + lever)
-        return np.clip(middle, 0, 1), np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
+        return middle, np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
 
 
 def left_out_predictions(

@@ -101,7 +101,7 @@ def tally(trials: Iterable[Trial]) -> list[Cell]:
         count = counts.setdefault((trial.policy, trial.task, trial.lighting), [0, 0])
         count[0] += 1
         count[1] += trial.success
-    return [Cell(*key, *count) for key, count in counts.items()]
+    return [Cell(*key, trials=n, successes=k) for key, (n, k) in counts.items()]
 
 
 def cells_text(cells: Iterable[Cell]) -> str:
