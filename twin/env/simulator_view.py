@@ -1,4 +1,4 @@
-"""What MuJoCo itself would show a policy: the extracted mesh in its filmed colours, the ground, obstacles and the robot.
+"""What MuJoCo itself would show a policy: the extracted mesh in its filmed colours, the ground, obstacles, the robot.
 
 This is the standard pipeline that a radiance field is compared with. `mujoco_warp`'s ray caster draws it, through the
 same camera as the field's pictures; its light is the model's own, whatever lighting is asked for.

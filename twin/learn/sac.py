@@ -47,9 +47,6 @@ class Encoder(BaseFeaturesExtractor):
 class DrivePolicy(SACPolicy):
     """Actor and critics with one encoder, which the critics' optimiser has."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, share_features_extractor=True, normalize_images=False, **kwargs)
-
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         encoder = set(self.actor.features_extractor.parameters())
@@ -64,10 +61,10 @@ class PixelSAC(SAC):
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Updates all networks `gradient_steps` times."""
-        assert self.replay_buffer is not None and self.ent_coef_optimizer is not None
+        assert self.replay_buffer is not None and self.ent_coef_optimizer is not None and self.log_ent_coef is not None
         assert isinstance(self.target_entropy, float)
         self.policy.set_training_mode(True)
-        follow = [[p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target)]
+        lead, follow = ([p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target))
         sums = np.zeros(4)
         for _ in range(gradient_steps):
             data = self.replay_buffer.sample(batch_size)
@@ -99,7 +96,7 @@ class PixelSAC(SAC):
             self.ent_coef_optimizer.zero_grad()
             entropy_loss.backward()
             self.ent_coef_optimizer.step()
-            polyak_update(*follow, self.tau)
+            polyak_update(lead, follow, self.tau)
             sums += [critic_loss.item(), actor_loss.item(), alpha.item(), best.mean().item()]
         self._n_updates += gradient_steps
         for name, value in zip(("critic_loss", "actor_loss", "ent_coef", "value"), sums / gradient_steps, strict=True):
@@ -109,7 +106,7 @@ class PixelSAC(SAC):
         """Drawn actions (n, actions) and the logarithm of their density (n, 1)."""
         latent = self.actor.latent_pi(features)
         log_std = self.actor.log_std(latent).clamp(LOG_STD_MIN, LOG_STD_MAX)  # type: ignore[operator]
-        action, log_prob = self.actor.action_dist.log_prob_from_params(self.actor.mu(latent), log_std)
+        action, log_prob = self.actor.action_dist.log_prob_from_params(self.actor.mu(latent), log_std)  # type: ignore[call-arg]
         return action, log_prob.reshape(-1, 1)
 
 

@@ -35,7 +35,7 @@ def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
     (folder / name).mkdir(parents=True)
     save_file(_tensors(model), folder / name / _TENSORS)
     arrays, replay = model.replay_buffer.state()
-    np.savez(folder / name / _REPLAY, **arrays)
+    np.savez(folder / name / _REPLAY, **arrays)  # type: ignore[arg-type]
     counts = {"steps": model.num_timesteps, "updates": model._n_updates, "episodes": model._episode_num}
     chance = {"action_space": model.action_space.np_random.bit_generator.state}
     write_json(folder / _JSON, {"folder": name, **counts, "replay": replay, "rng": chance, "more": more})

@@ -237,6 +237,8 @@ def _model(worlds: ShrunkVecEnv, config: TrainConfig, pictures: Path) -> PixelSA
             "features_extractor_class": Encoder,
             "features_extractor_kwargs": {"architecture": config.architecture},
             "net_arch": list(config.hidden),
+            "share_features_extractor": True,
+            "normalize_images": False,  # the encoder does
         },
         seed=config.seed,
         device=config.device,
