@@ -33,7 +33,7 @@ class Campaign:
     """Episodes driven and to be driven of one scene and task, and the table they go to."""
 
     def __init__(
-        self, twin: Twin, task: str, path: Path, policies: dict[str, tuple[str, bool]], processes: int, ray: str | None
+        self, twin: Twin, task: str, path: Path, policies: dict[str, tuple[str, bool]], processes: int
     ) -> None:
         """
         Args:
@@ -42,10 +42,9 @@ class Campaign:
             path: The table.
             policies: Source and trust by name.
             processes: How many drive here.
-            ray: Address of those that drive instead.
         """
         self._scene, self.task, self.path, self._policies = str(twin.scene.root), task, path, policies
-        self._processes, self._ray = processes, ray
+        self._processes = processes
         _mend(path)
         self._done = {_key(t): t for t in read_trials(path)} if path.exists() and _has_rows(path) else {}
 
@@ -61,7 +60,7 @@ class Campaign:
                 chunks.append((name, chunk))
         with progress.bar(what, len(keys), "episode") as bar:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
-            driven = campaign([chunk for _, chunk in chunks], self._processes, self._ray)
+            driven = campaign([chunk for _, chunk in chunks], self._processes)
             for (name, chunk), outcomes in zip(chunks, driven, strict=True):
                 trials = [
                     Trial(
@@ -98,7 +97,6 @@ def validate(
     worst: bool = False,
     trust: bool = False,
     processes: int = 1,
-    ray: str | None = None,
 ) -> dict:
     """Drives what is missing and writes `validation/`; returns what is in its `summary.json`.
 
@@ -110,13 +108,13 @@ def validate(
     folder = root / "validation"
     policies = _policies(root, sources, trust)
     _check_same(folder / "validated.json", twin, policies)
-    todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
+    todo = Campaign(twin, task, folder / "episodes.csv", policies, processes)
     seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
     todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
     trials = read_trials(folder / "episodes.csv")
     said = summary(trials)
     if worst:
-        search = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
+        search = Campaign(twin, task, folder / "worst.csv", policies, processes)
         said["worst"] = {name: _worst(search, name, episodes) for name in policies}
     (folder / "cells.csv").write_text(cells_text(tally(trials)), encoding="utf-8")
     write_json(folder / "summary.json", said)
@@ -206,7 +204,8 @@ def _mend(path: Path) -> None:
     if path.exists():
         blob = path.read_bytes()
         if not blob.endswith(b"\n"):
-            path.write_bytes(blob[: blob.rfind(b"\n") + 1])
+            whole = blob[: blob.rfind(b"\n") + 1]
+            path.write_bytes(whole) if whole else path.unlink()
 
 
 def _has_rows(path: Path) -> bool:
@@ -224,14 +223,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--worst", action="store_true", help="search for the light in which each policy fares worst")
     parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
     parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
-    parser.add_argument("--ray", metavar="ADDRESS", help="of a Ray cluster that drives instead")
     parser.add_argument("--quiet", action="store_true", help="no progress, no table")
     given = parser.parse_args(arguments)
     progress.set_quiet(given.quiet)
     try:
         if min(given.episodes, given.processes) < 1:
             raise InputError(f"--episodes {given.episodes}, --processes {given.processes}; expected at least 1")
-        run = given.task, given.lightings, given.episodes, given.worst, given.trust, given.processes, given.ray
+        run = given.task, given.lightings, given.episodes, given.worst, given.trust, given.processes
         said = validate(given.scene, given.policy, *run)
     except (InputError, OSError) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)

@@ -7,7 +7,7 @@ meets the same start, robot and light. So policies are compared on the same epis
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +17,6 @@ import numpy as np
 
 from twin.env.batch import Worlds
 from twin.env.suite import Stage
-from twin.errors import InputError
 from twin.learn.policy import Policy, load_policy
 from twin.loading import load_scene
 
@@ -91,17 +90,14 @@ def drive(chunk: Chunk) -> list[Driven]:
     return [done[number] for number in range(len(chunk.seeds))]
 
 
-def campaign(chunks: Sequence[Chunk], processes: int = 1, address: str | None = None) -> Iterator[list[Driven]]:
+def campaign(chunks: Sequence[Chunk], processes: int = 1) -> Iterator[list[Driven]]:
     """Drives chunks; what became of them, in their order, each as soon as it and those before it are done.
 
     Args:
         chunks: What to drive.
         processes: How many on this machine.
-        address: Of a Ray cluster that drives instead; its machines have scene and policies under the same paths.
     """
-    if address is not None:
-        yield from _on_ray(chunks, address)
-    elif processes == 1:
+    if processes == 1:
         yield from map(drive, chunks)
     else:
         # Warp and MuJoCo have threads, which a fork would not survive.
@@ -110,20 +106,6 @@ def campaign(chunks: Sequence[Chunk], processes: int = 1, address: str | None = 
                 yield from pool.map(drive, chunks)
             finally:
                 pool.shutdown(cancel_futures=True)
-
-
-def _on_ray(chunks: Sequence[Chunk], address: str) -> Iterator[list[Driven]]:
-    try:
-        import ray
-    except ImportError:
-        raise InputError("--ray needs Ray; pip install twin[ray]") from None
-    ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-    try:
-        there: Callable = ray.remote(max_retries=3)(drive).remote
-        for reference in [there(chunk) for chunk in chunks]:
-            yield ray.get(reference)
-    finally:
-        ray.shutdown()
 
 
 def drawn_light(stage: Stage, number: int) -> Stage:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from twin.errors import InputError
@@ -61,7 +62,7 @@ def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
         with np.load(folder / head["folder"] / _REPLAY, allow_pickle=False) as data:
             model.replay_buffer.set_state(dict(data), head["replay"])
         _set_tensors(model, tensors)
-    except (OSError, KeyError, ValueError, RuntimeError, json.JSONDecodeError) as error:
+    except (OSError, KeyError, ValueError, RuntimeError, json.JSONDecodeError, SafetensorError) as error:
         raise InputError(
             f"{folder}: the saved training is damaged ({' '.join(str(error).split())}); train anew under another name"
         ) from None
