@@ -254,3 +254,19 @@ def test_the_verb(scene, capsys):
     assert "error: " in capsys.readouterr().err
     assert train.main([*common, "--run", "two", "--lighting", "dusk"]) == 2
     assert "dusk" in capsys.readouterr().err
+
+
+def test_a_run_that_is_asked_to_stop_saves_and_goes_on(scene, tmp_path):
+    from twin.learn.training import train as run
+
+    def interrupt(now) -> None:
+        if now.steps == 120:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(twin.load_scene(scene), tmp_path, SHORT, interrupt)
+    head = json.loads((tmp_path / "state" / "state.json").read_text())
+    assert (head["steps"], head["replay"]["pos"]) == (120, 30)
+    seen = []
+    run(twin.load_scene(scene), tmp_path, SHORT, lambda now: seen.append(now.steps))
+    assert seen[0] == 124 and seen[-1] == SHORT.steps

@@ -14,6 +14,7 @@
 
 import csv
 import dataclasses
+import signal
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -175,6 +176,8 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
         config: Of the run; a run that is there must have the same but for `steps`.
         watch: Is told at every step of the worlds.
 
+    SIGINT and SIGTERM save, and then raise KeyboardInterrupt.
+
     Raises:
         InputError: the run is another, or damaged; or what `twin.load` raises.
     """
@@ -201,15 +204,15 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
 
     worlds.meanwhile = learn
     keeper = _Keeper(folder, config, twin, before["wall"], resumed, watch)
+    before_us = {one: signal.signal(one, keeper.stop) for one in (signal.SIGINT, signal.SIGTERM)}
     try:
         left = config.steps - model.num_timesteps
         if left > 0:
             model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
         keeper.save()
-    except KeyboardInterrupt:
-        keeper.save()
-        raise
     finally:
+        for one, handler in before_us.items():
+            signal.signal(one, handler)
         worlds.close()
 
 
@@ -281,6 +284,11 @@ class _Keeper(BaseCallback):
         self.model: PixelSAC
         self._folder, self._config, self._scene, self._watch = folder, config, twin.scene.root.resolve().name, watch
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
+        self._stop = False
+
+    def stop(self, *_: Any) -> None:
+        """A signal handler: before the next step, all is saved, and KeyboardInterrupt raised."""
+        self._stop = True
 
     @property
     def wall(self) -> float:
@@ -295,8 +303,10 @@ class _Keeper(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # Here, and not in _on_step, all that was collected is in the buffer.
-        if self.model.num_timesteps - self._saved >= self._config.save_every:
+        if self._stop or self.model.num_timesteps - self._saved >= self._config.save_every:
             self.save()
+        if self._stop:
+            raise KeyboardInterrupt
         every = self._config.steps / self._config.checkpoints
         number = int(self.model.num_timesteps / every)
         if number and self.model.num_timesteps - number * every < self._config.worlds:

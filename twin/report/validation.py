@@ -113,11 +113,17 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, stretch: tupl
     line = point_at(world.route[:, :2], np.append(np.arange(start, end, 0.5), end))
     edges = np.arange(0.0, end - start + _BIN, _BIN)
     failed = {cause: [t.progress for t in trials if t.cause == cause] for cause in CAUSES[1:]}
-    figure, (above, along) = plt.subplots(2, 1, figsize=(7.2, 6.4), layout="constrained", height_ratios=[3, 2])
+    across, up = np.ptp(line, axis=0) + 2.0 * world.half_width
+    tall = float(np.clip(6.4 * up / across, 0.5, 6.0))
+    figure, (above, along) = plt.subplots(
+        2, 1, figsize=(7.2, tall + 3.6), layout="constrained", height_ratios=[tall + 0.6, 2.6]
+    )
     above.fill(*corridor_outline(line, world.half_width).T, color="#dfe6ee", label="corridor")
     above.plot(*line.T, color="#7a8794", linewidth=1)
     for name, at in (("start", line[0]), ("goal", line[-1])):
-        above.annotate(name, at, xytext=(0, 10), textcoords="offset points", ha="center", fontsize=9)
+        above.annotate(
+            name, at, xytext=(0, 10), textcoords="offset points", ha="center", fontsize=9, annotation_clip=False
+        )
     before: NDArray = np.zeros(len(edges) - 1)
     for cause, ways in failed.items():
         if not ways:
@@ -131,6 +137,7 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, stretch: tupl
             _BIN,
             before,
             align="edge",
+            edgecolor="white",
             color=_COLORS[cause],
             label=f"{cause.replace('_', ' ')} ({len(ways)})",
         )
