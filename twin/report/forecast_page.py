@@ -139,7 +139,7 @@ def _policies(forecast: Forecast) -> Html:
             ]
             for c in mine
         ]
-        heads = ["policy", "twin", "trials", "rank there", "best there", "road", "trials", "best here"]
+        heads = ["policy", "twin", "trials", "rank in twin", "best in twin", "road", "trials", "best on road"]
         figures = [_chart("Success rates with 90% intervals", svg(draw.rates(mine)))]
         if len(mine) > 1:
             figures.append(_chart("How likely each rank is, in the twin", svg(draw.rank_chances(mine))))

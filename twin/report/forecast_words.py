@@ -148,8 +148,9 @@ def unknowns(forecast: Forecast) -> list[Caution]:
     )
     for task in forecast.tasks:
         mine = forecast.of(task)
-        common = set(mine[0].lightings).intersection(*(c.lightings for c in mine))
-        uneven = [c.policy for c in mine if set(c.lightings) != common]
+        sets = [frozenset(c.lightings) for c in mine]
+        usual = max(sets, key=sets.count)
+        uneven = [c.policy for c, under in zip(mine, sets, strict=True) if under != usual]
         if uneven:
             what = f"On {task} not all policies were validated under the same lightings ({listing(uneven)} differ)."
             out.append(Caution(what, "validate all of them under the same ones; the ranking mixes policy with light"))

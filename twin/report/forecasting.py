@@ -117,12 +117,14 @@ def _corrected(
 ) -> list[Estimate]:
     """What each candidate is expected to do on the road, from the other driven ones."""
     pairs = [(i, *_scores(mine, twin)) for i, mine in enumerate(driven) if mine]
+    few = _few([cell for mine in driven for cell in mine], twin)
     out = []
     for i, mine in enumerate(cells):
         others = [(f, y) for j, f, y in pairs if j != i]
-        few = _few([cell for j, row in enumerate(driven) if j != i for cell in row], twin)
-        if few:
-            out.append(Estimate(missing="; ".join(few)))
+        if few or len(others) < MIN_POLICIES:
+            out.append(
+                Estimate(missing="; ".join(few) or f"{len(others)} other policies driven, {MIN_POLICIES} needed")
+            )
             continue
         score = _scores(driven[i], twin)[0] if driven[i] else _mean_rate(mine).value
         if {c.lighting for c in mine} != set(lightings):
