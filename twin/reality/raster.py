@@ -32,6 +32,7 @@ SAMPLES = 2
 """Per pixel and axis."""
 
 _NEAR = 0.02  # [m]
+_FAR = 1.0e30
 _EMPTY = 1 << 62
 _DEPTHS = 1.0e5  # steps of depth per metre
 _INDEX_BITS = 20
@@ -44,13 +45,19 @@ def _clear(nearest: wp.array[wp.int64]):
 
 
 @wp.func
-def _low(a: float, b: float, c: float):
-    return wp.min(a, wp.min(b, c))
+def _around(box: wp.vec4, a: wp.vec3, b: wp.vec3, lens: wp.vec4):
+    """The box (x0, y0, x1, y1) [samples] grown to hold a, and where the edge from a to b meets the near plane."""
+    if a[2] >= _NEAR:
+        box = _holding(box, a, lens)
+    if (a[2] < _NEAR) != (b[2] < _NEAR):
+        box = _holding(box, a + (b - a) * ((_NEAR - a[2]) / (b[2] - a[2])), lens)
+    return box
 
 
 @wp.func
-def _high(a: float, b: float, c: float):
-    return wp.max(a, wp.max(b, c))
+def _holding(box: wp.vec4, p: wp.vec3, lens: wp.vec4):
+    x, y = lens[0] * p[0] / p[2] + lens[2], lens[1] * p[1] / p[2] + lens[3]
+    return wp.vec4(wp.min(box[0], x), wp.min(box[1], y), wp.max(box[2], x), wp.max(box[3], y))
 
 
 @wp.kernel
@@ -68,17 +75,13 @@ def _see(
     a, b, c = to_camera * (corners[i, 0] - eye), to_camera * (corners[i, 1] - eye), to_camera * (corners[i, 2] - eye)
     if a[2] < _NEAR and b[2] < _NEAR and c[2] < _NEAR:
         return
-    x0, x1, y0, y1 = int(0), int(width - 1), int(0), int(height - 1)
-    if a[2] >= _NEAR and b[2] >= _NEAR and c[2] >= _NEAR:
-        ax, bx, cx = a[0] / a[2], b[0] / b[2], c[0] / c[2]
-        ay, by, cy = a[1] / a[2], b[1] / b[2], c[1] / c[2]
-        # Sample k lies at k + 0.5.
-        left, right = lens[0] * _low(ax, bx, cx) + lens[2] - 0.5, lens[0] * _high(ax, bx, cx) + lens[2] - 0.5
-        top, bottom = lens[1] * _low(ay, by, cy) + lens[3] - 0.5, lens[1] * _high(ay, by, cy) + lens[3] - 0.5
-        if right < 0.0 or bottom < 0.0 or left > float(width - 1) or top > float(height - 1):
-            return
-        x0, x1 = wp.max(x0, int(wp.ceil(left))), wp.min(x1, int(wp.floor(right)))
-        y0, y1 = wp.max(y0, int(wp.ceil(top))), wp.min(y1, int(wp.floor(bottom)))
+    # Box around what of the triangle lies beyond the near plane; sample k lies at k + 0.5.
+    box = wp.vec4(_FAR, _FAR, -_FAR, -_FAR)
+    box = _around(_around(_around(box, a, b, lens), b, c, lens), c, a, lens)
+    if box[2] < 0.5 or box[3] < 0.5 or box[0] > float(width) - 0.5 or box[1] > float(height) - 0.5:
+        return
+    x0, x1 = int(wp.ceil(wp.max(box[0] - 0.5, 0.0))), int(wp.floor(wp.min(box[2] - 0.5, float(width - 1))))
+    y0, y1 = int(wp.ceil(wp.max(box[1] - 0.5, 0.0))), int(wp.floor(wp.min(box[3] - 0.5, float(height - 1))))
     na, nb, nc = wp.cross(b, c), wp.cross(c, a), wp.cross(a, b)
     det = wp.dot(a, na)
     if det < 0.0:
