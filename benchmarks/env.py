@@ -2,9 +2,9 @@
 
     python benchmarks/env.py --scene BUILT_SCENE [--only SECTION ...] [--json FILE]
 
-Needs a built scene with the tasks `straight` and `right_turn`. What each figure is, is said where it is measured:
-`env_sections.py`. Speeds are of 160×90 pictures, 10 Hz control and 2 ms physics; each is the best of several short runs
-in processes that have the cores they are said to have and nothing else in them.
+Needs a built scene; of one that has neither `straight` nor `right_turn` the whole route is driven. What each figure is,
+is said where it is measured: `env_sections.py`. Speeds are of 160×90 pictures, 10 Hz control and 2 ms physics; each is
+the best of several short runs in processes that have the cores they are said to have and nothing else in them.
 """
 
 import argparse

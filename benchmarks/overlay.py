@@ -133,7 +133,9 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
 
     Returns:
         Figures by name: `overlay.obstacle_psnr.<lighting>`, `overlay.unshaded_psnr.<lighting>` [dB],
-        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and its pieces.
+        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and its pieces;
+        `overlay.shadow_rms.<lighting>`, how wrong the share is to which pixels beside the obstacle are dimmed by it
+        (those dimmed by 5 % in the twin or in truth), and `overlay.no_shadow_rms.<lighting>`, without any dimming.
     """
     scene = load_scene(scene_path)
     world, field = scene.world(), scene.field()
@@ -171,7 +173,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                     data.body(f"obstacle_{kind}").xpos,
                 )
                 true_eye, true_pose = to_truth.poses(eye), to_truth.poses(pose)
-                _, bare_depth = true_world.show(true_eye, None, true_pose)
+                bare, bare_depth = true_world.show(true_eye, None, true_pose)
                 wanted, depth = true_world.show(true_eye, kind, true_pose)
                 seen = depth < bare_depth - 1e-3
                 if seen.sum() < 20:
@@ -183,6 +185,15 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                     error = ((out.rgb[0] - wanted)[seen] ** 2).ravel()
                     errors[f"{name}.{lighting}"].append(error)
                     if name == "shaded":
+                        dimmed = [
+                            luminance(a) / np.maximum(luminance(b), 0.02)
+                            for a, b in ((wanted, bare), (out.rgb[0], empty.rgb[0]))
+                        ]
+                        ground = (
+                            ~seen & (out.depth[0] > empty.depth[0] - 1e-3) & ((dimmed[0] < 0.95) | (dimmed[1] < 0.95))
+                        )
+                        errors[f"shadow.{lighting}"].append((dimmed[1] - dimmed[0])[ground])
+                        errors[f"no_shadow.{lighting}"].append((1.0 - dimmed[0])[ground])
                         errors[f"kind.{kind}"].append(error)
                         mine = out.depth[0] < empty.depth[0] - 1e-3
                         ious[lighting].append((int((mine & seen).sum()), int((mine | seen).sum())))
@@ -203,6 +214,11 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
         figures[f"overlay.gain_over_unshaded.{lighting}"] = shaded - unshaded
         both, either = np.sum(ious[lighting], 0)
         figures[f"overlay.mask_iou.{lighting}"] = float(both / either)
+        # The true world's sky is light without direction, which nothing hides: only its sun throws shadows.
+        casts = any(shadow for _, _, shadow in LIGHTINGS[lighting].suns)
+        for name in ("shadow", "no_shadow") if casts else ():
+            off = np.concatenate(errors[f"{name}.{lighting}"])
+            figures[f"overlay.{name}_rms.{lighting}"] = float(np.sqrt((off**2).mean()))
         figures[f"overlay.places.{lighting}"] = len(ious[lighting])
     for kind in kinds:
         if errors[f"kind.{kind}"]:
@@ -226,6 +242,10 @@ def seen_touched(scene_path: Path) -> dict[str, Any]:
     looks = look(field, world, along_the_drive(drive.camera_to_world), field.lightings[0])
     found = compare(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
     return {f"seen_touched.{name}": value for name, value in found.items() if name != "along"}
+
+
+def luminance(rgb: np.ndarray) -> np.ndarray:
+    return rgb @ np.array([0.299, 0.587, 0.114])
 
 
 def error_db(errors: list[np.ndarray]) -> float:

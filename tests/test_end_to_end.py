@@ -123,3 +123,37 @@ def test_the_benchmark_of_the_field_runs(built, tmp_path):
     assert 0 < figures["render.first_frame_s"] < figures["render.first_frame_cold_s"]
     assert 0 < figures["depth.median_error_m"] < 5 and figures["train.peak_bytes"] > 1e8
     assert all(name in done.stdout for name in figures if name != "about")
+
+
+def test_it_is_driven_by_what_it_sees(built, tmp_path):
+    """The environment on a real build: pictures that are those of the field, the goal reached, a film."""
+    from twin.env.drivers import RouteDriver
+    from twin.env.episode import record
+
+    root, _ = built
+    environment = twin.load(root, "route", 0, lighting="overcast")
+    seen = []
+    episode = record(environment, RouteDriver(), lambda step: seen.append(step.observation["pixels"][-1]))
+    assert episode.success and episode.trust.min() > 0.5
+    field, world = twin.load_scene(root).field(), environment.task.world
+    view = twin.Viewpoints.of(environment.physics.camera_to_world, world.intrinsics, (160, 90))
+    wanted = field.render(view, "overcast").rgb[0] * 255
+    assert abs(seen[-1] - wanted).mean() < 1.0
+    film = tmp_path / "drive.mp4"
+    command = [sys.executable, "-m", "twin.film", str(root), "--task", "route", "--out", str(film), "--obstacles", "0"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0 and "goal after" in done.stdout and film.stat().st_size > 1e4, done.stderr[-3000:]
+
+
+def test_the_benchmark_of_the_environment_runs(built, tmp_path):
+    root, _ = built
+    script, file = Path(__file__).parents[1] / "benchmarks/env.py", tmp_path / "figures.json"
+    sections = ["speed", "memory", "driver", "audit", "soak", "trust", "gpu"]
+    command = [sys.executable, str(script), "--quick", "--scene", str(root), "--json", str(file), "--only", *sections]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    figures = json.loads(file.read_text())
+    assert figures["single.steps_per_s"] > 1 and figures["batch8.steps_per_s"] > 1
+    assert figures["driver.success"] == 1.0 and figures["driver.blind.route"] == 0.0
+    assert figures["soak.not_finite"] == 0 and figures["audit.false_successes"] == 0
+    assert figures["trust.pictures"] > 10 and isinstance(figures["gpu.available"], bool)

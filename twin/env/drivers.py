@@ -68,7 +68,12 @@ class PolicyDriver:
 
 
 def load_policy(name: str) -> PolicyDriver:
-    """The driver of a policy that is a Python callable, `module:function`; modules of the working folder are found.
+    """The driver of a policy that is a Python callable, see `find_callable`."""
+    return PolicyDriver(find_callable(name))
+
+
+def find_callable(name: str) -> Policy:
+    """The Python callable `module:function`; modules of the working folder are found.
 
     Raises:
         InputError: there is none of that name.
@@ -79,7 +84,6 @@ def load_policy(name: str) -> PolicyDriver:
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:
-        found = getattr(importlib.import_module(module), function)
+        return getattr(importlib.import_module(module), function)
     except (ModuleNotFoundError, AttributeError) as error:
         raise InputError(f"policy {name!r}: {error}") from None
-    return PolicyDriver(found)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 _PENUMBRA = 0.03, 0.10  # [m] half width at the foot, and per metre behind it: the sun's halo and what is unsure of it
 _FILLED = 0.85  # of a box's sides that an obstacle really fills
-_UNDER = 0.75  # of the sky that the ground straight below loses
+_UNDER = 0.75  # of the sky that the ground straight below loses, as no obstacle fills its box
 _SKY_REACH = 1.2  # [m] from an obstacle's side, of what is hidden of the sky
 _MOST_REACH = 4.0  # [m] of a shadow behind the foot
 _SKIN = 0.15  # [m] above or below the foot where a surface counts as the ground
@@ -93,12 +93,12 @@ def _lost(boxes: Array, points: Array, turn: Array, share: float, sun: Array) ->
     hidden = np.zeros(len(points))
     for low, high in boxes:
         center, half = 0.5 * (low + high)[:2], 0.5 * _FILLED * (high - low)[:2]
-        # The sky: beside a side that is so wide and so high.
+        # The sky, weighted with the cosine: an endless wall hides half of it, a box its share by width and height.
         gap = np.linalg.norm(np.maximum(np.abs(local - center) - half, 0.0), axis=1)
         wide = np.arctan2(float(half.mean()), gap) / np.pi
         gap2 = gap**2 + 1e-6
         rise = high[2] ** 2 / (high[2] ** 2 + gap2) - low[2] ** 2 / (low[2] ** 2 + gap2)
-        hidden = np.maximum(hidden, np.where(gap > 0.0, wide * rise, 0.5 * rise))
+        hidden = np.maximum(hidden, np.where(gap > 0.0, wide, _UNDER) * rise)
         # The sun: the box drawn out on the ground, away from it.
         middle = turn @ center
         axes = turn * half  # columns: half sides in the world
@@ -109,7 +109,7 @@ def _lost(boxes: Array, points: Array, turn: Array, share: float, sun: Array) ->
         shade = _step((across - v) / spread) + _step((across + v) / spread) - 1.0
         shade *= _step((u - start) / spread) + _step((end - u) / spread) - 1.0
         light *= 1.0 - np.clip(shade, 0.0, 1.0)
-    return share * (1.0 - light) + (1.0 - share) * np.minimum(2.0 * hidden, 1.0) * _UNDER
+    return share * (1.0 - light) + (1.0 - share) * hidden
 
 
 def _step(x: Array) -> Array:

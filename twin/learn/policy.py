@@ -1,0 +1,337 @@
+"""A policy as files: what drives, without torch and without the library it was trained by.
+
+    policy = load_policy("scenes/demo/runs/night_owl")
+    action = policy(pixels)                 # uint8 (12, 90, 160), the newest picture last → numbers in [-1, 1]
+    v, yaw_rate = policy.command(action)    # m/s, rad/s
+
+A *policy folder* holds
+
+    policy.json          what it expects and what its numbers mean (`Control`), sizes of the network, how it was trained
+    policy.safetensors   its weights
+    policy.onnx          both in one file, for a robot's computer that has ONNX Runtime and nothing of this package
+
+The first two are what is loaded; the network runs in ONNX Runtime. Files of others drive, too (see `load_policy`). None
+of these files can run code, except where the user says that a file is to be trusted.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as safetensors_load
+from safetensors.numpy import save as safetensors_save
+
+from twin.env.drivers import find_callable
+from twin.env.options import STEERING, TWIST
+from twin.errors import InputError
+from twin.learn.architecture import Architecture, Floats, onnx_bytes
+from twin.scene import digest_file, write_json
+
+Pictures = NDArray[np.uint8]
+Act = Callable[[Pictures], Floats]
+"""Stacks (n, 3 · stack, height, width) → actions (n, actions)."""
+
+JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
+FORMAT, VERSION = "twin policy", 1
+
+_LARGEST = 256 << 20  # [bytes] of a file that is read
+_NOTE = "twin"  # key of our metadata in an ONNX file
+
+
+@dataclass(frozen=True)
+class Control:
+    """What a policy expects, and what its numbers mean. A policy of unknown origin gets the defaults."""
+
+    action: str = STEERING
+    """steering: one number, the yaw rate; twist: two, speed and yaw rate."""
+    speed: float = 1.0
+    """The speed when steering; of a twist the highest, -1 meaning standstill [m/s]."""
+    yaw_rate: float = 1.0
+    """What 1 means, to the left [rad/s]."""
+    control_timestep: float = 0.1
+    """Between two actions, and between two pictures of a stack [s]."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a number out of range."""
+        if self.action not in (STEERING, TWIST):
+            raise ValueError(f"action = {self.action!r} is neither {STEERING!r} nor {TWIST!r}")
+        for name, most in (("speed", 10.0), ("yaw_rate", 10.0), ("control_timestep", 1.0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= most:
+                raise ValueError(f"{name} = {value!r} is not in (0, {most:g}]")
+
+    @property
+    def actions(self) -> int:
+        """Numbers in an action."""
+        return 1 if self.action == STEERING else 2
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What drives. Deterministic: the same pictures give the same action."""
+
+    name: str
+    act: Act
+    """Stacks uint8 (n, 3 · stack, height, width) → actions float32 (n, actions), before they are checked."""
+    control: Control
+    size: tuple[int, int] = (160, 90)
+    """Width, height of the pictures [px]."""
+    stack: int = 4
+    trained: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Of a policy folder: scene, task, run, step, and so on."""
+
+    def actions(self, stacks: Pictures) -> Floats:
+        """Stacks uint8 (n, 3 · stack, height, width) → actions (n, actions), each number in [-1, 1].
+
+        Raises:
+            InputError: stacks it does not take, or an answer that is no action.
+        """
+        width, height = self.size
+        expected = (3 * self.stack, height, width)
+        if stacks.dtype != np.uint8 or stacks.shape[1:] != expected:
+            raise InputError(
+                f"policy {self.name}: pictures {stacks.dtype} {stacks.shape[1:]}; expected uint8 {expected}, "
+                f"the last {self.stack} pictures of {width} × {height} px, the newest last"
+            )
+        out = np.asarray(self.act(stacks), np.float32)
+        if out.shape != (len(stacks), self.control.actions) or not np.isfinite(out).all():
+            raise InputError(
+                f"policy {self.name}: answered {out.shape} to {len(stacks)} stacks; expected "
+                f"{(len(stacks), self.control.actions)}, finite ({self.control.action})"
+            )
+        return np.clip(out, -1.0, 1.0)
+
+    def __call__(self, stack: Pictures) -> Floats:
+        """One stack uint8 (3 · stack, height, width) → its action (actions,)."""
+        return self.actions(stack[None])[0]
+
+    def command(self, action: Floats) -> tuple[float, float]:
+        """Speed [m/s] and yaw rate [rad/s] that an action (actions,) means."""
+        c = self.control
+        v = c.speed if c.action == STEERING else (float(action[0]) + 1.0) / 2.0 * c.speed
+        return v, float(action[-1]) * c.yaw_rate
+
+    def options(self) -> dict[str, Any]:
+        """Keywords for `twin.load`: the environment that it can drive in."""
+        return {**dataclasses.asdict(self.control), "size": self.size, "stack": self.stack}
+
+
+def save_policy(
+    folder: Path, architecture: Architecture, control: Control, weights: dict[str, Floats], trained: dict[str, Any]
+) -> None:
+    """Writes a policy folder's files; policy.json comes last, without which there is no policy.
+
+    Args:
+        folder: Made if need be.
+        architecture: Sizes of the network.
+        control: What its numbers mean.
+        weights: See `Architecture.shapes`.
+        trained: How it came about, JSON-able.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = {name: np.ascontiguousarray(weights[name], np.float32) for name in architecture.shapes()}
+    head = {"control": dataclasses.asdict(control), "network": dataclasses.asdict(architecture)}
+    (folder / JSON).unlink(missing_ok=True)
+    (folder / WEIGHTS).write_bytes(safetensors_save(weights))
+    note = json.dumps({"format": FORMAT, "version": VERSION, **head, "trained": trained})
+    (folder / ONNX).write_bytes(onnx_bytes(architecture, weights, {_NOTE: note}))
+    sums = {"weights_sha256": digest_file(folder / WEIGHTS)}
+    write_json(folder / JSON, {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained})
+
+
+def load_policy(source: str | Path, trust: bool = False) -> Policy:
+    """The policy that is meant by
+
+    - a policy folder, such as a run, or a checkpoint of one (or its policy.json);
+    - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) of values 0 to 255, and one output
+      (n, 1 or 2) in [-1, 1];
+    - `module:function`, a callable of one stack uint8 (3 · stack, height, width); it is the user's own code;
+    - a zip of stable-baselines3, where it is to be trusted: loading one runs what code is in it.
+
+    Args:
+        source: A path, or `module:function`.
+        trust: Whether a file may run code.
+
+    Raises:
+        InputError: there is none, or it is not whole, or not what it should be.
+    """
+    path = Path(source)
+    if path.name == JSON:
+        path = path.parent
+    if path.is_dir():
+        return _from_folder(path)
+    if path.is_file() and path.suffix == ".onnx":
+        return _from_onnx(path)
+    if path.is_file() and path.suffix == ".zip":
+        if not trust:
+            raise InputError(f"{path}: a stable-baselines3 zip runs code when it is loaded; if you trust it, --trust")
+        return _from_zip(path)
+    if path.exists():
+        raise InputError(f"{path}: expected a policy folder, an .onnx file or a stable-baselines3 .zip")
+    if ":" in str(source):
+        return _from_callable(str(source))
+    raise InputError(f"no policy {source}; expected a run's folder, an .onnx file or module:function")
+
+
+def _from_folder(folder: Path) -> Policy:
+    head = _head(_json_of(folder / JSON), folder / JSON)
+    architecture, control = _parts(head, folder / JSON)
+    path = folder / WEIGHTS
+    blob = _read(path)
+    if digest_file(path) != head.get("weights_sha256"):
+        raise InputError(f"{path} is not the file that {JSON} was written with; copy the whole run again")
+    try:
+        weights = safetensors_load(blob)
+    except SafetensorError as error:
+        raise InputError(f"{path} is no safetensors file: {error}") from None
+    for name, shape in architecture.shapes().items():
+        found = weights.get(name)
+        if found is None or found.shape != shape or found.dtype != np.float32 or not np.isfinite(found).all():
+            what = "missing" if found is None else f"{found.dtype} {found.shape}, or not finite"
+            raise InputError(f"{path}: {name} is {what}; expected float32 {shape}, as {JSON} says")
+    act = _session(onnx_bytes(architecture, weights, {}), path)
+    return Policy(_name(folder), act, control, architecture.size, architecture.stack, head.get("trained", {}))
+
+
+def _from_onnx(path: Path) -> Policy:
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.load_model_from_string(_read(path))
+        if any(one.data_location == onnx.TensorProto.EXTERNAL for one in _tensors(model.graph)):
+            raise InputError(f"{path} keeps its weights in other files; save it with its weights inside")
+        onnx.checker.check_model(model)
+    except (DecodeError, onnx.checker.ValidationError) as error:
+        raise InputError(f"{path} is no ONNX file: {error}") from None
+    names = {one.name for one in model.graph.initializer}
+    inputs = [one for one in model.graph.input if one.name not in names]
+    shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
+    if len(inputs) != 1 or len(shapes) != 2 or len(shapes[0]) != 4 or shapes[0][1] % 3 or 0 in shapes[0][1:]:
+        raise InputError(
+            f"{path}: inputs and outputs {shapes}; expected one input (n, 3 · stack, height, width) and one output "
+            "(n, 1 or 2)"
+        )
+    _, channels, height, width = shapes[0]
+    notes = {one.key: one.value for one in model.metadata_props}
+    control, trained = Control(STEERING if shapes[1][-1] == 1 else TWIST), {}
+    if _NOTE in notes:
+        try:
+            head = _head(json.loads(notes[_NOTE]), path)
+        except json.JSONDecodeError as error:
+            raise InputError(f"{path}: its metadata are no JSON: {error}") from None
+        control, trained = _parts(head, path)[1], head.get("trained", {})
+    act = _session(model.SerializeToString(), path)
+    return Policy(path.stem, act, control, (width, height), channels // 3, trained)
+
+
+def _tensors(graph: Any) -> Iterator[Any]:
+    """Every constant of an ONNX graph and of the graphs within it."""
+    yield from graph.initializer
+    for attribute in (a for node in graph.node for a in node.attribute):
+        yield from (attribute.t, *attribute.tensors)
+        for inner in (attribute.g, *attribute.graphs):
+            yield from _tensors(inner) if inner.node or inner.initializer else ()
+
+
+def _from_callable(name: str) -> Policy:
+    function = find_callable(name)
+
+    def act(stacks: Pictures) -> Floats:
+        return np.stack([np.asarray(function(stack), np.float32) for stack in stacks])
+
+    answer = np.asarray(function(np.zeros((12, 90, 160), np.uint8)), float)
+    if answer.shape not in ((1,), (2,)):
+        raise InputError(f"policy {name}: answered {answer!r}; expected 1 number in [-1, 1] (steering) or 2 (twist)")
+    return Policy(name, act, Control(STEERING if answer.shape == (1,) else TWIST))
+
+
+def _from_zip(path: Path) -> Policy:
+    try:
+        from stable_baselines3 import SAC
+    except ImportError:
+        raise InputError(f"{path}: needs stable-baselines3; pip install twin[learn]") from None
+    try:
+        model = SAC.load(path, device="cpu")
+    except Exception as error:  # whatever is in the zip: any of a pickle's and a zip's errors
+        raise InputError(f"{path}: no SAC of stable-baselines3: {type(error).__name__}: {error}") from None
+    shape, actions = model.observation_space.shape, model.action_space.shape
+    if shape is None or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
+        raise InputError(f"{path}: takes {shape}, gives {actions}; expected (3 · stack, height, width), 1 or 2 numbers")
+    control = Control(STEERING if actions == (1,) else TWIST)
+
+    def act(stacks: Pictures) -> Floats:
+        return model.predict(stacks, deterministic=True)[0]
+
+    return Policy(path.stem, act, control, (shape[2], shape[1]), shape[0] // 3)
+
+
+def _session(model: bytes, path: Path) -> Act:
+    import onnxruntime
+
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads = settings.inter_op_num_threads = 1  # worlds run in parallel, and order is fixed
+    settings.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's exceptions share no base but this
+        raise InputError(f"{path}: ONNX Runtime refuses it: {error}") from None
+    (given,) = session.get_inputs()
+    kinds = {"tensor(uint8)": np.uint8, "tensor(float)": np.float32}
+    if given.type not in kinds:
+        raise InputError(f"{path}: takes {given.type}; expected uint8 or float32 pictures of values 0 to 255")
+
+    def act(stacks: Pictures) -> Floats:
+        return session.run(None, {given.name: stacks.astype(kinds[given.type], copy=False)})[0]
+
+    return act
+
+
+def _head(head: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(head, dict) or head.get("format") != FORMAT:
+        raise InputError(f"{path}: not a policy of twin (format {FORMAT!r})")
+    if head.get("version") != VERSION:
+        raise InputError(f"{path}: version {head.get('version')!r}; expected {VERSION}: it was written by another twin")
+    return head
+
+
+def _parts(head: dict[str, Any], path: Path) -> tuple[Architecture, Control]:
+    try:
+        network = dict(head["network"])
+        network["size"], network["hidden"] = tuple(network["size"]), tuple(network["hidden"])
+        network["convolutions"] = tuple(tuple(one) for one in network["convolutions"])
+        architecture, control = Architecture(**network), Control(**head["control"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}") from None
+    if architecture.actions != control.actions:
+        raise InputError(f"{path}: {architecture.actions} actions; expected {control.actions} ({control.action})")
+    return architecture, control
+
+
+def _json_of(path: Path) -> Any:
+    if not path.exists():
+        raise InputError(f"{path.parent} holds no {JSON}: not a policy folder, or a run that has not come to one yet")
+    try:
+        return json.loads(_read(path).decode("utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is no JSON: {error}") from None
+
+
+def _read(path: Path) -> bytes:
+    if not path.is_file():
+        raise InputError(f"{path} is missing; copy the whole run")
+    if path.stat().st_size > _LARGEST:
+        raise InputError(f"{path} has {path.stat().st_size >> 20} MiB; expected at most {_LARGEST >> 20}")
+    return path.read_bytes()
+
+
+def _name(folder: Path) -> str:
+    """`run`, or `run/checkpoint`."""
+    folder = folder.resolve()
+    return f"{folder.parent.parent.name}/{folder.name}" if folder.parent.name == "checkpoints" else folder.name
