@@ -92,6 +92,15 @@ class HuskyParams:
     wheel_radius: tuple[float, float] = (WHEEL_RADIUS, WHEEL_RADIUS)
     """Effective radius of the left and of the right tyres [m]: pressure and wear. The robot's own controller goes on
     reckoning with the nominal one."""
+    spin_friction: float = 1e-4
+    """Of a tyre's contact patch turning on the spot: moment / load [m]. Next to nothing by default, for the scrubbing
+    of four wheels dominates on hard ground; tyres that sink in have a long patch."""
+    slip_stiffness: float = 10.0
+    """How stiffly friction holds a tyre, against how stiffly the ground carries it (MuJoCo's `impratio`). Below 1 tyres
+    creep as on soft ground: force grows with the speed of slip before they slide."""
+    ground_viscosity: float = 0.0
+    """Of what the wheels wade through, such as long grass, mud or snow [Pa s]; none by default. It drags the tyres back
+    with about 2.4 N per Pa s and m/s each, so it grows with speed, and turns harder the faster."""
     wheel_shape: str = "ellipsoid"
     """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
 
@@ -180,6 +189,9 @@ _RANGES: dict[str, tuple[float, float]] = {
     "friction": (0.01, 3.0),
     "rolling_resistance": (0.0, 0.5),
     "wheel_radius": (0.1, 0.25),
+    "spin_friction": (0.0, 1.0),
+    "slip_stiffness": (1e-3, 1e3),
+    "ground_viscosity": (0.0, 1e3),
     "servo_gain": (1.0, 1e5),
     "servo_lag": (0.0, 2.0),
     "motor_inertia": (0.0, 5.0),

@@ -92,7 +92,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.modelname = config.name or "twin"
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
-    husky.set_options(spec)
+    husky.set_options(spec, config.robot)
     # Spares MuJoCo the poses of thousands of geoms that never move; what has motors, the robot, never sleeps.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_surroundings(spec)

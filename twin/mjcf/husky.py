@@ -3,7 +3,8 @@
 Names, for whoever scripts it: body and free joint `base_link`; bodies and joints `<front|rear>_<left|right>_wheel`;
 actuators `left` and `right`, commanded in wheel speed [rad/s]; camera `front` (160 × 90) and `front_native`, the same
 at its native size; site `imu`; sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`,
-`<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`.
+`<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`;
+`chassis_dry` touches nothing.
 
 `python -m twin.mjcf.husky` writes the robot alone to `twin/assets/husky/husky.xml`, for anyone's own scene:
 
@@ -58,20 +59,24 @@ _COLLISION_BOXES = (  # full size, centre in the base [m]
 _WHEEL_SOLIMP = (0.0, 0.95, 0.0025, 0.5, 2.5)
 _WHEEL_SOLREF = (0.02, 2.0)  # damped twice as much as critically: an eighth less shaking on a height field
 _IMU_POSITION = (0.19, 0.0, 0.149)  # in the base [m]
-_TORSIONAL = 1e-4  # [m] spin friction of the contact patch; next to nothing, the scrubbing of four wheels dominates
 
 ROBOT_GROUP = 4
 """Geom group of the robot's collision shapes; its looks are in group 1."""
 
 
-def set_options(spec: mujoco.MjSpec) -> None:
-    """Solver settings under which skid steering behaves: see the figures in the module's tests."""
+def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
+    """Solver settings under which skid steering behaves: see the figures in the module's tests.
+
+    The ground's softness is in them (`slip_stiffness`, `ground_viscosity`), as MuJoCo knows it for a whole world only.
+    """
+    params = params or HuskyParams()
     spec.option.timestep = TIMESTEP
     # Euler and RK4 misbehave with a stiff speed servo; implicitfast takes its damping into the mass matrix.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # The pyramidal cone reads the right chi with a torque 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
+    spec.option.impratio = params.slip_stiffness
+    spec.option.viscosity = params.ground_viscosity
     # At the default 1e-8 Newton takes twice the iterations to the same motion.
     spec.option.tolerance = 1e-5
 
@@ -106,6 +111,17 @@ def add_husky(
             group=ROBOT_GROUP,
             rgba=(0.2, 0.2, 0.8, 0.4),
         )
+    # What tyres wade through drags the tyres alone. MuJoCo's fluid acts on every body, unless one of its geoms is said
+    # to be an ellipsoid in it: then on that geom only. So the chassis gets one too small to be felt.
+    base.add_geom(
+        name="chassis_dry",
+        size=(1e-3, 1e-3, 1e-3),
+        mass=0,
+        contype=0,
+        conaffinity=0,
+        fluid_ellipsoid=True,
+        group=ROBOT_GROUP,
+    )
     wheels = {name: _add_wheel(base, name, i, params) for i, name in enumerate(WHEELS)}
     for side in SIDES:
         _add_drive(spec, side, params)
@@ -160,9 +176,10 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
         condim=6,
         priority=1,
         # A rolling friction coefficient [m] over the radius is Crr.
-        friction=(params.friction, _TORSIONAL, max(params.rolling_resistance * radius, 1e-5)),
+        friction=(params.friction, params.spin_friction, max(params.rolling_resistance * radius, 1e-5)),
         solimp=_WHEEL_SOLIMP,
         solref=_WHEEL_SOLREF,
+        fluid_ellipsoid=True,
         **shapes[params.wheel_shape],
     )
     return wheel

@@ -1,0 +1,395 @@
+"""Alignment: logs in, what they show of a robot out. Truth is a simulated robot's own parameters."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive_logs import columns, write_csv
+from twin.align import main
+from twin.alignment import commands, currents, ground, kinematics, logs, slope
+from twin.alignment.aligned import align, robot_toml
+from twin.alignment.checks import check
+from twin.alignment.identify import Parameter, bend, fit
+from twin.alignment.kinematics import Icr
+from twin.config import parse, read_robot
+from twin.env.controller import Controller
+from twin.errors import InputError
+from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
+
+SOFT = HuskyParams(
+    friction=0.45,
+    spin_friction=0.03,
+    ground_viscosity=4.0,
+    slip_stiffness=0.2,
+    center_of_mass=(-0.06, 0.0, 0.062),
+    command_latency=0.2,
+    servo_lag=0.12,
+    max_acceleration=2.0,
+    max_yaw_acceleration=3.0,
+    max_yaw_rate=1.4,
+    separation_multiplier=1.6,
+)
+
+
+@pytest.fixture(scope="module")
+def drive() -> dict[str, np.ndarray]:
+    """Two and a half minutes on soft ground."""
+    return columns(SOFT, 150.0, seed=1)
+
+
+def windows_of(wheels: np.ndarray, poses: np.ndarray | None = None, **others) -> logs.Windows:
+    n, k = wheels.shape[:2]
+    return logs.Windows(
+        **{
+            "commands": wheels.copy(),
+            "twist": False,
+            "wheels": wheels,
+            "poses": np.zeros((n, k + 1, 3)) if poses is None else poses,
+            "groups": np.arange(n),
+            "follows": np.zeros(n, bool),
+        }
+        | others
+    )
+
+
+def test_arc_in_closed_form():
+    """Constant wheel speeds make a circle: radius and angle are known."""
+    left, right = 2.0, 5.0
+    wheels = np.broadcast_to([left, right], (1, logs.SAMPLES, 2)).copy()
+    poses = kinematics.predict(kinematics.NOMINAL, windows_of(wheels))
+    rate = (right - left) * WHEEL_RADIUS / TRACK
+    radius = (right + left) * WHEEL_RADIUS / 2 / rate
+    angle = rate * logs.DURATION
+    x, y, yaw = poses[0, logs.SAMPLES]
+    # Twenty chords a second instead of the arc are short by a share of (rate · period)² / 24.
+    assert x == pytest.approx(radius * np.sin(angle), rel=1e-4)
+    assert y == pytest.approx(radius * (1 - np.cos(angle)), rel=1e-4)
+    assert yaw == pytest.approx(angle)
+
+
+def test_icr_of_icr_motion_is_found():
+    rng = np.random.default_rng(0)
+    truth = Icr(0.93, 0.97, 0.55, -0.62, -0.08)
+    wheels = np.repeat(rng.uniform(-6, 6, (60, 1, 2)), logs.SAMPLES, 1)
+    poses = kinematics.predict(truth, windows_of(wheels))[:, : logs.SAMPLES + 1]
+    poses[::7] = 0.0  # the robot stuck in every seventh window
+    found = kinematics.fit_icr(windows_of(wheels, poses))
+    for name in truth.__dataclass_fields__:
+        assert getattr(found, name) == pytest.approx(getattr(truth, name), abs=2e-3)
+
+
+def test_bent_residuals_count_as_logarithms():
+    error = np.random.default_rng(0).normal(size=(5, 2, 3)) * np.logspace(-6, 3, 5)[:, None, None]
+    mean_square = (error**2).sum((1, 2)) / 2
+    assert (bend(error) ** 2).sum((1, 2)) == pytest.approx(np.log1p(mean_square), rel=1e-6)
+
+
+def test_stale_poses_count_from_when_they_appeared():
+    poses = np.zeros((2, logs.SAMPLES + 1, 3))
+    poses[0, :, 0] = np.arange(logs.SAMPLES + 1) // 2  # 10 Hz, the first pose fresh
+    poses[1, :, 0] = (np.arange(logs.SAMPLES + 1) + 1) // 2  # 10 Hz, the first pose one sample old
+    elapsed = windows_of(np.zeros((2, logs.SAMPLES, 2)), poses).elapsed
+    assert elapsed[0, :5] == pytest.approx([0, 0, 0.1, 0.1, 0.2])
+    assert elapsed[1, :5] == pytest.approx(np.array([0, 1, 1, 3, 3]) * 0.05 + 0.05)
+
+
+def test_commands_become_the_controllers_wheel_speeds():
+    """The smooth arithmetic against the robot's controller itself, run at every phase of its 0.1 s."""
+    params = replace(SOFT, servo_lag=0.0)
+    request = (0.7, 0.9)
+    speeds = []
+    for phase in np.arange(10) * 0.01:
+        controller, told, rows = Controller(params), np.zeros(2), []
+        for i in range(200):
+            if i % 10 == 0:
+                controller.command(i * 0.01, *request)
+            if (i - round(phase * 100)) % 10 == 0 and i * 0.01 >= phase:
+                told = controller.update(i * 0.01)
+            rows.append(told)
+        speeds.append(rows)
+    windows = windows_of(np.zeros((1, logs.SAMPLES, 2)), commands=np.full((1, logs.SAMPLES, 2), request), twist=True)
+    told, _ = commands.targets(commands.Drive.of(params, True), windows)
+    mean = np.mean(speeds, 0)
+    assert np.abs(told[0, :200] - mean).max() < 0.3  # of 6 rad/s; the ramp's ends are rounder in the mean
+    assert np.abs(told[0, 190:200] - mean[190:]).max() < 1e-6
+
+
+def test_slope_is_found_from_accelerations():
+    """A robot that turns on a slope: gravity in its own frame turns the other way, whatever constant the IMU adds."""
+    n, truth = 72, np.array([0.5, -0.3])
+    rate = np.linspace(-0.3, 0.3, n)
+    wheels = np.repeat((rate[:, None] * [-1, 1] * TRACK / 2 / WHEEL_RADIUS)[:, None], logs.SAMPLES, 1)
+    windows = windows_of(wheels)
+    yaw = kinematics.predict(kinematics.NOMINAL, windows)[:, : logs.SAMPLES, 2]
+    start = np.linspace(0, 4 * np.pi, n, endpoint=False)  # headings all around, so the constant is told from the slope
+    down = (truth[0] + 1j * truth[1]) * np.exp(-1j * (start[:, None] + yaw))
+    acceleration = -np.stack([down.real, down.imag], -1) + [0.4, -0.2]
+    found = slope.gravity(replace(windows, acceleration=acceleration), kinematics.NOMINAL)
+    expected = (truth[0] + 1j * truth[1]) * np.exp(-1j * start)
+    assert found[:, 0] + 1j * found[:, 1] == pytest.approx(expected, abs=0.1)
+    assert not slope.gravity(windows, kinematics.NOMINAL).any()
+
+
+def test_averaging_slopes_turns_them_into_one_frame():
+    turn = np.array([0.3, -0.7, 1.1, 0.2])
+    heading = np.concatenate([[0.0], np.cumsum(turn)[:-1]])
+    vector = 0.8 * np.exp(1j * (0.4 - heading))  # one slope, seen from four headings
+    follows = np.array([False, True, True, True])
+    assert slope._averaged(vector, turn, follows) == pytest.approx(vector)
+
+
+def test_a_slope_pulls_downhill():
+    """On one and the same slope the robot creeps down it while it scrubs, whatever way it started to face."""
+    told = np.full((2, 210, 2), [-3.0, 3.0])
+    level = np.zeros((2, 2))
+    steep = np.array([[0.0, -1.0], [0.0, 1.0]])
+    start = told[:, 0]
+    still = ground.drive(SOFT, told, start, level, 0.005).poses
+    moved = ground.drive(SOFT, told, start, steep, 0.005).poses
+    shift = (moved - still)[:, -1, 1]
+    assert shift[0] < -0.05
+    assert shift[1] > 0.05
+
+
+def test_tyres_in_grass_are_dragged_and_the_chassis_is_not():
+    import mujoco
+
+    from twin.alignment.simulate import plane_model
+
+    def drag(params: HuskyParams) -> np.ndarray:
+        model = plane_model(params)
+        data = mujoco.MjData(model)
+        data.qvel[0] = 0.5
+        mujoco.mj_forward(model, data)
+        return data.qfrc_fluid[:3].copy()
+
+    assert not drag(HuskyParams()).any()
+    # Stokes drag of a sphere as wide as the tyre on the mean, four of them (MuJoCo's ellipsoid model).
+    width = 2 * (0.1651 + 0.1143 / 2 + 0.1651) / 3
+    assert drag(HuskyParams(ground_viscosity=5.0))[0] == pytest.approx(-4 * 3 * np.pi * width * 5.0 * 0.5, rel=0.01)
+
+
+def test_identified_are_what_residuals_move():
+    """A line through noise: slope and offset come out with their textbook errors; what does nothing is refused."""
+    rng = np.random.default_rng(3)
+    x = np.linspace(-1, 1, 400)
+    y = 2.0 * x + 0.5 + rng.normal(0, 0.1, 400)
+    table = [
+        Parameter("slope", 0.0, 1.0, -10, 10, 1.0, ""),
+        Parameter("offset", 0.0, 1.0, -10, 10, 0.0, ""),
+        Parameter("nothing", 3.0, 1.0, -10, 10, 7.0, "m", "another log"),
+    ]
+    found = fit(table, lambda v: (v["slope"] * x + v["offset"] + 0 * v["nothing"] - y)[:, None, None], np.arange(400))
+    assert found.values["slope"] == pytest.approx(2.0, abs=0.03)
+    assert found.errors["slope"] == pytest.approx(0.1 / np.sqrt((x**2).sum()), rel=0.2)
+    assert found.errors["offset"] == pytest.approx(0.1 / 20, rel=0.2)
+    assert found.values["nothing"] == 7.0
+    assert "nothing = 7 m" in found.refused["nothing"]
+    assert "another log" in found.refused["nothing"]
+
+
+def test_two_that_do_the_same_are_not_both_identified():
+    rng = np.random.default_rng(0)
+    x, noise = rng.normal(size=200), 0.1 * rng.normal(size=200)
+    table = [Parameter(name, 0.0, 1.0, -10, 10, 0.0, "") for name in ("a", "b")]
+    found = fit(table, lambda v: ((v["a"] + v["b"] - 1.0) * x + noise)[:, None, None], np.arange(200))
+    assert len(found.errors) == 1
+    assert sum(found.values.values()) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_known_robot_is_recovered(drive, tmp_path):
+    """Drive with known parameters, fit, and get them back; held-out windows are met far better than by kinematics."""
+    windows = logs.cut(drive, "log")
+    result = align(windows, HuskyParams(), "log")
+    found = result.identified
+    for name, tolerance in {
+        "command_latency": 0.05,
+        "servo_lag": 0.04,
+        "max_acceleration": 0.2,
+        "max_yaw_acceleration": 0.3,
+        "separation_multiplier": 0.05,
+        "friction": 0.07,
+        "ground_viscosity": 1.0,
+    }.items():
+        assert found[name][0] == pytest.approx(getattr(SOFT, name), abs=tolerance), name
+    assert found["center_of_mass"][0][0] == pytest.approx(-0.06, abs=0.015)
+    assert found["wheel_radius"][0] == pytest.approx((WHEEL_RADIUS, WHEEL_RADIUS), abs=0.003)
+    assert "rolling_resistance" not in found  # no torque in the log
+    assert any(line.startswith("rolling_resistance = 0.015") for line in result.refused)
+    held_out = ~windows.fitting
+    ours, theirs = result.fitted.score(held_out), result.baseline.score(held_out)
+    assert ours.position_m < min(0.03, theirs.position_m / 2)
+    assert ours.yaw_deg < min(2.0, theirs.yaw_deg / 2)
+    assert ours.wheels_rad_s < 0.15
+    # What is written is read back by the scene.
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_toml(result, {"camera_pitch": 7.0, "friction": 0.1}, "log"), encoding="utf-8")
+    robot = parse(HuskyParams, read_robot(path), "robot.toml")
+    assert robot.camera_pitch == 7.0
+    assert robot.friction == pytest.approx(result.robot.friction, rel=1e-4)
+    assert robot.center_of_mass == pytest.approx(result.robot.center_of_mass, abs=1e-4)
+
+
+def _bad(table: dict[str, np.ndarray], **changes) -> dict[str, np.ndarray]:
+    return table | changes
+
+
+def _with_nan(column: np.ndarray) -> np.ndarray:
+    column = column.copy()
+    column[37] = np.nan
+    return column
+
+
+BAD = {
+    "nan": (lambda t: _bad(t, yaw=_with_nan(t["yaw"])), r"yaw is nan at row 38 .*cut those rows out"),
+    "time": (
+        lambda t: _bad(t, time=np.where(np.arange(len(t["time"])) == 50, 0.0, t["time"])),
+        r"time goes from 2\.450 to 0\.000 s at row 51; expected it to increase",
+    ),
+    "yaw in degrees": (lambda t: _bad(t, yaw=np.degrees(t["yaw"])), r"yaw looks like degrees; multiply it by π/180"),
+    "yaw too small": (lambda t: _bad(t, yaw=np.radians(t["yaw"])), r"yaw looks π/180 times too small"),
+    "wheels in degrees": (
+        lambda t: _bad(t, **{n: np.degrees(t[n]) for n in logs.WHEEL_SPEEDS}),
+        r"wheel speeds look like °/s; multiply them by π/180",
+    ),
+    "wheels in m/s": (
+        lambda t: _bad(t, **{n: t[n] * WHEEL_RADIUS for n in logs.WHEEL_SPEEDS}),
+        r"wheel speeds look like m/s",
+    ),
+    "command in degrees": (
+        lambda t: _bad(t, cmd_yaw_rate=np.degrees(t["cmd_yaw_rate"])),
+        r"cmd_yaw_rate looks like degrees",
+    ),
+    "missing": (lambda t: {k: v for k, v in t.items() if k != "left_wheel_vel"}, r"no column left_wheel_vel among"),
+    "short": (lambda t: {k: v[:400] for k, v in t.items()}, r"windows of 2 s to fit to .*expected at least 20 and 10"),
+    "lengths": (lambda t: _bad(t, x=t["x"][:-1]), r"columns of different lengths"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_logs_get_one_line(kind, drive, tmp_path, capsys):
+    change, message = BAD[kind]
+    path = tmp_path / "log.npz"
+    np.savez(path, **change(drive))
+    assert main(["husky", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    import re
+
+    assert re.search(message, said), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_few_turns(tmp_path):
+    table = columns(HuskyParams(), 130.0, seed=2, strong=False)
+    with pytest.raises(InputError, match=r"0 windows turn left and 0 right .*drive more turns"):
+        check(logs.cut(table, "log"), "log")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere", "x.csv"], "no scene.toml there"),
+        (["husky", "x.csv"], "give one with --out"),
+        (["husky", "x.csv", "--out", "out"], "no such log"),
+    ],
+)
+def test_bad_arguments(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_csv_and_npz_are_the_same_log(drive, tmp_path):
+    np.savez(tmp_path / "log.npz", **drive)
+    one = logs.read_log(write_csv(tmp_path / "log.csv", drive))
+    other = logs.read_log(tmp_path / "log.npz")
+    assert np.array_equal(one.poses, other.poses)
+    assert np.array_equal(one.wheels, other.wheels)
+    assert one.follows[1:].all()
+    assert len(one) == 74
+
+
+def test_nothing_in_an_npz_runs_code(tmp_path):
+    np.savez(tmp_path / "log.npz", time=np.array([{"a": 1}], object))
+    with pytest.raises(InputError, match=r"not an \.npz of plain arrays"):
+        logs.read_log(tmp_path / "log.npz")
+
+
+def test_gaps_are_left_out(drive):
+    keep = (drive["time"] < 20.0) | (drive["time"] > 23.0)
+    windows = logs.cut({name: column[keep] for name, column in drive.items()}, "log")
+    assert len(windows) == 74 - 3
+    assert (~windows.follows).sum() == 2  # the first, and the first after the gap
+
+
+def test_bag_is_the_same_log(drive, tmp_path):
+    pytest.importorskip("rosbags")
+    from tests.ros_bag import write_bag
+
+    rows = {name: column[:900] for name, column in drive.items()}
+    bag = logs.read_log(write_bag(tmp_path / "bag", rows))
+    table = logs.cut(rows, "log")
+    assert len(bag) == len(table)
+    for name in ("commands", "wheels", "poses", "acceleration"):
+        assert getattr(bag, name) == pytest.approx(getattr(table, name), abs=1e-6), name
+
+
+def test_a_bag_without_commands(drive, tmp_path):
+    pytest.importorskip("rosbags")
+    from tests.ros_bag import write_bag
+
+    bag = write_bag(tmp_path / "bag", {name: column[:50] for name, column in drive.items()}, without=("commands",))
+    with pytest.raises(InputError, match=r"no topic with commands .*record it"):
+        logs.read_log(bag)
+
+
+def test_effort_of_motors():
+    """Made-up currents: the right side, outer in a left turn, takes three times a straight drive's, the left half."""
+    speeds = np.concatenate([np.full((50, 2), 0.5), np.full((50, 2), [0.4, 0.6])])
+    amps = np.concatenate([np.full((50, 2), 2.0), np.full((50, 2), [1.0, 6.0])])
+    effort = currents.measured_effort(currents.Steady(speeds, amps))
+    assert (effort.outer, effort.inner, effort.total) == pytest.approx((3.0, 0.5, 1.75))
+
+
+def test_rolling_resistance_that_currents_show_is_found():
+    rng = np.random.default_rng(0)
+    turning = rng.uniform(0.25, 0.4, (40, 1)) + np.array([[-0.06, 0.06]])
+    speeds = np.concatenate([np.full((40, 2), 0.6), turning])
+    truth = HuskyParams(rolling_resistance=0.05)
+    steady = currents.Steady(speeds, np.ones_like(speeds))
+    effort = currents.simulated_effort(steady, truth)
+    amps = np.concatenate([np.ones((40, 2)), np.full((40, 2), [effort.inner, effort.outer])])
+    found = currents.rolling_resistance_of(currents.Steady(speeds, amps), HuskyParams())
+    assert found == pytest.approx(0.05, rel=0.05)
+
+
+@pytest.mark.realdata
+def test_published_windows_are_read(real_data: Path):
+    windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
+    assert len(windows) == 402
+    assert set(windows.groups % 2) == {0, 1}
+    check(windows, "log")
+    # The IMU's axes after reading: it is pushed forward when wheels speed up, and into the turn.
+    motion = kinematics.fit_icr(windows).motion(windows.wheels)
+    speeding = np.gradient(motion[..., 0], logs.PERIOD, axis=1).ravel()
+    inward = (motion[..., 0] * motion[..., 2]).ravel()
+    assert np.corrcoef(speeding, windows.acceleration[..., 0].ravel())[0, 1] > 0.1
+    assert np.corrcoef(inward, windows.acceleration[..., 1].ravel())[0, 1] > 0.08
+
+
+@pytest.mark.realdata
+def test_kinematic_baselines_on_the_real_log(real_data: Path):
+    """The figures that others got from the same log: 0.45 m and 70° nominal, 0.18 m and 7° with a fitted ICR model."""
+    windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
+    held_out = ~windows.fitting
+    distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
+    assert np.median(distance[held_out]) == pytest.approx(0.45, abs=0.02)
+    assert 65 < np.median(angle[held_out]) < 85
+    model = kinematics.fit_icr(windows.of(windows.fitting))
+    distance, angle = kinematics.end_errors(kinematics.predict(model, windows), windows)
+    assert np.median(distance[held_out]) == pytest.approx(0.18, abs=0.01)
+    assert np.median(angle[held_out]) == pytest.approx(6.6, abs=0.6)

@@ -1,0 +1,232 @@
+"""The whole alignment of a robot to a log, and what is written of it.
+
+`robot.toml` gets what the log identified, one line each with its standard error, beside what stood there before; the
+rest of the robot stays as published or as `scene.toml` says. `align.json` has every figure.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.alignment import ground, slope
+from twin.alignment.checks import check
+from twin.alignment.commands import Drive, fit_drive
+from twin.alignment.identify import Fit
+from twin.alignment.kinematics import NOMINAL, Icr, fit_icr, predict
+from twin.alignment.logs import Windows, without_acceleration
+from twin.alignment.plots import steady, track_ratios
+from twin.alignment.score import Prediction
+from twin.robot import HuskyParams
+
+Array = NDArray[np.float64]
+
+_DRIVE_FIELDS = {  # a field of HuskyParams → what of the drive shows it
+    "separation_multiplier": ("half_gain",),
+    "max_yaw_rate": ("half_limit",),
+    "max_wheel_speed": ("wheel_limit",),
+    "command_latency": ("latency",),
+    "max_acceleration": ("mean_acceleration",),
+    "max_yaw_acceleration": ("half_acceleration",),
+    "servo_lag": ("lag",),
+}
+_GROUND_FIELDS = {
+    "friction": ("friction",),
+    "spin_friction": ("spin_friction",),
+    "slip_stiffness": ("log10_slip_stiffness",),
+    "ground_viscosity": ("ground_viscosity",),
+    "center_of_mass": ("center_of_mass_x", "center_of_mass_y", "center_of_mass_z"),
+    "wheel_radius": ("radius_left", "radius_right"),
+    "rolling_resistance": ("rolling_resistance",),
+    "servo_gain": ("log10_servo_gain",),
+}
+_UNSEEN = "the log's commands are wheel speeds, so it never meets the controller's own multiplier; needs v and ω"
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What a log says of a robot."""
+
+    windows: Windows
+    icr: Icr
+    drive: Drive
+    drive_fit: Fit
+    ground_fit: Fit
+    robot: HuskyParams
+    """With everything the log identified in place."""
+    nominal: Prediction
+    baseline: Prediction
+    fitted: Prediction
+    level: Prediction
+    """As fitted, the ground taken for level."""
+
+    @property
+    def identified(self) -> dict[str, tuple[float | tuple[float, ...], float | tuple[float, ...]]]:
+        """Fields of HuskyParams that the log identified: value and standard error, a number each or as many."""
+        out: dict[str, tuple[Any, Any]] = {}
+        units = Drive(*[1.0] * len(Drive.__dataclass_fields__)).robot(self.robot, self.windows.twist)
+        for field, (name,) in _DRIVE_FIELDS.items():
+            if name in self.drive_fit.errors and (self.windows.twist or field != "separation_multiplier"):
+                out[field] = getattr(self.robot, field), self.drive_fit.errors[name] * abs(units[field])
+        for field, names in _GROUND_FIELDS.items():
+            errors = [self.ground_fit.errors.get(name, 0.0) for name in names]
+            if not any(name in self.ground_fit.errors for name in names):
+                continue
+            value = getattr(self.robot, field)
+            if names[0].startswith("log10_"):
+                errors = [errors[0] * np.log(10) * value]
+            out[field] = (value, tuple(errors)) if isinstance(value, tuple) else (value, errors[0])
+        return out
+
+    @property
+    def refused(self) -> list[str]:
+        """One line per parameter that the log does not show."""
+        lines = [*self.drive_fit.refused.values(), *self.ground_fit.refused.values()]
+        if not self.windows.twist:
+            lines.append(f"separation_multiplier = {self.robot.separation_multiplier:g}: {_UNSEEN}")
+        return lines
+
+    def figures(self) -> dict[str, Any]:
+        """Every figure, for JSON."""
+        windows = self.windows
+        fitting, scoring = windows.fitting, ~windows.fitting
+        predictions = {
+            "nominal_kinematics": self.nominal,
+            "icr_kinematics": self.baseline,
+            "fitted": self.fitted,
+            "fitted_on_level_ground": self.level,
+        }
+        use = steady(windows)
+        real = track_ratios(windows.wheels, windows.poses[:, -1], windows.elapsed[:, -1])[use]
+        ours = track_ratios(windows.wheels, self.fitted.ends, windows.elapsed[:, -1])[use]
+        scores = {
+            name: {"fitted_to": p.score(fitting).told(), "held_out": p.score(scoring).told()}
+            for name, p in predictions.items()
+        }
+        ours_held, theirs = self.fitted.score(scoring), self.baseline.score(scoring)
+        return {
+            "windows": {"fitted_to": int(fitting.sum()), "held_out": int(scoring.sum())},
+            "scores": scores,
+            "better_than_icr": {
+                "position": round(1 - ours_held.position_m / theirs.position_m, 4),
+                "yaw": round(1 - ours_held.yaw_deg / theirs.yaw_deg, 4),
+            },
+            "track_ratio": {"measured": _quantiles(real), "fitted": _quantiles(ours)},
+            "slope_deg": _quantiles(np.degrees(np.hypot(*self.slope.T) / slope.GRAVITY)),
+            "robot": {
+                name: {"value": _plain(value), "standard_error": _plain(error)}
+                for name, (value, error) in self.identified.items()
+            },
+            "log": {
+                "mean_gain": round(self.drive.mean_gain, 4),
+                "half_gain": round(self.drive.half_gain, 4),
+                "pose_x_m": round(self.ground_fit.values["pose_x"], 4),
+                "pose_y_m": round(self.ground_fit.values["pose_y"], 4),
+            },
+            "refused": self.refused,
+        }
+
+    @property
+    def slope(self) -> Array:
+        """Gravity along x and y [m/s²], shape (n, 2)."""
+        return slope.gravity(self.windows, self.icr)
+
+
+def align(
+    windows: Windows,
+    params: HuskyParams,
+    where: str,
+    use_slope: bool = True,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Alignment:
+    """Fits baseline, drive, tyres and ground to the even groups of a log, and predicts all of it.
+
+    Raises:
+        InputError: the log cannot be used, see `checks`.
+    """
+    check(windows, where)
+    if not use_slope:
+        windows = without_acceleration(windows)
+    icr = fit_icr(windows.of(windows.fitting))
+    progress("commands and wheel speeds")
+    drive, drive_fit = fit_drive(windows, params)
+    tilt = slope.gravity(windows, icr)
+    ground_fit = ground.fit_ground(params, drive, windows, tilt, progress)
+    robot = ground.robot(params, ground_fit.values)
+    seen = {
+        field: value
+        for field, value in drive.robot(params, windows.twist).items()
+        if _DRIVE_FIELDS[field][0] in drive_fit.errors and (windows.twist or field != "separation_multiplier")
+    }
+    robot = replace(robot, **seen)
+    progress("predicting every window")
+
+    def prediction(name: str, under: Array) -> Prediction:
+        out = ground.simulated(params, ground_fit.values, drive, windows, under)
+        return Prediction(name, windows, out.poses, out.wheels)
+
+    fitted = prediction("fitted MJCF", tilt)
+    return Alignment(
+        windows,
+        icr,
+        drive,
+        drive_fit,
+        ground_fit,
+        robot,
+        Prediction("nominal kinematics", windows, predict(NOMINAL, windows)),
+        Prediction("ICR kinematics", windows, predict(icr, windows)),
+        fitted,
+        prediction("fitted, level ground", np.zeros_like(tilt)) if np.any(tilt) else fitted,
+    )
+
+
+def robot_toml(alignment: Alignment, kept: dict[str, Any], log: str) -> str:
+    """The text of a `robot.toml`: what was identified, after what stood there before and still holds."""
+    identified = alignment.identified
+    scoring = int((~alignment.windows.fitting).sum())
+    ours = alignment.fitted.score(~alignment.windows.fitting)
+    lines = [
+        f"# Fitted to {Path(log).name} by python -m twin.align; on {scoring} windows it was not fitted to the robot is "
+        f"off by {ours.position_m:.3f} m and {ours.yaw_deg:.1f}° after 2 s (median).",
+        *(f"{name} = {_toml(value)}" for name, value in kept.items() if name not in identified),
+        *(f"{name} = {_toml(value)}  # ± {_told(error)}" for name, (value, error) in identified.items()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def write(path: Path, text: str) -> None:
+    """Writes a text aside and renames it."""
+    aside = path.with_name(path.name + ".partial")
+    aside.write_text(text, encoding="utf-8")
+    aside.replace(path)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, int):
+        return str(value)
+    text = f"{value:.6g}"
+    return text if any(c in text for c in ".einf") else text + ".0"
+
+
+def _told(error: float | tuple[float, ...]) -> str:
+    return ", ".join(f"{e:.2g}" for e in error) if isinstance(error, tuple) else f"{error:.2g}"
+
+
+def _plain(value: Any) -> Any:
+    return [float(f"{v:.6g}") for v in value] if isinstance(value, tuple) else float(f"{value:.6g}")
+
+
+def _quantiles(values: Array) -> dict[str, float] | None:
+    """10th, 50th and 90th percentile; None without values."""
+    if not len(values):
+        return None
+    return {f"p{q}": round(float(np.nanquantile(values, q / 100)), 3) for q in (10, 50, 90)}

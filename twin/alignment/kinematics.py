@@ -1,0 +1,106 @@
+"""Skid steering without dynamics: what wheel speeds alone say of the motion, and how far off that is.
+
+*Nominal*: a differential drive whose wheels roll freely. *ICR model*: each side's tread meets the ground where it does
+not slip at a lateral offset of its own, the instantaneous centre of rotation of that side (Mandow et al. 2007); with a
+factor of slip per side and a common forward offset it is the usual baseline, five numbers. Residuals are *bent*, so
+that a window in which the robot was stuck counts little: a window's squared residuals s count as log(1 + s).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from twin.alignment.logs import PERIOD, SAMPLES, Windows, wrapped
+from twin.robot import TRACK, WHEEL_RADIUS
+
+Array = NDArray[np.float64]
+
+POSITION_SCALE, YAW_SCALE = 0.08, 0.07  # [m], [rad] what a good model misses by in 2 s
+LOOKS = (SAMPLES // 2, SAMPLES)
+"""Samples of a window at which a model is held against the poses."""
+
+
+@dataclass(frozen=True)
+class Icr:
+    """The ICR model."""
+
+    slip_left: float = 1.0
+    slip_right: float = 1.0
+    """Speed of a side's tread over the ground / of its wheels' circumference."""
+    y_left: float = TRACK / 2
+    y_right: float = -TRACK / 2
+    """[m]"""
+    x: float = 0.0
+    """[m]"""
+
+    def motion(self, wheels: Array) -> Array:
+        """vx, vy [m/s], yaw rate [rad/s], shape (..., 3), for wheel speeds [rad/s], shape (..., 2)."""
+        left = self.slip_left * WHEEL_RADIUS * wheels[..., 0]
+        right = self.slip_right * WHEEL_RADIUS * wheels[..., 1]
+        rate = (right - left) / (self.y_left - self.y_right)
+        forward = (right * self.y_left - left * self.y_right) / (self.y_left - self.y_right)
+        return np.stack([forward, -self.x * rate, rate], -1)
+
+
+NOMINAL = Icr()
+
+
+def integrate(motion: Array) -> Array:
+    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for motions (n, k, 3) held `PERIOD` [s] each."""
+    turned = motion[..., 2] * PERIOD
+    yaw = np.concatenate([np.zeros((len(motion), 1)), np.cumsum(turned, 1)], 1)
+    middle = yaw[:, :-1] + turned / 2
+    cos, sin = np.cos(middle), np.sin(middle)
+    x = np.cumsum((motion[..., 0] * cos - motion[..., 1] * sin) * PERIOD, 1)
+    y = np.cumsum((motion[..., 0] * sin + motion[..., 1] * cos) * PERIOD, 1)
+    start = np.zeros((len(motion), 1))
+    return np.stack([np.concatenate([start, x], 1), np.concatenate([start, y], 1), yaw], -1)
+
+
+def predict(model: Icr, windows: Windows) -> Array:
+    """Poses by measured wheel speeds, one sample beyond the end, shape (n, k + 2, 3)."""
+    wheels = np.concatenate([windows.wheels, windows.wheels[:, -1:]], 1)
+    return integrate(model.motion(wheels))
+
+
+def fit_icr(windows: Windows) -> Icr:
+    """The ICR model that fits these windows best."""
+    start = np.array([1.0, 1.0, 0.5, -0.5, 0.0])
+    found = least_squares(
+        lambda x: bend(residuals(predict(Icr(*x), windows), windows)).ravel(), start, x_scale=(0.1, 0.1, 0.1, 0.1, 0.1)
+    )
+    return Icr(*(float(value) for value in found.x))
+
+
+def at(poses: Array, time: Array) -> Array:
+    """Poses (n, m, 3), `PERIOD` [s] apart, at one time [s] per window, shape (n,), interpolated. Shape (n, 3)."""
+    position = np.clip(time / PERIOD, 0, poses.shape[1] - 1 - 1e-9)
+    before = position.astype(int)
+    share = (position - before)[:, None]
+    row = np.arange(len(poses))
+    return poses[row, before] * (1 - share) + poses[row, before + 1] * share
+
+
+def residuals(predicted: Array, windows: Windows) -> Array:
+    """Predicted minus measured in units of what a good model misses by, at `LOOKS`. Shape (n, looks, 3)."""
+    elapsed = windows.elapsed
+    error = np.stack([at(predicted, elapsed[:, i]) - windows.poses[:, i] for i in LOOKS], 1)
+    error[..., 2] = wrapped(error[..., 2])
+    return error / (POSITION_SCALE, POSITION_SCALE, YAW_SCALE)
+
+
+def bend(error: Array) -> Array:
+    """Residuals (n, ...) scaled per window so that their squares sum to log(1 + s), s their mean square over looks."""
+    size = (error**2).sum(tuple(range(1, error.ndim))) / error.shape[1]
+    # log(1 + s) / s tends to 1 at 0.
+    scale = np.sqrt(np.log1p(size) / np.maximum(size, 1e-12))
+    scale = np.where(size < 1e-9, 1.0, scale) / np.sqrt(error.shape[1])
+    return error * scale.reshape(-1, *[1] * (error.ndim - 1))
+
+
+def end_errors(predicted: Array, windows: Windows) -> tuple[Array, Array]:
+    """Distance [m] and angle [°] between predicted and measured pose at the end of each window, shapes (n,)."""
+    error = at(predicted, windows.elapsed[:, -1]) - windows.poses[:, -1]
+    return np.hypot(error[:, 0], error[:, 1]), np.abs(np.degrees(wrapped(error[:, 2])))

@@ -1,0 +1,266 @@
+"""Drive logs: what a robot was told, what its wheels did, and where it went, cut into windows.
+
+A *window* is two seconds of a log, sampled evenly: commands, wheel speeds, poses relative to the first one, and, where
+there was an IMU, accelerations. Windows of one *group* share an experiment; groups of even number are for fitting, odd
+ones for scoring. A window *follows* the one before it where it begins when that one ends. A pose is *stale* when it
+repeats the one before: it was measured when it first appeared.
+
+`read_log` takes
+
+- a table (.csv, or .npz of equally long columns) with one row per instant: `time` [s]; commands, either `cmd_v` [m/s]
+  and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
+  [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
+  [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
+- a ROS 2 bag (`twin.alignment.bags`), which becomes such a table;
+- windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
+"""
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import InputError
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.05  # [s] between two samples of a window
+DURATION = 2.0  # [s]
+SAMPLES = round(DURATION / PERIOD)
+MAX_GAP = 0.5  # [s] between two rows of a table; a window that touches a longer one is left out
+
+_TICK = 1e-6  # [s] instants nearer than this are the same
+_GROUP_WINDOWS = 3  # of a table without groups: six seconds
+_CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change from one window to the next
+
+TWIST = ("cmd_v", "cmd_yaw_rate")
+WHEEL_COMMANDS = ("cmd_left", "cmd_right")
+WHEEL_SPEEDS = ("left_wheel_vel", "right_wheel_vel")
+POSE = ("x", "y", "yaw")
+ACCELERATION = ("acceleration_x", "acceleration_y")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """n windows of k samples, `PERIOD` [s] apart."""
+
+    commands: Array
+    """v [m/s] and ω [rad/s], or left and right [rad/s], see `twist`; shape (n, k, 2)."""
+    twist: bool
+    """Whether commands are v and ω."""
+    wheels: Array
+    """Measured speed of the left and of the right wheels [rad/s], shape (n, k, 2)."""
+    poses: Array
+    """x, y [m], yaw [rad] relative to the first, which is zero; one more than samples, shape (n, k + 1, 3)."""
+    groups: NDArray[np.int64]
+    """Shape (n,)."""
+    follows: NDArray[np.bool_]
+    """Shape (n,)."""
+    acceleration: Array | None = None
+    """Proper acceleration forward and to the left [m/s²], shape (n, k, 2)."""
+
+    def __len__(self) -> int:
+        return len(self.wheels)
+
+    @property
+    def fitting(self) -> NDArray[np.bool_]:
+        """Which windows may be fitted to; the others are for scoring. Shape (n,)."""
+        return self.groups % 2 == 0
+
+    def of(self, which: NDArray) -> "Windows":
+        """Some of the windows; none of them follows another."""
+        return Windows(
+            self.commands[which],
+            self.twist,
+            self.wheels[which],
+            self.poses[which],
+            self.groups[which],
+            np.zeros(len(self.wheels[which]), bool),
+            None if self.acceleration is None else self.acceleration[which],
+        )
+
+    @property
+    def elapsed(self) -> Array:
+        """Time from the measurement of the first pose to that of each [s], shape (n, k + 1).
+
+        A stale pose counts as of when it first appeared. The first one may itself be stale: where poses come in runs of
+        r samples and the first run is cut short, by what is missing of it.
+        """
+        n, count = self.poses.shape[:2]
+        fresh = np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
+        first = np.zeros((n, count), int)
+        for i in range(1, count):
+            first[:, i] = np.where(fresh[:, i - 1], i, first[:, i - 1])
+        run = 1 if fresh.mean() > 0.75 else round(1 / max(float(fresh.mean()), 1e-3))
+        leading = np.where(fresh.any(1), fresh.argmax(1), count - 1)
+        return (first + np.maximum(run - 1 - leading, 0)[:, None]) * PERIOD
+
+
+def read_log(path: Path) -> Windows:
+    """Reads any kind of log. Raises InputError: unreadable, columns missing, times or values impossible, too short."""
+    if not path.exists():
+        raise InputError(f"{path}: no such log; expected a .csv, an .npz or the folder of a ROS 2 bag")
+    if path.is_dir() or path.suffix in (".db3", ".mcap", ".bag"):
+        from twin.alignment.bags import read_bag
+
+        return cut(read_bag(path), str(path))
+    if path.suffix == ".csv":
+        return cut(_read_csv(path), str(path))
+    if path.suffix == ".npz":
+        columns = _read_npz(path)
+        if columns.get("icp_x", np.zeros(0)).ndim == 2:
+            return _published_windows(columns, str(path))
+        return cut(columns, str(path))
+    raise InputError(f"{path}: expected a log in .csv, .npz or a ROS 2 bag; convert it to one of those")
+
+
+def _read_csv(path: Path) -> dict[str, Array]:
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            head, *rows = [row for row in csv.reader(file) if row]
+            values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
+    if values.ndim != 2 or values.shape[1] != len(head):
+        raise InputError(f"{path}: {len(head)} names over rows of another length; export it anew")
+    return {name.strip(): values[:, i] for i, name in enumerate(head)}
+
+
+def _read_npz(path: Path) -> dict[str, Array]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: np.asarray(file[name], np.float64) for name in file.files}
+    except Exception as error:  # numpy raises whatever the zip or the array inside happens to be wrong with
+        raise InputError(f"{path}: not an .npz of plain arrays: {error}; save it anew with numpy.savez") from None
+
+
+def cut(columns: dict[str, Array], where: str) -> Windows:
+    """Windows of a table; rows may come at any rate, the newest one counts.
+
+    Args:
+        columns: By name, shape (rows,) each; see the module's head.
+        where: What to call the log in an error.
+
+    Raises:
+        InputError: a column is missing or not a number throughout, or time does not increase.
+    """
+    twist = all(name in columns for name in TWIST)
+    commands = TWIST if twist else WHEEL_COMMANDS
+    needed = ("time", *commands, *WHEEL_SPEEDS, *POSE)
+    _need(columns, needed, where)
+    accelerations = ACCELERATION if all(name in columns for name in ACCELERATION) else ()
+    groups = ("group",) if "group" in columns else ()
+    data = {name: columns[name] for name in (*needed, *accelerations, *groups)}
+    if any(column.shape != data["time"].shape or column.ndim != 1 for column in data.values()):
+        shapes = ", ".join(f"{name} {column.shape}" for name, column in data.items())
+        raise InputError(f"{where}: columns of different lengths ({shapes}); expected one value per row in each")
+    _finite(data, where)
+    time = data["time"]
+    backward = np.flatnonzero(np.diff(time) <= 0)
+    if len(backward):
+        i = int(backward[0])
+        raise InputError(
+            f"{where}: time goes from {time[i]:.3f} to {time[i + 1]:.3f} s at row {i + 2}; expected it to increase; "
+            "sort the rows and drop those that repeat a time"
+        )
+    span = time[-1] - time[0] if len(time) else 0.0
+    starts = DURATION * np.arange(int(span / DURATION + _TICK)) + (time[0] if len(time) else 0.0)
+    instants = starts[:, None] + PERIOD * np.arange(SAMPLES + 1)
+    rows = np.maximum(np.searchsorted(time, instants.ravel() + _TICK, side="right") - 1, 0).reshape(instants.shape)
+    last = np.minimum(rows[:, -1] + 1, len(time) - 1) if len(rows) else np.zeros(0, int)
+    whole = np.array(
+        [np.diff(time[a : b + 1]).max(initial=0) <= MAX_GAP for a, b in zip(rows[:, 0], last, strict=True)], bool
+    )
+    order = np.arange(len(starts))[whole]
+    rows = rows[whole]
+    pose = np.stack([data[name] for name in POSE], -1)
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    group = data["group"][rows[:, 0]].astype(int) if groups else order // _GROUP_WINDOWS
+
+    def sampled(names: tuple[str, ...]) -> Array:
+        return np.stack([data[name][rows[:, :-1]] for name in names], -1)
+
+    return Windows(
+        sampled(commands),
+        twist,
+        sampled(WHEEL_SPEEDS),
+        relative(pose[rows]),
+        np.asarray(group, np.int64),
+        np.diff(order, prepend=-2) == 1,
+        sampled(accelerations) if accelerations else None,
+    )
+
+
+def _published_windows(columns: dict[str, Array], where: str) -> Windows:
+    """DRIVE's: the pose at 2 s, `gt_icp_*`, is the 41st sample; the robot's IMU looks backwards.
+
+    That it does is seen in the data: `imu_acceleration_x` falls when the wheels speed up, and `imu_acceleration_y`
+    points out of the turn (correlations −0.16 and −0.11 over 16,000 samples), whereas the yaw rate has the right sign.
+    """
+    poses = [f"{{}}icp_{name}" for name in POSE]
+    imu = ("imu_acceleration_x", "imu_acceleration_y")
+    names = [*WHEEL_COMMANDS, *WHEEL_SPEEDS, *(p.format("") for p in poses), *imu]
+    ends = [p.format("gt_") for p in poses]
+    _need(columns, ("calib_step", *names, *ends), where)
+    shape = columns["icp_x"].shape
+    for name in names:
+        if columns[name].shape != shape or shape[1] != SAMPLES:
+            raise InputError(f"{where}: {name} has shape {columns[name].shape}; expected (n, {SAMPLES}), 2 s at 20 Hz")
+    for name in ("calib_step", *ends):
+        if columns[name].shape != shape[:1]:
+            raise InputError(f"{where}: {name} has shape {columns[name].shape}; expected {shape[:1]}, one per window")
+    _finite({name: columns[name] for name in ("calib_step", *names, *ends)}, where)
+    pose = np.stack([np.concatenate([columns[p.format("")], columns[p.format("gt_")][:, None]], 1) for p in poses], -1)
+    pose[..., 2] = np.unwrap(pose[..., 2], axis=1)
+    wheels = np.stack([columns[name] for name in WHEEL_SPEEDS], -1)
+    step = columns["calib_step"].astype(np.int64)
+    jump = np.abs(wheels[1:, 0] - wheels[:-1, -1]).sum(1)
+    return Windows(
+        np.stack([columns[name] for name in WHEEL_COMMANDS], -1),
+        False,
+        wheels,
+        relative(pose),
+        step,
+        np.concatenate([[False], (jump < _CONTINUES) & (np.diff(step) <= 1) & (np.diff(step) >= 0)]),
+        -np.stack([columns[name] for name in imu], -1),
+    )
+
+
+def relative(poses: Array) -> Array:
+    """Poses in the frame of the first: x, y [m], yaw [rad], shape (n, k, 3)."""
+    turned = poses - poses[:, :1]
+    cos, sin = np.cos(poses[:, :1, 2]), np.sin(poses[:, :1, 2])
+    x, y = turned[..., 0], turned[..., 1]
+    return np.stack([cos * x + sin * y, cos * y - sin * x, turned[..., 2]], -1)
+
+
+def wrapped(angle: Array) -> Array:
+    """The same angle from −π to π [rad]."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+
+
+def without_acceleration(windows: Windows) -> Windows:
+    """The same, as if there had been no IMU."""
+    return replace(windows, acceleration=None)
+
+
+def _need(columns: dict[str, Array], names: tuple[str, ...], where: str) -> None:
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise InputError(
+            f"{where}: no column {', '.join(missing)} among {', '.join(sorted(columns)) or 'none'}; "
+            "name the columns as `python -m twin.align --help` says"
+        )
+
+
+def _finite(columns: dict[str, Array], where: str) -> None:
+    for name, column in columns.items():
+        bad = np.argwhere(~np.isfinite(column))
+        if len(bad):
+            place = ", ".join(str(int(i) + 1) for i in bad[0])
+            raise InputError(
+                f"{where}: {name} is {column[tuple(bad[0])]} at row {place} and in {len(bad)} places; "
+                "expected numbers; cut those rows out"
+            )

@@ -1,0 +1,148 @@
+"""Windows of a log driven by the Husky's MJCF on a plane, many at once.
+
+Each starts rolling: the robot stands settled on the plane, gets the wheel speeds that the log starts with, and holds
+them for `LEAD` before time starts, so that body and tyres are in the motion that goes with them. Then the servo is told
+what the controller makes of the log's commands (`commands.targets`), or what the wheels did. Nothing else of the log
+enters but the slope. `mujoco.rollout` steps windows in threads; gravity is tilted rather than the plane.
+"""
+
+import copy
+import os
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from numpy.typing import NDArray
+
+from twin.alignment.commands import AHEAD, STEP
+from twin.alignment.logs import PERIOD, SAMPLES, Windows
+from twin.alignment.slope import GRAVITY
+from twin.mjcf.husky import add_husky, set_options
+from twin.mjcf.husky_look import LOOK_GROUP
+from twin.robot import WHEELS, HuskyParams
+
+Array = NDArray[np.float64]
+
+LEAD = 0.4  # [s]
+COARSE = 0.005  # [s] time step while fitting: poses differ by millimetres from those of the shipped one
+
+_SETTLE = 1.0  # [s]
+_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+@dataclass(frozen=True)
+class Drives:
+    """What the robots did."""
+
+    poses: Array
+    """x, y [m], yaw [rad] of the base relative to the start, `PERIOD` [s] apart, shape (n, k + AHEAD, 3)."""
+    wheels: Array
+    """Of the left and of the right side [rad/s], shape (n, k + AHEAD, 2)."""
+    torques: Array
+    """Of the left and the right motor, at the wheels [N m], means over each `PERIOD`, shape (n, k + AHEAD − 1, 2)."""
+
+
+def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:
+    """The Husky on a plane, without its looks: they take a third of the time and nearly all of the memory."""
+    spec = mujoco.MjSpec()
+    set_options(spec, params)
+    if timestep:
+        spec.option.timestep = timestep
+    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
+    add_husky(spec, params=params)
+    for geom in [geom for geom in spec.geoms if geom.group == LOOK_GROUP]:
+        spec.delete(geom)
+    for mesh in list(spec.meshes):
+        spec.delete(mesh)
+    return spec.compile()
+
+
+def drive(params: HuskyParams, told: Array, start: Array, slope: Array, timestep: float | None = None) -> Drives:
+    """Drives every window.
+
+    Args:
+        params: The robot and its ground; its `servo_lag` acts on `told`.
+        told: Wheel speeds the servos are told, left and right [rad/s], `commands.STEP` [s] apart, shape (n, steps, 2).
+        start: Wheel speeds at the start [rad/s], shape (n, 2).
+        slope: Gravity along x and y [m/s²], shape (n, 2).
+        timestep: [s]; the shipped one by default.
+    """
+    model = plane_model(params, timestep)
+    step = model.opt.timestep
+    lead, per_sample = round(LEAD / step), round(PERIOD / step)
+    count = told.shape[1] * STEP
+    index = np.minimum((np.arange(round(count / step)) * step / STEP + 1e-9).astype(int), told.shape[1] - 1)
+    control = np.concatenate([np.repeat(start[:, None], lead, 1), told[:, index]], 1)
+    limit = model.actuator_ctrlrange[0, 1]
+    states, joints = _starts(model, params, np.clip(start, -limit, limit))
+    models = _tilted(model, slope)
+    threads = min(os.cpu_count() or 1, len(told))
+    states, sensors = rollout.rollout(models, [mujoco.MjData(model) for _ in range(threads)], states, control)
+    torque = [model.sensor(f"{side}_torque").adr[0] for side in ("left", "right")]
+    torques = sensors[:, lead:, torque]
+    # A rollout's first state is that after one step; the one before time starts is the last of the lead.
+    seen = states[:, lead - 1 :: per_sample]
+    position, velocity = seen[..., 1 : 1 + model.nq], seen[..., 1 + model.nq : 1 + model.nq + model.nv]
+    n, k = told.shape[0], SAMPLES + AHEAD
+    return Drives(
+        _planar(position[:, :k, :7]),
+        np.stack([velocity[:, :k, joints[[i, i + 2]]].mean(-1) for i in (0, 1)], -1),
+        torques[:, : (k - 1) * per_sample].reshape(n, k - 1, per_sample, 2).mean(2),
+    )
+
+
+def told_by_wheels(windows: Windows) -> Array:
+    """What servos without lag are to be told so that the wheels do what they did, shape as `drive` takes it."""
+    wheels = np.concatenate([windows.wheels, np.repeat(windows.wheels[:, -1:], AHEAD, 1)], 1)
+    position = np.arange(round((SAMPLES + AHEAD) * PERIOD / STEP)) * STEP / PERIOD
+    before = np.minimum(position.astype(int), SAMPLES + AHEAD - 2)
+    share = (position - before)[:, None]
+    return wheels[:, before] * (1 - share) + wheels[:, before + 1] * share
+
+
+def _starts(model: mujoco.MjModel, params: HuskyParams, start: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Full states to start from, shape (n, ·), and the degrees of freedom of the wheels, shape (4,)."""
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, round(_SETTLE / model.opt.timestep))
+    data.qvel[:] = 0.0
+    data.time = 0.0
+    joints = np.array([model.joint(f"{name}_wheel").dofadr[0] for name in WHEELS])
+    states = np.empty((len(start), mujoco.mj_stateSize(model, _FULL)))
+    for i, sides in enumerate(start):
+        rolling = sides * params.wheel_radius
+        data.qvel[0] = rolling.mean()
+        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # about half what a differential drive would turn
+        data.qvel[joints] = np.tile(sides, 2)
+        if model.na:
+            data.act[:] = sides
+        mujoco.mj_getState(model, data, states[i], _FULL)
+    return states, joints
+
+
+def _tilted(model: mujoco.MjModel, slope: Array) -> list[mujoco.MjModel]:
+    """One model per window; the same one where the ground is level throughout."""
+    if not np.any(slope):
+        return [model]
+    models = []
+    for x, y in slope:
+        tilted = copy.copy(model)
+        tilted.opt.gravity[:] = x, y, -np.sqrt(GRAVITY**2 - x * x - y * y)
+        models.append(tilted)
+    return models
+
+
+def _planar(pose: Array) -> Array:
+    """x, y, yaw relative to the first, shape (n, k, 3), of free-joint positions (n, k, 7)."""
+    w, x, y, z = np.moveaxis(pose[..., 3:7], -1, 0)
+    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), axis=1)
+    moved = pose[..., :2] - pose[:, :1, :2]
+    cos, sin = np.cos(yaw[:, :1]), np.sin(yaw[:, :1])
+    return np.stack(
+        [
+            cos * moved[..., 0] + sin * moved[..., 1],
+            cos * moved[..., 1] - sin * moved[..., 0],
+            yaw - yaw[:, :1],
+        ],
+        -1,
+    )
