@@ -2,8 +2,8 @@
 
 The world stands still under one lighting, so all of it is flattened once into triangles, textures in halving sizes
 (*levels*), lights and a shadow map. A picture is made in two passes over 2 × 2 samples per pixel: which triangle is
-nearest (*visibility*), then its colour (*shading*). Shading is what `film.Renderer` does, so that a picture looks like a
-frame of the film; textures are averaged over a sample's footprint, as a film's many pixels would be.
+nearest (*visibility*), then its colour (*shading*). Shading is what `film.Renderer` does, so that a picture looks like
+a frame of the film; textures are averaged over a sample's footprint, as a film's many pixels would be.
 
 A ray through a sample has direction d with z = 1 in the camera. With corners a, b, c seen from the camera, it meets the
 triangle where d · (b × c), d · (c × a), d · (a × b) have the sign of det = a · (b × c); they are proportional to the
@@ -152,7 +152,8 @@ def _sky(texels: wp.array[wp.uint8], level: wp.vec3i, ray: wp.vec3):
     """Colour of a cube map, six faces stacked in OpenGL's order, with its y axis up the world's z."""
     x, y, z = ray[0], ray[2], -ray[1]
     ax, ay, az = wp.abs(x), wp.abs(y), wp.abs(z)
-    face, s, t, most = int(0), -z, -y, ax
+    face = int(0)  # noqa: RUF046 - a variable to Warp
+    s, t, most = -z, -y, ax
     if ax >= ay and ax >= az:
         if x <= 0.0:
             face, s = 1, z
