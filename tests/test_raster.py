@@ -67,10 +67,10 @@ def test_shadows_are_where_rays_to_the_sun_are_blocked(campus, sunny):
     ground = np.column_stack([xy, ground_height(campus.route, xy)])
     shadows = draw(wp.array(flat.corners, dtype=wp.vec3, device="cpu"), flat)
     out = wp.zeros(len(ground), dtype=float, device="cpu")
-    points = wp.array((ground + [0, 0, 0.01]).astype(np.float32), dtype=wp.vec3, device="cpu")
+    points = wp.array((ground + np.array([0.0, 0.0, 0.01])).astype(np.float32), dtype=wp.vec3, device="cpu")
     wp.launch(_ask, len(ground), [shadows, points, out], device="cpu")
     surface = Surface(flat.corners.reshape(-1, 3).astype(float), np.arange(3 * len(flat.corners)).reshape(-1, 3))
-    free = surface.openness(ground + [0, 0, 0.02], -flat.sun_rays[shadows.sun][None].astype(float), 100.0)
+    free = surface.openness(ground + np.array([0.0, 0.0, 0.02]), -flat.sun_rays[shadows.sun][None].astype(float), 100.0)
     assert 0.2 < free.mean() < 0.95  # there is both
     assert np.mean(np.abs(out.numpy() - free) < 0.5) > 0.97  # the light through leaves is ragged
 

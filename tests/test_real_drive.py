@@ -17,7 +17,7 @@ from twin.env.stretches import STANDARD
 from twin.errors import InputError
 from twin.learn.architecture import Architecture
 from twin.learn.policy import Control, Policy, load_policy, save_policy
-from twin.mjcf.world import arc_lengths, nearest
+from twin.mjcf.world import arc_lengths, point_at
 from twin.reality import drive, log, road
 from twin.reality import place as places
 from twin.reality.__main__ import main
@@ -101,13 +101,15 @@ def test_tasks_are_the_twins():
 
 def test_the_corridor_is_free_and_a_drive_along_it_arrives():
     """The robot's width beyond the corridor, nothing solid stands; who knows the way reaches the goal."""
-    line = road.route()
+    points = point_at(road.route()[:, :2], np.arange(0.0, 60.0, 0.1))
     for thing in road.place().things:
         for solid in thing.solids:
-            radius = solid.half[0] if solid.kind == "cylinder" else float(np.hypot(*solid.half[:2]))
-            distance = abs(nearest(line, solid.centre[:2])[1])
-            if distance < 6.0 and solid.kind == "cylinder" or radius < 0.6:
-                assert distance - radius > MjcfConfig().half_width + 0.35, thing.name
+            c, s = np.cos(solid.yaw), np.sin(solid.yaw)
+            off = (points - solid.centre[:2]) @ np.array([[c, -s], [s, c]])
+            round_one = np.linalg.norm(off, axis=1) - solid.half[0]
+            square = np.linalg.norm(np.maximum(np.abs(off) - solid.half[:2], 0.0), axis=1)
+            distance = (round_one if solid.kind == "cylinder" else square).min()
+            assert distance > MjcfConfig().half_width + 0.35, thing.name
     for task in STANDARD:
         one = road.Road(task, robot(), STEERING)
         environment = control.Environment(one.physics, one.drive, control_timestep=0.1)
