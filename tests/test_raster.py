@@ -62,7 +62,7 @@ def _ask(shadows: Map, points: wp.array[wp.vec3], out: wp.array[float]):
 
 def test_shadows_are_where_rays_to_the_sun_are_blocked(campus, sunny):
     flat = flatten(sunny)
-    station, lateral = np.meshgrid(np.linspace(0, 60, 240), np.linspace(-2.9, 2.9, 40))
+    station, lateral = np.meshgrid(np.linspace(0, 60, 400), np.linspace(-7.0, 7.0, 80))
     xy = campus.route.at(station, lateral).reshape(-1, 2)
     ground = np.column_stack([xy, ground_height(campus.route, xy)])
     shadows = draw(wp.array(flat.corners, dtype=wp.vec3, device="cpu"), flat)
@@ -71,8 +71,9 @@ def test_shadows_are_where_rays_to_the_sun_are_blocked(campus, sunny):
     wp.launch(_ask, len(ground), [shadows, points, out], device="cpu")
     surface = Surface(flat.corners.reshape(-1, 3).astype(float), np.arange(3 * len(flat.corners)).reshape(-1, 3))
     free = surface.openness(ground + np.array([0.0, 0.0, 0.02]), -flat.sun_rays[shadows.sun][None].astype(float), 100.0)
-    assert 0.2 < free.mean() < 0.95  # there is both
-    assert np.mean(np.abs(out.numpy() - free) < 0.5) > 0.97  # the light through leaves is ragged
+    right = np.abs(out.numpy() - free) < 0.5
+    assert 0.2 < free.mean() < 0.9  # there is both
+    assert right[free > 0.5].mean() > 0.98 and right[free < 0.5].mean() > 0.92  # shadows of leaves are ragged
 
 
 def test_no_sun_casts_no_shadow(campus):

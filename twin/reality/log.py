@@ -59,7 +59,8 @@ def record(duration: float) -> dict[str, Array]:
         physics.step(_PERIOD)
     table = np.array(rows)
     table[:, 7] = np.unwrap(table[:, 7])
-    sigma = [0, 0, 0, *[_WHEEL_NOISE] * 2, *[_POSITION_NOISE] * 2, _YAW_NOISE, *[_ACCELERATION_NOISE] * 2]
+    told = (_WHEEL_NOISE, _WHEEL_NOISE, _POSITION_NOISE, _POSITION_NOISE, _YAW_NOISE)
+    sigma = np.array([0.0, 0.0, 0.0, *told, _ACCELERATION_NOISE, _ACCELERATION_NOISE])
     table[:, 5:8] = _relative(table[:, 5:8], first)
     table += rng.normal(size=table.shape) * sigma
     return dict(zip(COLUMNS, table.T, strict=True))

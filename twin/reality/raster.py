@@ -7,11 +7,11 @@ a frame of the film; textures are averaged over a sample's footprint, as a film'
 
 A ray through a sample has direction d with z = 1 in the camera. With corners a, b, c seen from the camera, it meets the
 triangle where d · (b × c), d · (c × a), d · (a × b) have the sign of det = a · (b × c); they are proportional to the
-barycentric coordinates there, and z = det / their sum (Olano and Greer, Triangle scan conversion using 2D homogeneous
-coordinates, 1997). No clipping is needed.
+barycentric coordinates there (Olano and Greer, Triangle scan conversion using 2D homogeneous coordinates, 1997). Their
+sum is d · ((b − a) × (c − a)), and z = det / the sum. No clipping is needed.
 """
 
-# mypy: disable-error-code="index, attr-defined, valid-type, misc, no-untyped-def"
+# mypy: disable-error-code="index, attr-defined, valid-type, misc, no-untyped-def, arg-type, operator, var-annotated"
 # (inside kernels, Warp's own types hold, which mypy does not know)
 
 from typing import Any
@@ -32,7 +32,8 @@ SAMPLES = 2
 """Per pixel and axis."""
 
 _NEAR = 0.02  # [m]
-_FAR = 1.0e30
+_FAR = 1.0e6  # [m]
+_ALL = 1.0e30  # [samples]
 _EMPTY = 1 << 62
 _DEPTHS = 1.0e5  # steps of depth per metre
 _INDEX_BITS = 20
@@ -76,16 +77,17 @@ def _see(
     if a[2] < _NEAR and b[2] < _NEAR and c[2] < _NEAR:
         return
     # Box around what of the triangle lies beyond the near plane; sample k lies at k + 0.5.
-    box = wp.vec4(_FAR, _FAR, -_FAR, -_FAR)
+    box = wp.vec4(_ALL, _ALL, -_ALL, -_ALL)
     box = _around(_around(_around(box, a, b, lens), b, c, lens), c, a, lens)
     if box[2] < 0.5 or box[3] < 0.5 or box[0] > float(width) - 0.5 or box[1] > float(height) - 0.5:
         return
     x0, x1 = int(wp.ceil(wp.max(box[0] - 0.5, 0.0))), int(wp.floor(wp.min(box[2] - 0.5, float(width - 1))))
     y0, y1 = int(wp.ceil(wp.max(box[1] - 0.5, 0.0))), int(wp.floor(wp.min(box[3] - 0.5, float(height - 1))))
     na, nb, nc = wp.cross(b, c), wp.cross(c, a), wp.cross(a, b)
-    det = wp.dot(a, na)
+    plane = wp.cross(b - a, c - a)
+    det = wp.dot(a, plane)
     if det < 0.0:
-        det, na, nb, nc = -det, -na, -nb, -nc
+        na, nb, nc = -na, -nb, -nc
     if det == 0.0:
         return
     for y in range(y0, y1 + 1):
@@ -96,8 +98,8 @@ def _see(
             wb = u * nb[0] + v * nb[1] + nb[2]
             wc = u * nc[0] + v * nc[1] + nc[2]
             if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
-                z = det / (wa + wb + wc)
-                if z > _NEAR:
+                z = det / (u * plane[0] + v * plane[1] + plane[2])
+                if z > _NEAR and z < _FAR:
                     key = wp.int64(z * _DEPTHS) * wp.int64(1 << _INDEX_BITS) + wp.int64(i)
                     wp.atomic_min(nearest, y * width + x, key)
 
@@ -214,7 +216,8 @@ def _shade(
         c = to_camera * (corners[i, 2] - eye)
         na, nb, nc = wp.cross(b, c), wp.cross(c, a), wp.cross(a, b)
         w = wp.vec3(wp.dot(d, na), wp.dot(d, nb), wp.dot(d, nc))
-        z = wp.dot(a, na) / (w[0] + w[1] + w[2])
+        plane = wp.cross(b - a, c - a)
+        z = wp.dot(a, plane) / wp.dot(d, plane)
         if sample == 0:
             depth[py, px] = z
         # Barycentric coordinates here and a sample further right and down: what the footprint of this one spans.
