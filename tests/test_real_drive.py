@@ -205,7 +205,8 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
         assert (cell.trials, cell.successes) == (len(mine), sum(t.success for t in mine))
         assert cell.twin_key == (cell.policy, "straight", "held-out")
     before = out.with_name("results_trials.csv").read_text()
-    drive.run([left], "straight", ["rain"], 3, out)
+    drive.run([left], "straight", ["rain"], 3, out, films=tmp_path / "films")
+    assert [film.name for film in (tmp_path / "films").iterdir()] == ["left_straight_rain_7000002.mp4"]
     after = out.with_name("results_trials.csv").read_text()
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
     written(left, 0.5)

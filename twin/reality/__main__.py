@@ -71,10 +71,13 @@ def main(given: list[str] | None = None) -> int:
     command.add_argument(
         "--lightings", nargs="+", choices=sorted(WEATHER), default=list(WEATHER), help="default: all of them"
     )
-    command.add_argument("--out", type=Path, required=True, help="results.csv; rows of trials go beside it")
+    command.add_argument(
+        "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
+    )
     command.add_argument(
         "--twin-lighting", default=HELD_OUT, help="the twin's lighting to compare with (default %(default)s)"
     )
+    command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
     command = commands.add_parser("log", help="a drive log of the world's Husky, for twin.align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
     command.add_argument("--duration", type=float, default=300.0, help="[s] (default %(default)g)")
@@ -87,7 +90,13 @@ def main(given: list[str] | None = None) -> int:
             log.write(options.out, log.record(options.duration))
         else:
             trials = drive.run(
-                options.policy, options.task, options.lightings, options.trials, options.out, options.twin_lighting
+                options.policy,
+                options.task,
+                options.lightings,
+                options.trials,
+                options.out,
+                options.twin_lighting,
+                options.films,
             )
             print(cells_text(tally(trials)), end="")
     except (InputError, OSError) as error:

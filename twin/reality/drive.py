@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from dm_control.rl import control
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from twin.learn.policy import JSON, WEIGHTS, Policy, load_policy
 from twin.progress import bar
 from twin.reality import world as worlds
 from twin.reality.eye import Eye
+from twin.reality.film import Plan, encode
 from twin.reality.raster import Raster
 from twin.reality.road import Road, place
 from twin.reality.robot import robot
@@ -40,6 +42,7 @@ HELD_OUT = "held-out"
 """The twin's lighting that results are compared with, as it knows none of reality's by name."""
 
 _FIRST_SEED = 7_000_000  # of the first trial
+_ENLARGED = 4  # times, in a film
 _COLUMNS = (*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS)
 
 Picture = NDArray[np.uint8]
@@ -116,6 +119,7 @@ def run(
     trials: int,
     out: Path,
     twin_lighting: str = HELD_OUT,
+    films: Path | None = None,
 ) -> list[Trial]:
     """Drives what is not yet in the table of trials, and sums all of it up.
 
@@ -127,6 +131,7 @@ def run(
         out: Gets the results as `twin.forecast` reads them; `<name>_trials.csv` beside it gets a row per trial, and
             `<name>_policies.json` the sums of the files that were driven with.
         twin_lighting: Goes into the results' column of this name.
+        films: Gets a film of every trial, of what the robot saw.
 
     Returns:
         Every trial of the table, those of earlier calls too.
@@ -151,12 +156,23 @@ def run(
             missing = [seed for seed in seeds if (policy.name, task, lighting, seed) not in known]
             with bar(f"{policy.name}, {task}, {lighting}", len(missing), "trial") as progress:
                 for seed in missing:
-                    done.append(test.trial(lighting, seed))
+                    frames: list[Picture] = []
+                    done.append(test.trial(lighting, seed, frames.append if films else None))
+                    if films:
+                        _film(frames, films / f"{policy.name.replace('/', '_')}_{task}_{lighting}_{seed}.mp4")
                     _write(done, table, out, twin_lighting)
                     progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
                     progress.update()
     _write(done, table, out, twin_lighting)
     return done
+
+
+def _film(frames: Sequence[Picture], path: Path) -> None:
+    """Ten pictures a second, enlarged."""
+    height, width = (_ENLARGED * side for side in frames[0].shape[:2])
+    plan = Plan(width=width, height=height, fps=10, crf=23)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encode((cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in frames), plan, path)
 
 
 def _key(trial: Trial) -> tuple[str, str, str]:
