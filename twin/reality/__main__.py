@@ -1,17 +1,28 @@
-"""`python -m twin.reality film --out DIR`: films the known-truth world into a scene folder.
+"""The known-truth world's verbs.
 
-The folder then holds `scene.toml`, `input/<lighting>.mp4` and `truth/`. Films are random only through the seeds stated
-in the code, so the same command gives the same frames.
+    python -m twin.reality film --out DIR
+    python -m twin.reality drive --policy FILE... --task straight|right_turn --out results.csv
+    python -m twin.reality log --out drive.csv
+
+`film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `drive` is the real test, `log` what
+`twin.align` may learn of the robot. All are random only through the seeds stated in the code, so the same command gives
+the same files.
 """
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+from twin.errors import InputError
+from twin.reality import drive, log
 from twin.reality import place as places
+from twin.reality.drive import HELD_OUT, TASKS
 from twin.reality.film import CAMERA_HEIGHT, Plan, depths, shoot
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import HALF_WIDTH, Film, Truth
+from twin.reality.weather import WEATHER
+from twin.report.trials import cells_text, tally
 
 TINY = Plan(
     lightings=("sun", "overcast"), start=24.0, length=12.0, speed=2.0, fps=4, width=320, height=180, samples=2, crf=18
@@ -45,19 +56,54 @@ def scene_toml(plan: Plan, name: str) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main(given: list[str] | None = None) -> int:
+    """Runs a command; returns the exit status: 0, or 2 with one line on standard error."""
     parser = argparse.ArgumentParser(prog="python -m twin.reality", description="The known-truth world.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("film", help="film the world into a scene folder")
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
     command.add_argument("--lightings", nargs="+", choices=sorted(LIGHTINGS), help="default: sun overcast night")
     command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
-    arguments = parser.parse_args()
-    plan = TINY if arguments.tiny else Plan()
-    if arguments.lightings:
-        plan = replace(plan, lightings=tuple(arguments.lightings))
-    film(plan, arguments.out)
+    command = commands.add_parser("drive", help="the real test: drive a policy file in weather that was not filmed")
+    command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
+    command.add_argument("--task", choices=TASKS, required=True)
+    command.add_argument("--trials", type=int, default=50, help="per policy and lighting (default %(default)s)")
+    command.add_argument(
+        "--lightings", nargs="+", choices=sorted(WEATHER), default=list(WEATHER), help="default: all of them"
+    )
+    command.add_argument(
+        "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
+    )
+    command.add_argument(
+        "--twin-lighting", default=HELD_OUT, help="the twin's lighting to compare with (default %(default)s)"
+    )
+    command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
+    command = commands.add_parser("log", help="a drive log of the world's Husky, for twin.align")
+    command.add_argument("--out", type=Path, required=True, help="drive.csv")
+    command.add_argument("--duration", type=float, default=300.0, help="[s] (default %(default)g)")
+    options = parser.parse_args(given)
+    try:
+        if options.command == "film":
+            plan = TINY if options.tiny else Plan()
+            film(replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan, options.out)
+        elif options.command == "log":
+            log.write(options.out, log.record(options.duration))
+        else:
+            trials = drive.run(
+                options.policy,
+                options.task,
+                options.lightings,
+                options.trials,
+                options.out,
+                options.twin_lighting,
+                options.films,
+            )
+            print(cells_text(tally(trials)), end="")
+    except (InputError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.progress import track
 from twin.reality import world
-from twin.reality.lighting import LIGHTINGS, Lighting
+from twin.reality.lighting import LIGHTINGS, Lighting, hazed
 from twin.reality.route import Route, ground_height
 from twin.reality.things import SEED, Place
 
@@ -165,7 +165,8 @@ def shoot(lighting: str, place: Place, plan: Plan, path: Path) -> tuple[Array, A
     rng = np.random.default_rng([SEED, 13, sum(map(ord, lighting))])
     render = Renderer(lighting, place, plan)
     steps = track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame")
-    encode((develop(rng, render(pose)[0], LIGHTINGS[lighting], float(gain)) for pose, gain in steps), plan, path)
+    light = LIGHTINGS[lighting]
+    encode((develop(rng, hazed(*render(pose), light), light, float(gain)) for pose, gain in steps), plan, path)
     return times, poses
 
 

@@ -47,6 +47,10 @@ class Lighting:
     """White balance."""
     glow_sun: Colour = (0.0, 0.0, 0.0)
     """Brightening of the sky around the first sun."""
+    wet: float = 0.0
+    """How much darker the ground is for being wet, 0 to 1."""
+    visibility: float = float("inf")
+    """Distance over which haze takes all but 1/e of the light [m]; haze has the colour of the horizon."""
 
 
 LIGHTINGS: dict[str, Lighting] = {
@@ -158,6 +162,14 @@ def sky(lighting: Lighting, seed: int, width: int = 512) -> NDArray[np.uint8]:
     trees = np.asarray(lighting.skyline) * (1.0 + 0.22 * texture[row, column])[..., None]
     out = np.where((elevation < edge)[..., None], trees, out)
     return (np.clip(out, 0.0, 1.0) * 255 + 0.5).astype(np.uint8).reshape(6 * width, width, 3)
+
+
+def hazed(light: NDArray[np.float32], depth: NDArray[np.float32], lighting: Lighting) -> NDArray[np.float32]:
+    """A picture (h, w, 3) seen through the lighting's haze, by its z-depth (h, w) [m]; the sky, 0, has its own."""
+    if np.isinf(lighting.visibility):
+        return light
+    share = np.where(depth > 0.0, np.exp(-depth / lighting.visibility), 1.0).astype(np.float32)[..., None]
+    return share * light + (1.0 - share) * np.asarray(lighting.horizon, np.float32)
 
 
 def add_lights(spec: mujoco.MjSpec, lighting: Lighting, lamp_heads: NDArray[np.float64]) -> None:

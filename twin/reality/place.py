@@ -7,7 +7,7 @@ from twin.reality import buildings, shapes, street, trees
 from twin.reality import route as roads
 from twin.reality.route import ROAD_HALF_WIDTH, Route
 from twin.reality.shapes import Part
-from twin.reality.things import Place, Thing
+from twin.reality.things import SEED, Place, Thing
 
 Array = NDArray[np.float64]
 
@@ -15,13 +15,16 @@ LAND = (-60.0, 120.0, -130.0, 60.0)  # [m] x and y range of the land beyond the 
 _LAND_STEP = 1.5
 
 
-def build(route: Route | None = None) -> Place:
-    """The campus road. Deterministic: the same place each time."""
+def build(route: Route | None = None, later: bool = False) -> Place:
+    """The campus road; `later`: on another day than it was filmed, cones, bins, crates and cars having been moved.
+
+    Deterministic: the same place each time.
+    """
     place = Place(route or Route())
     _ground(place)
     buildings.add(place)
     trees.add(place)
-    street.add(place)
+    street.add(place, np.random.default_rng([SEED, 8]) if later else None)
     return place
 
 

@@ -28,33 +28,46 @@ _CRATES = (  # side [m]
     *((18.5, -5.0, 1.1), (18.6, -6.3, 0.9), (29.5, -5.6, 1.2)),
     *((45.5, 6.5, 1.0), (54.0, -5.3, 1.15), (65.0, -4.9, 1.0)),
 )
+_KEPT_FREE = 2.15  # [m] from the centre line that nothing's middle is moved into
 _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
-def add(place: Place) -> None:
-    """Adds everything beside the road to a place."""
+def add(place: Place, later: np.random.Generator | None = None) -> None:
+    """Adds everything beside the road to a place; with a generator as on another day, when small things have moved."""
     for k, lamp in enumerate(_LAMPS):
         _lamp_post(place, k, *lamp)
     for k, sign in enumerate(_SIGNS):
         _sign(place, k, *sign)
-    for k, cone in enumerate(_CONES):
-        _cone(place, k, *cone)
+    for k, (station, lateral) in enumerate(_CONES):
+        _cone(place, k, *_moved(later, station, lateral, 1.5, 0.2))
     for k, bench in enumerate(_BENCHES):
         _bench(place, k, *bench)
     for k, (station, lateral, skin) in enumerate(_BINS):
+        station, lateral = _moved(later, station, lateral, 1.0, 0.2)
         foot = place.spot(station, lateral)
         part = cell(skin, shapes.tube(foot - up(0.05), foot + up(0.95), 0.24, 0.28, 14))
         solid = Solid("cylinder", foot + up(0.45), (0.27, 0.5, 0.0))
         place.things.append(Thing(f"bin_{k}", "obstacle", part, "atlas", (solid,)))
-    for k, crate in enumerate(_CRATES):
-        _crate(place, k, *crate)
-    for k, car in enumerate(_CARS):
-        _car(place, k, *car)
+    for k, (station, lateral, side) in enumerate(_CRATES):
+        _crate(place, k, *_moved(later, station, lateral, 0.5, 0.2), side)
+    for k, (station, lateral, skin) in enumerate(_CARS):
+        _car(place, k, *_moved(later, station, lateral, 1.5, 0.1), skin)
     for k, lateral in enumerate((-2.0, 0.0, 2.0)):  # the road ends here
         foot, yaw = place.spot(END - 3.0, lateral), place.heading(END) + np.pi / 2
         part = cell("barrier", shapes.box((1.8, 0.12, 1.0)).moved(foot, yaw))
         solid = Solid("box", foot + up(0.5), (0.9, 0.06, 0.5), yaw)
         place.things.append(Thing(f"barrier_{k}", "obstacle", part, "atlas", (solid,)))
+
+
+def _moved(
+    later: np.random.Generator | None, station: float, lateral: float, along: float, across: float
+) -> tuple[float, float]:
+    """Station and lateral of a thing that has been moved by up to so much [m], never nearer than `_KEPT_FREE`."""
+    if later is None:
+        return station, lateral
+    station += later.uniform(-along, along)
+    away = max(abs(lateral) + later.uniform(-across, across), min(abs(lateral), _KEPT_FREE))
+    return float(station), float(np.copysign(away, lateral))
 
 
 def _cone(place: Place, k: int, station: float, lateral: float) -> None:

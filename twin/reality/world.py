@@ -34,6 +34,9 @@ WALLS = {  # building → brick or plaster, colour
     "sheds": ("bricks", (0.42, 0.38, 0.34)),
 }
 
+WETTED = ("road", "kerb", "verge_left", "verge_right", "land")
+"""Textures of the ground, which rain darkens."""
+
 
 def _bytes(image: NDArray) -> NDArray[np.uint8]:
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
@@ -157,6 +160,8 @@ def spec(lighting: Lighting | str, place: Place | None = None) -> mujoco.MjSpec:
     for name, image in painted().items():
         if name in visibility:
             image = _shaded(image, 1.0 - light.occlusion * (1.0 - visibility[name]))
+        if light.wet > 0.0 and name in WETTED:
+            image = (image * (1.0 - light.wet)).astype(np.uint8)
         _add_texture(model, name, image)
     sky = lightings.sky(light, SEED)
     box = model.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX)

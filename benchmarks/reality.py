@@ -1,0 +1,94 @@
+"""Figures of the real test: how fast its rasteriser is, how near to the film, and where its tasks lie.
+
+    python benchmarks/reality.py [--scene BUILT_SCENE_WITH_TRUTH] [--json FILE] [--pictures FOLDER]
+
+Pictures of 160×90 are compared, before the sensor, with frames of the film's renderer in the film's size that are
+shrunk to it, from a robot's height along the film's path; *small* is the film's renderer at 160×90 itself. With a
+scene, its route is laid on the true one.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from twin.geometry.cameras import Cameras
+from twin.geometry.images import psnr, write_image
+from twin.loading import load_scene
+from twin.mjcf.world import nearest
+from twin.reality import film, world
+from twin.reality import place as places
+from twin.reality.raster import Raster
+from twin.reality.road import route
+from twin.reality.truth import Truth
+from twin.report.truth import align_rigid, matched_poses
+
+_LIGHTINGS = ("sun", "overcast", "night")
+_EVERY = 12  # frames of the film
+_LOWER = 0.6  # [m] that the robot's camera is below the film's
+
+
+def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
+    """Names and values, lighting by lighting."""
+    place, large = places.build(), film.Plan()
+    small = replace(large, width=160, height=90)
+    for lighting in _LIGHTINGS:
+        raster = Raster(world.spec(lighting, place).compile(), small.intrinsics, (160, 90))
+        renderer, renderer_small = film.Renderer(lighting, place, large), film.Renderer(lighting, place, small)
+        poses = film.trajectory(large, place.route, lighting)[1][::_EVERY]
+        raster(poses[0])
+        rows, seconds = [], []
+        for pose in poses:
+            pose = pose.copy()
+            pose[2, 3] -= _LOWER
+            begin = time.process_time()
+            mine = raster(pose)[0]
+            seconds.append(time.process_time() - begin)
+            wanted = cv2.resize(renderer(pose)[0], (160, 90), interpolation=cv2.INTER_AREA)
+            rows.append((psnr(mine, wanted), psnr(renderer_small(pose)[0], wanted)))
+            if folder:
+                both = np.hstack([mine, wanted, np.abs(mine - wanted)])
+                write_image(folder / f"{lighting}_{len(rows):02d}.png", (np.clip(both, 0, 1) * 255).astype(np.uint8))
+        yield f"reality.pictures_per_cpu_second.{lighting}", float(1.0 / np.median(seconds))
+        yield f"reality.psnr.{lighting}", float(np.mean(rows, 0)[0])
+        yield f"reality.psnr_lowest.{lighting}", float(np.min(rows, 0)[0])
+        yield f"reality.psnr_small.{lighting}", float(np.mean(rows, 0)[1])
+
+
+def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
+    """How far the route of a built scene lies from the route of the real test."""
+    twin = load_scene(scene)
+    truth = Truth.load(twin.scene.truth)
+    cameras = Cameras.load(twin.scene.stage("metric"))
+    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    station, lateral = nearest(route(), to_truth.points(twin.world().route)[:, :2])
+    yield "reality.route_off_max_m", float(np.abs(lateral).max())
+    yield "reality.route_off_mean_m", float(np.abs(lateral).mean())
+    yield "reality.route_begins_later_m", float(station[0])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, help="a built scene with truth")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures: rasterised, film, difference")
+    options = parser.parse_args()
+    if options.pictures:
+        options.pictures.mkdir(parents=True, exist_ok=True)
+    figures: dict[str, Any] = {}
+    for part in (places_of_tasks(options.scene) if options.scene else (), pictures(options.pictures)):
+        for name, value in part:
+            figures[name] = value
+            print(f"{name:44} {value:8.3f}", flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,244 @@
+"""The real test: whose robot, which road, which light, and that nothing but pictures goes in or rows come out."""
+
+import ast
+import hashlib
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dm_control.rl import control
+
+from twin.alignment.logs import read_log
+from twin.config import MjcfConfig
+from twin.env.drivers import RouteDriver
+from twin.env.options import parse_options
+from twin.env.stretches import STANDARD
+from twin.errors import InputError
+from twin.learn.architecture import Architecture
+from twin.learn.policy import Control, Policy, load_policy, save_policy
+from twin.mjcf.world import arc_lengths, point_at
+from twin.reality import drive, log, road
+from twin.reality import place as places
+from twin.reality.__main__ import main
+from twin.reality.drive import Test
+from twin.reality.lighting import LIGHTINGS
+from twin.reality.robot import Robot, robot
+from twin.reality.weather import WEATHER
+from twin.report.trials import Cell, read_results, read_trials
+from twin.robot import HuskyParams
+
+ROOT = Path(__file__).parents[1]
+STEERING = parse_options({"action": "steering", "pixels": False})
+NARROW = Architecture(convolutions=((2, 8, 8),), features=2, hidden=(2,))
+
+
+def steering(yaw_rate: float, seen: list | None = None) -> Policy:
+    """Always the same yaw rate [rad/s]; keeps what it is shown."""
+
+    def act(stacks):
+        if seen is not None:
+            seen.append(stacks.copy())
+        return np.full((len(stacks), 1), yaw_rate, np.float32)
+
+    return Policy("constant", act, Control())
+
+
+def written(folder: Path, yaw_rate: float) -> Path:
+    """A policy folder that always steers alike."""
+    weights = {name: np.zeros(shape, np.float32) for name, shape in NARROW.shapes().items()}
+    weights["mean.bias"][:] = np.arctanh(yaw_rate)
+    save_policy(folder, NARROW, Control(), weights, {})
+    return folder
+
+
+class Grey:
+    """Stands for a raster where pictures do not matter."""
+
+    def __call__(self, pose):
+        return np.full((90, 160, 3), 0.4, np.float32), np.full((90, 160), 5.0, np.float32)
+
+
+@pytest.fixture
+def grey(monkeypatch):
+    monkeypatch.setattr(drive, "_raster", lambda *_: Grey())
+
+
+# ---- robot, road, light
+
+
+def test_the_robot_is_one_and_another_than_the_published():
+    mine, published = asdict(robot().params), asdict(HuskyParams())
+    assert robot() == robot()
+    for name in ("payload_mass", "friction", "wheel_radius", "servo_lag", "command_latency", "camera_latency"):
+        assert mine[name] != published[name]
+    assert robot().camera.vibration > 0.0 and robot().exposure_drift > 0.0 and robot().camera.shutter > 0.0
+
+
+def test_the_same_commands_lead_elsewhere():
+    """With the published robot on the same road: the training side cannot know where reality's goes."""
+    ends = []
+    for one in (robot(), Robot(HuskyParams(), (0.0, 0.0, 0.0), robot().camera, 0.0)):
+        physics = road.Road("straight", one, STEERING).physics.robot
+        physics.place(10.0, 0.0, 0.0)
+        for k in range(40):
+            physics.command(0.8, 0.6 if k < 20 else -0.6)
+            physics.step()
+        ends.append(physics.planar_pose)
+    assert np.linalg.norm(ends[0][:2] - ends[1][:2]) > 0.05
+
+
+def test_tasks_are_the_twins():
+    """Straight 30 m and right turn 60 m of the filmed path, which is nowhere far from the road's centre."""
+    for task in STANDARD:
+        one = road.Road(task, robot(), STEERING)
+        assert one.stretch.length == pytest.approx({"straight": 30.0, "right_turn": 60.0}[task], abs=1.0)
+        assert one.drive.half_width == MjcfConfig().half_width
+    line = road.route()
+    assert arc_lengths(line)[-1] == pytest.approx(60.0, abs=1.0)
+    assert np.abs(places.build().route.project(line[:, :2])[1]).max() < 0.35
+
+
+def test_the_corridor_is_free_and_a_drive_along_it_arrives():
+    """The robot's width beyond the corridor, nothing solid stands; who knows the way reaches the goal."""
+    points = point_at(road.route()[:, :2], np.arange(0.0, 60.0, 0.1))
+    for thing in road.place().things:
+        for solid in thing.solids:
+            c, s = np.cos(solid.yaw), np.sin(solid.yaw)
+            off = (points - solid.centre[:2]) @ np.array([[c, -s], [s, c]])
+            round_one = np.linalg.norm(off, axis=1) - solid.half[0]
+            square = np.linalg.norm(np.maximum(np.abs(off) - solid.half[:2], 0.0), axis=1)
+            distance = (round_one if solid.kind == "cylinder" else square).min()
+            assert distance > MjcfConfig().half_width + 0.35, thing.name
+    for task in STANDARD:
+        one = road.Road(task, robot(), STEERING)
+        environment = control.Environment(one.physics, one.drive, control_timestep=0.1)
+        one.drive.seed(3)
+        step, driver = environment.reset(), RouteDriver()
+        while not step.last():
+            step = environment.step(driver(environment, step))
+        assert one.drive.cause == "goal"
+
+
+def test_small_things_have_moved_and_nothing_else():
+    filmed, later = places.build(), places.build(later=True)
+    assert [thing.name for thing in filmed.things] == [thing.name for thing in later.things]
+    for before, after in zip(filmed.things, later.things, strict=True):
+        moved = not np.array_equal(before.part.vertices, after.part.vertices)
+        assert moved == before.name.startswith(("cone_", "bin_", "crate_", "car_")), before.name
+        if moved:
+            off = np.linalg.norm(before.part.vertices.mean(0) - after.part.vertices.mean(0))
+            assert 0.0 < off < 2.0
+
+
+def test_its_light_is_not_filmed():
+    assert len(WEATHER) >= 4 and not set(WEATHER) & set(LIGHTINGS)
+    for one in WEATHER.values():
+        for other in LIGHTINGS.values():
+            assert one.ambient != other.ambient and one.suns != other.suns and one.zenith != other.zenith
+
+
+def test_nothing_leaks():
+    """Nothing outside its folder imports what is the test's alone: robot, weather, road, trials."""
+    secret = {"drive", "eye", "flatten", "log", "raster", "road", "robot", "shadows", "weather"}
+    for path in (ROOT / "twin").rglob("*.py"):
+        if path.parent.name == "reality":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+            module = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
+            for name in (f"{module}.{name}".strip(".") for name in names):
+                assert name != "twin.reality" and not (
+                    name.startswith("twin.reality.") and name.split(".")[2] in secret
+                ), (path, name)
+
+
+# ---- trials
+
+
+def test_a_policy_sees_pictures_and_nothing_else(grey):
+    seen: list = []
+    trial = Test(steering(0.9, seen), "straight").trial("rain", 1)
+    assert trial.cause == "out_of_bounds" and len(seen) == trial.steps
+    assert all(stacks.shape == (1, 12, 90, 160) and stacks.dtype == np.uint8 for stacks in seen)
+    assert np.array_equal(seen[0][0, :3], seen[0][0, 9:])  # at first the first picture four times
+    assert np.array_equal(seen[4][0, 3:6], seen[5][0, :3])  # the newest last
+
+
+def test_trials_repeat_and_differ_by_seed():
+    """Pictures and outcome, through a fresh road and robot; in the true light."""
+    sums, ends = [], []
+    for seed in (1, 1, 2):
+        frames: list = []
+        ends.append(Test(steering(0.9), "straight").trial("evening", seed, frames.append))
+        sums.append(hashlib.sha256(np.stack(frames).tobytes()).hexdigest())
+    assert sums[0] == sums[1] != sums[2] and ends[0] == ends[1]
+    assert ends[0].progress != ends[2].progress
+    assert len(frames[0].shape) == 3 and 15 < np.stack(frames).mean() < 200
+
+
+def test_the_seed_alone_decides_where_a_trial_starts(grey):
+    """Not the trials before it, nor the policy, nor the light: policies are compared pair by pair."""
+    one, starts = Test(steering(0.0), "straight"), []
+    environment = one._environment
+    for seed, lighting in ((5, "rain"), (6, "dawn"), (5, "haze")):
+        one.trial(lighting, seed)
+        one.road.drive.seed(seed)
+        environment.reset()
+        starts.append(one.road.physics.planar_pose)
+    assert np.array_equal(starts[0], starts[2]) and not np.array_equal(starts[0], starts[1])
+
+
+def test_results_are_the_sums_of_trials(grey, tmp_path):
+    """As `twin.forecast` reads them; a second call drives only what is missing; a row of another file is refused."""
+    left, ahead = written(tmp_path / "left", 0.9), written(tmp_path / "ahead", 0.001)
+    out = tmp_path / "real" / "results.csv"
+    stack = np.zeros((12, 90, 160), np.uint8)
+    assert load_policy(left)(stack) == pytest.approx(0.9) and load_policy(ahead)(stack) == pytest.approx(0.001)
+    drive.run([left, ahead], "straight", ["rain", "haze"], 2, out)
+    twin = [Cell(policy, "straight", "held-out", 10, 5) for policy in ("left", "ahead")]
+    cells = read_results(out, twin)
+    trials = read_trials(out.with_name("results_trials.csv"))
+    assert len(trials) == 8 and len(cells) == 4
+    for cell in cells:
+        mine = [t for t in trials if (t.policy, t.lighting) == (cell.policy, cell.lighting)]
+        assert (cell.trials, cell.successes) == (len(mine), sum(t.success for t in mine))
+        assert cell.twin_key == (cell.policy, "straight", "held-out")
+    before = out.with_name("results_trials.csv").read_text()
+    drive.run([left], "straight", ["rain"], 3, out, films=tmp_path / "films")
+    assert [film.name for film in (tmp_path / "films").iterdir()] == ["left_straight_rain_7000002.mp4"]
+    after = out.with_name("results_trials.csv").read_text()
+    assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
+    written(left, 0.5)
+    with pytest.raises(InputError, match="another file drove under the name 'left'"):
+        drive.run([left], "straight", ["rain"], 4, out)
+
+
+@pytest.mark.parametrize("what", ["math:sqrt", "missing", "policy.zip", "policy.txt", "folder"])
+def test_only_a_policy_file_drives(what, tmp_path, capsys):
+    given = what if ":" in what else str(tmp_path / what)
+    if what.startswith("policy"):
+        Path(given).write_bytes(b"PK")
+    if what == "folder":
+        Path(given).mkdir()
+    arguments = ["drive", "--policy", given, "--task", "straight", "--trials", "1", "--out", str(tmp_path / "r.csv")]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and what in said
+    assert not (tmp_path / "r.csv").exists()
+
+
+# ---- drive log
+
+
+def test_the_log_is_what_alignment_reads(tmp_path):
+    table = log.record(40.0)
+    log.write(tmp_path / "drive.csv", table)
+    windows = read_log(tmp_path / "drive.csv")
+    assert len(windows) == 19 and windows.twist and windows.acceleration is not None
+    assert np.ptp(table["cmd_v"]) > 0.8 and np.ptp(table["cmd_yaw_rate"]) > 1.5
+    assert np.abs(table["y"]).max() < 2.2
+    assert np.abs(np.diff(table["yaw"])).max() < 0.3
+    assert np.array_equal(log.record(12.0)["x"], log.record(12.0)["x"])
+    with pytest.raises(InputError, match="duration = 3 s"):
+        log.record(3.0)

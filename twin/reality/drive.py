@@ -1,0 +1,209 @@
+"""The real test: a policy file drives reality's Husky on reality's road, in weather that nobody filmed.
+
+A policy is told nothing but pictures. Its file is all that comes in from the training side; rows of trials are all that
+goes back. Trials have seeds: the k-th trial of every policy starts from the same place with the same shaking camera, so
+that policies can be compared pair by pair.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from dm_control.rl import control
+from numpy.typing import NDArray
+
+from twin.env.options import STEERING, parse_options
+from twin.env.tasks import CAMERA
+from twin.errors import InputError
+from twin.learn.policy import JSON, WEIGHTS, Policy, load_policy
+from twin.progress import bar
+from twin.reality import world as worlds
+from twin.reality.eye import Eye
+from twin.reality.film import Plan, encode
+from twin.reality.raster import Raster
+from twin.reality.road import Road, place
+from twin.reality.robot import robot
+from twin.reality.weather import WEATHER
+from twin.report.trials import (
+    EPISODE_COLUMNS,
+    OPTIONAL_RESULT_COLUMNS,
+    RESULT_COLUMNS,
+    Trial,
+    csv_text,
+    read_trials,
+    tally,
+)
+from twin.scene import digest_file, read_json, write_json
+
+TASKS = ("straight", "right_turn")
+HELD_OUT = "held-out"
+"""The twin's lighting that results are compared with, as it knows none of reality's by name."""
+
+_FIRST_SEED = 7_000_000  # of the first trial
+_ENLARGED = 4  # times, in a film
+_COLUMNS = (*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS)
+
+Picture = NDArray[np.uint8]
+
+
+def policy_file(path: Path) -> Policy:
+    """The policy in a file.
+
+    Raises:
+        InputError: none there, or something that could run code here, such as a Python callable.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such policy file; reality is driven by a policy folder or an .onnx file only")
+    return load_policy(path)
+
+
+@cache
+def _raster(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int]) -> Raster:
+    return Raster(worlds.spec(WEATHER[lighting], place()).compile(), np.array(intrinsics), size)
+
+
+class Test:
+    """One policy on one task."""
+
+    __test__ = False  # none of pytest's
+
+    def __init__(self, policy: Policy, task: str) -> None:
+        """Raises InputError: no such task, or a policy that asks for what the robot cannot do."""
+        self.policy, self._robot = policy, robot()
+        options = {key: value for key, value in policy.options().items() if key not in ("size", "stack")}
+        self.road = Road(task, self._robot, parse_options({**options, "pixels": False}))
+        self._environment = control.Environment(
+            self.road.physics, self.road.drive, control_timestep=policy.control.control_timestep
+        )
+
+    def trial(self, lighting: str, seed: int, watch: Callable[[Picture], None] | None = None) -> Trial:
+        """Drives once.
+
+        Args:
+            lighting: One of `WEATHER`.
+            seed: Of everything random in the trial.
+            watch: Is shown every picture (h, w, 3).
+        """
+        policy, drive, physics = self.policy, self.road.drive, self.road.physics
+        drive.seed(seed)
+        self._environment.reset()
+        intrinsics = self.road.intrinsics(policy.size)
+        eye = Eye(
+            _raster(lighting, tuple(intrinsics.tolist()), policy.size),
+            WEATHER[lighting],
+            self._robot,
+            intrinsics,
+            policy.size,
+            drive.rng(CAMERA),
+        )
+        width, height = policy.size
+        stack, steps, ended = np.zeros((policy.stack, 3, height, width), np.uint8), 0, False
+        while not ended:
+            picture = eye.look(physics.camera_to_world, physics.time())
+            if watch:
+                watch(picture)
+            newest = picture.transpose(2, 0, 1)
+            stack = np.concatenate([stack[1:], newest[None]]) if steps else np.repeat(newest[None], policy.stack, 0)
+            v, yaw_rate = policy.command(policy(stack.reshape(3 * policy.stack, height, width)))
+            action = [yaw_rate] if policy.control.action == STEERING else [v, yaw_rate]
+            ended, steps = self._environment.step(np.array(action)).last(), steps + 1
+        return Trial(policy.name, drive.stretch.name, lighting, seed, drive.cause, drive.progress, steps)
+
+
+def run(
+    policies: Sequence[Path],
+    task: str,
+    lightings: Sequence[str],
+    trials: int,
+    out: Path,
+    twin_lighting: str = HELD_OUT,
+    films: Path | None = None,
+) -> list[Trial]:
+    """Drives what is not yet in the table of trials, and sums all of it up.
+
+    Args:
+        policies: Files.
+        task: One of `TASKS`.
+        lightings: Some of `WEATHER`.
+        trials: Per policy and lighting.
+        out: Gets the results as `twin.forecast` reads them; `<name>_trials.csv` beside it gets a row per trial, and
+            `<name>_policies.json` the sums of the files that were driven with.
+        twin_lighting: Goes into the results' column of this name.
+        films: Gets a film of every trial, of what the robot saw.
+
+    Returns:
+        Every trial of the table, those of earlier calls too.
+
+    Raises:
+        InputError: unknown names, unusable policy files, or another file than before under a policy's name.
+    """
+    for name in lightings:
+        if name not in WEATHER:
+            raise InputError(f"lighting {name!r}: reality's are {', '.join(WEATHER)}")
+    if trials < 1:
+        raise InputError(f"trials = {trials}; expected at least 1")
+    table = out.with_name(f"{out.stem}_trials.csv")
+    loaded = [policy_file(path) for path in policies]
+    _remember(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
+    done = read_trials(table) if table.exists() else []
+    known = {(*_key(one), one.seed) for one in done}
+    for policy in loaded:
+        test = Test(policy, task)
+        for lighting in lightings:
+            seeds = [_FIRST_SEED + k for k in range(trials)]
+            missing = [seed for seed in seeds if (policy.name, task, lighting, seed) not in known]
+            with bar(f"{policy.name}, {task}, {lighting}", len(missing), "trial") as progress:
+                for seed in missing:
+                    frames: list[Picture] = []
+                    done.append(test.trial(lighting, seed, frames.append if films else None))
+                    if films:
+                        _film(frames, films / f"{policy.name.replace('/', '_')}_{task}_{lighting}_{seed}.mp4")
+                    _write(done, table, out, twin_lighting)
+                    progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
+                    progress.update()
+    _write(done, table, out, twin_lighting)
+    return done
+
+
+def _film(frames: Sequence[Picture], path: Path) -> None:
+    """Ten pictures a second, enlarged."""
+    height, width = (_ENLARGED * side for side in frames[0].shape[:2])
+    plan = Plan(width=width, height=height, fps=10, crf=23)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encode((cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in frames), plan, path)
+
+
+def _key(trial: Trial) -> tuple[str, str, str]:
+    return trial.policy, trial.task, trial.lighting
+
+
+def _write(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) -> None:
+    rows = [
+        (cell.policy, cell.lighting, str(cell.trials), str(cell.successes), cell.task, twin_lighting)
+        for cell in tally(trials)
+    ]
+    for path, text in (
+        (table, csv_text(EPISODE_COLUMNS, [trial.row() for trial in trials])),
+        (out, csv_text(_COLUMNS, rows)),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+
+
+def _remember(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -> None:
+    """Notes which file drove under which name."""
+    sums: dict[str, str] = read_json(record) if record.exists() else {}
+    for policy, path in zip(policies, paths, strict=True):
+        folder = path.parent if path.name == JSON else path
+        digest = digest_file(folder / WEIGHTS if folder.is_dir() else folder)
+        if sums.setdefault(policy.name, digest) != digest:
+            raise InputError(
+                f"{path}: {record} says that another file drove under the name {policy.name!r}; give another --out, or "
+                "rename the policy"
+            )
+    record.parent.mkdir(parents=True, exist_ok=True)
+    write_json(record, sums)
