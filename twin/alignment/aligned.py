@@ -158,7 +158,7 @@ def align(
     tilt = slope.gravity(windows, icr)
     ground_fit = ground.fit_ground(params, drive, windows, tilt, progress)
     robot = ground.robot(params, ground_fit.values)
-    seen = {
+    seen: dict[str, Any] = {
         field: value
         for field, value in drive.robot(params, windows.twist).items()
         if _DRIVE_FIELDS[field][0] in drive_fit.errors and (windows.twist or field != "separation_multiplier")

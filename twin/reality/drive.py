@@ -9,11 +9,10 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
-from dm_control.rl import control
 from numpy.typing import NDArray
 
+from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
 from twin.env.tasks import CAMERA
 from twin.errors import InputError
@@ -172,7 +171,7 @@ def _film(frames: Sequence[Picture], path: Path) -> None:
     height, width = (_ENLARGED * side for side in frames[0].shape[:2])
     plan = Plan(width=width, height=height, fps=10, crf=23)
     path.parent.mkdir(parents=True, exist_ok=True)
-    encode((cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in frames), plan, path)
+    encode((np.repeat(np.repeat(one, _ENLARGED, 0), _ENLARGED, 1) for one in frames), plan, path)
 
 
 def _key(trial: Trial) -> tuple[str, str, str]:

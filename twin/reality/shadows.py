@@ -4,8 +4,8 @@ The map covers the road that is driven, `_RANGE`; what lies beyond it is in the 
 something lies between it and the sun; each look asks the four nearest texels and blends their answers.
 """
 
-# mypy: disable-error-code="index, attr-defined, valid-type, misc, no-untyped-def, call-overload"
-# (inside kernels, Warp's own types hold, which mypy does not know)
+# Inside kernels Warp's own types hold, which mypy does not know.
+# mypy: ignore-errors
 
 import numpy as np
 import warp as wp
