@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from dm_control.rl import control
 from numpy.typing import NDArray
@@ -172,7 +171,7 @@ def _film(frames: Sequence[Picture], path: Path) -> None:
     height, width = (_ENLARGED * side for side in frames[0].shape[:2])
     plan = Plan(width=width, height=height, fps=10, crf=23)
     path.parent.mkdir(parents=True, exist_ok=True)
-    encode((cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in frames), plan, path)
+    encode((one.repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for one in frames), plan, path)
 
 
 def _key(trial: Trial) -> tuple[str, str, str]:

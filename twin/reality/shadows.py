@@ -4,7 +4,7 @@ The map covers the road that is driven, `_RANGE`; what lies beyond it is in the 
 something lies between it and the sun; each look asks the four nearest texels and blends their answers.
 """
 
-# mypy: disable-error-code="index, attr-defined, valid-type, misc, no-untyped-def, call-overload"
+# mypy: disable-error-code="index, attr-defined, valid-type, misc, no-untyped-def, call-overload, arg-type, type-var, operator, assignment"
 # (inside kernels, Warp's own types hold, which mypy does not know)
 
 import numpy as np
