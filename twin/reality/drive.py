@@ -171,7 +171,7 @@ def _film(frames: Sequence[Picture], path: Path) -> None:
     height, width = (_ENLARGED * side for side in frames[0].shape[:2])
     plan = Plan(width=width, height=height, fps=10, crf=23)
     path.parent.mkdir(parents=True, exist_ok=True)
-    encode((np.repeat(np.repeat(one, _ENLARGED, 0), _ENLARGED, 1) for one in frames), plan, path)
+    encode((one.repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for one in frames), plan, path)
 
 
 def _key(trial: Trial) -> tuple[str, str, str]:

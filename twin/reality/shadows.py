@@ -4,8 +4,8 @@ The map covers the road that is driven, `_RANGE`; what lies beyond it is in the 
 something lies between it and the sun; each look asks the four nearest texels and blends their answers.
 """
 
-# Inside kernels Warp's own types hold, which mypy does not know.
 # mypy: ignore-errors
+# (inside kernels, Warp's own types hold, which mypy does not know)
 
 import numpy as np
 import warp as wp
