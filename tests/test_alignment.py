@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drive_logs import columns, write_csv
 
-from tests.drive_logs import columns, write_csv
 from twin.align import main
 from twin.alignment import commands, currents, ground, kinematics, logs, slope
 from twin.alignment.aligned import align, robot_toml
@@ -328,7 +328,7 @@ def test_gaps_are_left_out(drive):
 
 def test_bag_is_the_same_log(drive, tmp_path):
     pytest.importorskip("rosbags")
-    from tests.ros_bag import write_bag
+    from ros_bag import write_bag
 
     rows = {name: column[:900] for name, column in drive.items()}
     bag = logs.read_log(write_bag(tmp_path / "bag", rows))
@@ -340,7 +340,7 @@ def test_bag_is_the_same_log(drive, tmp_path):
 
 def test_a_bag_without_commands(drive, tmp_path):
     pytest.importorskip("rosbags")
-    from tests.ros_bag import write_bag
+    from ros_bag import write_bag
 
     bag = write_bag(tmp_path / "bag", {name: column[:50] for name, column in drive.items()}, without=("commands",))
     with pytest.raises(InputError, match=r"no topic with commands .*record it"):

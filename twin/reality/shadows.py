@@ -4,8 +4,14 @@ The map covers the road that is driven, `_RANGE`; what lies beyond it is in the 
 something lies between it and the sun; each look asks the four nearest texels and blends their answers.
 """
 
+<<<<<<< HEAD
 # mypy: ignore-errors
+=======
+# mypy: disable-error-code="index, attr-defined, valid-type, misc, call-overload, arg-type, type-var, operator"
+>>>>>>> road
 # (inside kernels, Warp's own types hold, which mypy does not know)
+
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -96,7 +102,8 @@ def draw(corners: wp.array, flat: Flat) -> Map:
     low, high = (box @ np.stack([right, up], 1)).min(0), (box @ np.stack([right, up], 1)).max(0)
     columns, rows = np.ceil((high - low) / _TEXEL).astype(int).tolist() if len(casting) else (1, 1)
     out.right, out.up, out.ray, out.left_bottom = wp.vec3(*right), wp.vec3(*up), wp.vec3(*ray), wp.vec2(*low)
-    out.depth = wp.full((rows, columns), _FAR, dtype=float, device="cpu")
+    depth: Any = wp.full((rows, columns), _FAR, dtype=float, device="cpu")
+    out.depth = depth
     if len(casting):
         wp.launch(_draw, len(corners), [corners, out], device="cpu")
     return out
