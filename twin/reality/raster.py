@@ -11,11 +11,7 @@ barycentric coordinates there (Olano and Greer, Triangle scan conversion using 2
 sum is d · ((b − a) × (c − a)), and z = det / the sum. No clipping is needed.
 """
 
-<<<<<<< HEAD
-# mypy: ignore-errors
-=======
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
->>>>>>> road
 # (inside kernels, Warp's own types hold, which mypy does not know)
 
 from typing import Any

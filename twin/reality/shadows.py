@@ -4,11 +4,7 @@ The map covers the road that is driven, `_RANGE`; what lies beyond it is in the 
 something lies between it and the sun; each look asks the four nearest texels and blends their answers.
 """
 
-<<<<<<< HEAD
-# mypy: ignore-errors
-=======
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, call-overload, arg-type, type-var, operator"
->>>>>>> road
 # (inside kernels, Warp's own types hold, which mypy does not know)
 
 from typing import Any
