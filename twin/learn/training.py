@@ -114,7 +114,7 @@ class TrainConfig:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "cpu": {},
-    # The paper's input at full resolution, speed and steering both its own.
+    # The paper's input at full resolution. Not measured on a GPU yet.
     "gpu": {
         "pool": 1,
         "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
