@@ -118,6 +118,16 @@ def overlay(scene: Path, quick: bool) -> dict[str, Any]:
     return round_trip(scene, None, KINDS[:1] if quick else KINDS)
 
 
+def seen_touched(scene: Path, quick: bool) -> dict[str, Any]:
+    """What the last build's report says of what is seen against what is solid (`twin.report.seen_touched`)."""
+    from twin.loading import load_scene
+
+    found = load_scene(scene).report().get("seen_touched")
+    if not found:
+        return {"seen_touched.median_m": None}
+    return {f"seen_touched.{name}": value for name, value in found.items() if isinstance(value, int | float)}
+
+
 def gpu(scene: Path, quick: bool) -> dict[str, Any]:
     """Many worlds on one GPU, where there is one."""
     import warp as wp
@@ -135,5 +145,6 @@ SECTIONS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {
     "soak": soak,
     "trust": trust,
     "overlay": overlay,
+    "seen_touched": seen_touched,
     "gpu": gpu,
 }

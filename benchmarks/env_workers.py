@@ -107,17 +107,22 @@ def software_gl(scene: Path) -> tuple[Any, str]:
 def batch(scene: Path, count: int, runs: int) -> dict[str, Any]:
     """Many worlds on two cores; steps of all worlds counted."""
     worlds = _worlds(scene, count)
-    rates = []
+    rates, costs = [], []
     for _ in range(runs):
         worlds.begin(range(count))
-        begin, steps = 0.0, max(8, _STEPS * 4 // count)
+        begin, used, steps = 0.0, 0.0, max(8, _STEPS * 4 // count)
         for k in range(steps + 3):
             if k == 3:
-                begin = time.perf_counter()
+                begin, used = time.perf_counter(), time.process_time()
             worlds.step(_onward(worlds))
             worlds.observation()
         rates.append(count * steps / (time.perf_counter() - begin))
-    return {f"batch{count}.steps_per_s": max(rates), f"batch{count}.steps_per_s_all": [round(v, 1) for v in rates]}
+        costs.append((time.process_time() - used) / (count * steps))
+    return {
+        f"batch{count}.steps_per_s": max(rates),
+        f"batch{count}.steps_per_s_all": [round(v, 1) for v in rates],
+        f"batch{count}.cpu_ms_per_step": 1e3 * min(costs),
+    }
 
 
 def physics(scene: Path, runs: int) -> dict[str, Any]:

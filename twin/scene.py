@@ -8,6 +8,8 @@ scenes/<name>/
     1_capture/ ... 6_review/   one folder per stage, written aside as `<folder>.partial` and renamed when done
     report.json report.html review.mp4
   lightings/            <name>.json and .png: lightings fitted to photos of the built place
+  validation/           episodes.csv, cells.csv: policies driven in the twin
+  forecast/             forecast.json .csv .html: what that says about the real runs
 """
 
 import hashlib
@@ -69,6 +71,20 @@ class SceneDir:
     def lightings(self) -> Path:
         """Lightings added to the built field; outside `build/`, which may be deleted."""
         return self.root / "lightings"
+
+    @property
+    def episodes_csv(self) -> Path:
+        """One row per trial in the twin; columns in `twin.report.trials`."""
+        return self.root / "validation" / "episodes.csv"
+
+    @property
+    def cells_csv(self) -> Path:
+        """The same, summed up by policy, task and lighting."""
+        return self.root / "validation" / "cells.csv"
+
+    @property
+    def forecast(self) -> Path:
+        return self.root / "forecast"
 
     @property
     def truth(self) -> Path:

@@ -36,7 +36,7 @@ _DRIVE_FIELDS = {  # a field of HuskyParams → what of the drive shows it
 _GROUND_FIELDS = {
     "friction": ("friction",),
     "spin_friction": ("spin_friction",),
-    "slip_stiffness": ("log10_slip_stiffness",),
+    "slip_stiffness": ("creep",),
     "ground_viscosity": ("ground_viscosity",),
     "center_of_mass": ("center_of_mass_x", "center_of_mass_y", "center_of_mass_z"),
     "wheel_radius": ("radius_left", "radius_right"),
@@ -78,6 +78,8 @@ class Alignment:
             value = getattr(self.robot, field)
             if names[0].startswith("log10_"):
                 errors = [errors[0] * np.log(10) * value]
+            elif field == "slip_stiffness":  # the inverse of what was fitted
+                errors = [errors[0] * value**2]
             out[field] = (value, tuple(errors)) if isinstance(value, tuple) else (value, errors[0])
         return out
 
@@ -156,7 +158,7 @@ def align(
     tilt = slope.gravity(windows, icr)
     ground_fit = ground.fit_ground(params, drive, windows, tilt, progress)
     robot = ground.robot(params, ground_fit.values)
-    seen = {
+    seen: dict[str, Any] = {
         field: value
         for field, value in drive.robot(params, windows.twist).items()
         if _DRIVE_FIELDS[field][0] in drive_fit.errors and (windows.twist or field != "separation_multiplier")

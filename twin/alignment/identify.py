@@ -6,8 +6,8 @@ that are not, the least certain one goes back to its usual value, the rest is ju
 again. Before the first fit, far from the best values, only hopeless ones go: those uncertain by ten times their span.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
-any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible windows
-neither pull nor blow them up.
+any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible
+windows neither pull nor blow them up.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from twin.alignment.kinematics import bend
+from twin.alignment.kinematics import bend, bent_slopes, weighted
 
 Array = NDArray[np.float64]
 
@@ -72,14 +72,14 @@ def fit(
         error: Residuals of every window for values by name, in units of a good model's miss, shape (n, looks, ...).
         groups: Of the windows, shape (n,).
         evaluations: At most, per round of the search; each takes one `error` per free parameter besides.
-        progress: Told one line per round.
+        progress: Told a line per round and per step of the search.
     """
     free = {p.name: p for p in table}
     values = {p.name: p.start for p in table}
     refused: dict[str, str] = {}
 
-    def bent(point: Array, names: list[str]) -> Array:
-        return bend(error(values | dict(zip(names, point.tolist(), strict=True))))
+    def at(point: Array, names: list[str]) -> Array:
+        return error(values | dict(zip(names, point.tolist(), strict=True)))
 
     def slopes(point: Array, names: list[str], now: Array) -> Array:
         columns = []
@@ -88,13 +88,13 @@ def fit(
             step = _STEP * p.span * (1 if point[i] + _STEP * p.span <= p.high else -1)
             moved = point.copy()
             moved[i] += step
-            columns.append((bent(moved, names) - now) / step)
-        return np.stack([c.reshape(len(now), -1) for c in columns], -1)
+            columns.append((at(moved, names) - now) / step)
+        return np.stack(columns, -1)
 
     for attempt in range(_MAX_ROUNDS):
         names = list(free)
         point = np.array([values[name] for name in names])
-        now = bent(point, names)
+        now = at(point, names)
         jacobian = slopes(point, names, now)
         while True:  # judge, drop the worst, judge again
             errors = _standard_errors(jacobian, now, groups, np.array([free[n].span for n in names]))
@@ -110,33 +110,47 @@ def fit(
             )
             jacobian = np.delete(jacobian, worst, -1)
         if attempt and len(names) == len(point):  # nothing dropped after a fit
-            cost = float((now**2).sum((*range(1, now.ndim),)).mean())
+            cost = float((bend(now) ** 2).sum() / len(now))
             return Fit(values, dict(zip(names, errors.tolist(), strict=True)), refused, cost)
         progress(f"fitting {', '.join(names) or 'nothing'}")
         if not names:
             continue
-        bounds = ([free[n].low for n in names], [free[n].high for n in names])
+        # In spans from where the search begins: SciPy's first step is then one span at most, and its tolerances mean
+        # the same for every parameter.
         spans = np.array([free[n].span for n in names])
+        low = np.array([free[n].low for n in names])
+        high = np.array([free[n].high for n in names])
+        origin = np.clip([values[n] for n in names], low + 1e-6 * spans, high - 1e-6 * spans)
+
+        def shifted(z: Array, origin=origin, spans=spans, names=names) -> Array:
+            return bend(at(origin + z * spans, names)).ravel()
+
+        def tilted(z: Array, origin=origin, spans=spans, names=names) -> Array:
+            x = origin + z * spans
+            error_now = at(x, names)
+            progress(f"  mean log(1 + s) = {(bend(error_now) ** 2).sum() / len(error_now):.4f}")
+            return bent_slopes(error_now, slopes(x, names, error_now)).reshape(-1, len(names)) * spans
+
         found = least_squares(
-            lambda x, names=names: bent(x, names).ravel(),
-            np.clip([values[n] for n in names], *bounds),
-            jac=lambda x, names=names: slopes(x, names, bent(x, names)).reshape(-1, len(names)),
-            bounds=bounds,
-            x_scale=spans,
+            shifted,
+            np.zeros(len(names)),
+            jac=tilted,
+            bounds=((low - origin) / spans, (high - origin) / spans),
             ftol=3e-4,
-            xtol=1e-3,
+            xtol=3e-3,
             max_nfev=evaluations,
         )
-        values |= dict(zip(names, found.x.tolist(), strict=True))
+        values |= dict(zip(names, (origin + found.x * spans).tolist(), strict=True))
     raise ArithmeticError(f"parameters were still dropped after {_MAX_ROUNDS} fits: {', '.join(refused)}")
 
 
 def _standard_errors(jacobian: Array, error: Array, groups: NDArray[np.int64], spans: Array) -> Array:
-    """Cluster-robust, shape (p,), from slopes (n, m, p) and residuals (n, ...); infinite where there is no slope."""
+    """Cluster-robust, shape (p,), from slopes (n, ..., p) and residuals (n, ...); infinite where there is no slope."""
     if not jacobian.shape[-1]:
         return np.zeros(0)
-    scaled = jacobian * spans
-    score = np.einsum("nmp,nm->np", scaled, error.reshape(len(error), -1))
+    scaled = weighted(error, jacobian * spans).reshape(len(error), -1, len(spans))
+    error = weighted(error, error).reshape(len(error), -1)
+    score = np.einsum("nmp,nm->np", scaled, error)
     _, cluster = np.unique(groups, return_inverse=True)
     meat = np.zeros((scaled.shape[-1],) * 2)
     count = int(cluster.max()) + 1

@@ -92,12 +92,40 @@ def residuals(predicted: Array, windows: Windows) -> Array:
 
 
 def bend(error: Array) -> Array:
-    """Residuals (n, ...) scaled per window so that their squares sum to log(1 + s), s their mean square over looks."""
-    size = (error**2).sum(tuple(range(1, error.ndim))) / error.shape[1]
-    # log(1 + s) / s tends to 1 at 0.
-    scale = np.sqrt(np.log1p(size) / np.maximum(size, 1e-12))
-    scale = np.where(size < 1e-9, 1.0, scale) / np.sqrt(error.shape[1])
-    return error * scale.reshape(-1, *[1] * (error.ndim - 1))
+    """Residuals (n, looks, ...) scaled per window so that their squares sum to log(1 + s), s their mean over looks."""
+    return error * _per_window(_bent(_size(error)) / np.sqrt(error.shape[1]), error)
+
+
+def bent_slopes(error: Array, slopes: Array) -> Array:
+    """What a least-squares solver may take for the slopes of `bend(error)`: with them its gradient is exact.
+
+    The true ones turn with the residuals, over which differences stumble; Gauss and Newton do not need that part.
+
+    Args:
+        error: Shape (n, looks, ...).
+        slopes: Of `error`, one more axis.
+    """
+    size = _size(error)
+    factor = 1 / (1 + size) / _bent(size) / np.sqrt(error.shape[1])
+    return slopes * _per_window(factor, slopes)
+
+
+def weighted(error: Array, values: Array) -> Array:
+    """Values (n, ...) times the root of their window's weight 1 / (1 + s), as iterated least squares would have it."""
+    return values * _per_window(1 / np.sqrt((1 + _size(error)) * error.shape[1]), values)
+
+
+def _size(error: Array) -> Array:
+    return (error**2).sum(tuple(range(1, error.ndim))) / error.shape[1]
+
+
+def _bent(size: Array) -> Array:
+    """√(log(1 + s) / s), which tends to 1 at 0."""
+    return np.where(size < 1e-9, 1.0, np.sqrt(np.log1p(size) / np.maximum(size, 1e-12)))
+
+
+def _per_window(factor: Array, like: Array) -> Array:
+    return factor.reshape(-1, *[1] * (like.ndim - 1))
 
 
 def end_errors(predicted: Array, windows: Windows) -> tuple[Array, Array]:

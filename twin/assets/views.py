@@ -65,16 +65,18 @@ class Views:
     def __len__(self) -> int:
         return len(self.depth)
 
-    def points(self, i: int) -> Array:
-        """World points of view i's pixels, shape (h, w, 3) [m]."""
+    def points(self, i: int, depth: NDArray | None = None) -> Array:
+        """World points of view i's pixels, at another z-depth where given, shape (h, w, 3) [m]."""
         height, width = self.depth.shape[1:]
         rays = unproject(pixel_grid(width, height), self.intrinsics[i])
-        local = rays * self.depth[i, ..., None]
+        local = rays * (self.depth[i] if depth is None else depth)[..., None]
         return local @ self.camera_to_world[i, :3, :3].T + self.camera_to_world[i, :3, 3]
 
 
-def render_views(field: Field, cameras: Cameras, count: int, width: int, far: float) -> Views:
-    """Renders the field from `count` spread-out training frames, under its first lighting.
+def render_views(
+    field: Field, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
+) -> Views:
+    """Renders the field from `count` spread-out training frames, under its first lighting unless another is given.
 
     Args:
         field: The radiance field.
@@ -91,7 +93,7 @@ def render_views(field: Field, cameras: Cameras, count: int, width: int, far: fl
     with progress.bar("rendering depth", len(chosen), "view") as bar:
         for start in range(0, len(chosen), _BATCH):
             part = slice(start, start + _BATCH)
-            image = field.render(chosen.select(np.arange(len(chosen))[part]), field.lightings[0], size)
+            image = field.render(chosen.select(np.arange(len(chosen))[part]), lighting or field.lightings[0], size)
             rgb.append((np.clip(image.rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
             depth.append(believed_depth(np.asarray(image.depth), np.asarray(image.opacity), far))
             bar.update(len(image.depth))

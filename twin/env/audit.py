@@ -17,10 +17,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from dm_control.rl import control
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from twin.env.dm import control
 from twin.env.obstacles import ground_height
 from twin.env.physics import HuskyPhysics
 from twin.env.scene_model import episode_spec

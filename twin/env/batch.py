@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 
 import dm_env
 import numpy as np
-from dm_control.rl import control
 from numpy.typing import NDArray
 
+from twin.env.dm import control
 from twin.env.suite import Stage
 
 Array = NDArray[np.float64]
@@ -89,21 +89,24 @@ class Worlds:
         if self.pixels:
             self.pixels.begin(which)
 
-    def step(self, actions: NDArray) -> Outcome:
-        """One control step of all worlds, none of which may be at its episode's end.
+    def step(self, actions: NDArray, which: Sequence[int] | None = None) -> Outcome:
+        """One control step of worlds, none of which may be at its episode's end.
 
         Args:
-            actions: Of each world, every number in [-1, 1], which spans what `action_spec` allows; shape (n, actions).
+            actions: Of each, every number in [-1, 1], which spans what `action_spec` allows; shape (k, actions).
+            which: Of which worlds; all unless given. The outcome has their order.
         """
+        which = range(len(self)) if which is None else which
         wanted = self._low + (np.clip(actions, -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
 
-        def advance(i: int) -> dm_env.TimeStep:
-            return self._environments[i].step(wanted[i])
+        def advance(k: int) -> dm_env.TimeStep:
+            return self._environments[which[k]].step(wanted[k])
 
-        steps = self._each(advance, range(len(self)))
-        self._steps = list(steps)
+        steps = self._each(advance, range(len(which)))
+        for i, step in zip(which, steps, strict=True):
+            self._steps[i] = step
         if self.pixels:
-            self.pixels.look(range(len(self)))
+            self.pixels.look(which)
         last = np.array([step.last() for step in steps])
         goes_on = np.array([step.discount for step in steps]) > 0.0
         return Outcome(np.array([step.reward for step in steps]), last & ~goes_on, last & goes_on)

@@ -13,9 +13,9 @@ from typing import Protocol
 
 import dm_env
 import numpy as np
-from dm_control.rl import control
 from numpy.typing import NDArray
 
+from twin.env.dm import control
 from twin.env.follower import Pursuit
 from twin.env.options import STEERING
 from twin.errors import InputError

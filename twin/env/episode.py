@@ -7,10 +7,10 @@ from typing import Any
 
 import dm_env
 import numpy as np
-from dm_control.rl import control
 from numpy.typing import NDArray
 
 from twin.config import ObstacleConfig, parse
+from twin.env.dm import control
 from twin.env.drivers import Driver
 from twin.scene import read_json, write_json
 

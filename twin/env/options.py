@@ -17,6 +17,7 @@ CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
 """Why an episode ends."""
 
 TWIST, STEERING = "twist", "steering"
+NERF, SIMULATOR = "nerf", "simulator"
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class Options:
     """The robot starts beside the route by a distance uniform within ± this [m]..."""
     start_heading: float = 10.0
     """... and turned away from its heading by an angle uniform within ± this [°]."""
+    observe: str = NERF
+    """nerf: pictures of the field; simulator: MuJoCo's own of the extracted mesh, in its own light."""
     lighting: str | Sequence[str] = TRAINING
     """See `lightings.py`."""
     lighting_drift: bool = False
@@ -98,6 +101,8 @@ def parse_options(given: dict[str, Any]) -> Options:
     options = Options(**given)
     if options.action not in (TWIST, STEERING):
         raise InputError(f"action = {options.action!r}; expected {TWIST!r} or {STEERING!r}")
+    if options.observe not in (NERF, SIMULATOR):
+        raise InputError(f"observe = {options.observe!r}; expected {NERF!r} or {SIMULATOR!r}")
     for name, low in (("control_timestep", 0.01), ("speed", 0.01), ("yaw_rate", 0.01), ("stack", 1)):
         if not getattr(options, name) >= low:
             raise InputError(f"{name} = {getattr(options, name)}; expected at least {low:g}")

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from twin.env.camera_effects import CameraEffects
 from twin.env.dm_physics import DrivePhysics
 from twin.env.lightings import Light, LightSets, draw_light
-from twin.env.options import Options
+from twin.env.options import SIMULATOR, Options
 from twin.env.overlay import Overlay
+from twin.env.simulator_view import SimulatorView
 from twin.env.tasks import CAMERA, LIGHT, Drive
 from twin.env.trust import Trust
 from twin.nerf.baked import BakedField
 
 Picture = NDArray[np.uint8]
+
+_PLAIN = Light(SIMULATOR, np.zeros(0, np.float32))
 
 
 class Pixels:
@@ -26,8 +29,8 @@ class Pixels:
 
     def __init__(
         self,
-        overlay: Overlay,
-        field: BakedField,
+        overlay: Overlay | SimulatorView,
+        field: BakedField | None,
         trust: Trust,
         options: Options,
         worlds: Sequence[tuple[DrivePhysics, Drive]],
@@ -35,13 +38,13 @@ class Pixels:
         """
         Args:
             overlay: Renders the worlds.
-            field: Of the place; knows its lightings.
+            field: Of the place; knows its lightings. None where MuJoCo draws it, in its own light.
             trust: What was filmed of it.
             options: Size, stack, lighting.
             worlds: Whose episodes are observed.
         """
         self._overlay, self.options, self.worlds = overlay, options, list(worlds)
-        self._trust, self._sets = trust, LightSets(field)
+        self._trust, self._sets = trust, LightSets(field) if field else None
         width, height = options.size
         self.stacks = np.zeros((len(self.worlds), options.stack, 3, height, width), np.uint8)
         """Shape (n, stack, 3, height, width): colours first, as networks want them."""
@@ -55,7 +58,9 @@ class Pixels:
         o = self.options
         for i in which:
             task = self.worlds[i][1]
-            self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
+            self.lights[i] = _PLAIN
+            if self._sets:
+                self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
             if o.camera:
                 self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
         if len(which):

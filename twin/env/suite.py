@@ -11,17 +11,18 @@ from typing import Any
 import dm_env
 import mujoco
 import numpy as np
-from dm_control.rl import control
 from dm_env import specs
 
 from twin.config import load_config
+from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles
 from twin.env.obstacles import add_obstacles
-from twin.env.options import Options, parse_options
+from twin.env.options import NERF, Options, parse_options
 from twin.env.overlay import Overlay
 from twin.env.pixels import Pixels
 from twin.env.scene_model import episode_spec
+from twin.env.simulator_view import SimulatorView
 from twin.env.stretches import Stretch, find_task
 from twin.env.tasks import Drive
 from twin.env.trust import Trust
@@ -41,7 +42,7 @@ class Stage:
     obstacles: EpisodeObstacles
     model: mujoco.MjModel
     field: BakedField | None
-    """None where no pictures are wanted."""
+    """None where no pictures of it are wanted."""
     trust: Trust | None
 
     @staticmethod
@@ -58,7 +59,8 @@ class Stage:
         obstacles = EpisodeObstacles(wanted, world, stretch)
         spec = episode_spec(world, stretch.start, stretch.end, parsed.half_width or world.half_width)
         add_obstacles(spec, obstacles.pool, world)
-        field, trust = (twin.field(), Trust(twin.cameras())) if parsed.pixels else (None, None)
+        trust = Trust(twin.cameras()) if parsed.pixels else None
+        field = twin.field() if parsed.pixels and parsed.observe == NERF else None
         return Stage(world, stretch, parsed, obstacles, spec.compile(), field, trust)
 
     def drive(self, seed: int | None) -> tuple[DrivePhysics, Drive]:
@@ -67,10 +69,16 @@ class Stage:
         return physics, Drive(self.world, self.stretch, self.options, self.obstacles, self.model, seed)
 
     def pixels(self, worlds: list[tuple[DrivePhysics, Drive]]) -> Pixels | None:
-        if self.field is None or self.trust is None:
+        if self.trust is None:
             return None
-        overlay = Overlay(self.model, self.field, self.options.size, len(worlds))
-        return Pixels(overlay, self.field, self.trust, self.options, worlds)
+        size, count = self.options.size, len(worlds)
+        if self.field is not None:
+            overlay = Overlay(self.model, self.field, size, count)
+            return Pixels(overlay, self.field, self.trust, self.options, worlds)
+        half_width = self.options.half_width or self.world.half_width
+        spec = episode_spec(self.world, self.stretch.start, self.stretch.end, half_width, looks=True)
+        add_obstacles(spec, self.obstacles.pool, self.world)
+        return Pixels(SimulatorView(spec.compile(), size, count), None, self.trust, self.options, worlds)
 
 
 class SeenDrive(control.Environment):

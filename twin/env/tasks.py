@@ -14,11 +14,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from dm_control.rl import control
 from dm_env import specs
 from numpy.typing import NDArray
 
 from twin.config import ObstacleConfig
+from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles, Surroundings
 from twin.env.options import STEERING, Options

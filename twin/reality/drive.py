@@ -10,9 +10,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from dm_control.rl import control
 from numpy.typing import NDArray
 
+from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
 from twin.env.tasks import CAMERA
 from twin.errors import InputError

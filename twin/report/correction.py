@@ -56,7 +56,8 @@ def powered_mean(
 
     λ is tuned without the policy it is applied to (leave one out), which keeps the estimate exactly unbiased; tuned on
     the same few policies it would not be (Mani et al., arXiv 2505.20178). The interval uses Student's t with n − 1
-    degrees of freedom, as n is small.
+    degrees of freedom, as n is small; in simulation it holds 0.91 to 0.93 of the time for rates of policies of varied
+    quality, but 0.8 for six policies most of which fail.
 
     Args:
         twin: fᵢ, shape (n,).
@@ -76,7 +77,7 @@ def powered_mean(
     powers = _left_out_powers(f, y, n / more) if power is None else np.full(n, power)
     mean_power = float(powers.mean())
     value = mean_power * further.mean() + float((y - powers * f).mean())
-    error = np.var(y - mean_power * f, ddof=1) / n + mean_power**2 * np.var(further, ddof=1) / more
+    error = np.var(y - powers * f, ddof=1) / n + mean_power**2 * np.var(further, ddof=1) / more
     half = float(student.ppf(0.5 + confidence / 2, n - 1) * np.sqrt(error))
     return PoweredMean(float(value), float(value - half), float(value + half), mean_power, n, more)
 
@@ -125,13 +126,14 @@ class Correction:
         """Real scores that policies of these twin scores will show in as many trials as those fitted had.
 
         Value and ends of the interval, cut off at 0 and 1, each of the shape of `twin`. The interval is the one of
-        simple regression for a new observation (Draper and Smith, Applied Regression Analysis, section 3.1).
+        simple regression for a new observation (Draper and Smith, Applied Regression Analysis, section 3.1), about the
+        value as cut off, so that it keeps its width where the line leaves the range of rates.
         """
         f = np.asarray(twin, float)
-        middle = self.real_mean + self.slope * (f - self.twin_mean)
+        middle = np.clip(self.real_mean + self.slope * (f - self.twin_mean), 0, 1)
         lever = (f - self.twin_mean) ** 2 / self.variation if self.variation > _FLAT else np.zeros_like(f)
         half = student.ppf(0.5 + confidence / 2, self.n - 2) * self.spread * np.sqrt(1.0 + 1.0 / self.n + lever)
-        return np.clip(middle, 0, 1), np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
+        return middle, np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
 
 
 def left_out_predictions(

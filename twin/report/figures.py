@@ -64,14 +64,15 @@ _STYLE: dict[str, Any] = {
 }
 
 
-def _style() -> AbstractContextManager[None]:
+def style() -> AbstractContextManager[None]:
+    """How every figure looks; what draws text, lines or ticks stands within."""
     return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
 
 
 def svg(figure: Figure) -> str:
     """The figure as an SVG element for a page, themed and without ids that another figure could share."""
     buffer = io.BytesIO()
-    with _style():
+    with style():
         FigureCanvasSVG(figure)
         figure.savefig(
             buffer,
@@ -100,8 +101,9 @@ def svg(figure: Figure) -> str:
     )
 
 
-def _figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
-    with _style():
+def new_figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
+    """An empty figure [in] and its axes."""
+    with style():
         figure = Figure(figsize=(width, height), layout="constrained")
         return figure, figure.add_subplot()
 
@@ -109,14 +111,14 @@ def _figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
 def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
     """Axes in metres, equal in both directions, for the rectangle from `low` to `high`."""
     extent = np.maximum(high - low, 1.0)
-    figure, axes = _figure(float(np.clip(_WIDTH * extent[1] / extent[0], 1.6, 5.6)) + 0.7)
+    figure, axes = new_figure(float(np.clip(_WIDTH * extent[1] / extent[0], 1.6, 5.6)) + 0.7)
     axes.set_aspect("equal")
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     return figure, axes
 
 
 def _legend(axes: Axes, columns: int) -> None:
-    with _style():
+    with style():
         axes.legend(
             loc="upper center",
             bbox_to_anchor=(0.5, -0.22 if axes.get_aspect() == "auto" else -0.12),
@@ -163,7 +165,7 @@ def place_map(
     """
     low, high = bounds_of(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
     figure, axes = _map_axes(low, high)
-    with _style():
+    with style():
         shown = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(1))
         if len(shown) > _MOST_POINTS:
             shown = shown[np.linspace(0, len(shown) - 1, _MOST_POINTS).astype(int)]
@@ -195,7 +197,7 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
     figure, axes = _map_axes(low, high)
     heights = ground.height[seen] if seen.any() else ground.height
     lowest, highest = np.percentile(heights, [1, 99])
-    with _style():
+    with style():
         picture = axes.imshow(
             np.ma.masked_array(ground.height, ~ground.measured),
             origin="lower",
@@ -242,8 +244,8 @@ def _draw_parts(axes: Axes, parts: Sequence[Array]) -> None:
 
 def training_curve(steps: Sequence[float], values: Sequence[float], label: str) -> Figure:
     """How training went: a value per step."""
-    figure, axes = _figure(2.2)
-    with _style():
+    figure, axes = new_figure(2.2)
+    with style():
         axes.plot(steps, values, color=SERIES[0])
         axes.set(xlabel="training step", ylabel=label)
     return figure
@@ -251,9 +253,9 @@ def training_curve(steps: Sequence[float], values: Sequence[float], label: str) 
 
 def bars(values: dict[str, float], counts: dict[str, int], unit: str, label: str) -> Figure:
     """A horizontal bar per name with its value and the number of samples behind it."""
-    figure, axes = _figure(0.55 + 0.36 * max(1, len(values)))
+    figure, axes = new_figure(0.55 + 0.36 * max(1, len(values)))
     names = list(values)
-    with _style():
+    with style():
         axes.grid(False, axis="y")
         axes.barh(range(len(names)), [values[name] for name in names], color=SERIES[0], height=0.62)
         for i, name in enumerate(names):
@@ -274,10 +276,10 @@ def histogram(values: NDArray, label: str, highest: float | None = None, whole: 
         highest: Right end; by default where 99.5 % of the values are.
         whole: One bin per whole number.
     """
-    figure, axes = _figure(1.9)
+    figure, axes = new_figure(1.9)
     values = np.asarray(values, np.float64)
     top = float(highest if highest is not None else np.percentile(values, 99.5))
-    with _style():
+    with style():
         edges = np.arange(np.floor(top) + 2) - 0.5 if whole else np.linspace(0.0, max(top, 1e-9), 41)
         axes.hist(np.minimum(values, top), bins=edges, color=SERIES[0], rwidth=0.9)  # type: ignore[arg-type]
         median = float(np.median(values))
@@ -298,8 +300,8 @@ def along_the_path(
     lowest: float | None = None,
 ) -> Figure:
     """Curves over the distance driven or filmed [m]; ± `limit` are dashed lines, the axis starts at `lowest`."""
-    figure, axes = _figure(2.2)
-    with _style():
+    figure, axes = new_figure(2.2)
+    with style():
         for i, (name, values) in enumerate(curves.items()):
             axes.plot(distance[: len(values)], values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)
         if limit is not None:
@@ -315,8 +317,8 @@ def along_the_path(
 
 def errors_by_group(errors: dict[str, Sequence[float]], label: str, limit: float | None = None) -> Figure:
     """Per-frame errors, one curve per group (a source), over the frame's place in its group."""
-    figure, axes = _figure(2.2)
-    with _style():
+    figure, axes = new_figure(2.2)
+    with style():
         for i, (name, values) in enumerate(errors.items()):
             place = np.linspace(0.0, 100.0, len(values)) if len(values) > 1 else np.zeros(len(values))
             axes.plot(place, values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)

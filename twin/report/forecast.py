@@ -6,7 +6,7 @@ the twin that real cells of the task are compared with, or all of them where the
 in an `Estimate` with its count and its interval, or with what is missing for it.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +132,7 @@ class Forecast:
     scene: str
     twin_trials: int
     real_trials: int
+    tasks: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     """Task by task, best in the twin first."""
     pairs: tuple[Pair, ...]
@@ -143,7 +144,6 @@ class Forecast:
     seed: int = 0
     sure: float = ranking.SURE
     margin: float = ranking.MARGIN
-    tasks: tuple[str, ...] = field(default=())
 
     def of(self, task: str) -> list[Candidate]:
         return [c for c in self.candidates if c.task == task]

@@ -41,17 +41,20 @@ def make_forecast(scene: str, twin: Sequence[Cell], real: Sequence[Cell], seed: 
     """
     tasks = tuple(dict.fromkeys(cell.task for cell in twin))
     candidates: list[Candidate] = []
+    comparable: list[Candidate] = []
     groups, left_out, plans = [], [], []
     for task in tasks:
         here = [cell for cell in real if cell.task == task]
         mine, lightings = _candidates(task, [c for c in twin if c.task == task], here, seed)
         if here:
-            groups.append(_group(task, here, twin, [c for c in mine if c.lightings == lightings], seed))
+            alike = [c for c in mine if set(c.lightings) == set(lightings)]
+            groups.append(_group(task, here, twin, alike, seed))
+            comparable += alike
             left_out += _left_out(task, here, twin)
         plans.append(_plan(task, [c for c in twin if c.task == task and c.lighting in lightings], here, seed))
         candidates += mine
     if len(groups) > 1:
-        groups.append(_group(ALL_TASKS, real, twin, [], seed))
+        groups.append(_group(ALL_TASKS, real, twin, comparable, seed))
     return Forecast(
         scene=scene,
         twin_trials=sum(cell.trials for cell in twin),
@@ -114,12 +117,14 @@ def _corrected(
 ) -> list[Estimate]:
     """What each candidate is expected to do on the road, from the other driven ones."""
     pairs = [(i, *_scores(mine, twin)) for i, mine in enumerate(driven) if mine]
+    few = _few([cell for mine in driven for cell in mine], twin)
     out = []
     for i, mine in enumerate(cells):
         others = [(f, y) for j, f, y in pairs if j != i]
-        few = _few([cell for j, row in enumerate(driven) if j != i for cell in row], twin)
-        if few:
-            out.append(Estimate(missing="; ".join(few)))
+        if few or len(others) < MIN_POLICIES:
+            out.append(
+                Estimate(missing="; ".join(few) or f"{len(others)} other policies driven, {MIN_POLICIES} needed")
+            )
             continue
         score = _scores(driven[i], twin)[0] if driven[i] else _mean_rate(mine).value
         if {c.lighting for c in mine} != set(lightings):
@@ -169,7 +174,7 @@ def _few(real: Sequence[Cell], twin: Sequence[Cell]) -> list[str]:
         if c.trials < MIN_TRIALS
     ]
     if short:
-        out.append(f"cells need {MIN_TRIALS} trials: {listing(short)}; or leave these cells out")
+        out.append(f"cells of fewer than {MIN_TRIALS} trials: {listing(short)}; or leave these cells out")
     return out
 
 
@@ -296,7 +301,8 @@ def _pair(cell: Cell, twin: Sequence[Cell]) -> Pair:
         real_successes=cell.successes,
         real_trials=cell.trials,
     )
-    bias = Estimate(*(float(x) for x in difference), cell.trials)
+    value, low, high = (float(x) for x in difference)
+    bias = Estimate(value, low, high, cell.trials)
     return Pair(cell.policy, cell.task, cell.lighting, mate.lighting, _rate(mate), _rate(cell), bias)
 
 

@@ -17,13 +17,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from twin.env.options import CAUSES
 from twin.errors import InputError
 from twin.report.statistics import wilson
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
 """Of `validation/episodes.csv`. `trust` is the mean of the trial's pictures, empty without pictures."""
-CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
-"""How a trial may end (`twin.env.tasks`); only `goal` is a success."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Of `validation/cells.csv`: episodes summed up, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
@@ -42,7 +41,7 @@ class Trial:
     lighting: str
     seed: int
     cause: str
-    """One of `CAUSES`."""
+    """One of `twin.env.options.CAUSES`; only `goal` is a success."""
     progress: float
     """Way along the task's stretch [m]."""
     steps: int
@@ -101,7 +100,7 @@ def tally(trials: Iterable[Trial]) -> list[Cell]:
         count = counts.setdefault((trial.policy, trial.task, trial.lighting), [0, 0])
         count[0] += 1
         count[1] += trial.success
-    return [Cell(*key, *count) for key, count in counts.items()]
+    return [Cell(*key, trials=n, successes=k) for key, (n, k) in counts.items()]
 
 
 def cells_text(cells: Iterable[Cell]) -> str:

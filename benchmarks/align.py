@@ -1,0 +1,83 @@
+"""How well the Husky's model can be aligned to logs of real ones: every figure of `python -m twin.align`, and motor
+currents on asphalt beside simulated torques; as JSON where asked.
+
+    python benchmarks/align.py [--data FOLDER] [--work FOLDER] [--json FILE]
+
+`--data` holds `husky_drive` and `borealtc_asphalt`. Takes some minutes. Exit status 1 where a target is missed.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from twin import progress
+from twin.align import run, summary
+from twin.alignment import currents
+from twin.robot import REAR_HEAVY, HuskyParams
+
+_DATA = Path(__file__).parents[2] / "shared" / "data"
+_LOG = Path("husky_drive") / "husky_drive_dev.npz"
+_ASPHALT = "borealtc_asphalt"
+
+TARGETS = {"position_m": 0.12, "yaw_deg": 4.7, "wheels_rad_s": 0.3}
+"""Of medians over windows not fitted to; at most."""
+
+
+def efforts(data: Path) -> dict[str, dict[str, float]]:
+    """Current or torque of a side in a steady turn / of one driving straight: outer, inner, mean of both."""
+    steady = currents.read_currents(sorted((data / _ASPHALT).glob("ASPHALT_pro_*.npz")))
+    published = HuskyParams()
+    rolling = currents.rolling_resistance_of(steady, published)
+    robots = {
+        "simulated, published robot": published,
+        "simulated, rear-heavy": replace(published, center_of_mass=REAR_HEAVY),
+        f"simulated, rolling resistance {rolling:.3f} (fitted to the mean)": replace(
+            published, rolling_resistance=rolling
+        ),
+    }
+    found = {"measured": currents.measured_effort(steady)}
+    found |= {name: currents.simulated_effort(steady, params) for name, params in robots.items()}
+    return {
+        name: {"outer": round(e.outer, 3), "inner": round(e.inner, 3), "mean": round(e.total, 3)}
+        for name, e in found.items()
+    }
+
+
+def judged(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
+    """Name, value, target, whether it is met."""
+    held_out = figures["scores"]["fitted"]["held_out"]
+    rows = [(name, held_out[name], most, held_out[name] <= most) for name, most in TARGETS.items()]
+    return [*rows, *((f"better than ICR, {k}", v, 1 / 3, v >= 1 / 3) for k, v in figures["better_than_icr"].items())]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--data", type=Path, default=_DATA, help="folder of the real logs")
+    parser.add_argument("--work", type=Path, help="keep robot.toml, align.json and the pictures here")
+    parser.add_argument("--json", type=Path, help="write every figure here")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        work = options.work or Path(scratch)
+        result, folder = run("husky", options.data / _LOG, work)
+        figures = json.loads((folder / "alignment" / "align.json").read_text(encoding="utf-8"))
+    print(summary(result))
+    rows = judged(figures)
+    for name, value, target, met in rows:
+        print(f"{name:28} {value:8.3f}   wanted {target:.3f}   {'met' if met else 'missed'}")
+    progress.say("currents on asphalt")
+    asphalt = efforts(options.data)
+    print(f"\n{'a turn against driving straight':64} outer  inner   mean")
+    for name, e in asphalt.items():
+        print(f"{name:64} {e['outer']:5.2f}  {e['inner']:5.2f}  {e['mean']:5.2f}")
+    if options.json:
+        everything = {"drive": figures, "asphalt": asphalt, "targets": {n: bool(m) for n, _, _, m in rows}}
+        options.json.write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
+    return 0 if all(met for *_, met in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,314 @@
+"""The forecast: what it says follows from the tables, what they do not allow is refused, and nothing is made up."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from twin.env.options import CAUSES
+from twin.errors import InputError
+from twin.forecast import forecast, main
+from twin.report.forecast import ALL_TASKS, Estimate, Forecast
+from twin.report.forecast_page import forecast_page
+from twin.report.forecast_words import CSV_COLUMNS, STATISTICS, candidates_csv, show, summary, unknowns, verdicts
+from twin.report.forecasting import make_forecast
+from twin.report.statistics import mmrv, pearson, spearman, wilson
+from twin.report.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
+
+LIGHTS = ("held-out", "sun")
+
+
+def cells(
+    n: int = 7, driven: int = 7, tasks: tuple[str, ...] = ("straight",), trials: int = 20, seed: int = 0
+) -> tuple[list[Cell], list[Cell]]:
+    """Cells of the twin and of the road; the road's dusk is compared with the twin's held-out light."""
+    rng = np.random.default_rng(seed)
+    twin, real = [], []
+    for task in tasks:
+        for i in range(n):
+            quality = 4.0 * (i + 0.5) / n - 2.0
+            for light in LIGHTS:
+                twin.append(Cell(f"p{i}", task, light, 50, int(rng.binomial(50, expit(quality + 0.5)))))
+                if i < driven:
+                    name = "dusk" if light == "held-out" else light
+                    won = int(rng.binomial(trials, expit(quality)))
+                    real.append(Cell(f"p{i}", task, name, trials, won, light))
+    return twin, real
+
+
+def scene(root: Path, twin: list[Cell]) -> Path:
+    """A scene folder with validated policies."""
+    trials = [
+        Trial(c.policy, c.task, c.lighting, k, "goal" if k < c.successes else CAUSES[1 + k % 5], 10.0, 100, 0.9)
+        for c in twin
+        for k in range(c.trials)
+    ]
+    (root / "validation").mkdir(parents=True)
+    (root / "validation" / "episodes.csv").write_text(csv_text(EPISODE_COLUMNS, [t.row() for t in trials]))
+    return root
+
+
+def results(path: Path, real: list[Cell]) -> Path:
+    rows = [(c.policy, c.lighting, str(c.trials), str(c.successes), c.task, c.twin_lighting) for c in real]
+    path.write_text(csv_text(("policy", "lighting", "trials", "successes", "task", "twin_lighting"), rows))
+    return path
+
+
+class Text(HTMLParser):
+    """The text of a page and its links; fails on tags closed out of order."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.parts: list[str] = []
+        self.links: list[str] = []
+        self.tags: list[str] = []
+        self._open: list[str] = []
+        self.feed(html)
+        assert not self._open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+        if tag not in ("img", "meta", "br"):
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.parts.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.parts))
+
+
+def test_the_numbers_are_those_of_the_tables() -> None:
+    twin, real = cells()
+    made = make_forecast("road", twin, real)
+    found = {c.key: c for c in twin}
+    by_twin = [np.mean([found[(f"p{i}", "straight", light)].rate for light in LIGHTS]) for i in range(7)]
+    by_real = [np.mean([c.rate for c in real if c.policy == f"p{i}"]) for i in range(7)]
+    (group,) = made.groups
+    assert (group.policies, group.cells, group.missing) == (7, 14, ())
+    assert group.pearson.value == pytest.approx(pearson(twin=by_twin, real=by_real))
+    assert group.spearman.value == pytest.approx(spearman(twin=by_twin, real=by_real))
+    assert group.mmrv.value == pytest.approx(mmrv(twin=by_twin, real=by_real))
+    biases = [c.rate - found[c.twin_key].rate for c in real]
+    assert group.bias.value == pytest.approx(np.mean(biases))
+    assert [pair.bias.value for pair in made.pairs] == pytest.approx(biases)
+    for name, _, _ in STATISTICS[:-1]:
+        estimate = getattr(group, name)
+        assert estimate.low <= estimate.value <= estimate.high and estimate.n > 0
+    first = made.pairs[0]
+    assert (first.lighting, first.twin_lighting) == ("dusk", "held-out")
+    assert (first.real.low, first.real.high) == pytest.approx(wilson(real[0].successes, real[0].trials))
+
+
+def test_policies_not_driven_are_predicted_from_the_others() -> None:
+    twin, real = cells(n=9, driven=7)
+    made = make_forecast("road", twin, real)
+    further = [c for c in made.candidates if not c.driven]
+    assert {c.policy for c in further} == {"p7", "p8"}
+    for c in further:
+        assert c.corrected.value is not None and c.corrected.n == 7
+        # The twin promises too much, and the correction takes it back.
+        assert c.corrected.value < (c.twin.value or 0.0)
+    driven = [c for c in made.candidates if c.driven]
+    assert all(c.corrected.n == 6 for c in driven)
+    (group,) = made.groups
+    assert group.mean_real.n == 9 and group.corrected_coverage.n == 7
+
+
+def test_all_tasks_together() -> None:
+    twin, real = cells(tasks=("straight", "right_turn"))
+    made = make_forecast("road", twin, real)
+    assert [g.task for g in made.groups] == ["straight", "right_turn", ALL_TASKS]
+    assert [g.policies for g in made.groups] == [7, 7, 14]
+    one, two, both = (g.winner_regret.value or 0.0 for g in made.groups)
+    assert both == pytest.approx((one + two) / 2)
+    assert made.groups[2].bias.value == pytest.approx(np.mean([p.bias.value for p in made.pairs]))
+
+
+def test_the_candidates_are_ranked() -> None:
+    made = make_forecast("road", cells()[0], [])
+    rates = [c.twin.value for c in made.candidates]
+    assert rates == sorted(rates, reverse=True)
+    assert {c.policy for c in made.candidates[:2]} == {"p5", "p6"}
+    assert np.allclose(np.sum([c.twin_ranks for c in made.candidates], 0), 1.0)
+    assert all(c.real_ranks == () for c in made.candidates)
+
+
+def test_leaving_a_lighting_out() -> None:
+    twin, real = cells()
+    made = make_forecast("road", twin, real)
+    assert [(x.lighting, x.cells) for x in made.left_out] == [("dusk", 7), ("sun", 7)]
+    found = {c.key: c for c in twin}
+    dusk = [abs(c.rate - found[c.twin_key].rate) for c in real if c.lighting == "dusk"]
+    assert made.left_out[0].twin_error.value == pytest.approx(np.mean(dusk))
+    alone = make_forecast("road", twin, [c for c in real if c.lighting == "dusk"])
+    assert "a second real lighting" in alone.left_out[0].coverage.missing
+
+
+# ---- refusals
+
+
+def refused(made: Forecast) -> str:
+    (group,) = made.groups
+    for name, _, _ in STATISTICS:
+        estimate = getattr(group, name)
+        assert estimate.value is estimate.low is estimate.high is None and estimate.missing
+    assert all(c.corrected.value is None for c in made.candidates)
+    assert not re.search(r"Spearman [−\d]|Spearman +[−\d]", summary(made) + Text(forecast_page(made)).text)
+    assert any("no correlation is given" in caution.what for caution in unknowns(made))
+    return "; ".join(group.missing)
+
+
+@pytest.mark.parametrize("driven", [1, 4])
+def test_no_correlation_from_fewer_than_five_policies(driven: int) -> None:
+    twin, real = cells(driven=driven)
+    told = refused(make_forecast("road", twin, real))
+    assert told == f"{driven} policies driven on the road, 5 are needed: drive {5 - driven} more"
+
+
+def test_no_correlation_from_cells_of_fewer_than_five_trials() -> None:
+    twin, real = cells()
+    real[3] = Cell("p1", "straight", "sun", 4, 1, "sun")
+    told = refused(make_forecast("road", twin, real))
+    assert "p1 under sun has 4 real trials (1 more)" in told and "p2" not in told
+    twin, real = cells()
+    twin[0] = Cell("p0", "straight", "held-out", 3, 0)
+    assert "p0 under held-out has 3 trials in the twin (2 more)" in refused(make_forecast("road", twin, real))
+
+
+def test_rates_that_are_all_the_same_have_no_correlation_but_a_bias() -> None:
+    twin, real = cells()
+    made = make_forecast("road", twin, [Cell(c.policy, c.task, c.lighting, 10, 10, c.twin_lighting) for c in real])
+    (group,) = made.groups
+    assert group.spearman.value is None and "all rates on the road are 1" in group.spearman.missing
+    assert group.bias.value is not None and group.winner_regret.value == 0.0
+    assert verdicts(made)[0].mood == "bad" and "cannot be compared" in verdicts(made)[0].text
+    assert "nan" not in forecast_page(made) + summary(made) + candidates_csv(made)
+
+
+def test_without_real_trials_it_says_what_it_cannot_know() -> None:
+    made = make_forecast("road", cells()[0], [])
+    assert made.groups == made.pairs == made.left_out == ()
+    text = Text(forecast_page(made)).text
+    assert "Nothing is known yet about the road" in text and "What this cannot know" in text
+    assert any("Whether the road ranks" in caution.what for caution in unknowns(made))
+    (plan,) = made.plans
+    assert plan.basis == "twin" and plan.more_for_winner is not None and plan.more_for_winner > 0
+
+
+def test_uneven_lightings_are_told() -> None:
+    twin, real = cells(n=8)
+    twin = [c for c in twin if c.key != ("p7", "straight", "sun")]
+    told = [caution.what for caution in unknowns(make_forecast("road", twin, real[1:]))]
+    assert any("validated under the same lightings (p7 differ)" in what for what in told)
+    assert any("driven on the road under the same lightings" in what for what in told)
+
+
+def test_one_policy_alone() -> None:
+    made = make_forecast("road", [Cell("p", "straight", "sun", 10, 5)], [])
+    assert "one policy; there is nothing to rank" in summary(made)
+    assert Text(forecast_page(made)).text
+
+
+# ---- files and the verb
+
+
+def test_saved_and_loaded(tmp_path: Path) -> None:
+    for real in ([], cells()[1]):
+        made = make_forecast("road", cells()[0], real)
+        made.save(tmp_path)
+        assert Forecast.load(tmp_path) == made
+    json.loads((tmp_path / "forecast.json").read_text())
+    (tmp_path / "forecast.json").write_text('{"scene": 3}')
+    with pytest.raises(InputError):
+        Forecast.load(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        Forecast.load(tmp_path / "none")
+
+
+def test_the_same_seed_gives_the_same() -> None:
+    twin, real = cells(n=6, driven=6)
+    assert make_forecast("road", twin, real) == make_forecast("road", twin, real)
+    assert make_forecast("road", twin, real, seed=1) != make_forecast("road", twin, real)
+
+
+def test_the_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    twin, real = cells(n=8)
+    root = scene(tmp_path / "road", twin)
+    assert main([str(root), "--real", str(results(tmp_path / "results.csv", real))]) == 0
+    printed = capsys.readouterr().out
+    assert "Spearman" in printed and "not driven" in printed and "forecast.html" in printed
+    assert sorted(path.name for path in (root / "forecast").iterdir()) == [
+        "forecast.csv",
+        "forecast.html",
+        "forecast.json",
+    ]
+    page = Text((root / "forecast" / "forecast.html").read_text(encoding="utf-8"))
+    made = Forecast.load(root / "forecast")
+    assert all(verdict.text in page.text for verdict in verdicts(made))
+    assert f"Spearman {show(made.groups[0].spearman)}" in page.text and "these 7 policies" in page.text
+    assert {link for link in page.links if not link.startswith(("#", "data:"))} == {"forecast.json", "forecast.csv"}
+    assert "http" not in (root / "forecast" / "forecast.html").read_text(encoding="utf-8")
+    table = (root / "forecast" / "forecast.csv").read_text().splitlines()
+    assert table[0] == ",".join(CSV_COLUMNS) and len(table) == 9
+    assert made.twin_trials == 8 * 2 * 50 and made.real_trials == 7 * 2 * 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["nowhere"], "is no folder"),
+        (["road", "--real", "none.csv"], "none.csv does not exist"),
+        (["road", "--seed", "-1"], "--seed -1: expected 0 or more"),
+        (["empty"], "drive the policies in the twin first"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene(tmp_path / "road", cells()[0])
+    (tmp_path / "empty").mkdir()
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert told in said and said.startswith("error: ") and said.count("\n") == 1
+    assert not (tmp_path / "road" / "forecast").exists()
+
+
+def test_a_wrong_table_leaves_the_last_forecast_alone(tmp_path: Path) -> None:
+    twin, real = cells(n=6, driven=6)
+    root = scene(tmp_path / "road", twin)
+    forecast(root)
+    before = (root / "forecast" / "forecast.json").read_bytes()
+    table = results(tmp_path / "results.csv", [*real, Cell("p9", "straight", "sun", 5, 5, "sun")])
+    with pytest.raises(InputError, match="policy 'p9' was not validated"):
+        forecast(root, table)
+    assert (root / "forecast" / "forecast.json").read_bytes() == before
+
+
+def test_names_from_files_are_text() -> None:
+    evil = '<script>alert("1")</script>&$x$'
+    twin, real = cells(n=6, driven=6)
+    twin = [Cell(evil if c.policy == "p0" else c.policy, *c.key[1:], c.trials, c.successes) for c in twin]
+    real = [Cell(evil if c.policy == "p0" else c.policy, *c.key[1:], 20, c.successes, c.twin_lighting) for c in real]
+    page = Text(forecast_page(make_forecast(evil, twin, real)))
+    assert "script" not in page.tags and evil in page.text
+
+
+def test_numbers_are_shown_with_their_interval() -> None:
+    assert show(Estimate(0.934, 0.81, 0.97, 12)) == "0.93 (0.81 to 0.97)"
+    assert show(Estimate(-0.104, -0.2, 0.001, 12), percent=True) == "−10% (−20% to 0%)"
+    assert show(Estimate(-0.001, None, None, 1), percent=True) == "0%"
+    assert show(Estimate(missing="too few")) == "–"

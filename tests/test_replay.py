@@ -1,0 +1,139 @@
+"""The replay buffer of single pictures gives back the stacks that went in, also over episodes' borders and a wrap."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+
+from gymnasium import spaces
+
+from twin.errors import InputError
+from twin.learn.replay import FrameReplayBuffer
+
+WORLDS, STACK, SIZE = 3, 4, (5, 7)
+SPACE = spaces.Box(0, 255, (3 * STACK, *SIZE), np.uint8)
+ACTION = spaces.Box(-1, 1, (2,), np.float32)
+
+
+class NaiveWorlds:
+    """Worlds that show random pictures in episodes of random length, and remember every transition as whole stacks."""
+
+    def __init__(self, seed: int, longest: int) -> None:
+        self.rng, self.longest = np.random.default_rng(seed), longest
+        self.observation = np.stack([self.first() for _ in range(WORLDS)])
+        self.left = self.rng.integers(1, longest + 1, WORLDS)
+        self.seen: list[list[tuple]] = [[] for _ in range(WORLDS)]
+
+    def first(self) -> np.ndarray:
+        return np.tile(self.rng.integers(0, 256, (3, *SIZE), np.uint8), (STACK, 1, 1))
+
+    def step(self, buffer: FrameReplayBuffer) -> None:
+        before = self.observation.copy()
+        new = self.rng.integers(0, 256, (WORLDS, 3, *SIZE), np.uint8)
+        after = np.concatenate([before[:, 3:], new], 1)
+        action, reward = self.rng.uniform(-1, 1, (WORLDS, 2)).astype(np.float32), self.rng.normal(size=WORLDS)
+        self.left -= 1
+        done, cut = self.left == 0, self.rng.random(WORLDS) < 0.5
+        infos = [{"TimeLimit.truncated": bool(d and c)} for d, c in zip(done, cut, strict=True)]
+        buffer.add(before, after, action, reward, done, infos)
+        for i in range(WORLDS):
+            self.seen[i].append((before[i], after[i], action[i], np.float32(reward[i]), done[i] and not cut[i]))
+        self.observation = after.copy()
+        for i in np.flatnonzero(done):
+            self.observation[i], self.left[i] = self.first(), self.rng.integers(1, self.longest + 1)
+
+
+def check(buffer: FrameReplayBuffer, worlds: NaiveWorlds) -> int:
+    """Compares every transition that is whole with what went in; how many there were."""
+    filled = buffer.buffer_size if buffer.full else buffer.pos
+    total, count = len(worlds.seen[0]), 0
+    for world in range(WORLDS):
+        for age in range(filled):  # 0: the newest
+            row = np.array([(buffer.pos - 1 - age) % buffer.buffer_size])
+            if not buffer.whole(row, np.array([world]))[0]:
+                continue
+            before, after, action, reward, end = worlds.seen[world][total - 1 - age]
+            stacks = buffer.stacks(row, np.array([world]))
+            np.testing.assert_array_equal(stacks[0][0], before)
+            np.testing.assert_array_equal(stacks[1][0], after)
+            np.testing.assert_array_equal(buffer.actions[row[0], world], action)
+            assert buffer.rewards[row[0], world] == reward and buffer.ends[row[0], world] == end
+            count += 1
+    return count
+
+
+@pytest.mark.parametrize("longest", [1, 2, 6, 1000])
+@pytest.mark.parametrize("steps", [3, 40, 41, 137])
+def test_stacks_are_what_went_in(longest, steps):
+    buffer = FrameReplayBuffer(40 * WORLDS, SPACE, ACTION, "cpu", WORLDS)
+    worlds = NaiveWorlds(longest, longest)
+    for _ in range(steps):
+        worlds.step(buffer)
+    count = check(buffer, worlds)
+    # Only episodes of less than 8 steps may cost room, and then half of it at most.
+    assert count == min(steps, 40) * WORLDS or (longest < 16 and count > min(steps, 40) * WORLDS // 2)
+
+
+def test_samples_are_transitions_and_each_comes(tmp_path):
+    buffer = FrameReplayBuffer(10 * WORLDS, SPACE, ACTION, "cpu", WORLDS, seed=5)
+    worlds = NaiveWorlds(0, 4)
+    for _ in range(33):
+        worlds.step(buffer)
+    there = {}
+    for seen in worlds.seen:
+        there |= {one[2].tobytes(): one for one in seen}
+    sample = buffer.sample(2000)
+    drawn = set()
+    for k in range(2000):
+        before, after, action, reward, end = there[sample.actions[k].numpy().tobytes()]
+        np.testing.assert_array_equal(sample.observations[k], before)
+        np.testing.assert_array_equal(sample.next_observations[k], after)
+        assert sample.rewards[k].item() == reward and sample.dones[k].item() == end
+        drawn.add(action.tobytes())
+    assert len(drawn) == check(buffer, worlds)
+
+
+def test_shifted_samples_are_shifted_by_so_much_with_edges_repeated():
+    buffer = FrameReplayBuffer(40, SPACE, ACTION, "cpu", WORLDS, shift=2)
+    stacks = np.random.default_rng(0).integers(0, 256, (60, 12, *SIZE), np.uint8)
+    shifts = set()
+    for before, after in zip(stacks, buffer._shifted(stacks), strict=True):
+        found = [
+            (y, x)
+            for y in range(-2, 3)
+            for x in range(-2, 3)
+            if np.array_equal(before[:, np.clip(np.arange(5) + y, 0, 4)][:, :, np.clip(np.arange(7) + x, 0, 6)], after)
+        ]
+        assert len(found) == 1
+        shifts.add(found[0])
+    assert len(shifts) > 15
+
+
+def test_what_was_saved_is_there_after_more_was_written(tmp_path):
+    slack = 7 * WORLDS
+    settings = (20 * WORLDS, SPACE, ACTION, "cpu", WORLDS)
+    buffer = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack)
+    worlds = NaiveWorlds(3, 3)
+    for _ in range(50):
+        worlds.step(buffer)
+    arrays, rest = buffer.state()
+    arrays = {name: array.copy() for name, array in arrays.items()}
+    count = check(buffer, worlds)
+    saved = [list(seen) for seen in worlds.seen]
+    for _ in range(7):  # as many as the slack allows, and then it is killed
+        worlds.step(buffer)
+    again = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack)
+    again.set_state(arrays, rest)
+    worlds.seen = saved
+    assert check(again, worlds) == count
+    # It goes on with new episodes.
+    worlds.observation = np.stack([worlds.first() for _ in range(WORLDS)])
+    for _ in range(30):
+        worlds.step(again)
+    check(again, worlds)
+
+
+def test_pictures_of_another_size_are_refused(tmp_path):
+    (tmp_path / "pictures.bin").write_bytes(b"123")
+    with pytest.raises(InputError, match="3 bytes"):
+        FrameReplayBuffer(40, SPACE, ACTION, "cpu", WORLDS, file=tmp_path / "pictures.bin")

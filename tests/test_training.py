@@ -1,0 +1,272 @@
+"""Training runs: the update is SAC's, a run that was stopped goes on as if it had not been, and policies come out."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+
+import gymnasium
+import torch
+from gymnasium import spaces
+from safetensors.torch import load_file
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv
+from tiny_twin import tiny_twin
+
+import twin
+from twin import progress, train
+from twin.errors import InputError
+from twin.learn.architecture import Architecture, shrink
+from twin.learn.policy import load_policy, save_policy
+from twin.learn.replay import FrameReplayBuffer
+from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
+from twin.learn.state import load_state, save_state
+from twin.learn.training import TrainConfig
+
+SIZE = (32, 18)
+TINY = Architecture(SIZE, 2, 2, ((8, 5, 3),), 16, (32, 32), 1)
+
+
+class SpotEnv(gymnasium.Env):
+    """A bright spot; the action that points at it is worth most. Every episode has 5 steps."""
+
+    observation_space = spaces.Box(0, 255, (6, 9, 16), np.uint8)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return self._look(), {}
+
+    def step(self, action):
+        reward = 1.0 - abs(float(action[0]) - (self.where / 7.0 - 1.0))
+        self.count += 1
+        return self._look(), reward, False, self.count == 5, {}
+
+    def _look(self):
+        self.where = int(self.np_random.integers(15))
+        picture = np.zeros((6, 9, 16), np.uint8)
+        picture[:, :, self.where : self.where + 2] = 255
+        return picture
+
+
+def spot_model(folder: Path | None = None, seed: int = 0) -> PixelSAC:
+    torch.set_num_threads(1)
+    model = PixelSAC(
+        DrivePolicy,
+        DummyVecEnv([SpotEnv, SpotEnv]),
+        learning_rate=3e-3,
+        buffer_size=2000,
+        learning_starts=100,
+        batch_size=64,
+        gamma=0.5,
+        train_freq=1,
+        gradient_steps=1,
+        ent_coef="auto_0.1",
+        replay_buffer_class=FrameReplayBuffer,
+        replay_buffer_kwargs={"file": folder / "pictures.bin" if folder else None, "slack": 500, "seed": seed},
+        policy_kwargs={
+            "features_extractor_class": Encoder,
+            "features_extractor_kwargs": {"architecture": TINY},
+            "net_arch": [32, 32],
+            "share_features_extractor": True,
+            "normalize_images": False,
+        },
+        seed=seed,
+        device="cpu",
+    )
+    model.set_logger(configure(None, []))
+    return model
+
+
+def test_it_learns_to_point_and_its_file_does_the_same(tmp_path):
+    model = spot_model()
+    model.learn(1000)
+    save_policy(tmp_path, TINY, TrainConfig().control, actor_weights(model, TINY), {})
+    policy = load_policy(tmp_path)
+    env = SpotEnv()
+    env.reset(seed=9)
+    errors, untrained = [], []
+    for _ in range(50):
+        small = env._look()
+        large = small.repeat(2, 1).repeat(2, 2)
+        np.testing.assert_array_equal(shrink(large, 2), small)
+        action = policy(large)
+        np.testing.assert_allclose(action, model.predict(small, deterministic=True)[0], atol=1e-5)
+        errors.append(abs(action[0] - (env.where / 7.0 - 1.0)))
+        untrained.append(abs(env.where / 7.0 - 1.0))
+    assert np.mean(errors) < 0.5 * np.mean(untrained)
+
+
+def test_the_encoder_learns_from_the_critics_alone():
+    model = spot_model()
+    encoder = list(model.actor.features_extractor.parameters())
+    assert model.critic.features_extractor is model.actor.features_extractor
+    owned = [
+        {id(p) for group in optimizer.param_groups for p in group["params"]}
+        for optimizer in (model.actor.optimizer, model.critic.optimizer)
+    ]
+    assert all(id(p) not in owned[0] and id(p) in owned[1] for p in encoder)
+    model.learn(120)
+    before = [p.clone() for p in encoder]
+    for group in model.critic.optimizer.param_groups:
+        group["lr"] = 0.0
+    model.lr_schedule = lambda _: 0.0
+    model.train(1, 64)
+    assert all(torch.equal(a, b) for a, b in zip(before, encoder, strict=True))
+
+
+def test_scaled_weights_are_scaled_pictures():
+    encoder = Encoder(SpotEnv.observation_space, TINY)
+    pictures = torch.randint(0, 256, (3, 6, 9, 16))
+    plain = encoder.further(encoder.first(pictures / 255.0 - 0.5))
+    expected = torch.tanh(encoder.norm(encoder.linear(plain)))
+    torch.testing.assert_close(encoder(pictures.to(torch.uint8)), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_a_saved_training_goes_on_as_if_never_stopped(tmp_path):
+    """Updates after loading are, number for number, those of the model that was saved."""
+    (tmp_path / "a").mkdir()
+    model = spot_model(tmp_path / "a")
+    model.learn(300)
+    save_state(tmp_path / "a", model, {"wall": 3.0})
+    at_saving = torch.get_rng_state()
+    again = spot_model(tmp_path / "a", seed=77)
+    assert load_state(tmp_path / "a", again) == {"wall": 3.0}
+    assert (again.num_timesteps, again._n_updates) == (model.num_timesteps, model._n_updates)
+    after_loading = torch.get_rng_state()
+    again.train(5, 32)
+    torch.set_rng_state(at_saving)
+    model.train(5, 32)
+    assert torch.equal(at_saving, after_loading)
+    for (name, a), b in zip(model.policy.state_dict().items(), again.policy.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    assert torch.equal(model.log_ent_coef, again.log_ent_coef)
+
+
+def test_a_damaged_state_is_refused(tmp_path):
+    model = spot_model(tmp_path)
+    model.learn(120)
+    save_state(tmp_path, model, {})
+    (file,) = tmp_path.glob("state_*/tensors.safetensors")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="damaged"):
+        load_state(tmp_path, spot_model(tmp_path))
+    file.write_bytes(whole)
+    load_state(tmp_path, spot_model(tmp_path))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    return tiny_twin(tmp_path_factory.mktemp("twin"))
+
+
+SHORT = TrainConfig(
+    task="ahead",
+    lighting="day",
+    steps=240,
+    worlds=4,
+    starts=40,
+    batch=16,
+    buffer=400,
+    convolutions=((8, 8, 8),),
+    features=16,
+    hidden=(16,),
+    save_every=80,
+    checkpoints=3,
+    updates=0.25,
+)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_killed_at_random_three_times_comes_to_its_end(scene, tmp_path):
+    """As a process, with SIGKILL: all steps are there, tables have no gap and nothing twice, and the policy drives."""
+    folder = tmp_path / "run"
+    code = (
+        "import sys, dataclasses; sys.path.insert(0, sys.argv[3])\n"
+        "from pathlib import Path; import twin\n"
+        "from twin.learn.training import train\n"
+        "from test_training import SHORT\n"
+        "train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), SHORT)\n"
+    )
+    command = [sys.executable, "-c", code, str(scene), str(folder), str(Path(__file__).parent)]
+    rng = np.random.default_rng(0)
+    for wanted in sorted(rng.choice([1, 2], 3)):
+        process = subprocess.Popen(command, stderr=subprocess.PIPE)
+        while process.poll() is None and len(rows_of(folder)) < wanted:
+            time.sleep(0.02)
+        time.sleep(float(rng.uniform(0.0, 0.3)))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    done = subprocess.run(command, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()[-2000:]
+    head = json.loads((folder / "state" / "state.json").read_text())
+    assert head["steps"] == SHORT.steps
+    steps = [int(r["step"]) for r in rows(folder / "episodes.csv")]
+    assert steps == sorted(steps) and steps[-1] <= SHORT.steps
+    seeds = [r["seed"] for r in rows(folder / "episodes.csv")]
+    assert len(set(seeds)) == len(seeds)
+    assert [int(r["step"]) for r in rows(folder / "log.csv")] == [80, 160, 240]
+    with np.load(folder / "state" / head["folder"] / "replay.npz") as data:
+        assert data["age"].shape[0] == SHORT.buffer // SHORT.worlds
+        assert (data["written"] >= SHORT.steps // SHORT.worlds).all()
+    assert load_policy(folder)(np.zeros((12, 90, 160), np.uint8)).shape == (1,)
+    assert len(list((folder / "checkpoints").iterdir())) >= 2
+    assert load_file(folder / "state" / head["folder"] / "tensors.safetensors")
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    return rows(folder / "log.csv") if (folder / "log.csv").exists() else []
+
+
+def test_another_config_is_refused(scene, tmp_path):
+    from twin.learn.training import train as run
+
+    built = twin.load_scene(scene)
+    run(built, tmp_path, replace(SHORT, steps=8))
+    with pytest.raises(InputError, match=r"gamma = 0\.97"):
+        run(built, tmp_path, replace(SHORT, gamma=0.9))
+    run(built, tmp_path, replace(SHORT, steps=16))
+    assert json.loads((tmp_path / "state" / "state.json").read_text())["steps"] == 16
+
+
+def test_the_verb(scene, capsys):
+    common = [str(scene), "--task", "ahead", "--quiet", "--worlds", "2"]
+    assert train.main([*common, "--run", "one", "--steps", "4", "--observe", "simulator"]) == 0
+    assert (scene / "runs/one/success.png").exists()
+    assert load_policy(scene / "runs/one").trained["observe"] == "simulator"
+    assert train.main([*common, "--run", "one", "--steps", "4", "--lighting", "day"]) == 2
+    assert "error: " in capsys.readouterr().err
+    assert train.main([*common, "--run", "two", "--lighting", "dusk"]) == 2
+    assert "dusk" in capsys.readouterr().err
+
+
+def test_a_run_that_is_asked_to_stop_saves_and_goes_on(scene, tmp_path):
+    from twin.learn.training import train as run
+
+    def interrupt(now) -> None:
+        if now.steps == 120:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(twin.load_scene(scene), tmp_path, SHORT, interrupt)
+    head = json.loads((tmp_path / "state" / "state.json").read_text())
+    assert (head["steps"], head["replay"]["pos"]) == (120, 30)
+    seen = []
+    run(twin.load_scene(scene), tmp_path, SHORT, lambda now: seen.append(now.steps))
+    assert seen[0] == 124 and seen[-1] == SHORT.steps

@@ -1,0 +1,134 @@
+"""Tables of trials: what is written is read again, and what is wrong is told in one line, with its line and a cure."""
+
+from pathlib import Path
+
+import pytest
+
+from twin.errors import InputError
+from twin.report.statistics import wilson
+from twin.report.trials import (
+    CELL_COLUMNS,
+    EPISODE_COLUMNS,
+    Cell,
+    Trial,
+    cells_text,
+    csv_text,
+    read_results,
+    read_trials,
+    tally,
+)
+
+TRIALS = [
+    Trial("nerf", "straight", "sun", 0, "goal", 29.5, 300, 0.9),
+    Trial("nerf", "straight", "sun", 1, "collision", 3.25, 40, None),
+    Trial("runs/a, b", "straight", "sun:night:0.3", 0, "timeout", -0.1, 600, 0.0),
+]
+TWIN = [
+    Cell("nerf", "straight", "sun", 100, 90),
+    Cell("nerf", "straight", "held-out", 100, 80),
+    Cell("simulator", "straight", "sun", 100, 20),
+    Cell("simulator", "right_turn", "sun", 100, 10),
+    Cell("simulator", "right_turn", "night", 100, 10),
+]
+HEADER = "policy,lighting,trials,successes\n"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "results.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_trials_are_read_as_written(tmp_path: Path) -> None:
+    path = write(tmp_path, csv_text(EPISODE_COLUMNS, (trial.row() for trial in TRIALS)))
+    assert read_trials(path) == TRIALS
+    assert tally(TRIALS) == [
+        Cell("nerf", "straight", "sun", 2, 1),
+        Cell("runs/a, b", "straight", "sun:night:0.3", 1, 0),
+    ]
+
+
+def test_cells_have_their_interval() -> None:
+    header, row = cells_text([TWIN[0]]).splitlines()
+    assert header == ",".join(CELL_COLUMNS)
+    low, high = wilson(90, 100)
+    assert row == f"nerf,straight,sun,100,90,0.9000,{low:.4f},{high:.4f}"
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("nerf,straight,sun,0,1,flew,1.0,5,", "line 3: cause = 'flew'; expected one of goal, collision"),
+        ("nerf,straight,sun,0,1,collision,1.0,5,", "line 3: success = '1' with cause 'collision'"),
+        ("nerf,straight,sun,-1,1,goal,1.0,5,", "line 3: seed = '-1'; expected a whole number"),
+        ("nerf,straight,sun,0,1,goal,far,5,", "line 3: progress_m = 'far'; expected a number"),
+        ("nerf,straight,sun,0,1,goal,nan,5,", "line 3: progress_m = 'nan'; expected a number"),
+        ("nerf,straight,sun,0,1,goal,1.0,5", "line 3: 8 fields; expected 9"),
+        ("nerf,straight,sun,7,1,goal,1.0,5,", "line 3: seed 7 of this policy, task and lighting is there twice"),
+    ],
+)
+def test_a_spoilt_row_is_named(tmp_path: Path, line: str, told: str) -> None:
+    good = "nerf,straight,sun,7,1,goal,29.0,300,0.9"
+    path = write(tmp_path, ",".join(EPISODE_COLUMNS) + f"\n{good}\n{line}\n")
+    with pytest.raises(InputError) as error:
+        read_trials(path)
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_nothing_validated_says_what_to_run(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"twin\.validate"):
+        read_trials(tmp_path / "episodes.csv")
+
+
+def test_results_find_their_cell(tmp_path: Path) -> None:
+    text = (
+        "policy, lighting ,trials,successes,task,twin_lighting\nnerf,sun,10,9,,\n\nnerf, dusk ,20,5,straight,held-out\n"
+    )
+    first, second = read_results(write(tmp_path, "\ufeff" + text), TWIN)
+    assert (first.key, first.twin_key) == (("nerf", "straight", "sun"), ("nerf", "straight", "sun"))
+    assert (second.key, second.twin_key) == (("nerf", "straight", "dusk"), ("nerf", "straight", "held-out"))
+    assert (second.trials, second.successes, second.rate) == (20, 5, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (HEADER + "nerf,sun,10,11\n", "line 2: successes = 11 of 10 trials; expected at most 10"),
+        (HEADER + "nerf,sun,-3,0\n", "line 2: trials = '-3'; expected a whole number, 0 or more"),
+        (HEADER + "nerf,sun,10,-1\n", "line 2: successes = '-1'; expected a whole number"),
+        (HEADER + "nerf,sun,10,5.5\n", "line 2: successes = '5.5'; expected a whole number"),
+        (HEADER + "nerf,sun,ten,5\n", "line 2: trials = 'ten'; expected a whole number"),
+        (HEADER + "nerf,sun,²,0\n", "line 2: trials = '²'; expected a whole number"),
+        (HEADER + "nerf,sun,0,0\n", "line 2: trials = 0; expected at least 1"),
+        (HEADER + "nerv,sun,10,5\n", "line 2: policy 'nerv' was not validated; did you mean 'nerf'?"),
+        (HEADER + "other,sun,10,5\n", "line 2: policy 'other' was not validated; expected one of nerf, simulator"),
+        (HEADER + "nerf,sunn,10,5\n", "line 2: lighting 'sunn' is not in the twin; did you mean 'sun'?"),
+        (HEADER + "nerf,dusk,10,5\n", "expected one of held-out, sun; for light the twin does not know"),
+        (HEADER + "nerf,night,10,5\n", "policy 'nerf' was not validated under 'night'; run python -m twin.validate"),
+        (HEADER + "simulator,sun,10,5\n", "was validated on straight and right_turn; say which in a column task"),
+        (HEADER + "nerf,sun,10,5\nnerf,sun,10,6\n", "line 3: policy 'nerf', lighting 'sun', task 'straight' is there"),
+        (HEADER + ",sun,10,5\n", "line 2: no policy; expected a name"),
+        (HEADER + "nerf,sun,10\n", "line 2: 3 fields; expected 4"),
+        (HEADER, "has a header and no rows"),
+        ("", "is empty; its first line must be policy,lighting,trials,successes[,task][,twin_lighting]"),
+        ("policy;lighting;trials;successes\n", "no column policy; expected policy,lighting"),
+        ("policy,lighting,trials\nnerf,sun,10\n", "no column successes"),
+        ("policy,lighting,trials,successes,note\n", "'note' is unknown or there twice"),
+        (HEADER.replace("lighting", "policy,lighting"), "there twice"),
+        ("policy,lighting,trials,successes,task\nnerf,sun,10,5,strait\n", "not validated on task 'strait'; did you"),
+        (HEADER + 'nerf,"sun\x00,10,5\n', "line 2"),
+    ],
+)
+def test_wrong_results_are_told(tmp_path: Path, text: str, told: str) -> None:
+    with pytest.raises(InputError) as error:
+        read_results(write(tmp_path, text), TWIN)
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_what_is_no_text_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "results.csv"
+    path.write_bytes(b"policy,lighting\xff\xfe\n")
+    with pytest.raises(InputError, match="not UTF-8"):
+        read_results(path, TWIN)
+    with pytest.raises(InputError, match="does not exist"):
+        read_results(tmp_path / "none.csv", TWIN)

@@ -1,0 +1,200 @@
+"""Validation: episodes do not depend on who drives beside whom, a killed validation ends with the same table, and the
+summary says what the table holds."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_policy import some_weights
+from tiny_twin import tiny_twin
+
+from twin import load_scene, progress, validate
+from twin.env.suite import Stage
+from twin.errors import InputError
+from twin.learn import judging
+from twin.learn.architecture import Architecture
+from twin.learn.judging import Chunk, campaign, drawn_light, drive
+from twin.learn.policy import Control, load_policy, save_policy
+from twin.report.trials import Trial, read_trials
+from twin.report.validation import lines, pairs, rate, summary
+
+SMALL = Architecture((32, 18), 2, 1, ((4, 5, 4),), 8, (8,), 1)
+FIRST = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    root = tiny_twin(tmp_path_factory.mktemp("twin"))
+    for name, turn in (("ahead", 0.0), ("left", 0.8)):
+        weights = some_weights(SMALL)
+        weights["mean.weight"] *= 0.3
+        weights["mean.bias"][:] = np.arctanh(turn)
+        save_policy(root / "runs" / name, SMALL, Control(), weights, {})
+    return root
+
+
+@pytest.fixture
+def fresh(scene):
+    """The scene without its validation."""
+    shutil.rmtree(scene / "validation", ignore_errors=True)
+    return scene
+
+
+def chunk(scene: Path, seeds, lighting="day", name="ahead") -> Chunk:
+    return Chunk(str(scene), "ahead", str(scene / "runs" / name), False, lighting, tuple(seeds))
+
+
+def test_an_episode_is_the_same_whoever_drives_beside(scene):
+    together = drive(chunk(scene, range(11)))
+    assert [one.seed for one in together] == list(range(11))
+    assert len({one.steps for one in together}) > 1  # they end at different times
+    assert [drive(chunk(scene, [k]))[0] for k in (0, 7, 10)] == [together[k] for k in (0, 7, 10)]
+    assert drive(chunk(scene, (10, 3))) == [together[10], together[3]]
+
+
+def test_an_episode_is_that_of_the_environment_alone(scene):
+    import twin
+    from twin.env.drivers import PolicyDriver
+    from twin.env.episode import record
+
+    policy = load_policy(scene / "runs" / "ahead")
+    (driven,) = drive(chunk(scene, [5]))
+    environment = twin.load(scene, "ahead", 5, lighting="day", **policy.options())
+    episode = record(environment, PolicyDriver(policy))
+    assert (driven.cause, driven.steps) == (episode.cause, len(episode.times) - 1)
+    assert driven.progress == pytest.approx(episode.progress[-1], abs=1e-9)
+    assert driven.trust == pytest.approx(episode.trust[:-1].mean(), abs=1e-9)
+
+
+def test_processes_give_what_one_gives(scene):
+    chunks = [chunk(scene, [0, 1]), chunk(scene, [2]), chunk(scene, [0], "night")]
+    assert list(campaign(chunks, processes=2)) == list(campaign(chunks))
+
+
+def test_drawn_lights_do_not_depend_on_those_before(scene):
+    def light(numbers):
+        stage = Stage.open(load_scene(scene), "ahead", {"size": (32, 18)})
+        for number in numbers:
+            drawn_light(stage, number)
+        return stage.field.embedding(f"drawn_{numbers[-1]}")
+
+    np.testing.assert_array_equal(light([3]), light([0, 5, 3]))
+    assert not np.array_equal(light([3]), light([4]))
+
+
+def run(scene: Path, *policies: str, lightings=("day", "night"), episodes=5) -> str:
+    validate.validate(scene, policies, "ahead", lightings, episodes)
+    return (scene / "validation" / "episodes.csv").read_text()
+
+
+def test_a_killed_validation_ends_with_the_same_table(fresh, monkeypatch):
+    monkeypatch.setattr(validate, "CHUNK", 3)
+    whole = run(fresh, "ahead", "left")
+    path = fresh / "validation" / "episodes.csv"
+    assert len(whole.splitlines()) == 1 + 2 * 2 * 5
+    shutil.rmtree(fresh / "validation")
+
+    class Killed(BaseException):
+        pass
+
+    def killed(one):
+        if left.pop() == 0:
+            raise Killed
+        return drive(one)
+
+    left = [0, 1, 2, 3]
+    monkeypatch.setattr(judging, "drive", killed)
+    with pytest.raises(Killed):
+        run(fresh, "ahead", "left")
+    monkeypatch.setattr(judging, "drive", drive)
+    assert whole.startswith(path.read_text()) and 1 < len(path.read_text().splitlines()) < len(whole.splitlines())
+    assert run(fresh, "ahead", "left") == whole
+    # Killed while it wrote: within a row, and within the header.
+    for cut in (len(whole) - 60, 9):
+        path.write_text(whole[:cut])
+        assert run(fresh, "ahead", "left") == whole
+    monkeypatch.setattr(judging, "drive", None)  # nothing is driven twice
+    assert run(fresh, "ahead", "left") == whole
+
+
+def test_more_policies_and_episodes_are_added(fresh):
+    first = run(fresh, "ahead", lightings=["day"], episodes=2)
+    more = run(fresh, "left", "ahead", lightings=["day"], episodes=3)
+    assert more.startswith(first)
+    trials = read_trials(fresh / "validation" / "episodes.csv")
+    assert [(t.policy, t.seed - FIRST) for t in trials] == [
+        *[("ahead", 0), ("ahead", 1)],
+        *[("left", 0), ("left", 1), ("left", 2)],
+        ("ahead", 2),
+    ]
+    said = json.loads((fresh / "validation" / "summary.json").read_text())
+    assert [c["trials"] for c in said["cells"]] == [3, 3]
+    assert (fresh / "validation" / "failures_ahead.png").stat().st_size > 5_000
+
+
+def test_another_policy_of_the_same_name_is_refused(fresh, tmp_path):
+    run(fresh, "ahead", lightings=["day"], episodes=1)
+    save_policy(tmp_path / "ahead", SMALL, Control(), some_weights(SMALL, 9), {})
+    with pytest.raises(InputError, match="validated as another file"):
+        run(fresh, str(tmp_path / "ahead"))
+    with pytest.raises(InputError, match="two policies"):
+        run(fresh, "ahead", str(tmp_path / "ahead"))
+
+
+def test_the_worst_light_is_proved_on_fresh_episodes(fresh, monkeypatch):
+    monkeypatch.setattr(validate, "_LIGHTS", 4)
+    monkeypatch.setattr(validate, "_LOOKS", 1)
+    monkeypatch.setattr(validate, "_FINALISTS", 2)
+    said = validate.validate(fresh, ["ahead"], "ahead", ["day"], 2, worst=True)
+    worst = said["worst"]["ahead"]
+    trials = read_trials(fresh / "validation" / "worst.csv")
+    assert worst["trials"] == 2 and worst["of"] == 4
+    searched, proof = [t for t in trials if t.seed < 3_000_000], [t for t in trials if t.seed >= 3_000_000]
+    assert {t.lighting for t in searched} == {f"drawn_{k}" for k in range(4)} and len(searched) == 4 + 2 * 2
+    assert {t.lighting for t in proof} == {worst["lighting"]} and len(proof) == 2
+
+
+def test_the_verb(fresh, capsys):
+    common = [str(fresh), "--task", "ahead", "--lightings", "day", "--episodes", "2"]
+    assert validate.main([*common, "--policy", "ahead", "left", "--quiet"]) == 0
+    assert validate.main([*common, "--policy", "ahead", "left"]) == 0
+    said = capsys.readouterr().out
+    assert "only the first succeeded" in said and "/2 " in said
+    for wrong in (
+        ["--policy", "nobody"],
+        ["--policy", "ahead", "--lightings", "dusk"],
+        ["--policy", "ahead", "--episodes", "0"],
+    ):
+        assert validate.main([*common, *wrong, "--quiet"]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+# ---- what is said of trials
+
+
+def trial(policy: str, seed: int, cause: str, trust: float | None = 1.0, progress: float = 3.0) -> Trial:
+    return Trial(policy, "ahead", "day", seed, cause, progress, 10, trust)
+
+
+def test_paired_episodes_are_a_coin_tossed():
+    a = [trial("a", k, "goal" if k < 8 else "collision") for k in range(10)]
+    b = [trial("b", k, "goal" if k < 1 else "timeout") for k in range(1, 12)]
+    (pair,) = pairs([*a, *b])
+    assert (pair["episodes"], pair["only_a"], pair["only_b"]) == (9, 7, 0)
+    assert pair["p"] == pytest.approx(2 * 0.5**7)
+    assert pairs(a) == []
+
+
+def test_the_summary_splits_by_cause_and_trust():
+    trials = [trial("a", 0, "goal"), trial("a", 1, "goal", 0.5), trial("a", 2, "stuck", 0.5), trial("a", 3, "stuck")]
+    (cell,) = summary(trials)["cells"]
+    assert cell["causes"] == {"stuck": 2}
+    assert (cell["successes"], cell["trials"]) == (2, 4)
+    assert (cell["trusted"]["successes"], cell["trusted"]["trials"]) == (1, 2)
+    assert (cell["low_trust"]["successes"], cell["low_trust"]["trials"]) == (1, 2)
+    assert 0.0 < cell["low"] < 0.5 < cell["high"] < 1.0
+    assert rate([])["rate"] is None
+    assert "2 stuck" in lines(summary(trials))[0]

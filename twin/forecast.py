@@ -1,0 +1,91 @@
+"""The verb that tells what success in the twin says about success on the road.
+
+    python -m twin.forecast SCENE [--real results.csv]
+
+reads `validation/episodes.csv`, which `twin.validate` wrote, and the user's real trials, and writes `forecast.json`,
+`forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials it ranks the policies in the twin, and
+says what that leaves open.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from twin.errors import InputError
+from twin.report.forecast import Forecast
+from twin.report.trials import RESULT_COLUMNS, read_results, read_trials, tally
+from twin.scene import SceneDir
+
+
+def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
+    """Computes and writes the forecast of the scene at `root`; see the module.
+
+    Args:
+        root: The scene folder.
+        real: `results.csv`; None: no real trials.
+        seed: Of the resampling; the same seed gives the same forecast.
+
+    Raises:
+        InputError: nothing validated, or a table that is wrong; nothing is written then.
+    """
+    from twin.report.forecast_page import write_forecast_page
+    from twin.report.forecast_words import candidates_csv
+    from twin.report.forecasting import make_forecast
+
+    scene = SceneDir(root)
+    if not root.is_dir():
+        raise InputError(f"{root} is no folder; give the scene's folder, such as scenes/demo")
+    twin = tally(read_trials(scene.episodes_csv))
+    cells = read_results(real, twin) if real else []
+    out = make_forecast(root.resolve().name, twin, cells, seed)
+    out.save(scene.forecast)
+    table = scene.forecast / "forecast.csv"
+    aside = table.with_name(table.name + ".partial")
+    aside.write_text(candidates_csv(out), encoding="utf-8")
+    aside.replace(table)
+    write_forecast_page(out, scene.forecast)
+    return out
+
+
+_EPILOG = f"""\
+results.csv, one line per policy and lighting:
+
+  {",".join(RESULT_COLUMNS)}
+  runs/nerf,morning,10,8
+  runs/nerf,dusk,10,6
+
+Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task. Light that
+the twin does not know by name is compared with one that it does, named in a column twin_lighting, such as held-out.
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
+    parser = argparse.ArgumentParser(
+        prog="python -m twin.forecast",
+        description="What success in the twin says about success on the road.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("scene", type=Path, help="folder of a scene with validated policies")
+    parser.add_argument("--real", type=Path, metavar="CSV", help="trials on the road; see below")
+    parser.add_argument("--seed", type=int, default=0, help="of the resampling (default 0)")
+    parser.add_argument("--quiet", action="store_true", help="no summary")
+    arguments = parser.parse_args(argv)
+    try:
+        if arguments.seed < 0:
+            raise InputError(f"--seed {arguments.seed}: expected 0 or more")
+        out = forecast(arguments.scene, arguments.real, arguments.seed)
+    except (InputError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    if not arguments.quiet:
+        from twin.report.forecast_words import summary
+
+        print(summary(out))
+        print(f"look at {SceneDir(arguments.scene).forecast / 'forecast.html'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,140 @@
+"""Driving policies through numbered episodes of a task, to judge them.
+
+An *episode* is decided by its seed and its lighting; whoever drives it, on whatever machine, beside whichever others,
+meets the same start, robot and light. So policies are compared on the same episodes, and a campaign can be cut into
+*chunks*, done in any order and anywhere, and put together again.
+"""
+
+import dataclasses
+import re
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing import get_context
+
+import numpy as np
+
+from twin.env.batch import Worlds
+from twin.env.suite import Stage
+from twin.learn.policy import Policy, load_policy
+from twin.loading import load_scene
+
+CHUNK = 16
+"""Episodes at most that are driven by one process in one go."""
+
+_WORLDS = 8  # at once
+_DRAWN = re.compile(r"drawn_(\d+)")
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Episodes of one policy under one lighting."""
+
+    scene: str
+    task: str
+    source: str
+    """See `load_policy`."""
+    trust: bool
+    lighting: str
+    """See `env/lightings.py`; or `drawn_<number>`: the light that this seed draws, see `drawn_light`."""
+    seeds: tuple[int, ...]
+    randomise: bool = False
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What became of one episode."""
+
+    seed: int
+    cause: str
+    progress: float
+    """[m]"""
+    steps: int
+    trust: float
+    """Mean over its pictures."""
+    low_trust: float
+    """Of the picture that is trusted least."""
+
+
+def drive(chunk: Chunk) -> list[Driven]:
+    """Drives the episodes of a chunk; in the order of their seeds.
+
+    Raises:
+        InputError: the policy, scene, task or lighting is not to be had.
+    """
+    policy = _policy(chunk.source, chunk.trust)
+    worlds = _worlds(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting, chunk.randomise)
+    assert worlds.pixels is not None
+    waiting = list(range(len(chunk.seeds)))
+    driving: dict[int, int] = {}  # world → number of its episode
+    trusts: list[list[float]] = [[] for _ in chunk.seeds]
+    done: dict[int, Driven] = {}
+    while waiting or driving:
+        free = [i for i in range(len(worlds)) if i not in driving][: len(waiting)]
+        for i in free:
+            driving[i] = waiting.pop(0)
+            worlds.seed(i, chunk.seeds[driving[i]])
+        worlds.begin(free)
+        which = sorted(driving)
+        for i in which:
+            trusts[driving[i]].append(float(worlds.pixels.trust[i]))
+        pictures = worlds.observation()
+        # One by one: in a batch the sums are done in another order, and the last bit decides who meets the kerb.
+        over = worlds.step(np.stack([policy(pictures[i]) for i in which]), which).over
+        for i in [i for i, ended in zip(which, over, strict=True) if ended]:
+            number, info = driving.pop(i), worlds.info(i)
+            seen = trusts[number]
+            outcome = info["cause"], info["progress"], len(seen), float(np.mean(seen)), min(seen)
+            done[number] = Driven(chunk.seeds[number], *outcome)
+    return [done[number] for number in range(len(chunk.seeds))]
+
+
+def campaign(chunks: Sequence[Chunk], processes: int = 1) -> Iterator[list[Driven]]:
+    """Drives chunks; what became of them, in their order, each as soon as it and those before it are done.
+
+    Args:
+        chunks: What to drive.
+        processes: How many on this machine.
+    """
+    if processes == 1:
+        yield from map(drive, chunks)
+    else:
+        # Warp and MuJoCo have threads, which a fork would not survive.
+        with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+            try:
+                yield from pool.map(drive, chunks)
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+def drawn_light(stage: Stage, number: int) -> Stage:
+    """The stage with a light `drawn_<number>` in its field: one that could have been filmed, drawn with that seed."""
+    assert stage.field is not None
+    name = f"drawn_{number}"
+    if name not in stage.field.lightings:
+        # Of the filmed ones: lights drawn before must not change what this number draws.
+        filmed = stage.field.lightings_by_name.filmed()
+        stage.field.add_lightings({name: filmed.sample(np.random.default_rng(number))})
+    return stage
+
+
+@lru_cache(maxsize=4)
+def _policy(source: str, trust: bool) -> Policy:
+    return load_policy(source, trust)
+
+
+@lru_cache(maxsize=1)
+def _stage(scene: str, task: str, source: str, trust: bool, randomise: bool) -> Stage:
+    return Stage.open(load_scene(scene), task, {**_policy(source, trust).options(), "randomise": randomise})
+
+
+@lru_cache(maxsize=1)
+def _worlds(scene: str, task: str, source: str, trust: bool, lighting: str, randomise: bool) -> Worlds:
+    stage = _stage(scene, task, source, trust, randomise)
+    drawn = _DRAWN.fullmatch(lighting)
+    if drawn:
+        stage = drawn_light(stage, int(drawn[1]))
+    return Worlds(
+        dataclasses.replace(stage, options=dataclasses.replace(stage.options, lighting=lighting)), [None] * _WORLDS
+    )

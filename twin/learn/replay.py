@@ -1,0 +1,170 @@
+"""A replay buffer that keeps single pictures, not stacks: a quarter of an eighth of what stacks before and after need.
+
+Every world has a *tape*: the pictures that its robot saw, one after the other, each once. A *transition* knows where on
+the tape its newest picture is, and its *age*, the steps since its episode began; its stack is that picture and those
+before it, back to the episode's first, which fills the rest. The newest picture of the next stack follows it on the
+tape, also at an episode's end, after which the next episode's first picture is written.
+
+A tape is a ring in a file. It is longer than the transitions need by a *slack*, so that what was written since the last
+save has not run over what the saved transitions refer to: a training that was killed goes on from its last save with
+all it held then.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from twin.errors import InputError
+
+_SHORT = 8  # mean steps of an episode; shorter ones leave less than the whole buffer to draw from
+_ROWS = ("actions", "rewards", "ends", "newest", "age")
+
+
+class FrameReplayBuffer(ReplayBuffer):
+    """Transitions of n worlds whose observations are stacks (3 · stack, height, width), the newest picture last."""
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: torch.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        file: Path | None = None,
+        slack: int = 0,
+        shift: int = 0,
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            buffer_size: Transitions, of all worlds together.
+            observation_space: uint8 (3 · stack, height, width).
+            action_space: One-dimensional.
+            device: Where samples go.
+            n_envs: Number of worlds.
+            optimize_memory_usage: As stable-baselines3 passes it; it has no meaning here.
+            file: Where the tapes are; in memory where None. One that is there is read, see `set_state`.
+            slack: Transitions, of all worlds together, that may be added between two saves.
+            shift: Samples are shifted by up to so many pixels each way, edges repeated: Kostrikov et al. 2020 (DrQ).
+            seed: Of what is drawn.
+
+        Raises:
+            InputError: a file of another size.
+        """
+        BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.optimize_memory_usage, self.handle_timeout_termination = False, True
+        channels, height, width = self.obs_shape
+        self.stack, self.shift, self.rng = channels // 3, shift, np.random.default_rng(seed)
+        size = (self.buffer_size, n_envs)
+        self.actions = np.zeros((*size, self.action_dim), np.float32)
+        self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self.length = self.buffer_size + self.buffer_size // _SHORT + -(-2 * slack // n_envs) + self.stack + 2
+        """Pictures on a tape."""
+        shape = (n_envs, self.length, 3, height, width)
+        if file is None:
+            self.tapes = np.zeros(shape, np.uint8)
+        else:
+            there = file.exists()
+            if there and file.stat().st_size != int(np.prod(shape)):
+                raise InputError(f"{file} has {file.stat().st_size} bytes; expected {int(np.prod(shape))}: damaged")
+            self.tapes = np.memmap(file, np.uint8, "r+" if there else "w+", shape=shape)
+        self._reach = self.length - -(-2 * slack // n_envs)
+        self.written = np.zeros(n_envs, np.int64)
+        """Pictures ever written on each tape."""
+        self._ages = np.full(n_envs, -1)  # of each world's episode; -1: none
+
+    def add(
+        self,
+        obs: NDArray,
+        next_obs: NDArray,
+        action: NDArray,
+        reward: NDArray,
+        done: NDArray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Adds a transition of every world; the observations of a world must follow each other until `done`."""
+        for i in range(self.n_envs):
+            if self._ages[i] < 0:
+                self._write(i, obs[i, -3:])
+                self._ages[i] = 0
+            self.newest[self.pos, i], self.age[self.pos, i] = self.written[i] - 1, self._ages[i]
+            self._write(i, next_obs[i, -3:])
+            self._ages[i] = -1 if done[i] else self._ages[i] + 1
+        self.actions[self.pos] = action.reshape(self.n_envs, self.action_dim)
+        self.rewards[self.pos] = reward
+        # What ended by a time limit would have gone on.
+        self.ends[self.pos] = [d and not info.get("TimeLimit.truncated") for d, info in zip(done, infos, strict=True)]
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full, self.pos = True, 0
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """Draws transitions that are wholly there, each alike; stacks are uint8."""
+        filled = self.buffer_size if self.full else self.pos
+        row, world = np.empty(0, int), np.empty(0, int)
+        while len(row) < batch_size:
+            more = self.rng.integers(filled, size=batch_size), self.rng.integers(self.n_envs, size=batch_size)
+            whole = self.whole(*more)
+            row, world = np.append(row, more[0][whole]), np.append(world, more[1][whole])
+        row, world = row[:batch_size], world[:batch_size]
+        before, after = self.stacks(row, world)
+        if self.shift:
+            before, after = self._shifted(before), self._shifted(after)
+        rest = self.actions[row, world], after, self.ends[row, world, None], self.rewards[row, world, None]
+        return ReplayBufferSamples(*(torch.as_tensor(part, device=self.device) for part in (before, *rest)))
+
+    def whole(self, row: NDArray, world: NDArray) -> NDArray[np.bool_]:
+        """Whether all pictures of transitions are still on their tapes, shapes (k,)."""
+        oldest = self.newest[row, world] - np.minimum(self.age[row, world], self.stack - 1)
+        return oldest >= self.written[world] - self._reach
+
+    def stacks(self, row: NDArray, world: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Stacks before and after transitions, shapes (k,) → (k, 3 · stack, height, width) each."""
+        newest, age = self.newest[row, world], self.age[row, world]
+        back = np.arange(self.stack - 1, -1, -1)
+        first = (newest - age)[:, None]
+        out = []
+        for at in (newest, newest + 1):
+            where = np.maximum(at[:, None] - back, first) % self.length
+            out.append(self.tapes[world[:, None], where].reshape(len(row), *self.obs_shape))
+        return out[0], out[1]
+
+    def state(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
+        """Arrays, and what is JSON-able, of all but the tapes; those are on disk when this returns."""
+        if isinstance(self.tapes, np.memmap):
+            self.tapes.flush()
+        arrays = {name: getattr(self, name) for name in _ROWS} | {"written": self.written}
+        return arrays, {"pos": self.pos, "full": self.full, "rng": self.rng.bit_generator.state}
+
+    def set_state(self, arrays: dict[str, NDArray], rest: dict[str, Any]) -> None:
+        """Goes back to a state, with the tapes as they are; worlds begin new episodes."""
+        for name in (*_ROWS, "written"):
+            getattr(self, name)[:] = arrays[name]
+        self.pos, self.full = rest["pos"], rest["full"]
+        self.rng.bit_generator.state = rest["rng"]
+        self._ages[:] = -1
+
+    def _write(self, world: int, picture: NDArray) -> None:
+        self.tapes[world, self.written[world] % self.length] = picture
+        self.written[world] += 1
+
+    def _shifted(self, stacks: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        p, (height, width) = self.shift, self.obs_shape[1:]
+        padded = np.empty((*stacks.shape[:2], height + 2 * p, width + 2 * p), np.uint8)
+        padded[..., p:-p, p:-p] = stacks
+        padded[..., :p, p:-p], padded[..., -p:, p:-p] = stacks[..., :1, :], stacks[..., -1:, :]
+        padded[..., :p], padded[..., -p:] = padded[..., p : p + 1], padded[..., -p - 1 : -p]
+        out = np.empty_like(stacks)
+        for i, (y, x) in enumerate(self.rng.integers(0, 2 * p + 1, (len(stacks), 2))):
+            out[i] = padded[i, :, y : y + height, x : x + width]
+        return out

@@ -1,0 +1,126 @@
+"""SAC from pixels (Haarnoja et al. 2018) on stable-baselines3, with one encoder for actor and critics.
+
+The *encoder* turns stacks into features. It learns from the critics' loss alone, and the actor takes its features as
+they are (Yarats et al. 2019; Kostrikov et al. 2020); next states are encoded by it, too, and not by a slowly following
+copy (Yarats et al. 2021, DrQ-v2). So an update runs it forward twice and backward once, where stable-baselines3's own
+update, in which actor and critics have encoders of their own, has five passes forward and three backward.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, SACPolicy
+from torch import nn
+
+from twin.learn.architecture import NORM_EPSILON, Architecture, Floats
+
+
+class Encoder(BaseFeaturesExtractor):
+    """The part of `architecture` from shrunken stacks of values 0 to 255 to features."""
+
+    def __init__(self, observation_space: spaces.Box, architecture: Architecture) -> None:
+        super().__init__(observation_space, architecture.features)
+        layers: list[nn.Module] = []
+        before = architecture.channels
+        for channels, kernel, stride in architecture.convolutions:
+            layers += [nn.Conv2d(before, channels, kernel, stride), nn.ReLU()]
+            before = channels
+        assert isinstance(layers[0], nn.Conv2d)
+        self.first, self.further = layers[0], nn.Sequential(*layers[1:], nn.Flatten())
+        self.linear = nn.Linear(before * architecture.grid[0] * architecture.grid[1], architecture.features)
+        self.norm = nn.LayerNorm(architecture.features, NORM_EPSILON)
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        """Shapes (n, 3 · stack, h, w) → (n, features)."""
+        # Scaling the weights of the first convolution, instead of the pictures, saves a third of an update.
+        weight = self.first.weight
+        bias = self.first.bias - 0.5 * weight.sum((1, 2, 3))  # type: ignore[operator]
+        out = nn.functional.conv2d(pictures.float(), weight / 255.0, bias, self.first.stride)
+        return torch.tanh(self.norm(self.linear(self.further(out))))
+
+
+class DrivePolicy(SACPolicy):
+    """Actor and critics with one encoder, which the critics' optimiser has."""
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        encoder = set(self.actor.features_extractor.parameters())
+        rate = lr_schedule(1)
+        own = [p for p in self.actor.parameters() if p not in encoder]
+        self.actor.optimizer = self.optimizer_class(own, lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+        self.critic.optimizer = self.optimizer_class(self.critic.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+
+class PixelSAC(SAC):
+    """SAC whose update runs the encoder as seldom as can be."""
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Updates all networks `gradient_steps` times."""
+        assert self.replay_buffer is not None and self.ent_coef_optimizer is not None and self.log_ent_coef is not None
+        assert isinstance(self.target_entropy, float)
+        self.policy.set_training_mode(True)
+        lead, follow = ([p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target))
+        sums = np.zeros(4)
+        for _ in range(gradient_steps):
+            data = self.replay_buffer.sample(batch_size)
+            features = self.actor.features_extractor(data.observations)
+            with torch.no_grad():
+                alpha = self.log_ent_coef.exp()
+                after = self.actor.features_extractor(data.next_observations)
+                action, log_prob = self._act(after)
+                best = torch.cat([q(torch.cat([after, action], 1)) for q in self.critic_target.q_networks], 1)
+                value = best.min(1, keepdim=True).values - alpha * log_prob
+                target = data.rewards + (1.0 - data.dones) * self.gamma * value
+            given = torch.cat([features, data.actions], 1)
+            critic_loss = sum(nn.functional.mse_loss(q(given), target) for q in self.critic.q_networks) / 2
+            assert isinstance(critic_loss, torch.Tensor)
+            self.critic.optimizer.zero_grad()
+            critic_loss.backward()
+            self.critic.optimizer.step()
+
+            features = features.detach()
+            action, log_prob = self._act(features)
+            chosen = torch.cat([features, action], 1)
+            best = torch.cat([q(chosen) for q in self.critic.q_networks], 1).min(1, keepdim=True).values
+            actor_loss = (alpha * log_prob - best).mean()
+            self.actor.optimizer.zero_grad()
+            actor_loss.backward()
+            self.actor.optimizer.step()
+
+            entropy_loss = -(self.log_ent_coef * (log_prob.detach() + self.target_entropy)).mean()
+            self.ent_coef_optimizer.zero_grad()
+            entropy_loss.backward()
+            self.ent_coef_optimizer.step()
+            polyak_update(lead, follow, self.tau)
+            sums += [critic_loss.item(), actor_loss.item(), alpha.item(), best.mean().item()]
+        self._n_updates += gradient_steps
+        for name, value in zip(("critic_loss", "actor_loss", "ent_coef", "value"), sums / gradient_steps, strict=True):
+            self.logger.record(f"train/{name}", value)
+
+    def _act(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Drawn actions (n, actions) and the logarithm of their density (n, 1)."""
+        latent = self.actor.latent_pi(features)
+        log_std = self.actor.log_std(latent).clamp(LOG_STD_MIN, LOG_STD_MAX)  # type: ignore[operator]
+        action, log_prob = self.actor.action_dist.log_prob_from_params(self.actor.mu(latent), log_std)  # type: ignore[call-arg]
+        return action, log_prob.reshape(-1, 1)
+
+
+def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Floats]:
+    """The deterministic actor's weights by the names of `Architecture.shapes`."""
+    actor = model.actor
+    encoder = actor.features_extractor
+    assert isinstance(encoder, Encoder)
+    convolutions = [encoder.first, *(m for m in encoder.further if isinstance(m, nn.Conv2d))]
+    hidden = [m for m in actor.latent_pi if isinstance(m, nn.Linear)]
+    modules: dict[str, Any] = {f"conv.{i}": m for i, m in enumerate(convolutions)}
+    modules |= {"features": encoder.linear, "norm": encoder.norm}
+    modules |= {f"hidden.{i}": m for i, m in enumerate(hidden)} | {"mean": actor.mu}
+    return {
+        name: getattr(modules[name.rsplit(".", 1)[0]], name.rsplit(".", 1)[1]).detach().cpu().numpy()
+        for name in architecture.shapes()
+    }

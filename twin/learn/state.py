@@ -1,0 +1,107 @@
+"""A training that was stopped goes on: everything SAC holds, written so that loading it runs no code.
+
+`state.json` names the folder `state_<steps>` that is complete, and is written last; so whenever a training is killed,
+one complete state is there. Tensors are safetensors, the rest of the replay buffer npz, all else JSON.
+"""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from twin.errors import InputError
+from twin.learn.replay import FrameReplayBuffer
+from twin.learn.sac import PixelSAC
+from twin.scene import read_json, write_json
+
+_JSON, _TENSORS, _REPLAY = "state.json", "tensors.safetensors", "replay.npz"
+
+
+def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
+    """Writes a state, and removes the one before.
+
+    Args:
+        folder: Of the states.
+        model: With a `FrameReplayBuffer`.
+        more: JSON-able, given back by `load_state`.
+    """
+    assert isinstance(model.replay_buffer, FrameReplayBuffer)
+    name = f"state_{model.num_timesteps:09d}"
+    shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / name).mkdir(parents=True)
+    save_file(_tensors(model), folder / name / _TENSORS)
+    arrays, replay = model.replay_buffer.state()
+    np.savez(folder / name / _REPLAY, **arrays)  # type: ignore[arg-type]
+    counts = {"steps": model.num_timesteps, "updates": model._n_updates, "episodes": model._episode_num}
+    chance = {"action_space": model.action_space.np_random.bit_generator.state}
+    write_json(folder / _JSON, {"folder": name, **counts, "replay": replay, "rng": chance, "more": more})
+    for old in folder.glob("state_*"):
+        if old.name != name:
+            shutil.rmtree(old)
+
+
+def has_state(folder: Path) -> bool:
+    return (folder / _JSON).exists()
+
+
+def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
+    """Brings a new model to the saved state; returns `more`.
+
+    Raises:
+        InputError: files that are missing, damaged, or of another network.
+    """
+    assert isinstance(model.replay_buffer, FrameReplayBuffer)
+    try:
+        head = read_json(folder / _JSON)
+        tensors = load_file(folder / head["folder"] / _TENSORS)
+        with np.load(folder / head["folder"] / _REPLAY, allow_pickle=False) as data:
+            model.replay_buffer.set_state(dict(data), head["replay"])
+        _set_tensors(model, tensors)
+    except (OSError, KeyError, ValueError, RuntimeError, json.JSONDecodeError, SafetensorError) as error:
+        raise InputError(
+            f"{folder}: the saved training is damaged ({' '.join(str(error).split())}); train anew under another name"
+        ) from None
+    model.num_timesteps, model._n_updates, model._episode_num = head["steps"], head["updates"], head["episodes"]
+    model.action_space.np_random.bit_generator.state = head["rng"]["action_space"]
+    return head["more"]
+
+
+def _optimizers(model: PixelSAC) -> dict[str, torch.optim.Optimizer]:
+    assert model.ent_coef_optimizer is not None
+    return {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "entropy": model.ent_coef_optimizer}
+
+
+def _tensors(model: PixelSAC) -> dict[str, torch.Tensor]:
+    assert model.log_ent_coef is not None
+    out = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
+    out |= {"log_ent_coef": model.log_ent_coef.detach(), "rng": torch.get_rng_state()}
+    for name, optimizer in _optimizers(model).items():
+        for i, values in optimizer.state_dict()["state"].items():
+            out |= {f"optimizer.{name}.{i}.{key}": value for key, value in values.items()}
+    if torch.cuda.is_available():
+        out["rng.cuda"] = torch.cuda.get_rng_state()
+    # The shared encoder has several names; a file has no room for that.
+    return {name: value.detach().cpu().clone().contiguous() for name, value in out.items()}
+
+
+def _set_tensors(model: PixelSAC, tensors: dict[str, torch.Tensor]) -> None:
+    assert model.log_ent_coef is not None
+    policy = {n.removeprefix("policy."): value for n, value in tensors.items() if n.startswith("policy.")}
+    model.policy.load_state_dict(policy)
+    with torch.no_grad():
+        model.log_ent_coef.copy_(tensors["log_ent_coef"])
+    for name, optimizer in _optimizers(model).items():
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith(f"optimizer.{name}."):
+                i, what = key.removeprefix(f"optimizer.{name}.").split(".")
+                state.setdefault(int(i), {})[what] = value
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+    torch.set_rng_state(tensors["rng"])
+    if "rng.cuda" in tensors and torch.cuda.is_available():
+        torch.cuda.set_rng_state(tensors["rng.cuda"])

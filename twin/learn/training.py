@@ -1,0 +1,379 @@
+"""A training run: SAC in many worlds at once, in a folder that holds all that is known of it.
+
+    runs/<name>/
+      config.json                what was asked for
+      policy.json .safetensors .onnx     the newest policy (see `policy.py`)
+      checkpoints/<steps>/       policies along the way, of varied quality
+      episodes.csv               every episode driven in training
+      log.csv                    speed, memory and losses at every save
+      tensorboard/
+      state/                     what the training goes on from (see `state.py`), and its pictures
+
+*Steps* are control steps of all worlds together. *Updates* are steps of the optimisers.
+"""
+
+import csv
+import dataclasses
+import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from twin.env.options import STEERING
+from twin.errors import InputError
+from twin.learn.architecture import Architecture, shrink
+from twin.learn.policy import Control, save_policy
+from twin.learn.replay import FrameReplayBuffer
+from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
+from twin.learn.state import has_state, load_state, save_state
+from twin.learn.vectors import DriveVecEnv
+from twin.loading import Twin
+from twin.scene import digest_file, read_json, write_json
+
+EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward")
+LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
+RECENT = 100
+"""Episodes that a success rate in training is taken over."""
+
+_RESUMES = 1_000_003  # seeds of worlds are moved by this at every resumption, so that no episode is driven again
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What a training is. The defaults are the preset for a CPU."""
+
+    task: str = "straight"
+    observe: str = "nerf"
+    """nerf, or simulator: MuJoCo's own picture of the extracted mesh."""
+    lighting: str = "training"
+    """See `env/lightings.py`; the default varies between episodes."""
+    seed: int = 0
+    steps: int = 60_000
+    worlds: int = 8
+    action: str = STEERING
+    """steering (at `speed`) or twist."""
+    speed: float = 1.0
+    """[m/s]"""
+    yaw_rate: float = 1.0
+    """[rad/s]"""
+    randomise: bool = False
+    """Another robot in every episode."""
+    pool: int = 2
+    convolutions: tuple[tuple[int, int, int], ...] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
+    """Channels, kernel, stride."""
+    features: int = 64
+    hidden: tuple[int, ...] = (256, 256)
+    batch: int = 128
+    buffer: int = 50_000
+    """Transitions."""
+    starts: int = 1_000
+    """Steps at random before learning begins."""
+    updates: float = 0.5
+    """Per step."""
+    gamma: float = 0.97
+    """Discount per step: what is 33 steps (3 s) away counts a third."""
+    learning_rate: float = 5e-4
+    tau: float = 0.01
+    """Share by which the target critics follow, per update."""
+    shift: int = 2
+    """Random shift of pictures in updates [px of the shrunken ones]."""
+    checkpoints: int = 20
+    """Policies kept along the way."""
+    save_every: int = 4_000
+    """Steps between two saves of everything."""
+    device: str = "cpu"
+    threads: int = 1
+    """Of torch; the worlds are stepped beside it."""
+
+    @property
+    def architecture(self) -> Architecture:
+        actions = Control(self.action).actions
+        return Architecture((160, 90), 4, self.pool, self.convolutions, self.features, self.hidden, actions)
+
+    @property
+    def control(self) -> Control:
+        return Control(self.action, self.speed, self.yaw_rate)
+
+    def options(self) -> dict[str, Any]:
+        """Of the environment."""
+        lit = {"lighting": self.lighting, "observe": self.observe, "randomise": self.randomise}
+        return {**dataclasses.asdict(self.control), **lit}
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "cpu": {},
+    # The paper's input at full resolution, speed and steering both its own.
+    "gpu": {
+        "pool": 1,
+        "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
+        "features": 100,
+        "hidden": (512, 512),
+        "worlds": 32,
+        "batch": 256,
+        "buffer": 100_000,
+        "steps": 120_000,
+        "updates": 0.5,
+        "shift": 4,
+        "device": "cuda",
+    },
+}
+
+
+class ShrunkVecEnv(VecEnvWrapper):
+    """Worlds whose pictures are shrunk as the policy does; while they are stepped, the networks can learn."""
+
+    def __init__(self, worlds: DriveVecEnv, pool: int) -> None:
+        channels, height, width = worlds.observation_space.shape  # type: ignore[misc]
+        super().__init__(worlds, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
+        self._pool, self._thread = pool, ThreadPoolExecutor(1)
+        self.meanwhile: Callable[[], None] = lambda: None
+        """Called while the worlds are stepped. Neither sees anything of the other, so their order does not matter."""
+
+    def reset(self) -> NDArray:
+        return shrink(np.asarray(self.venv.reset()), self._pool)
+
+    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
+        stepped = self._thread.submit(self.venv.step_wait)
+        self.meanwhile()
+        pictures, rewards, dones, infos = stepped.result()
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = shrink(infos[i]["terminal_observation"], self._pool)
+        return shrink(np.asarray(pictures), self._pool), rewards, dones, infos
+
+    def close(self) -> None:
+        self._thread.shutdown()
+        super().close()
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands."""
+
+    steps: int
+    recent: tuple[bool, ...]
+    """Success of the last episodes, `RECENT` at most."""
+    steps_per_second: float
+
+
+def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progress], None] | None = None) -> None:
+    """Trains a policy, or goes on where it was stopped or killed.
+
+    Args:
+        twin: A built scene.
+        folder: Of the run.
+        config: Of the run; a run that is there must have the same but for `steps`.
+        watch: Is told at every step of the worlds.
+
+    SIGINT and SIGTERM save, and then raise KeyboardInterrupt.
+
+    Raises:
+        InputError: the run is another, or damaged; or what `twin.load` raises.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_config(folder / "config.json", twin, config)
+    go_on = has_state(folder / "state")
+    if not go_on:
+        for stale in ("episodes.csv", "log.csv", "state/pictures.bin"):
+            (folder / stale).unlink(missing_ok=True)
+        (folder / "state").mkdir(exist_ok=True)
+    elif not (folder / "state" / "pictures.bin").exists():
+        raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
+    worlds = ShrunkVecEnv(DriveVecEnv(twin, config.task, config.worlds, config.seed, **config.options()), config.pool)
+    torch.set_num_threads(config.threads)
+    model = _model(worlds, config, folder / "state" / "pictures.bin")
+    before: dict[str, Any] = load_state(folder / "state", model) if go_on else {"wall": 0.0, "resumed": -1}
+    resumed = before["resumed"] + 1
+    worlds.seed(config.seed + _RESUMES * resumed)
+    updates = max(1, round(config.updates * config.worlds))
+
+    def learn() -> None:
+        if model.num_timesteps > config.starts:
+            model.train(updates, config.batch)
+
+    worlds.meanwhile = learn
+    keeper = _Keeper(folder, config, twin, before["wall"], resumed, watch)
+    before_us = {one: signal.signal(one, keeper.stop) for one in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        left = config.steps - model.num_timesteps
+        if left > 0:
+            model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
+        keeper.save()
+    finally:
+        for one, handler in before_us.items():
+            signal.signal(one, handler)
+        worlds.close()
+
+
+def _model(worlds: ShrunkVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
+    model = PixelSAC(
+        DrivePolicy,
+        worlds,
+        learning_rate=config.learning_rate,
+        buffer_size=config.buffer,
+        learning_starts=config.starts,
+        batch_size=config.batch,
+        tau=config.tau,
+        gamma=config.gamma,
+        train_freq=1,
+        gradient_steps=0,  # see `meanwhile`
+        ent_coef="auto_0.1",
+        replay_buffer_class=FrameReplayBuffer,
+        replay_buffer_kwargs={
+            "file": pictures,
+            "slack": config.save_every + config.worlds,
+            "shift": config.shift,
+            "seed": config.seed,
+        },
+        policy_kwargs={
+            "features_extractor_class": Encoder,
+            "features_extractor_kwargs": {"architecture": config.architecture},
+            "net_arch": list(config.hidden),
+            "share_features_extractor": True,
+            "normalize_images": False,  # the encoder does
+        },
+        seed=config.seed,
+        device=config.device,
+    )
+    model.set_logger(configure(str(pictures.parent.parent / "tensorboard"), ["tensorboard"]))
+    return model
+
+
+def _check_config(path: Path, twin: Twin, config: TrainConfig) -> None:
+    """Writes the config of a new run; refuses another one for a run that is there."""
+    wanted = {**dataclasses.asdict(config), "field": digest_file(twin.scene.stamp("field"))}
+    # As JSON has it, for comparing.
+    wanted = {
+        k: [list(v) if isinstance(v, tuple) else v for v in x] if isinstance(x, tuple) else x for k, x in wanted.items()
+    }
+    if path.exists():
+        there = read_json(path)
+        for name in wanted:
+            if name != "steps" and there.get(name) != wanted[name]:
+                raise InputError(
+                    f"{path.parent} was trained with {name} = {there.get(name)!r}, not {wanted[name]!r}; "
+                    "go on with the same, or give another --run"
+                )
+    write_json(path, wanted)
+
+
+class _Keeper(BaseCallback):
+    """Writes down what happens, and saves."""
+
+    def __init__(
+        self,
+        folder: Path,
+        config: TrainConfig,
+        twin: Twin,
+        wall: float,
+        resumed: int,
+        watch: Callable[[Progress], None] | None,
+    ) -> None:
+        super().__init__()
+        self.model: PixelSAC
+        self._folder, self._config, self._scene, self._watch = folder, config, twin.scene.root.resolve().name, watch
+        self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
+        self._stop = False
+
+    def stop(self, *_: Any) -> None:
+        """A signal handler: before the next step, all is saved, and KeyboardInterrupt raised."""
+        self._stop = True
+
+    @property
+    def wall(self) -> float:
+        """Of the whole training [s]."""
+        return self._wall + time.monotonic() - self._started
+
+    def _on_training_start(self) -> None:
+        self._saved = self._first = self.model.num_timesteps
+        self._first_updates = self.model._n_updates
+        self._recent: list[bool] = _keep_rows(self._folder / "episodes.csv", EPISODE_COLUMNS, self._saved)[-RECENT:]
+        _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
+
+    def _on_rollout_start(self) -> None:
+        # Here, and not in _on_step, all that was collected is in the buffer.
+        if self._stop or self.model.num_timesteps - self._saved >= self._config.save_every:
+            self.save()
+        if self._stop:
+            raise KeyboardInterrupt
+        every = self._config.steps / self._config.checkpoints
+        number = int(self.model.num_timesteps / every)
+        if number and self.model.num_timesteps - number * every < self._config.worlds:
+            self._save_policy(self._folder / "checkpoints" / f"{self.model.num_timesteps:09d}")
+
+    def _on_step(self) -> bool:
+        rows = []
+        for info in (one for one in self.locals["infos"] if "episode" in one):
+            self._recent = [*self._recent, info["is_success"]][-RECENT:]
+            rows.append(
+                (
+                    *(self.model.num_timesteps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"]),
+                    *(int(info["is_success"]), info["cause"], f"{info['progress']:.2f}"),
+                    *(info["episode"]["l"], f"{info['episode']['r']:.3f}"),
+                )
+            )
+        _append(self._folder / "episodes.csv", rows)
+        if self._watch:
+            elapsed = max(time.monotonic() - self._started, 1e-9)
+            speed = (self.model.num_timesteps - self._first) / elapsed
+            self._watch(Progress(self.model.num_timesteps, tuple(self._recent), speed))
+        return True
+
+    def save(self) -> None:
+        model, elapsed = self.model, max(time.monotonic() - self._started, 1e-9)
+        logged = model.logger.name_to_value
+        row = (
+            *(model.num_timesteps, f"{self.wall:.1f}", model._n_updates),
+            f"{(model.num_timesteps - self._first) / elapsed:.2f}",
+            f"{(model._n_updates - self._first_updates) / elapsed:.2f}",
+            round(psutil.Process().memory_info().rss / 2**20),
+            *(f"{logged.get(f'train/{name}', float('nan')):.4g}" for name in ("ent_coef", "value")),
+        )
+        _append(self._folder / "log.csv", [row])
+        self._save_policy(self._folder)
+        save_state(self._folder / "state", model, {"wall": self.wall, "resumed": self._resumed})
+        self._saved = model.num_timesteps
+
+    def _save_policy(self, folder: Path) -> None:
+        c = self._config
+        trained = {
+            "scene": self._scene,
+            "run": self._folder.name,
+            "task": c.task,
+            "observe": c.observe,
+            "lighting": c.lighting,
+            "seed": c.seed,
+            "step": self.model.num_timesteps,
+        }
+        save_policy(folder, c.architecture, c.control, actor_weights(self.model, c.architecture), trained)
+
+
+def _append(path: Path, rows: list[tuple]) -> None:
+    if rows:
+        with path.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
+    """Makes a table, or drops what was written after the save; the successes of what is kept."""
+    rows: list[list[str]] = []
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            # A line that was being written when the training was killed is not whole.
+            rows = [row for row in list(csv.reader(file))[1:] if len(row) == len(columns) and int(row[0]) <= steps]
+    aside = path.with_name(path.name + ".partial")
+    with aside.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
+    aside.replace(path)
+    return [row[columns.index("success")] == "1" for row in rows] if "success" in columns else []

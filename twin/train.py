@@ -1,0 +1,78 @@
+"""Verb: a policy that drives a task of a built scene, learned from pixels.
+
+    python -m twin.train scenes/demo --task straight --run first
+    python -m twin.train scenes/demo --task straight --run plain --observe simulator
+    python -m twin.train scenes/demo --task straight --run day --lighting sun
+
+The same command goes on with a run that was stopped or killed. The policy is in `runs/<name>` of the scene's folder.
+"""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+from twin import progress
+from twin.errors import InputError
+from twin.loading import load_scene
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the verb; returns the exit status: 0, 2 with one line on standard error, or 130 when interrupted."""
+    given = _parser().parse_args(arguments)
+    progress.set_quiet(given.quiet)
+    try:
+        try:
+            from twin.learn import training
+        except ImportError as error:
+            raise InputError(f"training needs more: pip install .[learn] ({error})") from None
+        from twin.report.statistics import wilson
+        from twin.report.training import success_curve
+
+        names = {field.name for field in dataclasses.fields(training.TrainConfig)}
+        asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
+        config = training.TrainConfig(**{**training.PRESETS[given.preset], **asked})
+        folder = given.scene / "runs" / given.run
+        with progress.bar("train", config.steps, "step") as bar:
+
+            def watch(now: training.Progress) -> None:
+                bar.update(now.steps - bar.n)
+                if now.recent:
+                    low, high = wilson(sum(now.recent), len(now.recent))
+                    bar.set_postfix_str(
+                        f"success {sum(now.recent)}/{len(now.recent)} ({low:.2f} to {high:.2f})", refresh=False
+                    )
+
+            training.train(load_scene(given.scene), folder, config, watch)
+        picture = success_curve(folder)
+    except (InputError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    if not given.quiet:
+        print(f"{folder}: policy after {config.steps} steps; success along the training: {picture}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m twin.train", description="Train a policy by SAC from pixels.")
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument("--run", required=True, help="name of the run, a folder in SCENE/runs")
+    parser.add_argument("--observe", choices=("nerf", "simulator"), help="what is seen; the field (nerf) unless given")
+    parser.add_argument("--lighting", help="one lighting by name; it varies between episodes unless given")
+    parser.add_argument("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes; cpu unless given")
+    parser.add_argument("--action", choices=("steering", "twist"), help="steering at fixed speed unless given")
+    parser.add_argument("--steps", type=int, help="control steps of all worlds together")
+    parser.add_argument("--worlds", type=int, help="how many are driven at once")
+    parser.add_argument("--updates", type=float, help="of the networks per step")
+    parser.add_argument("--seed", type=int, help="of everything drawn")
+    parser.add_argument("--randomise", action="store_true", default=None, help="another robot in every episode")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,251 @@
+"""Verb: how often policies succeed in a built scene, lighting by lighting.
+
+    python -m twin.validate scenes/demo --task straight --policy scenes/demo/runs/first --episodes 100
+    python -m twin.validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst
+
+A policy is a run (its name or folder), a checkpoint of one, an ONNX file or `module:function`. All drive the same
+episodes. What is in `validation/episodes.csv` already is not driven again, so a validation that was stopped goes on.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from twin import progress
+from twin.errors import InputError
+from twin.learn.judging import CHUNK, Chunk, campaign
+from twin.learn.policy import JSON, load_policy
+from twin.loading import Twin, load_scene
+from twin.report.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
+from twin.report.validation import failure_map, lines, summary
+from twin.scene import digest_file, digest_json, read_json, write_json
+
+_FIRST_SEED = 1_000_000  # of validation; training's are small
+_SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
+_LIGHTS, _LOOKS, _FINALISTS = 16, 4, 4  # lights drawn, episodes in each, and how many are looked at more closely
+
+Key = tuple[str, str, str, int]
+
+
+class Campaign:
+    """Episodes driven and to be driven of one scene and task, and the table they go to."""
+
+    def __init__(
+        self, twin: Twin, task: str, path: Path, policies: dict[str, tuple[str, bool]], processes: int
+    ) -> None:
+        """
+        Args:
+            twin: A built scene.
+            task: See `twin.load`.
+            path: The table.
+            policies: Source and trust by name.
+            processes: How many drive here.
+        """
+        self._scene, self.task, self.path, self._policies = str(twin.scene.root), task, path, policies
+        self._processes = processes
+        _mend(path)
+        self._done = {_key(t): t for t in read_trials(path)} if path.exists() and _has_rows(path) else {}
+
+    def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
+        """Trials of (policy, lighting, seeds), in that order; what is not in the table yet is driven and added."""
+        keys = [(name, self.task, lighting, seed) for name, lighting, seeds in wanted for seed in seeds]
+        chunks: list[tuple[str, Chunk]] = []
+        for name, lighting, seeds in wanted:
+            left = [seed for seed in seeds if (name, self.task, lighting, seed) not in self._done]
+            for k in range(0, len(left), CHUNK):
+                source, trust = self._policies[name]
+                chunk = Chunk(self._scene, self.task, source, trust, lighting, tuple(left[k : k + CHUNK]))
+                chunks.append((name, chunk))
+        with progress.bar(what, len(keys), "episode") as bar:
+            bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
+            driven = campaign([chunk for _, chunk in chunks], self._processes)
+            for (name, chunk), outcomes in zip(chunks, driven, strict=True):
+                trials = [
+                    Trial(
+                        name,
+                        self.task,
+                        chunk.lighting,
+                        o.seed,
+                        o.cause,
+                        round(o.progress, 3),
+                        o.steps,
+                        round(o.trust, 4),
+                    )
+                    for o in outcomes
+                ]
+                self._append(trials)
+                bar.update(len(trials))
+        return [self._done[key] for key in keys]
+
+    def _append(self, trials: Sequence[Trial]) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if not self.path.exists():
+            self.path.write_text(csv_text(EPISODE_COLUMNS, []), encoding="utf-8")
+        with self.path.open("a", encoding="utf-8", newline="") as file:
+            file.write(csv_text(EPISODE_COLUMNS, [t.row() for t in trials]).split("\n", 1)[1])
+        self._done |= {_key(t): t for t in trials}
+
+
+def validate(
+    root: Path,
+    sources: Sequence[str],
+    task: str = "straight",
+    lightings: Sequence[str] = ("held-out",),
+    episodes: int = 100,
+    worst: bool = False,
+    trust: bool = False,
+    processes: int = 1,
+) -> dict:
+    """Drives what is missing and writes `validation/`; returns what is in its `summary.json`.
+
+    Raises:
+        InputError: a policy, the scene, the task or a lighting is not to be had; or names of other policies or another
+            build are in the table.
+    """
+    twin = load_scene(root)
+    folder = root / "validation"
+    policies = _policies(root, sources, trust)
+    _check_same(folder / "validated.json", twin, policies)
+    todo = Campaign(twin, task, folder / "episodes.csv", policies, processes)
+    seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
+    todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
+    trials = read_trials(folder / "episodes.csv")
+    said = summary(trials)
+    if worst:
+        search = Campaign(twin, task, folder / "worst.csv", policies, processes)
+        said["worst"] = {name: _worst(search, name, episodes) for name in policies}
+    (folder / "cells.csv").write_text(cells_text(tally(trials)), encoding="utf-8")
+    write_json(folder / "summary.json", said)
+    _draw_maps(twin, folder, trials)
+    return said
+
+
+def _worst(search: Campaign, policy: str, episodes: int) -> dict:
+    """The light of many drawn ones in which a policy fares worst, and how it fares in fresh episodes in it.
+
+    Few episodes in every light, as many again in the worst of them: successive halving. The way driven breaks ties.
+    """
+    seeds = range(_SEARCH_SEED, _SEARCH_SEED + _LOOKS)
+    lights = [f"drawn_{k}" for k in range(_LIGHTS)]
+    looks: dict[str, list[Trial]] = {name: [] for name in lights}
+    while len(lights) > 1:
+        trials = search.drive([(policy, light, seeds) for light in lights], f"worst light of {len(lights)}")
+        for trial in trials:
+            looks[trial.lighting].append(trial)
+        fared = {name: _fared(looks[name]) for name in lights}
+        lights = sorted(lights, key=lambda name: fared[name])[: _FINALISTS if len(lights) > _FINALISTS else 1]
+        seeds = range(seeds.stop, seeds.stop + 2 * len(seeds))
+    # What was worst by chance among many is less bad than it looked: so it is driven in anew.
+    proof = range(_PROOF_SEED, _PROOF_SEED + episodes)
+    said = summary(search.drive([(policy, lights[0], proof)], f"{lights[0]} anew"))["cells"][0]
+    return {**said, "of": _LIGHTS}
+
+
+def _fared(trials: Sequence[Trial]) -> tuple[float, float]:
+    return sum(t.success for t in trials) / len(trials), sum(t.progress for t in trials) / len(trials)
+
+
+def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tuple[str, bool]]:
+    """Source by the name it has in tables; each is loaded once, so that what is wrong is said at once."""
+    out: dict[str, tuple[str, bool]] = {}
+    for source in sources:
+        run = root / "runs" / source
+        where = str(run) if not Path(source).exists() and (run / JSON).exists() else source
+        name = load_policy(where, trust).name
+        if name in out:
+            raise InputError(f"two policies are named {name!r}: {out[name][0]} and {where}; rename one")
+        out[name] = (where, trust)
+    return out
+
+
+def _check_same(path: Path, twin: Twin, policies: dict[str, tuple[str, bool]]) -> None:
+    """Notes which policies and which build the table is of; refuses others of the same name."""
+    field = digest_file(twin.scene.stamp("field"))
+    noted: dict[str, Any] = read_json(path) if path.exists() else {"field": field, "policies": {}}
+    if noted["field"] != field:
+        raise InputError(f"{path.parent} is of another build of this scene; move it away to validate anew")
+    for name, (source, _) in policies.items():
+        digest = _digest(Path(source), source)
+        if noted["policies"].setdefault(name, digest) != digest:
+            raise InputError(
+                f"policy {name!r} was validated as another file than {source} is now; move {path.parent} away, or "
+                "copy the policy to another name"
+            )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, noted)
+
+
+def _digest(path: Path, source: str) -> str:
+    """Of a policy's files; of a callable, whose code nobody can know, of its name."""
+    if path.is_dir():
+        return digest_file(path / JSON)  # which has the digest of the weights
+    return digest_file(path) if path.is_file() else digest_json(source)
+
+
+def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
+    from twin.config import load_config
+    from twin.env.stretches import find_task
+
+    world, config = twin.world(), load_config(twin.scene.config_file)
+    for task in dict.fromkeys(t.task for t in trials):
+        stretch = find_task(task, world, config.task)
+        mine = [t for t in trials if t.task == task]
+        failure_map(folder / f"failures_{task}.png", mine, world, (stretch.start, stretch.end))
+
+
+def _key(trial: Trial) -> Key:
+    return trial.policy, trial.task, trial.lighting, trial.seed
+
+
+def _mend(path: Path) -> None:
+    """Cuts off a last line that was being written when the process was killed."""
+    if path.exists():
+        blob = path.read_bytes()
+        if not blob.endswith(b"\n"):
+            whole = blob[: blob.rfind(b"\n") + 1]
+            path.write_bytes(whole) if whole else path.unlink()
+
+
+def _has_rows(path: Path) -> bool:
+    return path.read_bytes().count(b"\n") > 1
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the verb; returns the exit status: 0, 2 with one line on standard error, or 130 when interrupted."""
+    parser = argparse.ArgumentParser(prog="python -m twin.validate", description="How often policies succeed.")
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
+    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument("--lightings", nargs="+", default=["held-out"], help="names, mixtures a:b:0.3, held-out, any")
+    parser.add_argument("--episodes", type=int, default=100, help="per policy and lighting; 100 unless given")
+    parser.add_argument("--worst", action="store_true", help="search for the light in which each policy fares worst")
+    parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
+    parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no table")
+    given = parser.parse_args(arguments)
+    progress.set_quiet(given.quiet)
+    try:
+        if min(given.episodes, given.processes) < 1:
+            raise InputError(f"--episodes {given.episodes}, --processes {given.processes}; expected at least 1")
+        run = given.task, given.lightings, given.episodes, given.worst, given.trust, given.processes
+        said = validate(given.scene, given.policy, *run)
+    except (InputError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    if not given.quiet:
+        print("\n".join(lines(said)))
+        for name, light in said.get("worst", {}).items():
+            print(
+                f"{name}: of {light['of']} lights drawn it fares worst in {light['lighting']}, in fresh episodes "
+                f"{light['successes']}/{light['trials']} ({light['low']:.2f} to {light['high']:.2f})"
+            )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
