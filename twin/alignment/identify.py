@@ -136,7 +136,7 @@ def fit(
             np.zeros(len(names)),
             jac=tilted,
             bounds=((low - origin) / spans, (high - origin) / spans),
-            ftol=1e-3,
+            ftol=3e-4,
             xtol=3e-3,
             max_nfev=evaluations,
         )
