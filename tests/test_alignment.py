@@ -202,7 +202,7 @@ def test_two_that_do_the_same_are_not_both_identified():
 @pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
-    reason="rolling resistance (0.033 for 0.015) and the height of the mass (0.21 for 0.06 m) are taken for identified, "
+    reason="rolling resistance (0.033 for 0.015) and height of the mass (0.21 for 0.06 m) are taken for identified, "
     "and pull the centre of mass 1.8 cm off",
 )
 def test_a_known_robot_is_recovered(drive, tmp_path):
