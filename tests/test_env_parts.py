@@ -102,6 +102,15 @@ def test_training_and_held_out_lights_never_mix(field):
     assert gap > 0.0
 
 
+def test_lights_of_rare_anchors_are_drawn_as_often_as_others(field):
+    sets, rng = LightSets(field), np.random.default_rng(3)
+    for which, held_out in ((TRAINING, False), (HELD_OUT, True)):
+        own = set(np.flatnonzero(sets.anchors.held_out == held_out))
+        near = [sets._place_of(sets.sample(which, rng))[1] for _ in range(40 * len(own))]
+        assert set(near) == own
+        assert min(near.count(anchor) for anchor in own) > 20
+
+
 def test_a_photo_added_later_moves_no_set():
     plain, added = tiny_field(()), tiny_field(())
     rng = np.random.default_rng(0)

@@ -40,7 +40,6 @@ _GROUND_FIELDS = {
     "ground_viscosity": ("ground_viscosity",),
     "center_of_mass": ("center_of_mass_x", "center_of_mass_y", "center_of_mass_z"),
     "wheel_radius": ("radius_left", "radius_right"),
-    "rolling_resistance": ("rolling_resistance",),
     "servo_gain": ("log10_servo_gain",),
 }
 _UNSEEN = "the log's commands are wheel speeds, so it never meets the controller's own multiplier; needs v and ω"

@@ -25,7 +25,7 @@ from twin.robot import WHEELS, HuskyParams
 Array = NDArray[np.float64]
 
 LEAD = 0.4  # [s]
-COARSE = 0.005  # [s] time step while fitting: poses after 2 s differ by 1 to 2 mm and 0.2° from those of a fifth of it
+COARSE = 0.005  # [s] time step to begin a fit with; poses after 2 s are up to 1 cm and 0.8° off those of a fine one
 
 _SETTLE = 1.0  # [s]
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -14,7 +14,7 @@ two lights is that of their pictures (rms over the probes' colours, see `nerf/pl
 with a fixed seed, *anchors* are chosen, each as far as possible from those before, the first being the filmed
 lightings. The filmed ones are anchors of the training set; of the others, every second, from the first on, is of the
 held-out set. A light belongs to the set of its nearest anchor, unless an anchor of the other set is nearly as near:
-then to neither.
+then to neither. Every anchor's lights are drawn as often as another's, or night would be rare.
 
 A light may also *drift*: an episode then begins in one and ends, if it lasts that long, in another of the same kind.
 """
@@ -22,6 +22,7 @@ A light may also *drift*: an episode then begins in one and ends, if it lasts th
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ _SEED = 20_240_315  # of the anchors; a constant, so that every run on a build h
 _DRAWN = 200  # lights that anchors are chosen among
 _FURTHER = 8  # anchors besides the filmed lightings
 _MARGIN = 1.25  # the other set's nearest anchor must be this much further than the own one
-_TRIES = 400
+_TRIES = 30  # draws for an anchor
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,18 @@ class Light:
         return ((1.0 - share) * self.start + share * self.end).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class Anchors:
+    """What the two sets are made of: k lights far from each other."""
+
+    embeddings: Floats
+    """Shape (k, dim)."""
+    pictures: Floats
+    """Shape (k, 3·probes)."""
+    held_out: NDArray[np.bool_]
+    """Whether each is of the held-out set, shape (k,)."""
+
+
 class LightSets:
     """Training and held-out lights of one field."""
 
@@ -70,42 +83,54 @@ class LightSets:
         self._filmed = field.lightings_by_name.filmed()
 
     @cached_property
-    def anchors(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Pictures of the anchors, shape (k, 3·probes), and whether each is of the held-out set, shape (k,).
-
-        Raises:
-            InputError: the field has no probes to judge lightings on.
-        """
-        filmed = [self._picture(vector) for vector in self._filmed.vectors]
+    def anchors(self) -> Anchors:
+        """Raises InputError: the field has no probes to judge lightings on."""
+        filmed = list(self._filmed.vectors)
         rng = np.random.default_rng(_SEED)
-        drawn = np.stack([self._picture(self._filmed.sample(rng)) for _ in range(_DRAWN)])
-        chosen = list(filmed)
-        nearest = np.min([_distance(drawn, picture) for picture in chosen], axis=0)
+        drawn = [self._filmed.sample(rng) for _ in range(_DRAWN)]
+        pictures = np.stack([self._picture(light) for light in drawn])
+        chosen, chosen_pictures = filmed, [self._picture(light) for light in filmed]
+        nearest = np.min([_distance(pictures, picture) for picture in chosen_pictures], axis=0)
         for _ in range(_FURTHER):
-            chosen.append(drawn[int(nearest.argmax())])
-            nearest = np.minimum(nearest, _distance(drawn, chosen[-1]))
-        held_out = np.arange(len(chosen)) - len(filmed)
-        return np.stack(chosen), (held_out >= 0) & (held_out % 2 == 0)
+            best = int(nearest.argmax())
+            chosen.append(drawn[best])
+            chosen_pictures.append(pictures[best])
+            nearest = np.minimum(nearest, _distance(pictures, pictures[best]))
+        held_out = np.arange(len(chosen)) - len(self._filmed.vectors)
+        return Anchors(np.stack(chosen), np.stack(chosen_pictures), (held_out >= 0) & (held_out % 2 == 0))
 
     def set_of(self, embedding: Floats) -> str | None:
         """`TRAINING`, `HELD_OUT`, or None for a light that belongs to neither; embedding (dim,)."""
-        pictures, held_out = self.anchors
-        distance = _distance(pictures, self._picture(embedding))
-        training, other = float(distance[~held_out].min()), float(distance[held_out].min())
-        if other > _MARGIN * training:
-            return TRAINING
-        return HELD_OUT if training > _MARGIN * other else None
+        return self._place_of(embedding)[0]
 
     def sample(self, which: str, rng: np.random.Generator) -> Floats:
-        """A random light of a set, shape (dim,). Raises InputError where none is found."""
-        for _ in range(_TRIES):
-            embedding = self._filmed.sample(rng)
-            if self.set_of(embedding) == which:
-                return embedding
+        """A random light of a set, shape (dim,): near one of its anchors, each as likely as another.
+
+        Raises:
+            InputError: none is found.
+        """
+        own = np.flatnonzero(self.anchors.held_out == (which == HELD_OUT))
+        anchor = int(rng.choice(own))
+        # Where lights are rarely drawn, such as at the edge of what was filmed, the anchor itself will do.
+        for light in chain((self._filmed.sample(rng) for _ in range(_TRIES)), [self.anchors.embeddings[anchor]]):
+            if self._place_of(light) == (which, anchor):
+                return light
         raise InputError(
-            f"lighting {which!r}: none among {_TRIES} drawn; this place was filmed in too few lightings: film another, "
+            f"lighting {which!r}: none among those drawn; this place was filmed in too few lightings: film another, "
             "or name the lightings to be driven in"
         )
+
+    def _place_of(self, embedding: Floats) -> tuple[str | None, int]:
+        """The set of a light, and its nearest anchor."""
+        distance, held_out = _distance(self.anchors.pictures, self._picture(embedding)), self.anchors.held_out
+        nearest, training, other = (
+            int(distance.argmin()),
+            float(distance[~held_out].min()),
+            float(distance[held_out].min()),
+        )
+        if other > _MARGIN * training:
+            return TRAINING, nearest
+        return (HELD_OUT if training > _MARGIN * other else None), nearest
 
     def _picture(self, embedding: Floats) -> Floats:
         return self._filmed.judge.probes.picture(embedding).ravel()

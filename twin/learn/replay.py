@@ -22,6 +22,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from twin.errors import InputError
+from twin.learn.colours import recoloured
 
 _SHORT = 8  # mean steps of an episode; shorter ones leave less than the whole buffer to draw from
 _ROWS = ("actions", "rewards", "ends", "newest", "age")
@@ -41,6 +42,7 @@ class FrameReplayBuffer(ReplayBuffer):
         file: Path | None = None,
         slack: int = 0,
         shift: int = 0,
+        colours: float = 0.0,
         seed: int = 0,
     ) -> None:
         """
@@ -54,6 +56,7 @@ class FrameReplayBuffer(ReplayBuffer):
             file: Where the tapes are; in memory where None. One that is there is read, see `set_state`.
             slack: Transitions, of all worlds together, that may be added between two saves.
             shift: Samples are shifted by up to so many pixels each way, edges repeated: Kostrikov et al. 2020 (DrQ).
+            colours: Strength of the random weather laid over samples, see `colours.recoloured`.
             seed: Of what is drawn.
 
         Raises:
@@ -63,7 +66,7 @@ class FrameReplayBuffer(ReplayBuffer):
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage, self.handle_timeout_termination = False, True
         channels, height, width = self.obs_shape
-        self.stack, self.shift, self.rng = channels // 3, shift, np.random.default_rng(seed)
+        self.stack, self.shift, self.colours, self.rng = channels // 3, shift, colours, np.random.default_rng(seed)
         size = (self.buffer_size, n_envs)
         self.actions = np.zeros((*size, self.action_dim), np.float32)
         self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
@@ -120,6 +123,8 @@ class FrameReplayBuffer(ReplayBuffer):
         before, after = self.stacks(row, world)
         if self.shift:
             before, after = self._shifted(before), self._shifted(after)
+        if self.colours:  # apart from each other: what a state is worth must not depend on the weather
+            before, after = (recoloured(stacks, self.colours, self.rng) for stacks in (before, after))
         rest = self.actions[row, world], after, self.ends[row, world, None], self.rewards[row, world, None]
         return ReplayBufferSamples(*(torch.as_tensor(part, device=self.device) for part in (before, *rest)))
 

@@ -31,7 +31,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from twin.env.options import STEERING
+from twin.env.lightings import ANY, TRAINING
+from twin.env.options import NERF, STEERING
 from twin.errors import InputError
 from twin.learn.architecture import Architecture, shrink
 from twin.learn.policy import Control, save_policy
@@ -55,9 +56,9 @@ class TrainConfig:
     """What a training is. The defaults are the preset for a CPU."""
 
     task: str = "straight"
-    observe: str = "nerf"
+    observe: str = NERF
     """nerf, or simulator: MuJoCo's own picture of the extracted mesh."""
-    lighting: str = "training"
+    lighting: str = TRAINING
     """See `env/lightings.py`; the default varies between episodes."""
     seed: int = 0
     steps: int = 60_000
@@ -89,6 +90,9 @@ class TrainConfig:
     """Share by which the target critics follow, per update."""
     shift: int = 2
     """Random shift of pictures in updates [px of the shrunken ones]."""
+    colours: float = 1.0
+    """Strength of the random weather laid over pictures in updates (see `colours.py`) where the lighting varies. One
+    lighting and the simulator's pictures are learnt as they are."""
     checkpoints: int = 20
     """Policies kept along the way."""
     save_every: int = 4_000
@@ -105,6 +109,11 @@ class TrainConfig:
     @property
     def control(self) -> Control:
         return Control(self.action, self.speed, self.yaw_rate)
+
+    @property
+    def varies(self) -> bool:
+        """Whether the lighting does, between episodes."""
+        return self.observe == NERF and self.lighting in (TRAINING, ANY)
 
     def options(self) -> dict[str, Any]:
         """Of the environment."""
@@ -234,6 +243,7 @@ def _model(worlds: ShrunkVecEnv, config: TrainConfig, pictures: Path) -> PixelSA
             "file": pictures,
             "slack": config.save_every + config.worlds,
             "shift": config.shift,
+            "colours": config.colours if config.varies else 0.0,
             "seed": config.seed,
         },
         policy_kwargs={

@@ -1,0 +1,38 @@
+"""Random weather over pictures: alike within a stack, another in every sample, and none at strength 0."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from twin.learn.colours import recoloured
+
+
+def stacks(count: int = 6) -> np.ndarray:
+    picture = np.random.default_rng(0).integers(40, 200, (3, 18, 32), np.uint8)
+    return np.repeat(np.tile(picture, (4, 1, 1))[None], count, 0)
+
+
+def test_strength_nought_changes_nothing():
+    before = stacks()
+    np.testing.assert_array_equal(recoloured(before, 0.0, np.random.default_rng(1)), before)
+
+
+def test_pictures_of_a_stack_change_alike_and_samples_do_not():
+    before = stacks()
+    after = recoloured(before, 1.0, np.random.default_rng(1))
+    assert after.shape == before.shape and after.dtype == np.uint8
+    for stack in after:
+        for later in stack.reshape(4, 3, 18, 32)[1:]:
+            np.testing.assert_array_equal(later, stack[:3])
+    assert all((a != b).mean() > 0.5 for a, b in pairwise(after))
+    assert len({stack.tobytes() for stack in after}) == len(after)
+
+
+def test_drawn_around_what_was_there_and_by_the_seed():
+    before = stacks(200)
+    after = recoloured(before, 1.0, np.random.default_rng(2))
+    np.testing.assert_array_equal(after, recoloured(before, 1.0, np.random.default_rng(2)))
+    means = after.reshape(200, 4, 3, -1).mean((1, 3))
+    assert abs(means.mean() - before.mean()) < 0.15 * before.mean()
+    assert 10.0 < means.mean(1).std() < 60.0  # brightness differs
+    assert (means[:, 0] - means[:, 2]).std() > 3.0  # and so does tint

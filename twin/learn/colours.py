@@ -1,0 +1,56 @@
+"""Light and camera as no field knows them: random tone curves, tints, haze and shades laid over pictures in updates.
+
+A field's lightings are those that the place was filmed in and what lies between them. Other weather has another sky,
+other shadows and another tint, and cameras expose as they see fit. What a policy must not depend on is varied at random
+here, for every sample anew and alike for all pictures of a stack, so that motion stays what it is:
+
+    tone     v → gain · v^gamma, each colour with a gain of its own; contrast about a random level
+    haze     a share of one random grey, tinted
+    shade    a smooth pattern of light and dark over the picture
+
+All is drawn around no change at all, and scaled by one *strength*; 1 is what the constants below say.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_GAIN, _TINT, _GAMMA, _CONTRAST = 0.25, 0.08, 0.25, 0.2  # standard deviations, of logarithms
+_HAZE = 0.5  # share at most; half of the samples have none
+_SHADE = 0.25  # standard deviation of the logarithm at the knots
+_KNOTS = (3, 5)  # of the pattern, down and across
+_LEVELS = np.arange(256) / 255.0
+
+
+def recoloured(stacks: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Stacks as they might look in other weather.
+
+    Args:
+        stacks: Shape (k, 3 · stack, height, width), colours of one picture next to each other.
+        strength: 0 changes nothing.
+        rng: What is drawn from.
+    """
+    count, channels, height, width = stacks.shape
+    curves = _curves(count, strength, rng)
+    knots = np.exp(strength * _SHADE * rng.normal(size=(count, *_KNOTS))).astype(np.float32)
+    out = np.empty_like(stacks)
+    for i in range(count):
+        shade = cv2.resize(knots[i], (width, height), interpolation=cv2.INTER_CUBIC)
+        for channel in range(channels):
+            toned = cv2.LUT(stacks[i, channel], curves[i, channel % 3])
+            cv2.multiply(toned, shade, out[i, channel], dtype=cv2.CV_8U)
+    return out
+
+
+def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A tone curve per sample and colour, shape (count, 3, 256)."""
+
+    def spread(deviation: float, *shape: int) -> NDArray[np.float64]:
+        return np.exp(strength * deviation * rng.normal(size=(count, *shape, 1)))
+
+    curve = _LEVELS ** spread(_GAMMA, 1) * spread(_GAIN, 1) * spread(_TINT, 3)
+    level = rng.uniform(0.2, 0.8, (count, 1, 1))
+    curve = level + (curve - level) * spread(_CONTRAST, 1)
+    share = min(1.0, strength * _HAZE) * rng.uniform(-1.0, 1.0, (count, 1, 1)).clip(0.0)
+    haze = rng.uniform(0.1, 0.9, (count, 1, 1)) * spread(_TINT, 3)
+    return (255.0 * ((1.0 - share) * curve + share * haze)).clip(0.0, 255.0).round().astype(np.uint8)
