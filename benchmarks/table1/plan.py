@@ -1,0 +1,65 @@
+"""What the experiment is: setups, tasks, runs, and which policies go to the road.
+
+A *setup* is a way to train. A *run* is a training: a setup on a task with a seed. Of every run, besides the finished
+policy, the checkpoints at a quarter and at half of the steps are taken: policies of varied quality for the forecast,
+chosen here and thus before anything is known of how they drive.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from twin.scene import read_json
+
+TASKS = {"straight": "straight", "right": "right_turn"}
+"""In names of runs → in `twin.load`."""
+SETUPS: dict[str, tuple[str, ...]] = {
+    "simulator": ("--observe", "simulator"),
+    "one_light": ("--lighting", "sun"),
+    "varied": (),
+}
+"""Name → options of `twin.train`."""
+STEPS = {"straight": 40_000, "right": 40_000}
+SHARES = (0.25, 0.5)
+"""Of a run's steps, at which checkpoints are taken for the forecast."""
+EPISODES = 50
+"""In the twin, per policy, in held-out lightings."""
+TRIALS = {"final": 10, "checkpoint": 4}
+"""In reality, per policy and weather; there are five."""
+PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
+    ("simulator", "straight"): (0.94, 0.57, 0.00),
+    ("one_light", "straight"): (1.00, 0.19, 0.00),
+    ("varied", "straight"): (0.99, 0.98, 0.80),
+    ("simulator", "right"): (0.73, 0.54, 0.00),
+    ("one_light", "right"): (1.00, 0.95, 0.67),
+    ("varied", "right"): (1.00, 1.00, 0.83),
+}
+"""Training, validation and real success, arXiv 2403.15791, table 1."""
+
+
+@dataclass(frozen=True)
+class Run:
+    task: str
+    setup: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.task}_{self.setup}_{self.seed}"
+
+    def folder(self, scene: Path) -> Path:
+        return scene / "runs" / self.name
+
+    def checkpoints(self, scene: Path) -> list[Path]:
+        """Those for the forecast: at each of `SHARES`, the last before it."""
+        there = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
+        picked = [[path for path in there if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
+        return [some[-1] for some in picked if some]
+
+    def finished(self, scene: Path) -> bool:
+        path = self.folder(scene) / "policy.json"
+        return path.exists() and read_json(path)["trained"]["step"] >= STEPS[self.task]
+
+
+def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:
+    """Every cell once before any has a second seed."""
+    return [Run(task, setup, seed) for seed in seeds for setup in setups for task in tasks]

@@ -1,0 +1,114 @@
+"""`results.json` and the table: all that is known of every run so far; none is left out."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+from plan import PAPER, SETUPS, TASKS, Run
+
+from twin.report.statistics import wilson
+from twin.report.trials import Trial, read_trials
+from twin.scene import read_json
+
+RECENT = 100  # episodes that success in training is taken over
+FORECAST = (
+    "pearson",
+    "spearman",
+    "mmrv",
+    "winner_agreement",
+    "winner_regret",
+    "bias",
+    "coverage",
+    "corrected_coverage",
+)
+
+
+def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
+    """What `results.json` holds."""
+    twin = _trials([scene / "validation" / "episodes.csv"])
+    real = _trials(sorted((scene / "real").glob("*_trials.csv")))
+    rows = []
+    for run in (run for run in every if (run.folder(scene) / "policy.json").exists()):
+        policies = [run.name, *(f"{run.name}/{path.name}" for path in run.checkpoints(scene))]
+        rows.append(
+            {"setup": run.setup, "task": TASKS[run.task], "seed": run.seed, "finished": run.finished(scene)}
+            | _training(run.folder(scene))
+            | {"policies": [_judged(name, twin, real) for name in policies]}
+        )
+    return {"runs": rows, "forecast": _forecast(scene / "forecast" / "forecast.json")}
+
+
+def table(results: dict[str, Any]) -> str:
+    """The paper's table with ours beside it, in Markdown; finished policies of all seeds together."""
+    lines = ["| | | straight: train / validate / real | right turn: train / validate / real |", "|---|---|---|---|"]
+    for setup in SETUPS:
+        lines.append(f"| paper | {setup} | " + " | ".join(_numbers(PAPER[setup, task]) for task in TASKS) + " |")
+        ours = []
+        for task in TASKS:
+            some = [r for r in results["runs"] if (r["setup"], r["task"]) == (setup, TASKS[task])]
+            parts = [[r["train"] for r in some], *([r["policies"][0][k] for r in some] for k in ("validate", "real"))]
+            ours.append(" / ".join(_together(part) for part in parts) + f" ({len(some)} runs)")
+        lines.append(f"| ours | {setup} | " + " | ".join(ours) + " |")
+    return "\n".join(lines)
+
+
+def _numbers(rates: tuple[float, ...]) -> str:
+    return " / ".join(f"{rate:.2f}" for rate in rates)
+
+
+def _together(parts: list[dict[str, Any]]) -> str:
+    trials, won = sum(p["trials"] for p in parts), sum(p["successes"] for p in parts)
+    if not trials:
+        return "–"
+    low, high = wilson(won, trials)
+    return f"{won / trials:.2f} [{low:.2f}, {high:.2f}], {won}/{trials}"
+
+
+def _training(folder: Path) -> dict[str, Any]:
+    with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
+        last = list(csv.DictReader(file))[-1]
+    with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
+        episodes = [row["success"] == "1" for row in csv.DictReader(file)]
+    return {
+        "steps": int(last["step"]),
+        "updates": int(last["updates"]),
+        "wall_s": float(last["wall_s"]),
+        "memory_mb": float(last["memory_mb"]),
+        "episodes": len(episodes),
+        "train": _rate(episodes[-RECENT:]),
+    }
+
+
+def _judged(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
+    out: dict[str, Any] = {"policy": name}
+    for where, trials in (("validate", twin), ("real", real)):
+        mine = [trial for trial in trials if trial.policy == name]
+        out[where] = _rate([trial.success for trial in mine]) | {
+            "by_lighting": {
+                light: _rate([t.success for t in mine if t.lighting == light])
+                for light in dict.fromkeys(t.lighting for t in mine)
+            },
+            "causes": {
+                cause: sum(t.cause == cause for t in mine) for cause in dict.fromkeys(sorted(t.cause for t in mine))
+            },
+        }
+    return out
+
+
+def _rate(successes: list[bool]) -> dict[str, Any]:
+    return {"successes": sum(successes), "trials": len(successes)}
+
+
+def _trials(paths: list[Path]) -> list[Trial]:
+    return [trial for path in paths if path.exists() for trial in read_trials(path)]
+
+
+def _forecast(path: Path) -> dict[str, Any]:
+    """Statistics with their intervals, by task."""
+    if not path.exists():
+        return {}
+    return {
+        group["task"]: {"policies": group["policies"], "cells": group["cells"], "missing": group["missing"]}
+        | {name: group[name] for name in FORECAST}
+        for group in read_json(path)["groups"]
+    }
