@@ -198,3 +198,36 @@ def test_the_summary_splits_by_cause_and_trust():
     assert 0.0 < cell["low"] < 0.5 < cell["high"] < 1.0
     assert rate([])["rate"] is None
     assert "2 stuck" in lines(summary(trials))[0]
+
+
+def test_two_nodes_of_ray_give_the_table_of_one_process(fresh):
+    ray = pytest.importorskip("ray", reason="ray is not installed")
+    from ray.cluster_utils import Cluster
+
+    options = ("ahead", ("day", "night"), 20)
+    whole = validate.validate(fresh, ("ahead", "left"), *options)
+    path = fresh / "validation" / "episodes.csv"
+    table = path.read_text()
+    shutil.rmtree(fresh / "validation")
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=2)
+        assert validate.validate(fresh, ("ahead", "left"), *options, ray=cluster.address) == whole
+        assert path.read_text() == table
+        shutil.rmtree(fresh / "validation")
+        # What is wrong on a node is said as if it were here.
+        with pytest.raises(InputError, match="lighting 'noon'"):
+            validate.validate(fresh, ("ahead",), "ahead", ("noon",), 2, ray=cluster.address)
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+
+def test_no_cluster_is_one_line(fresh, capsys):
+    pytest.importorskip("ray", reason="ray is not installed")
+    given = [str(fresh), "--policy", "ahead", "--task", "ahead", "--lightings", "day", "--episodes", "1", "--quiet"]
+    assert validate.main([*given, "--ray", "127.0.0.1:1"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: --ray 127.0.0.1:1: no cluster there")
+    assert said.count("\n") == 1

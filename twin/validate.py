@@ -9,13 +9,13 @@ episodes. What is in `validation/episodes.csv` already is not driven again, so a
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from twin import progress
 from twin.errors import InputError
-from twin.learn.judging import CHUNK, Chunk, campaign
+from twin.learn.judging import CHUNK, Chunk, Driven, campaign
 from twin.learn.policy import JSON, load_policy
 from twin.loading import Twin, load_scene
 from twin.report.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
@@ -33,7 +33,13 @@ class Campaign:
     """Episodes driven and to be driven of one scene and task, and the table they go to."""
 
     def __init__(
-        self, twin: Twin, task: str, path: Path, policies: dict[str, tuple[str, bool]], processes: int
+        self,
+        twin: Twin,
+        task: str,
+        path: Path,
+        policies: dict[str, tuple[str, bool]],
+        processes: int,
+        ray: str | None = None,
     ) -> None:
         """
         Args:
@@ -42,9 +48,10 @@ class Campaign:
             path: The table.
             policies: Source and trust by name.
             processes: How many drive here.
+            ray: Address of a Ray cluster that drives instead.
         """
-        self._scene, self.task, self.path, self._policies = str(twin.scene.root), task, path, policies
-        self._processes = processes
+        self._scene, self.task, self.path, self._policies = str(twin.scene.root.resolve()), task, path, policies
+        self._processes, self._ray = processes, ray
         _mend(path)
         self._done = {_key(t): t for t in read_trials(path)} if path.exists() and _has_rows(path) else {}
 
@@ -60,7 +67,7 @@ class Campaign:
                 chunks.append((name, chunk))
         with progress.bar(what, len(keys), "episode") as bar:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
-            driven = campaign([chunk for _, chunk in chunks], self._processes)
+            driven = self._campaign([chunk for _, chunk in chunks])
             for (name, chunk), outcomes in zip(chunks, driven, strict=True):
                 trials = [
                     Trial(
@@ -78,6 +85,13 @@ class Campaign:
                 self._append(trials)
                 bar.update(len(trials))
         return [self._done[key] for key in keys]
+
+    def _campaign(self, chunks: list[Chunk]) -> Iterator[list[Driven]]:
+        if self._ray and chunks:
+            from twin.learn.cluster import campaign_on_ray
+
+            return campaign_on_ray(chunks, self._ray)
+        return campaign(chunks, self._processes)
 
     def _append(self, trials: Sequence[Trial]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,6 +111,7 @@ def validate(
     worst: bool = False,
     trust: bool = False,
     processes: int = 1,
+    ray: str | None = None,
 ) -> dict:
     """Drives what is missing and writes `validation/`; returns what is in its `summary.json`.
 
@@ -108,13 +123,13 @@ def validate(
     folder = root / "validation"
     policies = _policies(root, sources, trust)
     _check_same(folder / "validated.json", twin, policies)
-    todo = Campaign(twin, task, folder / "episodes.csv", policies, processes)
+    todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
     seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
     todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
     trials = read_trials(folder / "episodes.csv")
     said = summary(trials)
     if worst:
-        search = Campaign(twin, task, folder / "worst.csv", policies, processes)
+        search = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
         said["worst"] = {name: _worst(search, name, episodes) for name in policies}
     (folder / "cells.csv").write_text(cells_text(tally(trials)), encoding="utf-8")
     write_json(folder / "summary.json", said)
@@ -153,6 +168,7 @@ def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tupl
     for source in sources:
         run = root / "runs" / source
         where = str(run) if not Path(source).exists() and (run / JSON).exists() else source
+        where = str(Path(where).resolve()) if Path(where).exists() else where  # a node of a cluster works elsewhere
         name = load_policy(where, trust).name
         if name in out:
             raise InputError(f"two policies are named {name!r}: {out[name][0]} and {where}; rename one")
@@ -223,13 +239,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--worst", action="store_true", help="search for the light in which each policy fares worst")
     parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
     parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
+    parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
     parser.add_argument("--quiet", action="store_true", help="no progress, no table")
     given = parser.parse_args(arguments)
     progress.set_quiet(given.quiet)
     try:
         if min(given.episodes, given.processes) < 1:
             raise InputError(f"--episodes {given.episodes}, --processes {given.processes}; expected at least 1")
-        run = given.task, given.lightings, given.episodes, given.worst, given.trust, given.processes
+        run = given.task, given.lightings, given.episodes, given.worst, given.trust, given.processes, given.ray
         said = validate(given.scene, given.policy, *run)
     except (InputError, OSError) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
