@@ -3,6 +3,7 @@
 Its nodes need `twin`, and see the scene and the policies under the same paths, as on a shared disk.
 """
 
+import logging
 import os
 import socket
 from collections.abc import Iterator, Sequence
@@ -29,7 +30,7 @@ def campaign_on_ray(chunks: Sequence[Chunk], address: str) -> Iterator[list[Driv
         if address != "auto":  # Ray itself would try for minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), _PATIENCE).close()
-        ray.init(address, log_to_driver=False, logging_level="ERROR")
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         first = str(error).splitlines()[0]
         raise InputError(f"--ray {address}: no cluster there ({first}); start one with `ray start --head`") from None
