@@ -98,8 +98,6 @@ class TrainConfig:
     save_every: int = 4_000
     """Steps between two saves of everything."""
     device: str = "cpu"
-    threads: int = 1
-    """Of torch; the worlds are stepped beside it."""
 
     @property
     def architecture(self) -> Architecture:
@@ -200,7 +198,6 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
     elif not (folder / "state" / "pictures.bin").exists():
         raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
     worlds = ShrunkVecEnv(DriveVecEnv(twin, config.task, config.worlds, config.seed, **config.options()), config.pool)
-    torch.set_num_threads(config.threads)
     model = _model(worlds, config, folder / "state" / "pictures.bin")
     before: dict[str, Any] = load_state(folder / "state", model) if go_on else {"wall": 0.0, "resumed": -1}
     resumed = before["resumed"] + 1
