@@ -149,7 +149,8 @@ def test_the_worst_light_is_proved_on_fresh_episodes(fresh, monkeypatch):
     monkeypatch.setattr(validate, "_LOOKS", 1)
     monkeypatch.setattr(validate, "_FINALISTS", 2)
     said = validate.validate(fresh, ["ahead"], "ahead", ["day"], 2, worst=True)
-    worst = said["worst"]["ahead"]
+    (worst,) = said["worst"]
+    assert validate.validate(fresh, ["ahead"], "ahead", ["day"], 2)["worst"] == [worst]  # it is not forgotten
     trials = read_trials(fresh / "validation" / "worst.csv")
     assert worst["trials"] == 2 and worst["of"] == 4
     searched, proof = [t for t in trials if t.seed < 3_000_000], [t for t in trials if t.seed >= 3_000_000]

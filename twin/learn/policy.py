@@ -145,6 +145,13 @@ def save_policy(
     write_json(folder / JSON, {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained})
 
 
+def find_policy(root: Path, source: str) -> str:
+    """What `load_policy` takes for a policy that was named in a scene's folder: the name of a run means its folder."""
+    run = root / "runs" / source
+    where = str(run) if not Path(source).exists() and (run / JSON).exists() else source
+    return str(Path(where).resolve()) if Path(where).exists() else where  # a node of a cluster works elsewhere
+
+
 def load_policy(source: str | Path, trust: bool = False) -> Policy:
     """The policy that is meant by
 

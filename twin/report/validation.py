@@ -31,13 +31,17 @@ _BIN = 2.0  # [m] of the route, within which failures are counted together
 _COLORS = dict(zip(CAUSES[1:], ("#d62728", "#ff7f0e", "#7f7f7f", "#9467bd", "#8c564b"), strict=True))
 
 
-def rate(trials: Sequence[Trial]) -> dict[str, Any]:
+def share(won: int, trials: int) -> dict[str, Any]:
     """Successes, trials, rate and its interval, JSON-able; the rate is None without trials."""
-    won = sum(t.success for t in trials)
     if not trials:
         return {"successes": 0, "trials": 0, "rate": None, "low": 0.0, "high": 1.0}
-    low, high = wilson(won, len(trials))
-    return {"successes": won, "trials": len(trials), "rate": won / len(trials), "low": float(low), "high": float(high)}
+    low, high = wilson(won, trials)
+    return {"successes": won, "trials": trials, "rate": won / trials, "low": float(low), "high": float(high)}
+
+
+def rate(trials: Sequence[Trial]) -> dict[str, Any]:
+    """`share` of trials."""
+    return share(sum(t.success for t in trials), len(trials))
 
 
 def summary(trials: Sequence[Trial]) -> dict[str, Any]:
@@ -74,6 +78,19 @@ def pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     return out
 
 
+def typical_episode(trials: Sequence[Trial]) -> Trial:
+    """The episode whose way driven is the median; of an even number, the further one of the two in the middle."""
+    return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
+
+
+def worst_episode(trials: Sequence[Trial]) -> Trial:
+    """The failed episode that got least far; where none failed, the one whose pictures are trusted least."""
+    failed = [t for t in trials if not t.success]
+    if failed:
+        return min(failed, key=lambda t: t.progress)
+    return min(trials, key=lambda t: 1.0 if t.trust is None else t.trust)
+
+
 def lines(said: dict[str, Any]) -> list[str]:
     """The summary as a table for a terminal."""
     out = []
@@ -96,6 +113,11 @@ def lines(said: dict[str, Any]) -> list[str]:
         out.append(
             f"{p['a']} against {p['b']}, {p['task']}, the same {p['episodes']} episodes: only the first succeeded in "
             f"{p['only_a']}, only the second in {p['only_b']} (p = {p['p']:.2g})"
+        )
+    for w in said.get("worst", []):
+        out.append(
+            f"{w['policy']}, {w['task']}: of {w['of']} lights drawn it fares worst in {w['lighting']}, in fresh "
+            f"episodes {w['successes']}/{w['trials']} ({w['low']:.2f} to {w['high']:.2f})"
         )
     return out
 
