@@ -65,7 +65,7 @@ def test_an_episode_is_that_of_the_environment_alone(scene):
     environment = twin.load(scene, "ahead", 5, lighting="day", **policy.options())
     episode = record(environment, PolicyDriver(policy))
     assert (driven.cause, driven.steps) == (episode.cause, len(episode.times) - 1)
-    assert driven.progress == pytest.approx(episode.progress[-1], abs=1e-9)
+    assert driven.progress == episode.progress[-1]  # to the last bit, which decides who meets the kerb
     assert driven.trust == pytest.approx(episode.trust[:-1].mean(), abs=1e-9)
 
 
