@@ -198,7 +198,7 @@ def test_the_summary_splits_by_cause_and_trust():
     assert (cell["low_trust"]["successes"], cell["low_trust"]["trials"]) == (1, 2)
     assert 0.0 < cell["low"] < 0.5 < cell["high"] < 1.0
     assert rate([])["rate"] is None
-    assert "2 stuck" in lines(summary(trials))[0]
+    assert "2 got stuck" in lines(summary(trials))[0]
 
 
 def test_two_nodes_of_ray_give_the_table_of_one_process(fresh):

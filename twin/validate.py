@@ -174,10 +174,10 @@ def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[T
     from twin.report.video import last_frame
 
     noted = folder / "films" / "films.json"
-    all_films: list[dict] = read_json(noted) if noted.exists() else []
+    before: list[dict] = read_json(noted) if noted.exists() else []
     chosen: dict[Trial, list[str]] = {}
-    for which, trial in (("typical", typical_episode(trials)), ("worst", worst_episode(trials))):
-        chosen.setdefault(trial, []).append(which)
+    for kind, trial in (("typical", typical_episode(trials)), ("worst", worst_episode(trials))):
+        chosen.setdefault(trial, []).append(kind)
     mine = []
     for trial, which in chosen.items():
         path = folder / "films" / trial.policy / film_name(trial.task, trial.lighting, trial.seed)
@@ -198,7 +198,7 @@ def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[T
         files = {"file": path.relative_to(folder).as_posix(), "poster": poster.relative_to(folder).as_posix()}
         mine.append(told | files)
     key = trials[0].policy, trials[0].task
-    write_json(noted, [one for one in all_films if (one["policy"], one["task"]) != key] + mine)
+    write_json(noted, [one for one in before if (one["policy"], one["task"]) != key] + mine)
 
 
 def _search(search: Campaign, policy: str, episodes: int) -> None:

@@ -146,10 +146,12 @@ def save_policy(
 
 
 def find_policy(root: Path, source: str) -> str:
-    """What `load_policy` takes for a policy that was named in a scene's folder: the name of a run means its folder."""
-    run = root / "runs" / source
-    where = str(run) if not Path(source).exists() and (run / JSON).exists() else source
-    return str(Path(where).resolve()) if Path(where).exists() else where  # a node of a cluster works elsewhere
+    """What `load_policy` takes for a scene's policy: `run` and `run/checkpoint`, as in tables, mean their folders."""
+    run, _, checkpoint = source.partition("/")
+    folder = root / "runs" / run
+    folder = folder / "checkpoints" / checkpoint if checkpoint else folder
+    where = folder if not Path(source).exists() and (folder / JSON).exists() else Path(source)
+    return str(where.resolve()) if where.exists() else source  # absolute: a node of a cluster works elsewhere
 
 
 def load_policy(source: str | Path, trust: bool = False) -> Policy:

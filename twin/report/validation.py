@@ -20,6 +20,7 @@ from twin.mjcf.world import World, point_at
 from twin.report.figures import corridor_outline
 from twin.report.statistics import wilson
 from twin.report.trials import CAUSES, Trial, tally
+from twin.report.validation_words import FAILURES, why
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -97,7 +98,7 @@ def lines(said: dict[str, Any]) -> list[str]:
     wide = max((len(c["policy"]) for c in said["cells"]), default=0)
     light = max((len(c["lighting"]) for c in said["cells"]), default=0)
     for c in said["cells"]:
-        causes = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in c["causes"].items())
+        causes = why(c)
         out.append(
             f"{c['policy']:{wide}}  {c['task']}  {c['lighting']:{light}}  {c['successes']:3d}/{c['trials']:<3d} = "
             f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})" + (f"  {causes}" if causes else "")
@@ -161,7 +162,7 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, stretch: tupl
             align="edge",
             edgecolor="white",
             color=_COLORS[cause],
-            label=f"{cause.replace('_', ' ')} ({len(ways)})",
+            label=f"{FAILURES[cause][0]} ({len(ways)})",
         )
         before = before + count
     lost = sum(len(ways) for ways in failed.values())

@@ -18,7 +18,7 @@ _APART = 0.18  # between two lightings of a policy, of the distance of two polic
 def rates(cells: Sequence[dict[str, Any]]) -> Figure:
     """One row per policy, one colour per lighting: success in the cells of a task with its interval."""
     policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
-    height = 0.8 + max(0.34, _ROW * len(lightings)) * len(policies)
+    height = 0.9 + max(0.34, _ROW * len(lightings)) * len(policies)
     figure, axes = new_figure(height)
     apart = min(_APART, 0.8 / len(lightings))
     with style():
@@ -31,8 +31,10 @@ def rates(cells: Sequence[dict[str, Any]]) -> Figure:
             axes.errorbar(x, y, xerr=ends, fmt=marker, color=colour, ms=3.5, lw=1.1, label=lighting)
         axes.set_yticks(range(len(policies)), [short(name) for name in policies])
         axes.grid(False, axis="y")
-        axes.set(xlim=LIMITS, ylim=(len(policies) - 0.5, -0.5), xlabel="success rate", xticks=TICKS)
-    legend_below(axes, min(4, len(lightings)), height)
+        label = "success rate" if len(lightings) > 1 else f"success rate in the light {lightings[0]}"
+        axes.set(xlim=LIMITS, ylim=(len(policies) - 0.5, -0.5), xlabel=label, xticks=TICKS)
+    if len(lightings) > 1:
+        legend_below(axes, min(4, len(lightings)), height)
     return figure
 
 

@@ -32,7 +32,7 @@ from twin.report.validation_words import (
 from twin.report.words import Caution, listing
 from twin.scene import SceneDir
 
-_STYLE = ".whole { white-space:nowrap }\nimg { background:#fff }\n"
+_STYLE = ".whole, td code { white-space:nowrap }\nimg { background:#fff }\n"
 
 Section = tuple[str, str, Html]
 
@@ -71,7 +71,7 @@ def validation_page(scene: str, folder: Path, said: dict[str, Any], curves: Sequ
         *_worst(said),
         ("trust", "What if the pictures are wrong?", _trust(said)),
         ("where", "Where do they fail?", _maps(folder, said)),
-        *_films(said, folder),
+        ("films", "Watch them", _films(said, folder)),
         *_curves(said, curves),
         ("unknown", "What this cannot know", join(*map(_caution, unknowns(said)))),
     ]
@@ -113,8 +113,9 @@ def _cells(said: dict[str, Any]) -> Html:
         _lead(
             "An episode is one drive, from a start drawn at random to the goal or to a failure. All policies drive the "
             f"same episodes. Brackets are {said['confidence']:.0%} intervals: how far chance alone may have moved the "
-            "rate. “In training” is success over the last 100 episodes before the policy was saved; a policy that does "
-            "much worse here has learnt its training by heart."
+            "rate. “In training” is success over the last 100 episodes before the policy was saved, in which it also "
+            "tried things out, so that it may do better here; one that does much worse has learnt its training by "
+            "heart."
         )
     ]
     for task in tasks(said):
@@ -160,14 +161,17 @@ def _better(said: dict[str, Any]) -> list[Section]:
         ]
         for p in said["pairs"]
     ]
-    heads = ["first", "second", "task", "episodes", "only first arrived", "only second", "by luck", "difference"]
+    heads = ["first", "second", "task", "episodes", "only first arrived", "only second", "by luck", "verdict"]
     lead = (
         "Two policies are compared on the episodes that both drove, where start, robot and light were the same. Only "
         "those tell them apart in which one arrived and the other did not. “By luck” is how often two equally good "
         f"policies would differ as much; above {LUCK:.0%} the difference is called chance. "
     )
     if len(rows) > 1:
-        lead += f"Of {len(rows)} comparisons of equal policies, luck would call {LUCK * len(rows):.1f} a difference."
+        lead += (
+            f"Were all of them equally good, luck would still call {LUCK * len(rows):.1f} of these {len(rows)} "
+            "comparisons a difference."
+        )
     return [("better", "Which policy is better?", join(_lead(lead), table(heads, rows, (3, 4, 5, 6))))]
 
 
@@ -229,9 +233,16 @@ def _maps(folder: Path, said: dict[str, Any]) -> Html:
     return join(lead, element("div", *drawn, class_="pictures"))
 
 
-def _films(said: dict[str, Any], folder: Path) -> list[Section]:
+def _films(said: dict[str, Any], folder: Path) -> Html:
+    other = element(
+        "p",
+        "To film any row of episodes.csv: ",
+        element("code", "python -m twin.film SCENE --policy NAME --task TASK --lighting LIGHT --seed SEED"),
+        class_="meaning",
+    )
     if not said["films"]:
-        return []
+        none = "Nothing was filmed: the command that made this page does so with --films, a minute for each film."
+        return join(element("p", none, class_="na"), other)
     shown = []
     for film in said["films"]:
         ended = "reached the goal" if film["cause"] == "goal" else FAILURES[film["cause"]][0]
@@ -258,7 +269,7 @@ def _films(said: dict[str, Any], folder: Path) -> list[Section]:
         f"{of} episodes driven by the command that filmed them, and are those of the table, driven again with the "
         "same seed. The films lie beside this page."
     )
-    return [("films", "Watch them", join(_lead(lead), element("div", *shown, class_="pictures")))]
+    return join(_lead(lead), element("div", *shown, class_="pictures"), other)
 
 
 def _curves(said: dict[str, Any], curves: Sequence[Curve]) -> list[Section]:

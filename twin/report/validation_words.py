@@ -84,6 +84,9 @@ def verdicts(said: dict[str, Any]) -> list[Verdict]:
         tied = [policy for policy in means if means[policy] == means[best] and policy != best]
         lead = " most often" if len(by_policy) > 1 and not tied else ""
         text = f"On {task}, {best} reaches the goal{lead}: in {won} of {of} episodes"
+        every = dict.fromkeys(c["lighting"] for c in said["cells"] if c["task"] == task)
+        if len(common) < len(every):
+            text += f" in the light that all have driven in ({listing(name for name in every if name in common)})"
         text += f", and so does {listing(tied)} as often" if tied else ""
         weakest = min(cells, key=lambda c: c["rate"])
         if weakest["rate"] < max(c["rate"] for c in cells):
@@ -100,7 +103,7 @@ def verdicts(said: dict[str, Any]) -> list[Verdict]:
 def pair_words(pair: dict[str, Any]) -> str:
     """Whether a paired difference is more than luck."""
     if pair["only_a"] == pair["only_b"]:
-        return "none"
+        return "no difference"
     return "within chance" if pair["p"] > LUCK else f"{pair['a' if pair['only_a'] > pair['only_b'] else 'b']} is better"
 
 
