@@ -137,3 +137,17 @@ def test_pictures_of_another_size_are_refused(tmp_path):
     (tmp_path / "pictures.bin").write_bytes(b"123")
     with pytest.raises(InputError, match="3 bytes"):
         FrameReplayBuffer(40, SPACE, ACTION, "cpu", WORLDS, file=tmp_path / "pictures.bin")
+
+
+def test_weather_is_laid_over_half_of_what_samples_begin_with_and_over_no_target():
+    def drawn(colours: float):
+        buffer = FrameReplayBuffer(60, SPACE, ACTION, "cpu", WORLDS, colours=colours, seed=4)
+        worlds = NaiveWorlds(2, 6)
+        for _ in range(15):
+            worlds.step(buffer)
+        return buffer.sample(12)
+
+    plain, weather = drawn(0.0), drawn(1.0)
+    np.testing.assert_array_equal(plain.next_observations, weather.next_observations)
+    np.testing.assert_array_equal(plain.observations[6:], weather.observations[6:])
+    assert all((a != b).any() for a, b in zip(plain.observations[:6], weather.observations[:6], strict=True))

@@ -36,6 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
         with progress.bar("train", config.steps, "step") as bar:
 
             def watch(now: training.Progress) -> None:
+                if not bar.n:  # what was trained before was not trained in this time
+                    bar.initial = bar.n = now.steps
                 bar.update(now.steps - bar.n)
                 if now.recent:
                     low, high = wilson(sum(now.recent), len(now.recent))

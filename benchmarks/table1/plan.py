@@ -18,7 +18,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
     "varied": (),
 }
 """Name → options of `twin.train`."""
-STEPS = {"straight": 40_000, "right": 40_000}
+STEPS = {"straight": 60_000, "right": 60_000}
 SHARES = (0.25, 0.5)
 """Of a run's steps, at which checkpoints are taken for the forecast."""
 EPISODES = 50

@@ -56,7 +56,7 @@ class FrameReplayBuffer(ReplayBuffer):
             file: Where the tapes are; in memory where None. One that is there is read, see `set_state`.
             slack: Transitions, of all worlds together, that may be added between two saves.
             shift: Samples are shifted by up to so many pixels each way, edges repeated: Kostrikov et al. 2020 (DrQ).
-            colours: Strength of the random weather laid over samples, see `colours.recoloured`.
+            colours: Strength of the random weather laid over half of what samples begin with, see `recoloured`.
             seed: Of what is drawn.
 
         Raises:
@@ -123,8 +123,10 @@ class FrameReplayBuffer(ReplayBuffer):
         before, after = self.stacks(row, world)
         if self.shift:
             before, after = self._shifted(before), self._shifted(after)
-        if self.colours:  # apart from each other: what a state is worth must not depend on the weather
-            before, after = (recoloured(stacks, self.colours, self.rng) for stacks in (before, after))
+        if self.colours:
+            # Half of them, and never what targets are made of: Hansen et al. 2021 (SVEA).
+            half = batch_size // 2
+            before[:half] = recoloured(before[:half], self.colours, self.rng)
         rest = self.actions[row, world], after, self.ends[row, world, None], self.rewards[row, world, None]
         return ReplayBufferSamples(*(torch.as_tensor(part, device=self.device) for part in (before, *rest)))
 
