@@ -189,6 +189,19 @@ def test_one_camera_or_many_are_the_same(monkeypatch):
         assert np.allclose(alone.rgb[0], together.rgb[i], atol=1e-5)
 
 
+def test_a_picture_does_not_depend_on_the_lights_beside_it():
+    """To the last bit: or an episode would end otherwise beside others than alone."""
+    field = baked(wall(1.0, 2.0))
+    rng, hidden = np.random.default_rng(0), len(field._bias_of[0])
+    field._bias_of = field._bias_of[0], rng.normal(0, 0.1, (32, hidden)).astype(np.float32)  # as wide as a real one's
+    lights = rng.normal(0, 1, (16, 32)).astype(np.float32)
+    for n in (2, 3, 8, 16):
+        together = field.render(Viewpoints.of(np.tile(looking(), (n, 1, 1)), K, SIZE), lights[:n])
+        for i in range(n):
+            alone = field.render(Viewpoints.of(looking(), K, SIZE), lights[i : i + 1])
+            assert np.array_equal(alone.rgb[0], together.rgb[i])
+
+
 def test_every_camera_may_have_a_lighting_of_its_own():
     field = baked(wall(1.0, 2.0))
     cameras = Viewpoints.of(np.concatenate([looking(), looking()]), K, SIZE)

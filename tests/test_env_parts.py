@@ -14,7 +14,7 @@ import twin
 from twin import progress
 from twin.config import TaskConfig
 from twin.env.audit import EVENTS, Findings, Seen, audit
-from twin.env.drivers import RouteDriver, load_policy
+from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
 from twin.env.lightings import HELD_OUT, TRAINING, Light, LightSets, draw_light
 from twin.env.physics import HuskyPhysics
@@ -263,14 +263,14 @@ def test_a_policy_is_a_function_by_name(scene, tmp_path, monkeypatch):
     )
     monkeypatch.chdir(tmp_path)
     environment = twin.load(scene, "bend", 0, **SMALL)
-    episode = record(environment, load_policy("my_policy:act"), most=5)
+    episode = record(environment, PolicyDriver(find_callable("my_policy:act")), most=5)
     np.testing.assert_array_equal(episode.actions[:5], np.tile([1.0, 0.0], (5, 1)))
     assert episode.cause == ""
     with pytest.raises(InputError, match="expected 2 numbers"):
-        record(environment, load_policy("my_policy:bad"), most=1)
+        record(environment, PolicyDriver(find_callable("my_policy:bad")), most=1)
     for name in ("my_policy", "my_policy:nothing", "no_such_module:act"):
         with pytest.raises(InputError):
-            load_policy(name)
+            find_callable(name)
 
 
 @pytest.mark.slow

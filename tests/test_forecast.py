@@ -222,6 +222,23 @@ def test_one_policy_alone() -> None:
     assert Text(forecast_page(made)).text
 
 
+def test_the_papers_table_has_training_twin_and_road_of_every_policy() -> None:
+    twin, real = cells(driven=6, tasks=("straight", "bend"))
+    trained = {("p0", "straight"): Estimate(0.97, 0.93, 0.99, 100)}
+    made = make_forecast("road", twin, real, trained=trained)
+    html = forecast_page(made)
+    table = html[html.index('<section id="stages"') :]
+    rows = [row.split("<td>")[1:] for row in table[: table.index("</section>")].split("<tr>")[2:]]
+    found = {(c.policy, c.task): c for c in made.candidates}
+    assert len(rows) == 7
+    for row in rows:
+        policy, *cells_ = (Text(cell).text.strip() for cell in (part.split("</td>")[0] for part in row))
+        wanted = [e for task in made.tasks for c in [found[policy, task]] for e in (c.trained, c.twin, c.real)]
+        assert cells_ == [show(e, percent=True) for e in wanted]
+        assert (cells_[0] == "97% (93% to 99%)") == (policy == "p0") and (cells_[2] == "–") == (policy == "p6")
+    assert candidates_csv(made).count("0.97,0.93,0.99") == 1
+
+
 # ---- files and the verb
 
 

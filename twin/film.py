@@ -1,17 +1,17 @@
 """Verb: a film of a drive in a built scene, to be judged by eye.
 
     python -m twin.film scenes/demo --task right_turn --lighting night --obstacles 4
-    python -m twin.film scenes/demo --policy my_policy:act --seed 7 --out drive.mp4
+    python -m twin.film scenes/demo --policy first --task straight --lighting held-out --seed 1000007 --out drive.mp4
 
 Shows what the robot sees, the robot from behind, where it is, its speed and its reward. The driver is scripted unless a
-policy is named: `module:function`, called with pictures, uint8 (3 · stack, height, width), the newest three channels
-last, and answering with numbers in [-1, 1], one per action.
+policy is named: whatever `twin.validate` takes, in the environment that the policy asks for. Task, lighting and seed
+decide the episode: those of a row of `validation/episodes.csv` show that very episode.
 """
 
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dm_env
 import numpy as np
@@ -20,6 +20,9 @@ from twin import progress
 from twin.errors import InputError
 from twin.loading import load, load_scene
 
+if TYPE_CHECKING:
+    from twin.env.episode import Episode
+
 
 def film(
     root: Path,
@@ -27,31 +30,40 @@ def film(
     policy: str | None = None,
     seed: int = 0,
     out: Path | None = None,
+    trust: bool = False,
     **options: Any,
-) -> tuple[Path, Any]:
+) -> tuple[Path, "Episode"]:
     """Drives one episode and films it.
 
     Args:
         root: A built scene.
         task: See `twin.load`.
-        policy: `module:function`; the scripted driver where None.
+        policy: A run's name, or see `twin.learn.policy.load_policy`; the scripted driver where None.
         seed: Of the episode.
         out: The mp4; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder.
-        options: See `twin.env.options.Options`.
+        trust: Whether a policy file may run code.
+        options: See `twin.env.options.Options`; where not given, as the policy asks for.
 
     Returns:
-        The film's path, and the `Episode`.
+        The film's path, and the episode.
 
     Raises:
         InputError: the scene, task, policy or an option is not to be had.
     """
-    from twin.env.drivers import RouteDriver, load_policy
+    from twin.env.drivers import Driver, PolicyDriver, RouteDriver
     from twin.env.episode import record
     from twin.report.episode_film import film_episode
     from twin.report.review import surroundings
 
     scene = load_scene(root)
-    driver = load_policy(policy) if policy else RouteDriver()
+    driver: Driver = RouteDriver()
+    who = "scripted driver"
+    if policy:
+        from twin.learn.policy import find_policy, load_policy
+
+        loaded = load_policy(find_policy(root, policy), trust)
+        driver, who = PolicyDriver(loaded), loaded.name
+        options = {**loaded.options(), **options}
     environment = load(scene, task, seed, **options)
     seen: list[np.ndarray] = []
 
@@ -63,8 +75,7 @@ def film(
 
     with progress.bar("drive", longest, "step") as wheel:
         episode = record(environment, driver, watch)
-    name = "".join(c if c.isalnum() or c in "-." else "_" for c in f"{task}_{episode.lighting}_{seed}")
-    path = out or root / "films" / f"{name}.mp4"
+    path = out or root / "films" / film_name(task, episode.lighting, seed)
     path.parent.mkdir(parents=True, exist_ok=True)
     drive = environment.task
     film_episode(
@@ -75,9 +86,14 @@ def film(
         drive.half_width,
         (drive.stretch.start, drive.stretch.end),
         surroundings(scene.scene),
-        f"{task.replace('_', ' ')}: {policy or 'scripted driver'}",
+        f"{task.replace('_', ' ')}: {who}",
     )
     return path, episode
+
+
+def film_name(task: str, lighting: str, seed: int) -> str:
+    """File name of an episode's film."""
+    return "".join(c if c.isalnum() or c in "-." else "_" for c in f"{task}_{lighting}_{seed}") + ".mp4"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -88,7 +104,8 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--policy", metavar="MODULE:FUNCTION", help="who drives; a script unless given")
+    parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function; a script unless given")
+    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
     parser.add_argument("--lighting", default=None, help="a name, a mixture a:b:0.3, training, held-out or any")
     parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
     parser.add_argument("--obstacles", default="scene", help="how many at random; those of scene.toml unless given")
@@ -106,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
         }
         if given.lighting:
             options["lighting"] = given.lighting
-        path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, **options)
+        path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
     except (InputError, OSError) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         return 2

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from twin.errors import InputError
-from twin.report.forecast import Forecast
+from twin.report.forecast import Estimate, Forecast
 from twin.report.trials import RESULT_COLUMNS, read_results, read_trials, tally
 from twin.scene import SceneDir
 
@@ -31,13 +31,19 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     from twin.report.forecast_page import write_forecast_page
     from twin.report.forecast_words import candidates_csv
     from twin.report.forecasting import make_forecast
+    from twin.report.training import trainings
 
     scene = SceneDir(root)
     if not root.is_dir():
         raise InputError(f"{root} is no folder; give the scene's folder, such as scenes/demo")
     twin = tally(read_trials(scene.episodes_csv))
     cells = read_results(real, twin) if real else []
-    out = make_forecast(root.resolve().name, twin, cells, seed)
+    trained = {
+        (policy, told["task"]): Estimate(told["rate"], told["low"], told["high"], told["trials"])
+        for policy, told in trainings(root, {cell.policy for cell in twin}).items()
+        if told["trials"]
+    }
+    out = make_forecast(root.resolve().name, twin, cells, seed, trained)
     out.save(scene.forecast)
     table = scene.forecast / "forecast.csv"
     aside = table.with_name(table.name + ".partial")

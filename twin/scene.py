@@ -8,7 +8,7 @@ scenes/<name>/
     1_capture/ ... 6_review/   one folder per stage, written aside as `<folder>.partial` and renamed when done
     report.json report.html review.mp4
   lightings/            <name>.json and .png: lightings fitted to photos of the built place
-  validation/           episodes.csv, cells.csv: policies driven in the twin
+  validation/           episodes.csv, cells.csv, validation.html, films/: policies driven in the twin
   forecast/             forecast.json .csv .html: what that says about the real runs
 """
 
@@ -73,14 +73,18 @@ class SceneDir:
         return self.root / "lightings"
 
     @property
+    def validation(self) -> Path:
+        return self.root / "validation"
+
+    @property
     def episodes_csv(self) -> Path:
         """One row per trial in the twin; columns in `twin.report.trials`."""
-        return self.root / "validation" / "episodes.csv"
+        return self.validation / "episodes.csv"
 
     @property
     def cells_csv(self) -> Path:
         """The same, summed up by policy, task and lighting."""
-        return self.root / "validation" / "cells.csv"
+        return self.validation / "cells.csv"
 
     @property
     def forecast(self) -> Path:

@@ -1,10 +1,11 @@
 """Verb: how often policies succeed in a built scene, lighting by lighting.
 
     python -m twin.validate scenes/demo --task straight --policy scenes/demo/runs/first --episodes 100
-    python -m twin.validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst
+    python -m twin.validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst --films
 
 A policy is a run (its name or folder), a checkpoint of one, an ONNX file or `module:function`. All drive the same
 episodes. What is in `validation/episodes.csv` already is not driven again, so a validation that was stopped goes on.
+`validation/validation.html` shows it all.
 """
 
 import argparse
@@ -16,11 +17,13 @@ from typing import Any
 from twin import progress
 from twin.errors import InputError
 from twin.learn.judging import CHUNK, Chunk, Driven, campaign
-from twin.learn.policy import JSON, load_policy
+from twin.learn.policy import JSON, find_policy, load_policy
 from twin.loading import Twin, load_scene
+from twin.report.training import read_episodes, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
-from twin.report.validation import failure_map, lines, summary
-from twin.scene import digest_file, digest_json, read_json, write_json
+from twin.report.validation import failure_map, lines, summary, typical_episode, worst_episode
+from twin.report.validation_page import Curve, write_validation_page
+from twin.scene import SceneDir, digest_file, digest_json, read_json, write_json
 
 _FIRST_SEED = 1_000_000  # of validation; training's are small
 _SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
@@ -112,33 +115,94 @@ def validate(
     trust: bool = False,
     processes: int = 1,
     ray: str | None = None,
+    films: bool = False,
 ) -> dict:
     """Drives what is missing and writes `validation/`; returns what is in its `summary.json`.
 
     Raises:
         InputError: a policy, the scene, the task or a lighting is not to be had; or names of other policies or another
-            build are in the table.
+            build are in the table; or an episode of the table ends otherwise when it is driven again to be filmed.
     """
     twin = load_scene(root)
-    folder = root / "validation"
+    folder = twin.scene.validation
     policies = _policies(root, sources, trust)
     _check_same(folder / "validated.json", twin, policies)
     todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
     seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
-    todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
-    trials = read_trials(folder / "episodes.csv")
-    said = summary(trials)
+    driven = todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
     if worst:
-        search = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
-        said["worst"] = {name: _worst(search, name, episodes) for name in policies}
-    (folder / "cells.csv").write_text(cells_text(tally(trials)), encoding="utf-8")
-    write_json(folder / "summary.json", said)
-    _draw_maps(twin, folder, trials)
+        searched = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
+        for name in policies:
+            _search(searched, name, episodes)
+    said = _write(twin)
+    if films:
+        for name, (source, _) in policies.items():
+            _film(root, folder, source, trust, [t for t in driven if t.policy == name])
+        said = _write(twin)
     return said
 
 
-def _worst(search: Campaign, policy: str, episodes: int) -> dict:
-    """The light of many drawn ones in which a policy fares worst, and how it fares in fresh episodes in it.
+def _write(twin: Twin) -> dict:
+    """Tells what is in the tables: `cells.csv`, `summary.json`, maps and page; returns the summary."""
+    folder, trials = twin.scene.validation, read_trials(twin.scene.episodes_csv)
+    twin.scene.cells_csv.write_text(cells_text(tally(trials)), encoding="utf-8")
+    said = summary(trials)
+    said["training"] = trainings(twin.scene.root, dict.fromkeys(t.policy for t in trials))
+    said["worst"] = _worst_lights(folder / "worst.csv")
+    films = folder / "films" / "films.json"
+    said["films"] = read_json(films) if films.exists() else []
+    write_json(folder / "summary.json", said)
+    _draw_maps(twin, folder, trials)
+    runs = dict.fromkeys(trained["run"] for trained in said["training"].values())
+    curves = [Curve(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
+    write_validation_page(twin.scene, said, curves)
+    return said
+
+
+def _worst_lights(path: Path) -> list[dict]:
+    """A cell for every policy and task that the worst light was searched for: its fresh episodes in that light."""
+    trials = read_trials(path) if path.exists() and _has_rows(path) else []
+    cells = summary([t for t in trials if t.seed >= _PROOF_SEED])["cells"]
+    return [
+        c | {"of": len({t.lighting for t in trials if (t.policy, t.task) == (c["policy"], c["task"])})} for c in cells
+    ]
+
+
+def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[Trial]) -> None:
+    """Films the typical and the worst of a policy's episodes on a task; what is filmed already is kept."""
+    from twin.film import film, film_name
+    from twin.report.video import last_frame
+
+    noted = folder / "films" / "films.json"
+    before: list[dict] = read_json(noted) if noted.exists() else []
+    chosen: dict[Trial, list[str]] = {}
+    for kind, trial in (("typical", typical_episode(trials)), ("worst", worst_episode(trials))):
+        chosen.setdefault(trial, []).append(kind)
+    mine = []
+    for trial, which in chosen.items():
+        path = folder / "films" / trial.policy / film_name(trial.task, trial.lighting, trial.seed)
+        poster = path.with_suffix(".jpg")
+        if not poster.exists():
+            episode = film(root, trial.task, source, trial.seed, path, trust, lighting=trial.lighting)[1]
+            if (episode.cause, len(episode.times) - 1) != (trial.cause, trial.steps):
+                path.unlink()
+                raise InputError(
+                    f"{trial.policy}, {trial.task}, {trial.lighting}, seed {trial.seed}: driven again to be filmed it "
+                    f"ends by {episode.cause} after {len(episode.times) - 1} steps; expected {trial.cause} after "
+                    f"{trial.steps}, as in {folder / 'episodes.csv'}: the policy's code changed, or another kind of "
+                    f"machine drove it; move {folder} away to validate anew"
+                )
+            poster.write_bytes(last_frame(path))
+        told = {"policy": trial.policy, "task": trial.task, "lighting": trial.lighting, "seed": trial.seed}
+        told |= {"which": which, "cause": trial.cause, "progress_m": trial.progress, "of": len(trials)}
+        files = {"file": path.relative_to(folder).as_posix(), "poster": poster.relative_to(folder).as_posix()}
+        mine.append(told | files)
+    key = trials[0].policy, trials[0].task
+    write_json(noted, [one for one in before if (one["policy"], one["task"]) != key] + mine)
+
+
+def _search(search: Campaign, policy: str, episodes: int) -> None:
+    """Drives a policy in many drawn lights, and in fresh episodes in the one of them in which it fares worst.
 
     Few episodes in every light, as many again in the worst of them: successive halving. The way driven breaks ties.
     """
@@ -154,8 +218,7 @@ def _worst(search: Campaign, policy: str, episodes: int) -> dict:
         seeds = range(seeds.stop, seeds.stop + 2 * len(seeds))
     # What was worst by chance among many is less bad than it looked: so it is driven in anew.
     proof = range(_PROOF_SEED, _PROOF_SEED + episodes)
-    said = summary(search.drive([(policy, lights[0], proof)], f"{lights[0]} anew"))["cells"][0]
-    return {**said, "of": _LIGHTS}
+    search.drive([(policy, lights[0], proof)], f"{lights[0]} anew")
 
 
 def _fared(trials: Sequence[Trial]) -> tuple[float, float]:
@@ -166,9 +229,7 @@ def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tupl
     """Source by the name it has in tables; each is loaded once, so that what is wrong is said at once."""
     out: dict[str, tuple[str, bool]] = {}
     for source in sources:
-        run = root / "runs" / source
-        where = str(run) if not Path(source).exists() and (run / JSON).exists() else source
-        where = str(Path(where).resolve()) if Path(where).exists() else where  # a node of a cluster works elsewhere
+        where = find_policy(root, source)
         name = load_policy(where, trust).name
         if name in out:
             raise InputError(f"two policies are named {name!r}: {out[name][0]} and {where}; rename one")
@@ -237,6 +298,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--lightings", nargs="+", default=["held-out"], help="names, mixtures a:b:0.3, held-out, any")
     parser.add_argument("--episodes", type=int, default=100, help="per policy and lighting; 100 unless given")
     parser.add_argument("--worst", action="store_true", help="search for the light in which each policy fares worst")
+    parser.add_argument("--films", action="store_true", help="film each policy's typical and worst episode")
     parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
     parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
     parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
@@ -246,7 +308,16 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if min(given.episodes, given.processes) < 1:
             raise InputError(f"--episodes {given.episodes}, --processes {given.processes}; expected at least 1")
-        run = given.task, given.lightings, given.episodes, given.worst, given.trust, given.processes, given.ray
+        run = (
+            given.task,
+            given.lightings,
+            given.episodes,
+            given.worst,
+            given.trust,
+            given.processes,
+            given.ray,
+            given.films,
+        )
         said = validate(given.scene, given.policy, *run)
     except (InputError, OSError) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
@@ -256,11 +327,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     if not given.quiet:
         print("\n".join(lines(said)))
-        for name, light in said.get("worst", {}).items():
-            print(
-                f"{name}: of {light['of']} lights drawn it fares worst in {light['lighting']}, in fresh episodes "
-                f"{light['successes']}/{light['trials']} ({light['low']:.2f} to {light['high']:.2f})"
-            )
+        print(f"look at {SceneDir(given.scene).validation / 'validation.html'}")
     return 0
 
 

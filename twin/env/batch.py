@@ -97,7 +97,8 @@ class Worlds:
             which: Of which worlds; all unless given. The outcome has their order.
         """
         which = range(len(self)) if which is None else which
-        wanted = self._low + (np.clip(actions, -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
+        # In float64, as a driver of one environment does it.
+        wanted = self._low + (np.clip(np.asarray(actions, float), -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
 
         def advance(k: int) -> dm_env.TimeStep:
             return self._environments[which[k]].step(wanted[k])

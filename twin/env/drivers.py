@@ -67,11 +67,6 @@ class PolicyDriver:
         return spec.minimum + (np.clip(action, -1.0, 1.0) + 1.0) / 2.0 * (spec.maximum - spec.minimum)
 
 
-def load_policy(name: str) -> PolicyDriver:
-    """The driver of a policy that is a Python callable, see `find_callable`."""
-    return PolicyDriver(find_callable(name))
-
-
 def find_callable(name: str) -> Policy:
     """The Python callable `module:function`; modules of the working folder are found.
 

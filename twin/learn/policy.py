@@ -145,6 +145,15 @@ def save_policy(
     write_json(folder / JSON, {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained})
 
 
+def find_policy(root: Path, source: str) -> str:
+    """What `load_policy` takes for a scene's policy: `run` and `run/checkpoint`, as in tables, mean their folders."""
+    run, _, checkpoint = source.partition("/")
+    folder = root / "runs" / run
+    folder = folder / "checkpoints" / checkpoint if checkpoint else folder
+    where = folder if not Path(source).exists() and (folder / JSON).exists() else Path(source)
+    return str(where.resolve()) if where.exists() else source  # absolute: a node of a cluster works elsewhere
+
+
 def load_policy(source: str | Path, trust: bool = False) -> Policy:
     """The policy that is meant by
 

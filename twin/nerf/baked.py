@@ -188,7 +188,8 @@ class BakedField:
         if len(vectors) not in (1, n):
             raise InputError(f"{len(vectors)} lightings for {n} cameras; expected one, or one per camera")
         bias, matrix = self._bias_of
-        return np.broadcast_to(bias + vectors @ matrix, (n, len(bias)))
+        # One by one: of a matrix BLAS adds up in another order, and a picture must not depend on those beside it.
+        return np.broadcast_to(bias + np.stack([vector @ matrix for vector in vectors]), (n, len(bias)))
 
     def _picture(self, n: int, width: int, height: int, stopped: bool) -> "_Picture":
         """Arrays for pictures of this size; the last few are kept, as the next is likely of a size there was before."""

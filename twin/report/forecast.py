@@ -34,6 +34,9 @@ class Estimate:
     """What it would take; empty where there is a value."""
 
 
+UNKNOWN_TRAINING = Estimate(missing="its training on this task is not known")
+
+
 @dataclass(frozen=True)
 class Pair:
     """A real cell beside the twin's."""
@@ -65,6 +68,8 @@ class Candidate:
     """Probability of each rank on the road among the driven; empty where it was not driven or is the only one."""
     corrected: Estimate
     """Real rate expected, from its twin score and the other driven candidates; its own real trials are not used."""
+    trained: Estimate = UNKNOWN_TRAINING
+    """Rate in its training, on this task, before it was saved."""
 
     @property
     def driven(self) -> bool:

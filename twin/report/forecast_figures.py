@@ -9,10 +9,12 @@ from matplotlib.figure import Figure
 from twin.report.figures import CARD, INK, MUTED, SERIES, new_figure, style
 from twin.report.forecast import Candidate, Estimate, Forecast
 
+LIMITS = (-0.04, 1.04)
+"""Of an axis of rates."""
+TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
 _NAMED = 3  # points furthest off, which are named
 _LONGEST = 26  # characters of a name
-_LIMITS = (-0.04, 1.04)
-_TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _ROW = 0.34  # [in]
 _SQUARE = 4.6  # [in]
 
@@ -27,7 +29,7 @@ def twin_against_road(forecast: Forecast) -> Figure:
             if mine:
                 _crosses(axes, [c.twin for c in mine], [c.real for c in mine], SERIES[i % len(SERIES)], task)
         _name_furthest(axes, [(c.policy, c.twin.value or 0.0, c.real.value or 0.0) for c in driven])
-    _legend_below(axes, 3, _SQUARE)
+    legend_below(axes, 3, _SQUARE)
     return figure
 
 
@@ -41,7 +43,7 @@ def predicted_against_road(forecast: Forecast) -> Figure:
             if mine:
                 _crosses(axes, [c.corrected for c in mine], [c.real for c in mine], SERIES[i % len(SERIES)], task)
         _name_furthest(axes, [(c.policy, c.corrected.value or 0.0, c.real.value or 0.0) for c in known])
-    _legend_below(axes, 3, _SQUARE)
+    legend_below(axes, 3, _SQUARE)
     return figure
 
 
@@ -63,8 +65,8 @@ def rates(candidates: Sequence[Candidate]) -> Figure:
             axes.errorbar(x, y, xerr=ends, fmt=marker, color=colour, ms=3.5, lw=1.1, label=name)
         _names(axes, candidates)
         axes.grid(False, axis="y")
-        axes.set(xlim=_LIMITS, ylim=(n - 0.5, -0.5), xlabel="success rate", xticks=_TICKS)
-    _legend_below(axes, len(shown), 0.8 + _ROW * n)
+        axes.set(xlim=LIMITS, ylim=(n - 0.5, -0.5), xlabel="success rate", xticks=TICKS)
+    legend_below(axes, len(shown), 0.8 + _ROW * n)
     return figure
 
 
@@ -93,7 +95,7 @@ def _square(x: str, y: str) -> tuple[Figure, Axes]:
     figure, axes = new_figure(_SQUARE)
     with style():
         axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
-        axes.set(xlim=_LIMITS, ylim=_LIMITS, xlabel=x, ylabel=y, xticks=_TICKS, yticks=_TICKS)
+        axes.set(xlim=LIMITS, ylim=LIMITS, xlabel=x, ylabel=y, xticks=TICKS, yticks=TICKS)
     return figure, axes
 
 
@@ -116,19 +118,20 @@ def _name_furthest(axes: Axes, points: list[tuple[str, float, float]]) -> None:
     for name, x, y in sorted(points, key=lambda p: -abs(p[2] - p[1]))[:_NAMED]:
         offset, side = ((-7, -10), "right") if x > 0.5 else ((7, -10), "left")
         box = {"facecolor": CARD, "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
-        text = axes.annotate(_short(name), (x, y), offset, textcoords="offset points", ha=side, bbox=box, zorder=3)
+        text = axes.annotate(short(name), (x, y), offset, textcoords="offset points", ha=side, bbox=box, zorder=3)
         text.set(fontsize=7.5, color=MUTED)
 
 
 def _names(axes: Axes, candidates: Sequence[Candidate]) -> None:
-    axes.set_yticks(range(len(candidates)), [_short(c.policy) for c in candidates])
+    axes.set_yticks(range(len(candidates)), [short(c.policy) for c in candidates])
 
 
-def _legend_below(axes: Axes, columns: int, height: float) -> None:
+def legend_below(axes: Axes, columns: int, height: float) -> None:
+    """A legend below the axes of a figure of this height [in]."""
     with style():
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.45 / height), ncols=columns, handlelength=1.4)
 
 
-def _short(name: str) -> str:
-    """Checkpoints differ at their end, so the middle goes."""
+def short(name: str) -> str:
+    """A name as long as a figure has room for; checkpoints differ at their end, so the middle goes."""
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST // 2]}…{name[-(_LONGEST // 2 - 1) :]}"

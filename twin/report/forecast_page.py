@@ -25,6 +25,7 @@ def forecast_page(forecast: Forecast) -> str:
     """The whole page."""
     sections = [
         ("road", "Does the twin foretell the road?", _road(forecast)),
+        ("stages", "From training to the road", _stages(forecast)),
         ("policies", "Which policy is best?", _policies(forecast)),
         ("predictions", "What to expect on the road", _predictions(forecast)),
         ("more", "How many more trials?", _more(forecast)),
@@ -113,6 +114,30 @@ def _refusal(group: Group) -> Html:
         class_="caution",
         role="note",
     )
+
+
+def _stages(forecast: Forecast) -> Html:
+    """The table that papers print: a row per policy, and for every task its rates where it learnt and was judged."""
+    lead = element(
+        "p",
+        "Train: success over the last episodes of its training. Validate: success in the twin, in the lightings that "
+        "are compared with the road’s. Real: success on the road. A policy that falls from the first to the second "
+        "has learnt its training by heart; what falls from the second to the third is the twin’s error, or chance.",
+        class_="done",
+    )
+    policies = dict.fromkeys(c.policy for c in forecast.candidates)
+    found = {(c.policy, c.task): c for c in forecast.candidates}
+    rows: list[list[str]] = []
+    for policy in policies:
+        mine = [found.get((policy, task)) for task in forecast.tasks]
+        rates = [_stage(e) for c in mine for e in ((c.trained, c.twin, c.real) if c else (None,) * 3)]
+        rows.append([element("code", policy), *rates])
+    heads = ["policy", *(f"{task}: {stage}" for task in forecast.tasks for stage in ("train", "validate", "real"))]
+    return join(lead, table(heads, rows))
+
+
+def _stage(estimate: Estimate | None) -> Html:
+    return Html("–") if estimate is None or estimate.value is None else _show(estimate, True)
 
 
 def _policies(forecast: Forecast) -> Html:

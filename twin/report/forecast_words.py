@@ -28,7 +28,7 @@ SHARES = ("winner_regret", "bias", "coverage", "corrected_coverage", "mean_real"
 CSV_COLUMNS = (
     *("task", "policy", "twin", "twin_low", "twin_high", "twin_trials", "rank", "rank_low", "rank_high"),
     *("best_in_twin", "real", "real_low", "real_high", "real_trials", "best_on_road"),
-    *("predicted", "predicted_low", "predicted_high"),
+    *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
 )
 
 
@@ -228,7 +228,7 @@ def candidates_csv(forecast: Forecast) -> str:
         numbers = [
             *(c.twin.value, c.twin.low, c.twin.high, c.twin.n, c.twin_rank.value, c.twin_rank.low, c.twin_rank.high),
             *(c.twin_ranks[0], c.real.value, c.real.low, c.real.high, c.real.n, *(c.real_ranks[:1] or [None])),
-            *(c.corrected.value, c.corrected.low, c.corrected.high),
+            *(c.corrected.value, c.corrected.low, c.corrected.high, c.trained.value, c.trained.low, c.trained.high),
         ]
         rows.append((c.task, c.policy, *("" if x is None else f"{x:.4f}".rstrip("0").rstrip(".") for x in numbers)))
     return csv_text(CSV_COLUMNS, rows)

@@ -1,6 +1,7 @@
 """How a `Forecast` is computed from the cells of the twin and of the road; see `forecast.py` for the words."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,13 @@ from twin.report.trials import Cell
 from twin.report.words import listing
 
 
-def make_forecast(scene: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int = 0) -> Forecast:
+def make_forecast(
+    scene: str,
+    twin: Sequence[Cell],
+    real: Sequence[Cell],
+    seed: int = 0,
+    trained: Mapping[tuple[str, str], Estimate] | None = None,
+) -> Forecast:
     """Computes everything.
 
     Args:
@@ -38,6 +45,7 @@ def make_forecast(scene: str, twin: Sequence[Cell], real: Sequence[Cell], seed: 
         twin: Cells of the twin.
         real: Real cells, each with a cell of the twin to compare with; may be none.
         seed: Of the resampling.
+        trained: Rates in training by policy and task, where they are known.
     """
     tasks = tuple(dict.fromkeys(cell.task for cell in twin))
     candidates: list[Candidate] = []
@@ -52,7 +60,7 @@ def make_forecast(scene: str, twin: Sequence[Cell], real: Sequence[Cell], seed: 
             comparable += alike
             left_out += _left_out(task, here, twin)
         plans.append(_plan(task, [c for c in twin if c.task == task and c.lighting in lightings], here, seed))
-        candidates += mine
+        candidates += [replace(c, trained=(trained or {}).get((c.policy, task), c.trained)) for c in mine]
     if len(groups) > 1:
         groups.append(_group(ALL_TASKS, real, twin, comparable, seed))
     return Forecast(

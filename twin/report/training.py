@@ -1,17 +1,63 @@
-"""Success along a training, drawn from its `episodes.csv`."""
+"""Success along a training, from its `episodes.csv`: the curve, and what a policy did that was saved on the way."""
 
 import csv
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.report.statistics import wilson
+from twin.report.validation import share
+from twin.scene import SceneDir, digest_file, read_json
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+RECENT = 100
+"""Episodes before a policy was saved that its success in training is taken over, as `twin.train` does."""
+
 _BINS = 25
+
+
+def trainings(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """What is known of the training of validated policies: those that lie in `runs/` as they were validated.
+
+    Args:
+        root: The scene folder.
+        policies: Their names in the tables, `run` or `run/checkpoint`.
+
+    Returns:
+        JSON-able, by policy: run, step at which it was saved, task, observe and lighting of the training, and the rate
+        (`share`) over the `RECENT` episodes before that step.
+    """
+    noted = SceneDir(root).validation / "validated.json"
+    digests = read_json(noted)["policies"] if noted.exists() else {}
+    out = {}
+    for policy in policies:
+        run, _, checkpoint = policy.partition("/")
+        folder = root / "runs" / run
+        head = (folder / "checkpoints" / checkpoint if checkpoint else folder) / "policy.json"
+        if not (head.exists() and (folder / "episodes.csv").exists()) or digest_file(head) != digests.get(policy):
+            continue
+        trained = read_json(head).get("trained", {})
+        if "step" not in trained:
+            continue
+        steps, success = read_episodes(folder)
+        won = success[steps <= trained["step"]][-RECENT:]
+        told = {key: trained.get(key, "") for key in ("step", "task", "observe", "lighting")}
+        out[policy] = {"run": run, **told, **share(int(won.sum()), len(won))}
+    return out
+
+
+def read_episodes(folder: Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Of a run: the steps at which episodes ended, ascending, and success, 0 or 1; both of shape (n,)."""
+    with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
+        rows = [(int(row["step"]), int(row["success"])) for row in csv.DictReader(file)]
+    steps, success = np.array(rows, np.int64).reshape(-1, 2).T
+    return steps, success
 
 
 def binned(steps: np.ndarray, success: np.ndarray, bins: int = _BINS) -> list[tuple[float, int, int, float, float]]:
@@ -32,15 +78,14 @@ def binned(steps: np.ndarray, success: np.ndarray, bins: int = _BINS) -> list[tu
 
 def success_curve(folder: Path) -> Path:
     """Draws `success.png` of a run: the rate of success over steps, with intervals of 90 %."""
-    with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    steps, success = read_episodes(folder)
     path = folder / "success.png"
     figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-    if rows:
-        curve = binned(np.array([int(r["step"]) for r in rows]), np.array([int(r["success"]) for r in rows]))
+    if len(steps):
+        curve = binned(steps, success)
         step, won, count, low, high = (np.array(column, float) for column in zip(*curve, strict=True))
         axes.fill_between(step, low, high, color="#1f77b4", alpha=0.2, linewidth=0, label="90 % interval")
-        axes.plot(step, won / count, ".-", color="#1f77b4", label=f"{len(rows)} episodes, {int(count[0])} a point")
+        axes.plot(step, won / count, ".-", color="#1f77b4", label=f"{len(steps)} episodes, {int(count[0])} a point")
         axes.legend(loc="lower right", frameon=False)
     axes.set(xlabel="steps of all worlds", ylabel="success in training", ylim=(-0.02, 1.02), xlim=(0, None))
     axes.grid(alpha=0.3)

@@ -20,6 +20,7 @@ from twin.mjcf.world import World, point_at
 from twin.report.figures import corridor_outline
 from twin.report.statistics import wilson
 from twin.report.trials import CAUSES, Trial, tally
+from twin.report.validation_words import FAILURES, why
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -31,13 +32,17 @@ _BIN = 2.0  # [m] of the route, within which failures are counted together
 _COLORS = dict(zip(CAUSES[1:], ("#d62728", "#ff7f0e", "#7f7f7f", "#9467bd", "#8c564b"), strict=True))
 
 
-def rate(trials: Sequence[Trial]) -> dict[str, Any]:
+def share(won: int, trials: int) -> dict[str, Any]:
     """Successes, trials, rate and its interval, JSON-able; the rate is None without trials."""
-    won = sum(t.success for t in trials)
     if not trials:
         return {"successes": 0, "trials": 0, "rate": None, "low": 0.0, "high": 1.0}
-    low, high = wilson(won, len(trials))
-    return {"successes": won, "trials": len(trials), "rate": won / len(trials), "low": float(low), "high": float(high)}
+    low, high = wilson(won, trials)
+    return {"successes": won, "trials": trials, "rate": won / trials, "low": float(low), "high": float(high)}
+
+
+def rate(trials: Sequence[Trial]) -> dict[str, Any]:
+    """`share` of trials."""
+    return share(sum(t.success for t in trials), len(trials))
 
 
 def summary(trials: Sequence[Trial]) -> dict[str, Any]:
@@ -74,13 +79,26 @@ def pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     return out
 
 
+def typical_episode(trials: Sequence[Trial]) -> Trial:
+    """The episode whose way driven is the median; of an even number, the further one of the two in the middle."""
+    return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
+
+
+def worst_episode(trials: Sequence[Trial]) -> Trial:
+    """The failed episode that got least far; where none failed, the one whose pictures are trusted least."""
+    failed = [t for t in trials if not t.success]
+    if failed:
+        return min(failed, key=lambda t: t.progress)
+    return min(trials, key=lambda t: 1.0 if t.trust is None else t.trust)
+
+
 def lines(said: dict[str, Any]) -> list[str]:
     """The summary as a table for a terminal."""
     out = []
     wide = max((len(c["policy"]) for c in said["cells"]), default=0)
     light = max((len(c["lighting"]) for c in said["cells"]), default=0)
     for c in said["cells"]:
-        causes = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in c["causes"].items())
+        causes = why(c)
         out.append(
             f"{c['policy']:{wide}}  {c['task']}  {c['lighting']:{light}}  {c['successes']:3d}/{c['trials']:<3d} = "
             f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})" + (f"  {causes}" if causes else "")
@@ -96,6 +114,11 @@ def lines(said: dict[str, Any]) -> list[str]:
         out.append(
             f"{p['a']} against {p['b']}, {p['task']}, the same {p['episodes']} episodes: only the first succeeded in "
             f"{p['only_a']}, only the second in {p['only_b']} (p = {p['p']:.2g})"
+        )
+    for w in said.get("worst", []):
+        out.append(
+            f"{w['policy']}, {w['task']}: of {w['of']} lights drawn it fares worst in {w['lighting']}, in fresh "
+            f"episodes {w['successes']}/{w['trials']} ({w['low']:.2f} to {w['high']:.2f})"
         )
     return out
 
@@ -139,7 +162,7 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, stretch: tupl
             align="edge",
             edgecolor="white",
             color=_COLORS[cause],
-            label=f"{cause.replace('_', ' ')} ({len(ways)})",
+            label=f"{FAILURES[cause][0]} ({len(ways)})",
         )
         before = before + count
     lost = sum(len(ways) for ways in failed.values())

@@ -4,6 +4,8 @@ A *frame* is RGB uint8, shape (height, width, 3). Films are yuv420p in BT.709 (w
 sizes, and carry their index at the front so that playing starts before the whole file has arrived.
 """
 
+import io
+from collections import deque
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -12,6 +14,7 @@ from types import TracebackType
 import av
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 _BT709 = 1  # ITU-T H.273: matrix, primaries and transfer all number BT.709 as 1
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
@@ -98,6 +101,14 @@ def read_frames(path: Path, every: int = 1) -> Iterator[NDArray[np.uint8]]:
         for i, frame in enumerate(container.decode(video=0)):
             if i % every == 0:
                 yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+
+
+def last_frame(path: Path, width: int = 640, quality: int = 80) -> bytes:
+    """The last picture of a film as a JPEG of this width [px]."""
+    frame = Image.fromarray(deque(read_frames(path), maxlen=1)[0])
+    out = io.BytesIO()
+    frame.resize((width, round(width * frame.height / frame.width))).save(out, "JPEG", quality=quality)
+    return out.getvalue()
 
 
 def describe(path: Path) -> dict[str, str | int | float]:

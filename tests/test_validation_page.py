@@ -1,0 +1,289 @@
+"""The page of a validation says what its tables hold, and its films are the episodes of the table."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_forecast import Text
+from test_policy import some_weights
+from test_validate import SMALL
+from tiny_twin import tiny_twin
+
+from twin import film, progress, validate
+from twin.errors import InputError
+from twin.learn.policy import Control, save_policy
+from twin.report.training import RECENT, trainings
+from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
+from twin.report.validation import rate, share, summary, typical_episode, worst_episode
+from twin.report.validation_page import Curve, validation_page
+from twin.report.validation_words import FAILURES, chance_words, pair_words, percent, unknowns, verdicts, why
+from twin.report.video import describe
+from twin.scene import digest_file, write_json
+
+TRAINED = {"run": "ahead", "task": "ahead", "observe": "nerf", "lighting": "training", "step": 300}
+EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: step, success
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    root = tiny_twin(tmp_path_factory.mktemp("twin"))
+    for name, turn in (("ahead", 0.0), ("left", 0.8)):
+        weights = some_weights(SMALL)
+        weights["mean.weight"] *= 0.3
+        weights["mean.bias"][:] = np.arctanh(turn)
+        save_policy(root / "runs" / name, SMALL, Control(), weights, TRAINED if name == "ahead" else {})
+    write_episodes(root / "runs" / "ahead", EPISODES)
+    return root
+
+
+@pytest.fixture
+def fresh(scene):
+    """The scene without its validation."""
+    shutil.rmtree(scene / "validation", ignore_errors=True)
+    return scene
+
+
+def write_episodes(run: Path, rows) -> None:
+    with (run / "episodes.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([("step", "success"), *rows])
+
+
+def trial(
+    policy="a", seed=0, cause="goal", progress=4.0, trust: float | None = 1.0, task="ahead", light="day"
+) -> Trial:
+    return Trial(policy, task, light, seed, cause, progress, 40, trust)
+
+
+def told(trials, **more) -> dict:
+    """What `summary.json` would hold."""
+    return summary(trials) | {"training": {}, "worst": [], "films": []} | more
+
+
+def page(folder: Path, said: dict, *curves: Curve) -> Text:
+    """The page's text; the maps are any picture."""
+    from PIL import Image
+
+    for task in {c["task"] for c in said["cells"]}:
+        Image.new("RGB", (8, 8)).save(folder / f"failures_{task}.png")
+    return Text(validation_page("road", folder, said, curves))
+
+
+# ---- which episodes are typical and worst
+
+
+def test_the_typical_episode_is_the_median_of_the_way():
+    ways = [3.0, 0.5, 2.0, 4.0, 1.0]
+    assert typical_episode([trial(seed=k, progress=way) for k, way in enumerate(ways)]).progress == np.median(ways)
+    assert typical_episode([trial(seed=k, progress=way) for k, way in enumerate(ways[:4])]).progress == 3.0
+    assert typical_episode([trial(seed=k) for k in range(5)]).seed == 2
+
+
+def test_the_worst_episode_failed_first_and_else_is_trusted_least():
+    won = [trial(seed=k, progress=0.1, trust=trust) for k, trust in enumerate((0.9, 0.7, None))]
+    lost = [trial(seed=9, cause="stuck", progress=2.0, trust=1.0), trial(seed=8, cause="collision", progress=1.0)]
+    assert worst_episode([*won, *lost]).seed == 8
+    assert worst_episode(won).seed == 1
+
+
+# ---- training
+
+
+def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
+    run = tmp_path / "runs" / "r"
+    heads = {"r": run / "policy.json", "r/5": run / "checkpoints" / "5" / "policy.json"}
+    (run / "checkpoints" / "5").mkdir(parents=True)
+    for (name, head), step in zip(heads.items(), (3000, 1500), strict=True):
+        write_json(head, {"trained": {"run": name, "step": step, "task": "t", "observe": "nerf", "lighting": "sun"}})
+    rng = np.random.default_rng(0)
+    rows = [(10 * k, int(rng.random() < k / 400)) for k in range(1, 401)]
+    write_episodes(run, rows)
+    (tmp_path / "validation").mkdir()
+    noted = {"policies": {name: digest_file(head) for name, head in heads.items()}}
+    write_json(tmp_path / "validation" / "validated.json", noted)
+    found = trainings(tmp_path, ["r", "r/5", "my_module:act", "r/6"])
+    assert set(found) == {"r", "r/5"}
+    for name, step in (("r", 3000), ("r/5", 1500)):
+        won = [success for at, success in rows if at <= step][-RECENT:]
+        assert {k: found[name][k] for k in ("successes", "trials")} == {"successes": sum(won), "trials": 100}
+    assert found["r"]["low"] < found["r"]["rate"] < found["r"]["high"] and found["r/5"]["run"] == "r"
+    # The run was trained on, or is another one: its curve is not that of the policy that was validated.
+    write_json(heads["r"], {"trained": {"step": 4000}})
+    assert set(trainings(tmp_path, ["r", "r/5"])) == {"r/5"}
+    shutil.rmtree(tmp_path / "validation")
+    assert trainings(tmp_path, ["r", "r/5"]) == {}
+
+
+# ---- words
+
+
+def test_every_cause_has_words():
+    from twin.env.options import CAUSES
+
+    assert set(FAILURES) == set(CAUSES) - {"goal"}
+    cell = {"causes": {"collision": 2, "out_of_bounds": 9}}
+    assert why(cell) == "9 left the corridor, 2 hit something" and why({"causes": {}}) == ""
+
+
+def test_the_headline_compares_what_all_have_driven():
+    """`b` is better where both were; that `a` also drove in easy light does not help it."""
+    trials = [trial("a", k, "goal" if k < 4 else "stuck") for k in range(10)]
+    trials += [trial("a", k, light="easy") for k in range(90)]
+    trials += [trial("b", k, "goal" if k < 7 else "stuck") for k in range(10)]
+    (verdict,) = verdicts(told(trials))
+    assert (
+        "b reaches the goal most often: in 7 of 10 episodes in the light that all have driven in (day)" in verdict.text
+        and verdict.mood == "mixed"
+    )
+    apart = [trial("a", 0, light="day"), trial("b", 0, light="night")]
+    assert "there is no best one" in verdicts(told(apart))[0].text
+    alike = [trial("a", 0), trial("b", 0)]
+    assert "most often" not in verdicts(told(alike))[0].text and "so does b" in verdicts(told(alike))[0].text
+
+
+def test_a_weak_light_and_untrusted_pictures_are_headlines():
+    trials = [*(trial("a", k) for k in range(3)), trial("a", 0, "stuck", light="night", trust=0.2)]
+    first, second = verdicts(told(trials))
+    assert "least often in the light night, 0 of 1" in first.text
+    assert "1 of 4 episodes" in second.text
+
+
+def test_differences_are_named_by_chance():
+    pair = {"a": "x", "b": "y", "only_a": 9, "only_b": 1, "p": 0.02}
+    assert pair_words(pair) == "x is better"
+    assert pair_words(pair | {"only_a": 1, "only_b": 9}) == "y is better"
+    assert pair_words(pair | {"p": 0.3}) == "within chance" and pair_words(pair | {"only_b": 9}) == "no difference"
+    assert [chance_words(p) for p in (1e-5, 0.0213, 0.62, 1.0)] == ["<0.1%", "2.1%", "62%", "100%"]
+
+
+def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
+    assert percent(share(3, 4)).startswith("75% (") and percent(rate([])) == "–"
+    text = page(tmp_path, told([trial("my_module:act")])).text
+    assert "not known" in text and "nan" not in text and "None" not in text
+    assert "There is no such episode here" in text and "Nothing was filmed" in text
+    for absent in ("Which policy is better", "The worst light that", "How they were trained"):
+        assert (absent in text) == (absent == "The worst light that")
+
+
+def test_the_page_says_the_tables_numbers(tmp_path):
+    trials = [trial("a", k, "goal" if k < 31 else "collision", trust=0.9 if k % 2 else 0.5) for k in range(40)]
+    trials += [trial("b", k, "goal" if k < 12 else "timeout", light=light) for k in range(40) for light in ("day", "n")]
+    trials += [trial("a", 7, "stuck", task="bend", light="any")]
+    trained = {"a": TRAINED | {"run": "a"} | share(96, 100)}
+    worst = [summary([trial("a", k, "rollover", light="drawn_3") for k in range(5)])["cells"][0] | {"of": 16}]
+    curve = Curve("a", np.arange(10, 400, 10), np.arange(39) % 2)
+    said = told(trials, training=trained, worst=worst)
+    text = page(tmp_path, said, curve).text
+    for cell in [*said["cells"], *worst]:
+        assert percent(cell) in text and why(cell) in text
+    assert percent(trained["a"]) in text and "after 300 steps" in text and "in varying light" in text
+    assert "19" in text and "only first arrived" in text and "a is better" in text  # 31 - 12 episodes
+    assert percent(said["cells"][0]["low_trust"]) in text
+    assert "drawn_3" in text and "5 rolled over" in text
+    assert all(v.text in text for v in verdicts(said)) and all(c.what in text for c in unknowns(said))
+
+
+def test_names_from_files_are_text(tmp_path):
+    evil = "<script>alert(1)</script>&$x$"
+    shown = page(tmp_path, told([trial(evil, light=evil), trial("b", light=evil, cause="stuck")]))
+    assert "script" not in shown.tags and evil in shown.text
+
+
+# ---- the verb
+
+
+def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
+    said = validate.validate(fresh, ["ahead", "left"], "ahead", ["day", "night"], 3)
+    folder = fresh / "validation"
+    html = (folder / "validation.html").read_text(encoding="utf-8")
+    shown = Text(html)
+    assert "http" not in html
+    links = {link for link in shown.links if not link.startswith(("#", "data:"))}
+    assert links == {"summary.json", "cells.csv", "episodes.csv"} and all((folder / link).exists() for link in links)
+    assert json.loads((folder / "summary.json").read_text()) == said
+    assert list(said["training"]) == ["ahead"]  # the other's run has no episodes
+    won = [success for step, success in EPISODES if step <= TRAINED["step"]]
+    assert percent(share(sum(won), len(won))) in shown.text and "How they were trained" in shown.text
+
+
+class NoCamera:
+    """In place of the camera behind the robot, whose kernels take long to compile."""
+
+    def __init__(self, world, size, obstacles):
+        self.size = size
+
+    def render(self, qpos, pose, time):
+        return np.full((self.size[1], self.size[0], 3), 90, np.uint8)
+
+
+@pytest.fixture
+def episodes(monkeypatch):
+    """Every episode that is filmed."""
+    seen = []
+
+    def spy(*args, **options):
+        path, episode = whole(*args, **options)
+        seen.append(episode)
+        return path, episode
+
+    whole = film.film
+    monkeypatch.setattr(film, "film", spy)
+    monkeypatch.setattr("twin.report.episode_film.SceneCamera", NoCamera)
+    return seen
+
+
+def test_films_are_the_tables_episodes(fresh, episodes):
+    said = validate.validate(fresh, ["ahead", "left"], "ahead", ["night", "held-out"], 3, films=True)
+    folder = fresh / "validation"
+    rows = {(t.policy, t.lighting, t.seed): t for t in read_trials(folder / "episodes.csv")}
+    assert {(f["policy"], which) for f in said["films"] for which in f["which"]} == {
+        *(("ahead", "typical"), ("ahead", "worst"), ("left", "typical"), ("left", "worst"))
+    }
+    assert len(episodes) == len(said["films"])
+    for one, episode in zip(said["films"], episodes, strict=True):
+        row = rows[one["policy"], one["lighting"], one["seed"]]
+        assert (episode.cause, len(episode.times) - 1) == (row.cause, row.steps)
+        assert episode.progress[-1] == pytest.approx(row.progress, abs=1e-3)
+        assert episode.trust[:-1].mean() == pytest.approx(row.trust, abs=1e-4)
+        assert (one["cause"], one["progress_m"], one["of"]) == (row.cause, row.progress, 6)
+        assert describe(folder / one["file"])["frames"] > row.steps // 2
+    shown = Text((folder / "validation.html").read_text(encoding="utf-8"))
+    assert {f["file"] for f in said["films"]} <= set(shown.links) and "To film any row" in shown.text
+    # What is filmed stays, is not filmed again, and is still on the page of a call that films nothing.
+    before = len(episodes)
+    assert validate.validate(fresh, ["ahead", "left"], "ahead", ["night", "held-out"], 3, films=True) == said
+    assert validate.validate(fresh, ["left"], "ahead", ["night"], 2)["films"] == said["films"]
+    assert len(episodes) == before
+
+
+def test_a_film_that_ends_otherwise_than_the_table_is_refused(fresh, episodes):
+    validate.validate(fresh, ["left"], "ahead", ["day"], 1)
+    table = fresh / "validation" / "episodes.csv"
+    (row,) = read_trials(table)
+    table.write_text(csv_text(EPISODE_COLUMNS, [replace(row, steps=row.steps + 1).row()]))
+    with pytest.raises(InputError, match="driven again to be filmed"):
+        validate.validate(fresh, ["left"], "ahead", ["day"], 1, films=True)
+    assert not list((fresh / "validation").rglob("*.mp4")) and (fresh / "validation" / "validation.html").exists()
+
+
+def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes, tmp_path, monkeypatch, capsys):
+    """A run, its folder and its ONNX file drive alike; a callable drives, too; what is no policy is one line."""
+    (tmp_path / "my_film_policy.py").write_text("def act(pixels):\n    return [0.0, 0.5]\n")
+    monkeypatch.chdir(tmp_path)
+    run = fresh / "runs" / "ahead"
+    shutil.copytree(run, run / "checkpoints" / "000000100", ignore=lambda *_: ["checkpoints"])
+    common = [str(fresh), "--task", "ahead", "--lighting", "day", "--seed", "5", "--out", str(tmp_path / "a.mp4")]
+    for source in ("ahead", str(run), str(run / "policy.onnx"), "ahead/000000100", "my_film_policy:act"):
+        assert film.main([*common, "--policy", source, "--quiet"]) == 0
+    one, *others, callable_ = episodes
+    assert one.actions.shape[1] == 1  # it steers, which is not the environment's default
+    for other in others:
+        np.testing.assert_array_equal(other.qpos, one.qpos)
+    np.testing.assert_array_equal(callable_.actions[0], [0.5, 0.5])
+    capsys.readouterr()
+    assert film.main([*common, "--policy", "nobody", "--quiet"]) == 2
+    assert capsys.readouterr().err.startswith("error: no policy nobody")

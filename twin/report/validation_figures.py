@@ -1,0 +1,58 @@
+"""The validation's figures: success per policy and light, and success along the trainings."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from twin.report.figures import INK, SERIES, new_figure, style
+from twin.report.forecast_figures import LIMITS, TICKS, legend_below, short
+from twin.report.training import binned
+
+_ROW = 0.17  # [in] per point
+_APART = 0.18  # between two lightings of a policy, of the distance of two policies; less where there are many
+
+
+def rates(cells: Sequence[dict[str, Any]]) -> Figure:
+    """One row per policy, one colour per lighting: success in the cells of a task with its interval."""
+    policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
+    height = 0.9 + max(0.34, _ROW * len(lightings)) * len(policies)
+    figure, axes = new_figure(height)
+    apart = min(_APART, 0.8 / len(lightings))
+    with style():
+        for k, lighting in enumerate(lightings):
+            mine = [c for c in cells if c["lighting"] == lighting]
+            y = np.array([policies.index(c["policy"]) for c in mine]) + (k - (len(lightings) - 1) / 2) * apart
+            x, low, high = (np.array([c[key] for c in mine], float) for key in ("rate", "low", "high"))
+            ends = np.maximum([x - low, high - x], 0.0)
+            colour, marker = SERIES[k % len(SERIES)], "osD^v"[k // len(SERIES) % 5]
+            axes.errorbar(x, y, xerr=ends, fmt=marker, color=colour, ms=3.5, lw=1.1, label=lighting)
+        axes.set_yticks(range(len(policies)), [short(name) for name in policies])
+        axes.grid(False, axis="y")
+        label = "success rate" if len(lightings) > 1 else f"success rate in the light {lightings[0]}"
+        axes.set(xlim=LIMITS, ylim=(len(policies) - 0.5, -0.5), xlabel=label, xticks=TICKS)
+    if len(lightings) > 1:
+        legend_below(axes, min(4, len(lightings)), height)
+    return figure
+
+
+def along_training(steps: NDArray[np.int64], success: NDArray[np.int64], saved: Sequence[int]) -> Figure:
+    """Success over the steps of a training with its interval; where policies were saved that are validated.
+
+    Args:
+        steps: At which episodes ended, ascending, shape (n,), n > 0.
+        success: 0 or 1, shape (n,).
+        saved: Steps at which the validated policies were saved.
+    """
+    figure, axes = new_figure(2.2)
+    step, won, count, low, high = (np.array(column, float) for column in zip(*binned(steps, success), strict=True))
+    with style():
+        axes.fill_between(step, low, high, color=SERIES[0], alpha=0.2, linewidth=0)
+        axes.plot(step, won / count, ".-", color=SERIES[0])
+        for one in saved:
+            axes.axvline(one, color=INK, lw=0.9, ls="--")
+        axes.set(xlabel="training step", ylabel="success in training", ylim=LIMITS, yticks=TICKS)
+        axes.set_xlim(left=0)
+    return figure

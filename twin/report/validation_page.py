@@ -1,0 +1,312 @@
+"""`validation.html`: one file that tells a newcomer how often policies arrive, in which light, and why not otherwise.
+
+It is drawn from what `summary.json` holds (*said*, see `validation.summary` and `twin.validate`), from the maps beside
+it, and from the curves of the trainings. Films lie beside the page; their pictures are in it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.report import validation_figures as draw
+from twin.report.figures import svg
+from twin.report.markup import STYLE, Html, data_url, element, join, picture, table
+from twin.report.validation_words import (
+    FAILURES,
+    LUCK,
+    chance_words,
+    light_words,
+    pair_words,
+    percent,
+    tasks,
+    trained_words,
+    unknowns,
+    verdicts,
+    why,
+)
+from twin.report.words import Caution, listing
+from twin.scene import SceneDir
+
+_STYLE = ".whole, td code { white-space:nowrap }\nimg { background:#fff }\n"
+
+Section = tuple[str, str, Html]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The training of a run."""
+
+    run: str
+    steps: NDArray[np.int64]
+    """At which episodes ended, ascending, shape (n,)."""
+    success: NDArray[np.int64]
+    """0 or 1, shape (n,)."""
+
+
+def write_validation_page(scene: SceneDir, said: dict[str, Any], curves: Sequence[Curve]) -> None:
+    """Writes `validation/validation.html`; half a page is never seen."""
+    path = scene.validation / "validation.html"
+    aside = path.with_name(path.name + ".partial")
+    aside.write_text(validation_page(scene.root.resolve().name, path.parent, said, curves), encoding="utf-8")
+    aside.replace(path)
+
+
+def validation_page(scene: str, folder: Path, said: dict[str, Any], curves: Sequence[Curve]) -> str:
+    """The whole page.
+
+    Args:
+        scene: Its name.
+        folder: Where maps and films are.
+        said: See the module.
+        curves: Trainings that validated policies come from.
+    """
+    sections: list[Section] = [
+        ("arrive", "How often does each policy arrive?", _cells(said)),
+        *_better(said),
+        *_worst(said),
+        ("trust", "What if the pictures are wrong?", _trust(said)),
+        ("where", "Where do they fail?", _maps(folder, said)),
+        ("films", "Watch them", _films(said, folder)),
+        *_curves(said, curves),
+        ("unknown", "What this cannot know", join(*map(_caution, unknowns(said)))),
+    ]
+    files = [element("a", name, href=name) for name in ("summary.json", "cells.csv", "episodes.csv")]
+    body = element(
+        "main",
+        _header(scene, said),
+        element("nav", *(element("a", title, href=f"#{name}") for name, title, _ in sections)),
+        *(element("section", element("h2", title), content, id=name) for name, title, content in sections),
+        element("footer", "Every number is in ", files[0], ", ", files[1], " and ", files[2], " beside this page."),
+    )
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("title", f"{scene}: validation"),
+        element("style", Html(STYLE + _STYLE)),
+    )
+    return "<!DOCTYPE html>\n" + element("html", head, element("body", body), lang="en") + "\n"
+
+
+def _header(scene: str, said: dict[str, Any]) -> Html:
+    policies = len({c["policy"] for c in said["cells"]})
+    lights = len({c["lighting"] for c in said["cells"]})
+    episodes = sum(c["trials"] for c in said["cells"])
+    told = f"{_count(policies, 'policy', 'policies')}, {_count(lights, 'lighting')}: {episodes} episodes in the twin."
+    return element(
+        "header",
+        element("h1", f"{scene}: validation"),
+        element("p", told, class_="kicker"),
+        element("ul", *(element("li", v.text, class_=v.mood) for v in verdicts(said)), class_="verdicts"),
+        class_="top",
+    )
+
+
+def _cells(said: dict[str, Any]) -> Html:
+    trained = said["training"]
+    parts: list[Html] = [
+        _lead(
+            "An episode is one drive, from a start drawn at random to the goal or to a failure. All policies drive the "
+            f"same episodes. Brackets are {said['confidence']:.0%} intervals: how far chance alone may have moved the "
+            "rate. “In training” is success over the last 100 episodes before the policy was saved, in which it also "
+            "tried things out, so that it may do better here; one that does much worse has learnt its training by "
+            "heart."
+        )
+    ]
+    for task in tasks(said):
+        mine = [c for c in said["cells"] if c["task"] == task]
+        rows: list[list[str]] = []
+        for policy in dict.fromkeys(c["policy"] for c in mine):
+            name: list[str] = [element("code", policy), _training(trained.get(policy))]
+            for c in (c for c in mine if c["policy"] == policy):
+                light = element("span", c["lighting"], class_="whole")
+                rows.append([*name, light, _rate(c), str(c["trials"]), why(c)])
+                name = ["", ""]
+        heads = ["policy", "in training", "light", "arrived", "episodes", "the others"]
+        chart = _chart("Share of episodes that reached the goal", svg(draw.rates(mine)))
+        parts += [element("h3", task), element("div", chart, class_="charts"), table(heads, rows, (4,))]
+    causes = dict.fromkeys(cause for c in said["cells"] for cause in c["causes"])
+    meanings = [(FAILURES[cause][0], FAILURES[cause][1]) for cause in causes]
+    lights = [(name, light_words(name)) for name in dict.fromkeys(c["lighting"] for c in said["cells"])]
+    words = [element("li", element("b", name), f": {meaning}") for name, meaning in (*lights, *meanings)]
+    parts.append(element("details", element("summary", "What the words mean"), element("ul", *words)))
+    return join(*parts)
+
+
+def _training(trained: dict[str, Any] | None) -> Html:
+    if trained is None or not trained["trials"]:
+        return element("span", "not known", class_="meaning")
+    words = f" {trained_words(trained)}, after {trained['step']} steps"
+    return join(_rate(trained), element("span", words, class_="meaning"))
+
+
+def _better(said: dict[str, Any]) -> list[Section]:
+    if not said["pairs"]:
+        return []
+    rows = [
+        [
+            element("code", p["a"]),
+            element("code", p["b"]),
+            p["task"],
+            str(p["episodes"]),
+            str(p["only_a"]),
+            str(p["only_b"]),
+            chance_words(p["p"]),
+            element("span", pair_words(p), class_="whole"),
+        ]
+        for p in said["pairs"]
+    ]
+    heads = ["first", "second", "task", "episodes", "only first arrived", "only second", "by luck", "verdict"]
+    lead = (
+        "Two policies are compared on the episodes that both drove, where start, robot and light were the same. Only "
+        "those tell them apart in which one arrived and the other did not. “By luck” is how often two equally good "
+        f"policies would differ as much; above {LUCK:.0%} the difference is called chance. "
+    )
+    if len(rows) > 1:
+        lead += (
+            f"Were all of them equally good, luck would still call {LUCK * len(rows):.1f} of these {len(rows)} "
+            "comparisons a difference."
+        )
+    return [("better", "Which policy is better?", join(_lead(lead), table(heads, rows, (3, 4, 5, 6))))]
+
+
+def _worst(said: dict[str, Any]) -> list[Section]:
+    if not said["worst"]:
+        return []
+    rows = [
+        [
+            element("code", w["policy"]),
+            w["task"],
+            w["lighting"],
+            str(w["of"]),
+            _rate(w),
+            str(w["trials"]),
+            why(w),
+        ]
+        for w in said["worst"]
+    ]
+    heads = ["policy", "task", "its worst light", "lights searched", "arrived in it", "episodes", "the others"]
+    lead = (
+        "Lights that could have been filmed were drawn, and each policy was driven in all of them, longer in those it "
+        "fared worst in. The worst one was then driven in anew, in other episodes: those are counted here, so that bad "
+        "luck is not taken for a bad light. The same number is the same light for every policy."
+    )
+    return [("worst", "The worst light", join(_lead(lead), table(heads, rows, (3, 5))))]
+
+
+def _trust(said: dict[str, Any]) -> Html:
+    lead = _lead(
+        "Trust says from 0 to 1 how far a picture can be believed: 1 is near to what was filmed. Episodes whose "
+        f"pictures have less than {said['trusted_from']} on average are counted apart: a failure there may be the "
+        "twin’s and not the policy’s."
+    )
+    split = [c for c in said["cells"] if c["low_trust"]["trials"]]
+    if not split:
+        return join(lead, element("p", "There is no such episode here.", class_="na"))
+    rows: list[list[str]] = [
+        [
+            element("code", c["policy"]),
+            c["task"],
+            c["lighting"],
+            _rate(c["trusted"]),
+            str(c["trusted"]["trials"]),
+            _rate(c["low_trust"]),
+            str(c["low_trust"]["trials"]),
+        ]
+        for c in split
+    ]
+    heads = ["policy", "task", "light", "arrived where trusted", "episodes", "arrived elsewhere", "episodes"]
+    return join(lead, table(heads, rows, (4, 6)))
+
+
+def _maps(folder: Path, said: dict[str, Any]) -> Html:
+    lead = _lead(
+        "Where the failed episodes of all policies ended, on the map and along the way. Failures in one place are the "
+        "place’s doing: a bend, a narrow gap, or a fault of the twin; failures everywhere are the policy’s."
+    )
+    drawn = [picture(folder / f"failures_{task}.png", f"{task}, all policies and lights") for task in tasks(said)]
+    return join(lead, element("div", *drawn, class_="pictures"))
+
+
+def _films(said: dict[str, Any], folder: Path) -> Html:
+    other = element(
+        "p",
+        "To film any row of episodes.csv: ",
+        element("code", "python -m twin.film SCENE --policy NAME --task TASK --lighting LIGHT --seed SEED"),
+        class_="meaning",
+    )
+    if not said["films"]:
+        none = "Nothing was filmed: the command that made this page does so with --films, a minute for each film."
+        return join(element("p", none, class_="na"), other)
+    shown = []
+    for film in said["films"]:
+        ended = "reached the goal" if film["cause"] == "goal" else FAILURES[film["cause"]][0]
+        kinds = " and ".join(film["which"])
+        caption = join(
+            element("b", f"{film['policy']}, {kinds}"),
+            f": {film['task']}, light {film['lighting']}, seed {film['seed']}; {ended} after "
+            f"{film['progress_m']:.1f} m. ",
+            element("a", "file", href=_link(film["file"])),
+        )
+        video = element(
+            "video",
+            src=_link(film["file"]),
+            poster=data_url(folder / film["poster"]),
+            controls=True,
+            preload="none",
+            playsinline=True,
+        )
+        shown.append(element("figure", video, element("figcaption", caption)))
+    of = listing(dict.fromkeys(str(film["of"]) for film in said["films"]))
+    lead = (
+        "The typical episode of a policy is the one whose way driven is the median. Its worst is the failed one that "
+        "got least far; where none failed, the one whose pictures are trusted least. They were chosen from the "
+        f"{of} episodes driven by the command that filmed them, and are those of the table, driven again with the "
+        "same seed. The films lie beside this page."
+    )
+    return join(_lead(lead), element("div", *shown, class_="pictures"), other)
+
+
+def _curves(said: dict[str, Any], curves: Sequence[Curve]) -> list[Section]:
+    told = [curve for curve in curves if len(curve.steps)]
+    if not told:
+        return []
+    charts = []
+    for curve in told:
+        saved = [t["step"] for t in said["training"].values() if t["run"] == curve.run]
+        charts.append(_chart(curve.run, svg(draw.along_training(curve.steps, curve.success, sorted(saved)))))
+    lead = (
+        "Success over the steps of training, in the episodes that the policy learnt from, with 90% intervals. Dashed "
+        "lines are where the policies were saved that are validated here."
+    )
+    return [("training", "How they were trained", join(_lead(lead), element("div", *charts, class_="charts")))]
+
+
+def _lead(text: str) -> Html:
+    return element("p", text, class_="done")
+
+
+def _rate(rate: dict[str, Any]) -> Html:
+    """A rate whose interval does not break across lines."""
+    return element("span", percent(rate), class_="whole")
+
+
+def _count(n: int, one: str, many: str = "") -> str:
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def _link(path: str) -> str:
+    return quote(path)
+
+
+def _chart(title: str, drawing: str) -> Html:
+    return element("div", element("h3", title), Html(drawing))
+
+
+def _caution(caution: Caution) -> Html:
+    return element("div", element("b", caution.what), f"What helps: {caution.cure}.", class_="caution", role="note")
