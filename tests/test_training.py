@@ -270,3 +270,11 @@ def test_a_run_that_is_asked_to_stop_saves_and_goes_on(scene, tmp_path):
     seen = []
     run(twin.load_scene(scene), tmp_path, SHORT, lambda now: seen.append(now.steps))
     assert seen[0] == 124 and seen[-1] == SHORT.steps
+
+
+def test_arriving_is_worth_what_surviving_for_ever_would_be():
+    config = TrainConfig()
+    rewards = config.options()["rewards"]
+    for_ever = sum(rewards.step * config.gamma**k for k in range(2000))
+    assert rewards.step + rewards.goal == pytest.approx(for_ever)
+    assert (rewards.collision, rewards.out_of_bounds) == (-4.0, -5.0)

@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
 
             def watch(now: training.Progress) -> None:
                 if not bar.n:  # what was trained before was not trained in this time
-                    bar.initial = bar.n = now.steps
+                    bar.initial = bar.n = bar.last_print_n = now.steps
                 bar.update(now.steps - bar.n)
                 if now.recent:
                     low, high = wilson(sum(now.recent), len(now.recent))

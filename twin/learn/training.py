@@ -32,7 +32,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin.env.lightings import ANY, TRAINING
-from twin.env.options import NERF, STEERING
+from twin.env.options import NERF, STEERING, Rewards
 from twin.errors import InputError
 from twin.learn.architecture import Architecture, shrink
 from twin.learn.policy import Control, save_policy
@@ -115,8 +115,11 @@ class TrainConfig:
 
     def options(self) -> dict[str, Any]:
         """Of the environment."""
+        # Worth what surviving for ever would be. With nothing to be had behind it, a policy that is paid by the step
+        # learns to linger before the goal, and rather leaves the road there than to arrive.
+        goal = Rewards(goal=Rewards.step * self.gamma / (1.0 - self.gamma))
         lit = {"lighting": self.lighting, "observe": self.observe, "randomise": self.randomise}
-        return {**dataclasses.asdict(self.control), **lit}
+        return {**dataclasses.asdict(self.control), **lit, "rewards": goal}
 
 
 PRESETS: dict[str, dict[str, Any]] = {
