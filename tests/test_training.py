@@ -25,7 +25,7 @@ from tiny_twin import tiny_twin
 import twin
 from twin import progress, train
 from twin.errors import InputError
-from twin.learn.architecture import Architecture, shrink
+from twin.learn.architecture import Architecture, levelled, prepared
 from twin.learn.policy import load_policy, save_policy
 from twin.learn.replay import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
@@ -56,7 +56,8 @@ class SpotEnv(gymnasium.Env):
         self.where = int(self.np_random.integers(15))
         picture = np.zeros((6, 9, 16), np.uint8)
         picture[:, :, self.where : self.where + 2] = 255
-        return picture
+        self.raw = picture
+        return levelled(picture)
 
 
 def spot_model(folder: Path | None = None, seed: int = 0) -> PixelSAC:
@@ -98,8 +99,8 @@ def test_it_learns_to_point_and_its_file_does_the_same(tmp_path):
     errors, untrained = [], []
     for _ in range(50):
         small = env._look()
-        large = small.repeat(2, 1).repeat(2, 2)
-        np.testing.assert_array_equal(shrink(large, 2), small)
+        large = env.raw.repeat(2, 1).repeat(2, 2)
+        np.testing.assert_array_equal(prepared(large, 2), small)
         action = policy(large)
         np.testing.assert_allclose(action, model.predict(small, deterministic=True)[0], atol=1e-5)
         errors.append(abs(action[0] - (env.where / 7.0 - 1.0)))

@@ -1,7 +1,10 @@
 """The network that a policy is: from a stack of pictures to an action, and the same as an ONNX graph.
 
 A *stack* is uint8, (3 · stack, height, width), the newest three channels last. It is shrunk by averaging squares of
-`pool` pixels and rounding, so that what a policy was trained on (small frames, as bytes) is what it acts on, exactly.
+`pool` pixels and rounding, and *levelled*: every colour of every picture is given the same mean and spread in the lower
+half, where the ground is. So the road looks much the same by day and by night, in haze and under a red sky, whatever
+the camera's exposure and white balance. Both end in bytes: what a policy was trained on is what it acts on.
+
 Convolutions with ReLU follow, then a linear layer with layer normalisation and tanh (Kostrikov et al. 2020, DrQ, whose
 encoder this is but for its size), hidden layers with ReLU, and a tanh: an action, each of its numbers in [-1, 1].
 """
@@ -15,6 +18,10 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 NORM_EPSILON = 1e-5
+LEVEL, SPREAD = 128.0, 48.0
+"""Mean and standard deviation of a levelled colour in the lower half of a picture."""
+NOISE = 4.0
+"""Added to the spread that a colour has, so that a camera's noise is not blown up where there is nothing else."""
 _OPSET, _IR = 17, 8  # old enough for the ONNX Runtime of a robot's computer
 
 
@@ -95,6 +102,19 @@ def shrink(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
     return ((total + pool * pool // 2) // (pool * pool)).astype(np.uint8)
 
 
+def levelled(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Every channel with `LEVEL` and about `SPREAD` in the lower half of its rows; shape (..., height, width)."""
+    ground = pictures[..., pictures.shape[-2] // 2 :, :].astype(np.float32)
+    mean, spread = ground.mean((-2, -1), keepdims=True), ground.std((-2, -1), keepdims=True)
+    scaled = (pictures.astype(np.float32) - mean) * (np.float32(SPREAD) / (spread + np.float32(NOISE)))
+    return (scaled + np.float32(LEVEL + 0.5)).clip(0.0, 255.0).astype(np.uint8)
+
+
+def prepared(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
+    """What the convolutions are given: shrunk and levelled; shapes (..., h, w) → (..., h/pool, w/pool)."""
+    return levelled(shrink(pictures, pool))
+
+
 def onnx_bytes(architecture: Architecture, weights: dict[str, Floats], notes: dict[str, str]) -> bytes:
     """The network as an ONNX file: `pixels` uint8 (n, 3 · stack, height, width) → `action` float32 (n, actions).
 
@@ -107,7 +127,8 @@ def onnx_bytes(architecture: Architecture, weights: dict[str, Floats], notes: di
 
     a = architecture
     nodes: list[Any] = []
-    constants = {"half": 0.5, "scale": 1.0 / 255.0}
+    constants = {"half": 0.5, "scale": 1.0 / 255.0, "noise": NOISE, "spread": SPREAD, "level": LEVEL + 0.5}
+    constants |= {"least": 0.0, "most": 255.0}
     tensors = [numpy_helper.from_array(np.array(value, np.float32), name) for name, value in constants.items()]
     tensors += [numpy_helper.from_array(np.ascontiguousarray(weights[name]), name) for name in a.shapes()]
     last = "pixels"
@@ -122,6 +143,25 @@ def onnx_bytes(architecture: Architecture, weights: dict[str, Floats], notes: di
         add("AveragePool", kernel_shape=[a.pool, a.pool], strides=[a.pool, a.pool])
         add("Add", "half")
         add("Floor")
+    small = last
+    rows = {"from": [a.small[1] // 2], "to": [a.small[1]], "axis": [2]}
+    tensors += [numpy_helper.from_array(np.array(value, np.int64), name) for name, value in rows.items()]
+    add("Slice", *rows)
+    ground = last
+    add("ReduceMean", axes=[2, 3])
+    mean, last = last, ground
+    add("Sub", mean)
+    add("Mul", last)
+    add("ReduceMean", axes=[2, 3])
+    add("Sqrt")
+    add("Add", "noise")
+    spread, last = last, small
+    add("Sub", mean)
+    add("Mul", "spread")
+    add("Div", spread)
+    add("Add", "level")
+    add("Clip", "least", "most")
+    add("Floor")
     add("Mul", "scale")
     add("Sub", "half")
     for i, (_, kernel, stride) in enumerate(a.convolutions):

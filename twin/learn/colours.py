@@ -1,11 +1,12 @@
-"""Light and camera as no field knows them: random tone curves, tints, haze and shades laid over pictures in updates.
+"""Light as no field knows it: random tones, tints and shades laid over pictures in updates.
 
-A field's lightings are those that the place was filmed in and what lies between them. Other weather has another sky,
-other shadows and another tint, and cameras expose as they see fit. What a policy must not depend on is varied at random
-here, for every sample anew and alike for all pictures of a stack, so that motion stays what it is:
+A field's lightings are those that the place was filmed in and what lies between them. Other weather has another sky and
+other shadows, and things take another colour in it. Brightness, contrast and tint of the ground as a whole are levelled
+before a policy sees them (`architecture.levelled`); what is left is varied at random here, for every sample anew and
+alike for all pictures of a stack, so that motion stays what it is:
 
-    tone     v → gain · v^gamma, each colour with a gain of its own; contrast about a random level
-    haze     a share of one random grey, tinted
+    tone     v → v^gamma, and its contrast about the middle
+    tint     a gain for each colour
     shade    a smooth pattern of light and dark over the picture
 
 All is drawn around no change at all, and scaled by one *strength*; 1 is what the constants below say.
@@ -15,9 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_GAIN, _TINT, _GAMMA, _CONTRAST = 0.25, 0.08, 0.25, 0.2  # standard deviations, of logarithms
-_HAZE = 0.5  # share at most; half of the samples have none
-_SHADE = 0.25  # standard deviation of the logarithm at the knots
+_GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations, of logarithms
+_SHADE = 0.25  # the same, at the knots
 _KNOTS = (3, 5)  # of the pattern, down and across
 _LEVELS = np.arange(256) / 255.0
 
@@ -45,12 +45,8 @@ def recoloured(stacks: NDArray[np.uint8], strength: float, rng: np.random.Genera
 def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """A tone curve per sample and colour, shape (count, 3, 256)."""
 
-    def spread(deviation: float, *shape: int) -> NDArray[np.float64]:
-        return np.exp(strength * deviation * rng.normal(size=(count, *shape, 1)))
+    def spread(deviation: float, colours: int) -> NDArray[np.float64]:
+        return np.exp(strength * deviation * rng.normal(size=(count, colours, 1)))
 
-    curve = _LEVELS ** spread(_GAMMA, 1) * spread(_GAIN, 1) * spread(_TINT, 3)
-    level = rng.uniform(0.2, 0.8, (count, 1, 1))
-    curve = level + (curve - level) * spread(_CONTRAST, 1)
-    share = min(1.0, strength * _HAZE) * rng.uniform(-1.0, 1.0, (count, 1, 1)).clip(0.0)
-    haze = rng.uniform(0.1, 0.9, (count, 1, 1)) * spread(_TINT, 3)
-    return (255.0 * ((1.0 - share) * curve + share * haze)).clip(0.0, 255.0).round().astype(np.uint8)
+    toned = 0.5 + (_LEVELS ** spread(_GAMMA, 1) - 0.5) * spread(_CONTRAST, 1)
+    return (255.0 * toned * spread(_TINT, 3)).clip(0.0, 255.0).round().astype(np.uint8)

@@ -38,7 +38,7 @@ Act = Callable[[Pictures], Floats]
 """Stacks (n, 3 · stack, height, width) → actions (n, actions)."""
 
 JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
-FORMAT, VERSION = "twin policy", 1
+FORMAT, VERSION = "twin policy", 2
 
 _LARGEST = 256 << 20  # [bytes] of a file that is read
 _NOTE = "twin"  # key of our metadata in an ONNX file

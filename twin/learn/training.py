@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import psutil
-import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
@@ -34,7 +33,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from twin.env.lightings import ANY, TRAINING
 from twin.env.options import NERF, STEERING, Rewards
 from twin.errors import InputError
-from twin.learn.architecture import Architecture, shrink
+from twin.learn.architecture import Architecture, prepared
 from twin.learn.policy import Control, save_policy
 from twin.learn.replay import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
@@ -89,7 +88,7 @@ class TrainConfig:
     tau: float = 0.01
     """Share by which the target critics follow, per update."""
     shift: int = 2
-    """Random shift of pictures in updates [px of the shrunken ones]."""
+    """Random shift of pictures in updates [px of the small ones]."""
     colours: float = 1.0
     """Strength of the random weather laid over pictures in updates (see `colours.py`) where the lighting varies. One
     lighting and the simulator's pictures are learnt as they are."""
@@ -141,8 +140,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-class ShrunkVecEnv(VecEnvWrapper):
-    """Worlds whose pictures are shrunk as the policy does; while they are stepped, the networks can learn."""
+class PreparedVecEnv(VecEnvWrapper):
+    """Worlds whose pictures are prepared as the policy does it; while they are stepped, the networks can learn."""
 
     def __init__(self, worlds: DriveVecEnv, pool: int) -> None:
         channels, height, width = worlds.observation_space.shape  # type: ignore[misc]
@@ -152,15 +151,15 @@ class ShrunkVecEnv(VecEnvWrapper):
         """Called while the worlds are stepped. Neither sees anything of the other, so their order does not matter."""
 
     def reset(self) -> NDArray:
-        return shrink(np.asarray(self.venv.reset()), self._pool)
+        return prepared(np.asarray(self.venv.reset()), self._pool)
 
     def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
         stepped = self._thread.submit(self.venv.step_wait)
         self.meanwhile()
         pictures, rewards, dones, infos = stepped.result()
         for i in np.flatnonzero(dones):
-            infos[i]["terminal_observation"] = shrink(infos[i]["terminal_observation"], self._pool)
-        return shrink(np.asarray(pictures), self._pool), rewards, dones, infos
+            infos[i]["terminal_observation"] = prepared(infos[i]["terminal_observation"], self._pool)
+        return prepared(np.asarray(pictures), self._pool), rewards, dones, infos
 
     def close(self) -> None:
         self._thread.shutdown()
@@ -200,7 +199,7 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
         (folder / "state").mkdir(exist_ok=True)
     elif not (folder / "state" / "pictures.bin").exists():
         raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
-    worlds = ShrunkVecEnv(DriveVecEnv(twin, config.task, config.worlds, config.seed, **config.options()), config.pool)
+    worlds = PreparedVecEnv(DriveVecEnv(twin, config.task, config.worlds, config.seed, **config.options()), config.pool)
     model = _model(worlds, config, folder / "state" / "pictures.bin")
     before: dict[str, Any] = load_state(folder / "state", model) if go_on else {"wall": 0.0, "resumed": -1}
     resumed = before["resumed"] + 1
@@ -225,7 +224,7 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
         worlds.close()
 
 
-def _model(worlds: ShrunkVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
+def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
     model = PixelSAC(
         DrivePolicy,
         worlds,
