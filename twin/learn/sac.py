@@ -4,8 +4,12 @@ The *encoder* turns stacks into features. It learns from the critics' loss alone
 they are (Yarats et al. 2019; Kostrikov et al. 2020); next states are encoded by it, too, and not by a slowly following
 copy (Yarats et al. 2021, DrQ-v2). So an update runs it forward twice and backward once, where stable-baselines3's own
 update, in which actor and critics have encoders of their own, has five passes forward and three backward.
+
+What drives in the end is the *steady* actor, the running mean of the actor and its encoder: from one update to the next
+the actor swings, and a policy file written at the wrong moment leaves the road where the ones before and after do not.
 """
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -14,10 +18,12 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import polyak_update
-from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, SACPolicy
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
 from twin.learn.architecture import NORM_EPSILON, Architecture, Floats
+
+_STEADY = 1e-3  # share of an update in the steady actor
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -59,6 +65,12 @@ class DrivePolicy(SACPolicy):
 class PixelSAC(SAC):
     """SAC whose update runs the encoder as seldom as can be."""
 
+    steady: Actor
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.steady = copy.deepcopy(self.actor).requires_grad_(False)
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Updates all networks `gradient_steps` times."""
         assert self.replay_buffer is not None and self.ent_coef_optimizer is not None and self.log_ent_coef is not None
@@ -66,7 +78,8 @@ class PixelSAC(SAC):
         self.policy.set_training_mode(True)
         lead, follow = ([p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target))
         sums = np.zeros(4)
-        for _ in range(gradient_steps):
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        for step in range(gradient_steps):
             data = self.replay_buffer.sample(batch_size)
             features = self.actor.features_extractor(data.observations)
             with torch.no_grad():
@@ -97,6 +110,8 @@ class PixelSAC(SAC):
             entropy_loss.backward()
             self.ent_coef_optimizer.step()
             polyak_update(lead, follow, self.tau)
+            done = self._n_updates + step
+            polyak_update(self.actor.parameters(), self.steady.parameters(), max(_STEADY, 1.0 / (done + 1)))
             sums += [critic_loss.item(), actor_loss.item(), alpha.item(), best.mean().item()]
         self._n_updates += gradient_steps
         for name, value in zip(("critic_loss", "actor_loss", "ent_coef", "value"), sums / gradient_steps, strict=True):
@@ -111,8 +126,8 @@ class PixelSAC(SAC):
 
 
 def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Floats]:
-    """The deterministic actor's weights by the names of `Architecture.shapes`."""
-    actor = model.actor
+    """The steady, deterministic actor's weights by the names of `Architecture.shapes`."""
+    actor = model.steady
     encoder = actor.features_extractor
     assert isinstance(encoder, Encoder)
     convolutions = [encoder.first, *(m for m in encoder.further if isinstance(m, nn.Conv2d))]

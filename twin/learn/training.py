@@ -47,6 +47,7 @@ LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "mem
 RECENT = 100
 """Episodes that a success rate in training is taken over."""
 
+_LEAST_RATE = 0.1  # of the learning rate, at the end
 _RESUMES = 1_000_003  # seeds of worlds are moved by this at every resumption, so that no episode is driven again
 
 
@@ -85,6 +86,7 @@ class TrainConfig:
     gamma: float = 0.97
     """Discount per step: what is 33 steps (3 s) away counts a third."""
     learning_rate: float = 5e-4
+    """In the first half of the training; see `_model`."""
     tau: float = 0.01
     """Share by which the target critics follow, per update."""
     shift: int = 2
@@ -228,7 +230,8 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
     model = PixelSAC(
         DrivePolicy,
         worlds,
-        learning_rate=config.learning_rate,
+        # Falls over the second half, so that the policy settles.
+        learning_rate=lambda left: config.learning_rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * min(1.0, 2.0 * left)),
         buffer_size=config.buffer,
         learning_starts=config.starts,
         batch_size=config.batch,
