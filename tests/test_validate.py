@@ -8,19 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_policy import some_weights
+from tiny_runs import SMALL, tiny_runs
 from tiny_twin import tiny_twin
 
 from twin import load_scene, progress, validate
 from twin.env.suite import Stage
 from twin.errors import InputError
 from twin.learn import judging
-from twin.learn.architecture import Architecture
 from twin.learn.judging import Chunk, campaign, drawn_light, drive
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.report.trials import Trial, read_trials
 from twin.report.validation import lines, pairs, rate, summary
 
-SMALL = Architecture((32, 18), 2, 1, ((4, 5, 4),), 8, (8,), 1)
 FIRST = 1_000_000
 
 
@@ -28,11 +27,7 @@ FIRST = 1_000_000
 def scene(tmp_path_factory):
     progress.set_quiet(True)
     root = tiny_twin(tmp_path_factory.mktemp("twin"))
-    for name, turn in (("ahead", 0.0), ("left", 0.8)):
-        weights = some_weights(SMALL)
-        weights["mean.weight"] *= 0.3
-        weights["mean.bias"][:] = np.arctanh(turn)
-        save_policy(root / "runs" / name, SMALL, Control(), weights, {})
+    tiny_runs(root)
     return root
 
 

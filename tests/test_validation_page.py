@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_forecast import Text
-from test_policy import some_weights
-from test_validate import SMALL
+from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
 from twin import film, progress, validate
 from twin.errors import InputError
-from twin.learn.policy import Control, save_policy
 from twin.report.training import RECENT, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.report.validation import rate, share, summary, typical_episode, worst_episode
@@ -32,11 +30,7 @@ EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: 
 def scene(tmp_path_factory):
     progress.set_quiet(True)
     root = tiny_twin(tmp_path_factory.mktemp("twin"))
-    for name, turn in (("ahead", 0.0), ("left", 0.8)):
-        weights = some_weights(SMALL)
-        weights["mean.weight"] *= 0.3
-        weights["mean.bias"][:] = np.arctanh(turn)
-        save_policy(root / "runs" / name, SMALL, Control(), weights, TRAINED if name == "ahead" else {})
+    tiny_runs(root, TRAINED)
     write_episodes(root / "runs" / "ahead", EPISODES)
     return root
 

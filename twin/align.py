@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from twin import progress
-from twin.alignment.aligned import Alignment, align, robot_toml, write
+from twin.alignment.aligned import Alignment, align, robot_toml
 from twin.alignment.logs import read_log
 from twin.config import ROBOT_TOML, load_config, parse, read_robot
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.robot import HuskyParams
-from twin.scene import SceneDir, digest_file, write_json
+from twin.scene import SceneDir, digest_file, write_json, write_text
 
 FOLDER = "alignment"
 """Where figures and pictures go, beside `robot.toml`."""
@@ -56,7 +56,7 @@ def run(target: str, log: Path, out: Path | None = None, use_slope: bool = True)
     draw(pictures, result.windows, result.fitted, result.baseline)
     figures = {"log": str(log), "log_sha256": digest_file(log) if log.is_file() else None} | result.figures()
     write_json(pictures / "align.json", figures)
-    write(folder / ROBOT_TOML, robot_toml(result, kept, str(log)))
+    write_text(folder / ROBOT_TOML, robot_toml(result, kept, str(log)))
     return result, folder
 
 
@@ -124,8 +124,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         result, folder = run(options.robot, options.log, options.out, not options.level)
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     if not options.quiet:
         print(summary(result))
         overruled = hidden(options.robot, result)

@@ -21,7 +21,7 @@ from typing import Any
 
 from twin import progress
 from twin.config import SceneConfig, load_config
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.memory import PeakMemory
 from twin.scene import STAGES, SceneDir, digest_file, write_json
 from twin.stamp import Stamp, commit, digest_folder, key_of, package_versions, recover, replace_file
@@ -291,7 +291,7 @@ def main(argv: list[str] | None = None) -> int:
         _select_device(arguments.device)
         report = build(arguments.scene, arguments.until, tuple(arguments.force), tuple(arguments.set))
     except InputError as error:
-        return _fail(str(error))
+        return refuse(error)
     except OSError as error:
         # Only what the user's machine refuses; any other OSError is a bug and keeps its traceback.
         cures = {
@@ -303,7 +303,7 @@ def main(argv: list[str] | None = None) -> int:
         }
         if error.errno not in cures:
             raise
-        return _fail(f"{error.filename or arguments.scene}: {error.strerror}; {cures[error.errno]} and run again")
+        return refuse(f"{error.filename or arguments.scene}: {error.strerror}; {cures[error.errno]} and run again")
     except KeyboardInterrupt:
         print("stopped; run the same command to resume", file=sys.stderr)
         return 130
@@ -312,11 +312,6 @@ def main(argv: list[str] | None = None) -> int:
         if arguments.until is None:
             print(f"look at {SceneDir(arguments.scene).report_html} and {SceneDir(arguments.scene).review_mp4}")
     return 0
-
-
-def _fail(message: str) -> int:
-    print("error: " + " ".join(message.split()), file=sys.stderr)
-    return 2
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from twin import progress
 from twin.assets.gaussians import gaussians_of_views
 from twin.assets.views import Views, render_views
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.geometry.cameras import project
 from twin.loading import load_scene
 
@@ -113,8 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise InputError("nothing to write; give --glb FILE, --ply FILE or both")
         lines = export(options.scene, options.lighting, options.glb, options.ply)
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     if not options.quiet:
         print("\n".join(lines))
     return 0

@@ -17,7 +17,7 @@ import dm_env
 import numpy as np
 
 from twin import progress
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.loading import load, load_scene
 
 if TYPE_CHECKING:
@@ -125,8 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
             options["lighting"] = given.lighting
         path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     if not given.quiet:
         print(f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}")
     return 0

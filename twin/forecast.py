@@ -11,10 +11,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.report.forecast import Estimate, Forecast
 from twin.report.trials import RESULT_COLUMNS, read_results, read_trials, tally
-from twin.scene import SceneDir
+from twin.scene import SceneDir, write_text
 
 
 def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
@@ -45,10 +45,7 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     }
     out = make_forecast(root.resolve().name, twin, cells, seed, trained)
     out.save(scene.forecast)
-    table = scene.forecast / "forecast.csv"
-    aside = table.with_name(table.name + ".partial")
-    aside.write_text(candidates_csv(out), encoding="utf-8")
-    aside.replace(table)
+    write_text(scene.forecast / "forecast.csv", candidates_csv(out))
     write_forecast_page(out, scene.forecast)
     return out
 
@@ -83,8 +80,7 @@ def main(argv: list[str] | None = None) -> int:
             raise InputError(f"--seed {arguments.seed}: expected 0 or more")
         out = forecast(arguments.scene, arguments.real, arguments.seed)
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     if not arguments.quiet:
         from twin.report.forecast_words import summary
 

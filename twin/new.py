@@ -14,8 +14,8 @@ from pathlib import Path
 
 from twin.capture.formats import detect_kind
 from twin.capture.video import probe
-from twin.errors import InputError
-from twin.scene import SceneDir, digest_file
+from twin.errors import InputError, refuse
+from twin.scene import SceneDir, digest_file, write_text
 
 _HEAD = """\
 # What twin.build knows of this place. Every other setting has a default: see twin/config.py.
@@ -83,9 +83,7 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
     line = f"camera_height = {given} # lens above the ground [m], carried at a constant height"
     if given is None:
         line = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another way below"
-    aside = scene.config_file.with_name("scene.toml.partial")
-    aside.write_text(text + _REST.format(camera_height=line), encoding="utf-8")
-    aside.replace(scene.config_file)
+    write_text(scene.config_file, text + _REST.format(camera_height=line))
     return scene.config_file
 
 
@@ -131,8 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = new_scene(options.scene, options.films, options.camera_height)
     except (InputError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return refuse(error)
     print(f"wrote {config}")
     if options.camera_height is None:
         print("fill in [metric] there: without a scale nothing is metric")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import progress
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.geometry.images import psnr, resize, write_image
 from twin.nerf.added import AddedLighting, check_name, field_result
 from twin.scene import SceneDir
@@ -176,8 +176,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         lighting = relight(options.scene, options.photo, options.name)
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     if not options.quiet:
         print(summary(lighting))
         print(f"look at {SceneDir(options.scene).lightings / f'{options.name}.png'}")

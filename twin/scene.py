@@ -111,11 +111,16 @@ def digest_json(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Writes JSON aside and renames it, so that a reader never sees half a file. NaN is refused."""
+def write_text(path: Path, text: str) -> None:
+    """Writes a text aside and renames it, so that a reader never sees half a file."""
     aside = path.with_name(path.name + ".partial")
-    aside.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    aside.write_text(text, encoding="utf-8")
     aside.replace(path)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON as `write_text` does. NaN is refused."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from twin import progress
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.loading import load_scene
 
 
@@ -48,8 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
             training.train(load_scene(given.scene), folder, config, watch)
         picture = success_curve(folder)
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
         return 130

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from twin import progress
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.learn.judging import CHUNK, Chunk, Driven, campaign
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.loading import Twin, load_scene
@@ -23,7 +23,7 @@ from twin.report.training import read_episodes, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
 from twin.report.validation import failure_map, lines, summary, typical_episode, worst_episode
 from twin.report.validation_page import Curve, write_validation_page
-from twin.scene import SceneDir, digest_file, digest_json, read_json, write_json
+from twin.scene import SceneDir, digest_file, digest_json, read_json, write_json, write_text
 
 _FIRST_SEED = 1_000_000  # of validation; training's are small
 _SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
@@ -99,7 +99,7 @@ class Campaign:
     def _append(self, trials: Sequence[Trial]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if not self.path.exists():
-            self.path.write_text(csv_text(EPISODE_COLUMNS, []), encoding="utf-8")
+            write_text(self.path, csv_text(EPISODE_COLUMNS, []))
         with self.path.open("a", encoding="utf-8", newline="") as file:
             file.write(csv_text(EPISODE_COLUMNS, [t.row() for t in trials]).split("\n", 1)[1])
         self._done |= {_key(t): t for t in trials}
@@ -145,7 +145,7 @@ def validate(
 def _write(twin: Twin) -> dict:
     """Tells what is in the tables: `cells.csv`, `summary.json`, maps and page; returns the summary."""
     folder, trials = twin.scene.validation, read_trials(twin.scene.episodes_csv)
-    twin.scene.cells_csv.write_text(cells_text(tally(trials)), encoding="utf-8")
+    write_text(twin.scene.cells_csv, cells_text(tally(trials)))
     said = summary(trials)
     said["training"] = trainings(twin.scene.root, dict.fromkeys(t.policy for t in trials))
     said["worst"] = _worst_lights(folder / "worst.csv")
@@ -320,8 +320,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         said = validate(given.scene, given.policy, *run)
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
         return 130

@@ -198,13 +198,6 @@ def robot_toml(alignment: Alignment, kept: dict[str, Any], log: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write(path: Path, text: str) -> None:
-    """Writes a text aside and renames it."""
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(text, encoding="utf-8")
-    aside.replace(path)
-
-
 def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()

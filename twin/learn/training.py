@@ -40,7 +40,8 @@ from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.state import has_state, load_state, save_state
 from twin.learn.vectors import DriveVecEnv
 from twin.loading import Twin
-from twin.scene import digest_file, read_json, write_json
+from twin.report.trials import csv_text
+from twin.scene import digest_file, read_json, write_json, write_text
 
 EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward")
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
@@ -384,8 +385,5 @@ def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
         with path.open(newline="", encoding="utf-8") as file:
             # A line that was being written when the training was killed is not whole.
             rows = [row for row in list(csv.reader(file))[1:] if len(row) == len(columns) and int(row[0]) <= steps]
-    aside = path.with_name(path.name + ".partial")
-    with aside.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
-    aside.replace(path)
+    write_text(path, csv_text(columns, rows))
     return [row[columns.index("success")] == "1" for row in rows] if "success" in columns else []

@@ -14,7 +14,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from twin.errors import InputError
+from twin.errors import InputError, refuse
 from twin.reality import drive, log
 from twin.reality import place as places
 from twin.reality.drive import HELD_OUT, TASKS
@@ -100,8 +100,7 @@ def main(given: list[str] | None = None) -> int:
             )
             print(cells_text(tally(trials)), end="")
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+        return refuse(error)
     return 0
 
 

@@ -34,7 +34,7 @@ from twin.report.trials import (
     read_trials,
     tally,
 )
-from twin.scene import digest_file, read_json, write_json
+from twin.scene import digest_file, read_json, write_json, write_text
 
 TASKS = ("straight", "right_turn")
 HELD_OUT = "held-out"
@@ -188,9 +188,7 @@ def _write(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) 
         (out, csv_text(_COLUMNS, rows)),
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        write_text(path, text)
 
 
 def _remember(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -> None:

@@ -6,19 +6,16 @@ from twin.report import forecast_figures as draw
 from twin.report.figures import svg
 from twin.report.forecast import Estimate, Forecast, Group
 from twin.report.forecast_words import SHARES, STATISTICS, chance, plan_words, points, show, unknowns, verdicts
-from twin.report.markup import STYLE, Html, element, join, table
+from twin.report.markup import Html, caution, document, element, join, table
 from twin.report.statistics import MIN_POLICIES, MIN_TRIALS
-from twin.report.words import Caution
+from twin.scene import write_text
 
 _STYLE = ".whole { white-space:nowrap }\n"
 
 
 def write_forecast_page(forecast: Forecast, folder: Path) -> None:
     """Writes `forecast.html`; half a page is never seen."""
-    path = folder / "forecast.html"
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(forecast_page(forecast), encoding="utf-8")
-    aside.replace(path)
+    write_text(folder / "forecast.html", forecast_page(forecast))
 
 
 def forecast_page(forecast: Forecast) -> str:
@@ -30,28 +27,21 @@ def forecast_page(forecast: Forecast) -> str:
         ("predictions", "What to expect on the road", _predictions(forecast)),
         ("more", "How many more trials?", _more(forecast)),
         ("cells", "Cell by cell", _cells(forecast)),
-        ("unknown", "What this cannot know", join(*map(_caution, unknowns(forecast)))),
+        ("unknown", "What this cannot know", join(*map(caution, unknowns(forecast)))),
     ]
     links = (
         element("a", "forecast.json", href="forecast.json"),
         " and ",
         element("a", "forecast.csv", href="forecast.csv"),
     )
-    body = element(
-        "main",
+    return document(
+        f"{forecast.scene}: forecast",
+        _STYLE,
         _header(forecast),
         element("nav", *(element("a", title, href=f"#{name}") for name, title, _ in sections)),
         *(element("section", element("h2", title), content, id=name) for name, title, content in sections),
         element("footer", "Every number is in ", *links, " beside this page."),
     )
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("title", f"{forecast.scene}: forecast"),
-        element("style", Html(STYLE + _STYLE)),
-    )
-    return "<!DOCTYPE html>\n" + element("html", head, element("body", body), lang="en") + "\n"
 
 
 def _header(forecast: Forecast) -> Html:
@@ -261,7 +251,3 @@ def _cells(forecast: Forecast) -> Html:
 
 def _chart(title: str, drawing: str) -> Html:
     return element("div", element("h3", title), Html(drawing))
-
-
-def _caution(caution: Caution) -> Html:
-    return element("div", element("b", caution.what), f"What helps: {caution.cure}.", class_="caution", role="note")

@@ -143,7 +143,7 @@ def unknowns(forecast: Forecast) -> list[Caution]:
     out.append(
         Caution(
             f"How the policies do in light that is not like {listing(sorted(lightings))}.",
-            "validate under --lightings held-out, film the place in that light, or add a photo with twin.relight",
+            "validate under --lightings held-out, film the place in that light, or add a photo with twin.relight.",
         )
     )
     for task in forecast.tasks:
@@ -153,16 +153,16 @@ def unknowns(forecast: Forecast) -> list[Caution]:
         uneven = [c.policy for c, under in zip(mine, sets, strict=True) if under != usual]
         if uneven:
             what = f"On {task} not all policies were validated under the same lightings ({listing(uneven)} differ)."
-            out.append(Caution(what, "validate all of them under the same ones; the ranking mixes policy with light"))
+            out.append(Caution(what, "validate all of them under the same ones; the ranking mixes policy with light."))
         rows = {c.policy: {p.lighting for p in forecast.pairs if (p.policy, p.task) == (c.policy, task)} for c in mine}
         driven = {name: under for name, under in rows.items() if under}
         if len({frozenset(under) for under in driven.values()}) > 1:
             what = f"On {task} not all policies were driven on the road under the same lightings."
-            out.append(Caution(what, "drive all of them under the same ones; the rates mix policy with light"))
+            out.append(Caution(what, "drive all of them under the same ones; the rates mix policy with light."))
     out.append(
         Caution(
             "What the twin does not have: other traffic, weather, wet ground, and whatever changed since the films.",
-            "only real trials tell; spread them over days",
+            "only real trials tell; spread them over days.",
         )
     )
     return out
@@ -170,7 +170,7 @@ def unknowns(forecast: Forecast) -> list[Caution]:
 
 _NEEDED = (
     f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
-    "good and bad ones, chosen before their real results are known"
+    "good and bad ones, chosen before their real results are known."
 )
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from twin.report.words import Caution
+
 _STRIP = 2.4  # width over height from which on a picture is a strip
 
 
@@ -38,6 +40,23 @@ def element(tag: str, *children: str, **attributes: str | bool | None) -> Html:
 def join(*children: str) -> Html:
     """Children one after another, escaped unless they are Html."""
     return Html("".join(child if isinstance(child, Html) else html.escape(child, quote=False) for child in children))
+
+
+def document(title: str, style: str, *body: str) -> str:
+    """A whole page; `style` is added to `STYLE`."""
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("title", title),
+        element("style", Html(STYLE + style)),
+    )
+    return "<!DOCTYPE html>\n" + element("html", head, element("body", element("main", *body)), lang="en") + "\n"
+
+
+def caution(it: Caution) -> Html:
+    """What is not to be relied on, and what helps."""
+    return element("div", element("b", it.what), f"What helps: {it.cure}", class_="caution", role="note")
 
 
 def table(head: list[str], rows: list[list[str]], numeric: tuple[int, ...] = ()) -> Html:

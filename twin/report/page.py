@@ -9,11 +9,11 @@ from typing import Any
 
 from twin.report.against_truth import truth_section
 from twin.report.charts import Chart, charts
-from twin.report.markup import STYLE, Html, data_url, element, join, picture, table
+from twin.report.markup import Html, caution, data_url, document, element, join, picture, table
 from twin.report.sections import SECTIONS, general_cautions
 from twin.report.seen_section import seen_section
-from twin.report.words import NOT_MEASURED, Caution, Section, duration, flat, number, pick, verdicts
-from twin.scene import SceneDir, read_json
+from twin.report.words import NOT_MEASURED, Section, duration, flat, number, pick, verdicts
+from twin.scene import SceneDir, read_json, write_text
 
 _STAGE_WORDS = {name: make({}).title for name, make in SECTIONS.items()}
 
@@ -25,10 +25,7 @@ def write_page(scene: SceneDir, report: dict[str, Any]) -> None:
         scene: Where pictures and figures come from; what is missing is left out.
         report: As in `report.json`. Whatever it lacks is shown as not measured.
     """
-    path = scene.report_html
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(page(scene, report), encoding="utf-8")
-    aside.replace(path)
+    write_text(scene.report_html, page(scene, report))
 
 
 def page(scene: SceneDir, report: dict[str, Any]) -> str:
@@ -36,8 +33,9 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
     drawn, kept = charts(scene, report), _pictures(scene)
     name = str(report.get("scene") or scene.root.name)
     sections = [make(report) for make in SECTIONS.values()] + [seen_section(report), truth_section(report)]
-    body = element(
-        "main",
+    return document(
+        f"{name}: a twin's report",
+        "",
         _header(name, report),
         _film(scene, kept),
         element(
@@ -47,14 +45,6 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
         _costs(report),
         element("footer", "Every number is in ", element("a", "report.json", href="report.json"), " beside this page."),
     )
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("title", f"{name}: a twin's report"),
-        element("style", Html(STYLE)),
-    )
-    return "<!DOCTYPE html>\n" + element("html", head, element("body", body), lang="en") + "\n"
 
 
 def _header(name: str, report: dict[str, Any]) -> Html:
@@ -70,7 +60,7 @@ def _header(name: str, report: dict[str, Any]) -> Html:
         element("h1", name),
         element("p", f"A filmed place as a MuJoCo twin: {cost}, {memory}.", class_="kicker"),
         element("ul", *sentences, class_="verdicts"),
-        *map(_caution, general_cautions(report)),
+        *map(caution, general_cautions(report)),
         class_="top",
     )
 
@@ -136,7 +126,7 @@ def _section(
         title,
         element("p", section.done, class_="done"),
         _not_applicable(section) if section.not_applicable else "",
-        *map(_caution, section.cautions),
+        *map(caution, section.cautions),
         element("dl", *facts),
         element("div", *pictures, class_="pictures") if pictures else "",
         element("div", *figures, class_="charts") if figures else "",
@@ -151,10 +141,6 @@ def _section(
 
 def _not_applicable(section: Section) -> Html:
     return element("p", f"Does not apply here: {section.not_applicable}.", class_="na")
-
-
-def _caution(caution: Caution) -> Html:
-    return element("div", element("b", caution.what), f"What helps: {caution.cure}", class_="caution", role="note")
 
 
 def _gibibytes(size: Any) -> float | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twin.report import validation_figures as draw
 from twin.report.figures import svg
-from twin.report.markup import STYLE, Html, data_url, element, join, picture, table
+from twin.report.markup import Html, caution, data_url, document, element, join, picture, table
 from twin.report.validation_words import (
     FAILURES,
     LUCK,
@@ -29,8 +29,8 @@ from twin.report.validation_words import (
     verdicts,
     why,
 )
-from twin.report.words import Caution, listing
-from twin.scene import SceneDir
+from twin.report.words import listing
+from twin.scene import SceneDir, write_text
 
 _STYLE = ".whole, td code { white-space:nowrap }\nimg { background:#fff }\n"
 
@@ -51,9 +51,7 @@ class Curve:
 def write_validation_page(scene: SceneDir, said: dict[str, Any], curves: Sequence[Curve]) -> None:
     """Writes `validation/validation.html`; half a page is never seen."""
     path = scene.validation / "validation.html"
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(validation_page(scene.root.resolve().name, path.parent, said, curves), encoding="utf-8")
-    aside.replace(path)
+    write_text(path, validation_page(scene.root.resolve().name, path.parent, said, curves))
 
 
 def validation_page(scene: str, folder: Path, said: dict[str, Any], curves: Sequence[Curve]) -> str:
@@ -73,24 +71,17 @@ def validation_page(scene: str, folder: Path, said: dict[str, Any], curves: Sequ
         ("where", "Where do they fail?", _maps(folder, said)),
         ("films", "Watch them", _films(said, folder)),
         *_curves(said, curves),
-        ("unknown", "What this cannot know", join(*map(_caution, unknowns(said)))),
+        ("unknown", "What this cannot know", join(*map(caution, unknowns(said)))),
     ]
     files = [element("a", name, href=name) for name in ("summary.json", "cells.csv", "episodes.csv")]
-    body = element(
-        "main",
+    return document(
+        f"{scene}: validation",
+        _STYLE,
         _header(scene, said),
         element("nav", *(element("a", title, href=f"#{name}") for name, title, _ in sections)),
         *(element("section", element("h2", title), content, id=name) for name, title, content in sections),
         element("footer", "Every number is in ", files[0], ", ", files[1], " and ", files[2], " beside this page."),
     )
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("title", f"{scene}: validation"),
-        element("style", Html(STYLE + _STYLE)),
-    )
-    return "<!DOCTYPE html>\n" + element("html", head, element("body", body), lang="en") + "\n"
 
 
 def _header(scene: str, said: dict[str, Any]) -> Html:
@@ -306,7 +297,3 @@ def _link(path: str) -> str:
 
 def _chart(title: str, drawing: str) -> Html:
     return element("div", element("h3", title), Html(drawing))
-
-
-def _caution(caution: Caution) -> Html:
-    return element("div", element("b", caution.what), f"What helps: {caution.cure}.", class_="caution", role="note")

@@ -117,7 +117,7 @@ def unknowns(said: dict[str, Any]) -> list[Caution]:
     out = [
         Caution(
             "Success here is success in the twin. How often it means success on the road is another question.",
-            "drive some of the policies on the road and run python -m twin.forecast",
+            "drive some of the policies on the road and run python -m twin.forecast.",
         )
     ]
     few = [c for c in said["cells"] if c["trials"] < FEW]
@@ -127,7 +127,7 @@ def unknowns(said: dict[str, Any]) -> list[Caution]:
             Caution(
                 f"{len(few)} of {len(said['cells'])} rates come from fewer than {FEW} episodes (the least: "
                 f"{smallest}), so their intervals are wide.",
-                "run the same command with more --episodes; what was driven is kept",
+                "run the same command with more --episodes; what was driven is kept.",
             )
         )
     searched = {(w["policy"], w["task"]) for w in said.get("worst", [])}
@@ -136,7 +136,7 @@ def unknowns(said: dict[str, Any]) -> list[Caution]:
         out.append(
             Caution(
                 f"The worst light that {listing(left)} might meet was not searched for.",
-                "run the same command with --worst",
+                "run the same command with --worst.",
             )
         )
     return out
