@@ -50,11 +50,9 @@ class SimulatorView:
         datas: Sequence[mujoco.MjData],
         lighting: Any = None,
         effects: Sequence[CameraEffects] | None = None,
-        poses: Array | None = None,
     ) -> Rendering:
         """What the front camera of every world sees; arguments as in `Overlay.render`, the lighting has no effect."""
-        if poses is None:
-            poses = np.stack([camera_pose(data, self._camera) for data in datas])
+        poses = np.stack([camera_pose(data, self._camera) for data in datas])
         if effects is not None:
             poses = np.stack([e.shaken(p, d.time) for e, p, d in zip(effects, poses, datas, strict=True)])
         width, height = self.size
