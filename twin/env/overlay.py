@@ -57,7 +57,7 @@ class Overlay:
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         # One after the other, as Warp compiles kernels when they are first used.
-        self._painters = [_Painter(model, field, self.intrinsics, size) for _ in range(min(worlds, cores))]
+        self._painters = [_Painter(model, field, self._camera, size) for _ in range(min(worlds, cores))]
         self._pool = ThreadPoolExecutor(len(self._painters)) if len(self._painters) > 1 else None
         self._shadows = Shadows(model, self._painters[0].view.geoms)
         self._route, self._shaded, self._lock = route_of(model), shaded, threading.Lock()
@@ -130,9 +130,9 @@ class Overlay:
 class _Painter:
     """What one thread draws and marches with."""
 
-    def __init__(self, model: mujoco.MjModel, field: BakedField, intrinsics: Array, size: tuple[int, int]):
-        self.view = ObstacleView(model, intrinsics, size)
-        self._field, self._intrinsics = field, intrinsics
+    def __init__(self, model: mujoco.MjModel, field: BakedField, camera: int, size: tuple[int, int]):
+        self.view = ObstacleView(model, camera, size)
+        self._field, self._intrinsics = field, camera_intrinsics(model, camera, size)
         self._fronts: dict[tuple[int, int], BakedField] = {}
 
     def front(self, pose: Array, drawn: Drawn, lighting: Lighting) -> Rendering:
