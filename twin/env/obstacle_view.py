@@ -1,5 +1,5 @@
-"""What of a MuJoCo model a camera sees besides the field: obstacles, other robots, the robot's own body but for what the
-camera is built into.
+"""What of a MuJoCo model a camera sees besides the field: obstacles, other robots, the robot's own body without what
+the camera is built into.
 
 `mujoco_warp`'s ray caster draws them, without OpenGL, from a small model of their geoms alone. It is given only the
 rays it needs: of the pixels that some geom's box may cover, one each, and at edges four each, so that outlines come

@@ -95,9 +95,9 @@ def _mast(base: mujoco.MjsBody, camera: tuple[float, float, float]) -> None:
         _tube(base, (foot, -0.144, z - 0.04), (foot, 0.144, z - 0.04), 0.014)
         _tube(base, (foot, y, z - 0.04), (x - 0.03, y, z - 0.02), 0.012, name=f"{_CAMERA_PART}bracket")
     _box(base, (0.03, 0.175, 0.03), (x - 0.02, y, z), rgba=_STEEL, name=f"{_CAMERA_PART}housing")
-    for side, offset in (("right", -0.06), ("left", 0.06)):
-        ends, look = ((x - 0.01, y + offset, z), (x - 0.002, y + offset, z)), {"material": "husky_black"}
-        _cylinder(base, *ends, 0.011, name=f"{_CAMERA_PART}lens_{side}", **look)
+    for name, offset in (("lens_right", -0.06), ("lens_left", 0.06)):
+        ends = (x - 0.01, y + offset, z), (x - 0.002, y + offset, z)
+        _cylinder(base, *ends, 0.011, material="husky_black", name=f"{_CAMERA_PART}{name}")
 
 
 def camera_parts(model: mujoco.MjModel, camera: int) -> NDArray[np.int64]:
