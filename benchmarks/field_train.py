@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from twin.config import load_config
+from twin.config_file import load_config
 from twin.geometry.cameras import Cameras
 from twin.geometry.points import SparsePoints
 from twin.nerf import compute, fit, network

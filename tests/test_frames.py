@@ -17,7 +17,8 @@ from twin.capture.motion import median_motion, sharpness, stands_still
 from twin.capture.photos import photo_times, regular_choice
 from twin.capture.types import Capture
 from twin.capture.video import FilmCount, FilmFacts, decode, index_of, oriented, probe, slot_of, upright
-from twin.config import CalibrationConfig, CaptureConfig, SceneConfig, SourceConfig, load_config
+from twin.config import CalibrationConfig, CaptureConfig, SceneConfig, SourceConfig
+from twin.config_file import load_config
 from twin.errors import InputError
 from twin.geometry.images import read_image, write_image
 from twin.new import main as new_main
