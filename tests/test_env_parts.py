@@ -12,11 +12,11 @@ from tiny_world import tiny_world
 
 import twin
 from twin import progress
-from twin.config import TaskConfig
+from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.audit import EVENTS, Findings, Seen, audit
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
-from twin.env.lightings import HELD_OUT, TRAINING, Light, LightSets, draw_light
+from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.physics import HuskyPhysics
 from twin.env.randomisation import Draw, Nominal, Ranges
 from twin.env.scene_model import episode_spec

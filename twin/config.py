@@ -8,6 +8,11 @@ from dataclasses import dataclass, field
 
 from twin.robot import HuskyParams
 
+TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
+"""Said where a lighting's name could be: one drawn at random, as `twin/env/lightings.py` has it."""
+RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
+"""So no lighting may be called so."""
+
 
 @dataclass(frozen=True)
 class CalibrationConfig:
@@ -28,7 +33,7 @@ class SourceConfig:
     path: str = ""
     """Video file, image folder, COLMAP model folder or transforms.json, relative to the scene folder."""
     lighting: str = ""
-    """Its name; by default the file's stem."""
+    """Its name, none of `RESERVED_LIGHTINGS`; by default the file's stem."""
     kind: str = "auto"
     """auto, video, images, colmap or transforms."""
     images: str = ""

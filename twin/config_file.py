@@ -1,4 +1,4 @@
-"""Reading `scene.toml` and `robot.toml`: a TOML table becomes the frozen dataclasses of `config.py`, or one line says why not.
+"""Reading `scene.toml` and `robot.toml`: a TOML table becomes dataclasses of `config.py`, or one line says why not.
 
 An *override* is a setting of the command line, `section.key=value`, which wins over the file. Unknown keys are refused
 with the nearest valid name, so that a typo never silently becomes a default.
