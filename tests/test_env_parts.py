@@ -286,6 +286,21 @@ def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
     assert "task 'moon': unknown; there are route" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (["--seed", "-1"], "seed = -1: expected 0 or more"),
+        (["--obstacles", "²"], "--obstacles '²': expected a number"),
+        (["--obstacles", "-1"], "--obstacles '-1': expected a number"),
+        (["--lighting", "day:night:30"], "share 30 is not from 0 to 1"),
+    ],
+)
+def test_a_film_of_nothing_possible_is_one_line(scene, capsys, option, words):
+    assert main([str(scene.scene.root), "--task", "ahead", "--quiet", *option]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and words in error and error.count("\n") == 1
+
+
 # ---- audit
 
 
