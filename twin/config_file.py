@@ -33,8 +33,8 @@ _RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "min_motion": (0, _MOST),
     },
     "cameras": {
-        "features": (1, _MOST),
-        "max_feature_size": (64, _MOST),
+        "features": (1, 1e6),
+        "max_feature_size": (64, 1e5),
         "min_registered": (0, 1),
         "max_outlier": (1e-3, _MOST),
     },
@@ -176,7 +176,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     return value
 
 
-def scale_sources(metric: MetricConfig) -> tuple[str, ...]:
+def _scale_sources(metric: MetricConfig) -> tuple[str, ...]:
     """Names of the scale sources that are given: camera_height, distance, gps, marker, poses_are_metric."""
     given = {
         "camera_height": metric.camera_height > 0.0,
@@ -205,11 +205,11 @@ def _check(config: SceneConfig, path: Path) -> None:
     for section, ranges in _RANGES.items():
         for key, (low, high) in ranges.items():
             _check_range(getattr(getattr(config, section), key), low, high, f"{path}: {section}.{key}")
-    _check_range(config.seed, 0, _MOST, f"{path}: seed")
+    _check_range(config.seed, 0, 2**31 - 1, f"{path}: seed")  # as COLMAP takes it
     for source in config.source:
         _check_range(source.camera_height, 0, _MOST, f"{path}: camera_height of [[source]] {source.path!r}")
     _check_obstacles(config.obstacle, path)
-    given = scale_sources(config.metric)
+    given = _scale_sources(config.metric)
     if len(given) != 1 and not (not given and any(source.camera_height > 0.0 for source in config.source)):
         # Checked before anything runs, so that nobody waits minutes to learn it.
         raise InputError(
@@ -221,8 +221,8 @@ def _check(config: SceneConfig, path: Path) -> None:
 
 def _check_range(value: float, low: float, high: float, what: str) -> None:
     if not low <= value <= high:
-        expected = f"at least {low:g}" if high == _MOST else f"{low:g} to {high:g}"
-        raise InputError(f"{what} = {value:g}; expected {expected}")
+        expected = f"at least {low:,.10g}" if high == _MOST else f"{low:,.10g} to {high:,.10g}"
+        raise InputError(f"{what} = {value:,.10g}; expected {expected}")
 
 
 def _check_obstacles(obstacles: tuple[ObstacleConfig, ...], path: Path) -> None:
