@@ -129,12 +129,8 @@ def seen_touched(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def gpu(scene: Path, quick: bool) -> dict[str, Any]:
-    """Many worlds on one GPU, where there is one."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_ERROR
-    wp.init()
-    return {"gpu.available": wp.is_cuda_available()}
+    """Many worlds on one GPU (wanted: 10,000 steps per second): there are none, so there is nothing to measure."""
+    return {"gpu.none": "many worlds step on the CPU only; worlds on CUDA are not there"}
 
 
 SECTIONS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from field_common import SIZE, Bench, load_baked, load_field, render, route_views, worker
 
-from twin.config import NerfConfig, load_config
+from twin.config import NerfConfig
+from twin.config_file import load_config
 from twin.geometry.cameras import Cameras
 from twin.geometry.points import SparsePoints
 from twin.nerf import compute

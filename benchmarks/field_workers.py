@@ -141,7 +141,7 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
 
     import numpy as np
 
-    from twin.config import load_config
+    from twin.config_file import load_config
     from twin.geometry.cameras import Cameras
     from twin.geometry.points import SparsePoints
     from twin.nerf.fit import fit

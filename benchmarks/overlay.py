@@ -238,7 +238,7 @@ def seen_touched(scene_path: Path) -> dict[str, Any]:
 
     scene = load_scene(scene_path)
     world, field, mesh = scene.world(), scene.field(), scene.scene.stage("mesh")
-    drive = follow(world, HuskyPhysics(world.model()))
+    drive = follow(world, HuskyPhysics(world.model(), world.robot))
     looks = look(field, world, along_the_drive(drive.camera_to_world), field.lightings[0])
     found = compare(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
     return {f"seen_touched.{name}": value for name, value in found.items() if name != "along"}

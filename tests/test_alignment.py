@@ -13,7 +13,7 @@ from twin.alignment.aligned import align, robot_toml
 from twin.alignment.checks import check
 from twin.alignment.identify import Parameter, bend, fit
 from twin.alignment.kinematics import Icr
-from twin.config import parse, read_robot
+from twin.config_file import parse, read_robot
 from twin.env.controller import Controller
 from twin.errors import InputError
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams

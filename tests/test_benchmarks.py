@@ -5,8 +5,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from twin.robot import HuskyParams
+from twin.scene import SceneDir
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -34,8 +38,37 @@ def test_a_score_is_not_met_where_its_budget_was_exceeded(scripts, monkeypatch):
     assert field.judge("fox.seconds_60s", figures) == ("≤ 60", "yes")
     late = figures | {"fox.seconds_60s": 61.0}
     assert field.judge("fox.psnr_60s", late)[1] == field.judge("fox.psnr_60s_unfitted", late)[1] == "no, took 61.0 s"
-    assert field.judge("gpu.cpu_difference_max", {"gpu.cpu_difference_max": 1 / 255}) == ("≤ 0.003922", "yes")
+    apart = {"gpu.cpu_difference_mean": 1 / 255, "gpu.cpu_difference_max": 0.5}  # the mean is what is wanted of
+    assert field.judge("gpu.cpu_difference_mean", apart) == ("≤ 0.003922", "yes")
+    assert field.judge("gpu.cpu_difference_max", apart) == ("", "")
     assert field.judge("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
+
+
+def test_nothing_is_wanted_that_no_section_measures(scripts, tmp_path):
+    import env
+    from env_sections import gpu
+
+    found = gpu(tmp_path, True)
+    assert list(found) == ["gpu.none"] and "CPU only" in found["gpu.none"]
+    assert not any(name.startswith("gpu.") for name in env.TARGETS)
+
+
+def test_seen_and_touched_is_driven_by_the_scene_s_own_robot(scripts, monkeypatch, tmp_path):
+    import overlay
+
+    class Told(Exception):
+        pass
+
+    def physics(model, params=None):
+        raise Told(params)
+
+    monkeypatch.setattr("twin.env.physics.HuskyPhysics", physics)
+    world = SimpleNamespace(model=lambda: None, robot=HuskyParams(friction=0.5))
+    opened = SimpleNamespace(world=lambda: world, field=lambda: None, scene=SceneDir(tmp_path))
+    monkeypatch.setattr(overlay, "load_scene", lambda path: opened)
+    with pytest.raises(Told) as told:
+        overlay.seen_touched(tmp_path)
+    assert told.value.args == (world.robot,)
 
 
 def test_the_peak_is_that_of_this_process(scripts):

@@ -1,6 +1,11 @@
+import dataclasses
+import math
+
 import pytest
 
-from twin.config import load_config
+from twin import build
+from twin.config import SceneConfig
+from twin.config_file import _RANGES, load_config
 from twin.errors import InputError
 
 _SOURCE = '[[source]]\npath = "a.mp4"\n'
@@ -35,14 +40,16 @@ def test_nested_table_and_integer_for_float(tmp_path):
         (_MINIMAL + "[nerf]\nsteps = true\n", "expected int, got True"),
         (_MINIMAL + "[nerf]\nsteps = 0\n", "expected at least 1"),
         (_SOURCE + "[metric]\ncamera_height = nan\n", "got nan"),
+        (_SOURCE + "[metric]\ncamera_height = inf\n", "expected a finite number, got inf"),
         (_SOURCE + "[metric]\ncamera_height = -1.0\n", "camera_height = -1"),
+        (_MINIMAL + "camera_height = -1.0\n", "camera_height of [[source]] 'a.mp4' = -1; expected at least 0"),
+        ("seed = -1\n" + _MINIMAL, "seed = -1; expected 0 to 2,147,483,647"),
+        (f"seed = {2**31}\n" + _MINIMAL, "seed = 2,147,483,648; expected"),
         (_SOURCE, "no scale"),
         (_SOURCE + "[metric]\ncamera_height = 1.0\ngps = true\n", "camera_height and gps"),
         (_MINIMAL + 'kind = "film"\n', "expected auto, video"),
         ("[[source]]\n", "no path"),
         ("seed = 1\n", "no [[source]]"),
-        ("seed = -1\n" + _MINIMAL, "seed = -1; expected 0 to 2147483647"),
-        ("seed = 2147483648\n" + _MINIMAL, "seed = 2147483648; expected 0 to 2147483647"),
         ("seed = \n", "not valid TOML"),
         ("[source]\npath='a'\n", "expected a list"),
     ],
@@ -65,3 +72,51 @@ def test_overrides(tmp_path):
     for bad in ("nerf.steps", "nerf.stepz=1", "=1", "seed.x=1"):
         with pytest.raises(InputError):
             load_config(path, (bad,))
+
+
+def _numbers():
+    """Section, key and value of every number of the sections that a stage reads, by its default."""
+    config = SceneConfig()
+    for section in ("capture", "cameras", "metric", "nerf", "mesh", "mjcf", "review"):
+        for key, value in dataclasses.asdict(getattr(config, section)).items():
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                yield section, key, value
+
+
+def test_every_number_has_a_range_and_is_kept_to_it(tmp_path):
+    path = _write(tmp_path, _MINIMAL)
+    for section, key, default in _numbers():
+        low, high = _RANGES[section][key]
+        assert low <= default <= high
+        kind = type(default)
+        # The lens's height is the scale: none given is another error.
+        allowed = [end for end in (low, high) if math.isfinite(end) and (section, end) != ("metric", 0)]
+        for end in allowed:
+            config = load_config(path, (f"{section}.{key}={kind(end)!r}",))
+            assert getattr(getattr(config, section), key) == end
+        for beyond in (low - 1, high + 1):
+            if math.isfinite(beyond):
+                with pytest.raises(InputError, match=rf"{section}\.{key} = .*; expected (at least )?{low:g}"):
+                    load_config(path, (f"{section}.{key}={kind(beyond)!r}",))
+    assert {(section, key) for section, ranges in _RANGES.items() for key in ranges} == {n[:2] for n in _numbers()}
+
+
+def test_a_file_given_for_a_scene_is_one_line(tmp_path, capsys, monkeypatch):
+    path = _write(tmp_path, _MINIMAL)
+    (tmp_path / "README.md").write_text("no scene")
+    for given, cure in ((path, f"give the folder of the scene, {tmp_path}"), (tmp_path / "README.md", "scenes/demo")):
+        assert build.main([str(given)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"error: {given} is a file; ") and cure in error and error.count("\n") == 1
+    (tmp_path / "other/scene.toml").mkdir(parents=True)
+    assert build.main([str(tmp_path / "other")]) == 2
+    assert "is a folder; expected a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("setting", ["nerf.bake_steps=0", "nerf.sightings=1.0", "nerf.levels=0", "mesh.views=0"])
+def test_a_number_that_no_stage_could_work_with_ends_the_build_before_it_begins(tmp_path, capsys, setting):
+    _write(tmp_path, _MINIMAL)
+    assert build.main([str(tmp_path), "--set", setting]) == 2
+    error = capsys.readouterr().err
+    assert setting.split("=")[0] in error and "expected" in error and error.count("\n") == 1
+    assert not (tmp_path / "build").exists()

@@ -156,4 +156,4 @@ def test_the_benchmark_of_the_environment_runs(built, tmp_path):
     assert figures["single.steps_per_s"] > 1 and figures["batch8.steps_per_s"] > 1
     assert figures["driver.success"] == 1.0 and figures["driver.blind.route"] <= 1.0  # a dozen nearly straight metres
     assert figures["soak.not_finite"] == 0 and figures["audit.false_successes"] == 0
-    assert figures["trust.pictures"] > 10 and isinstance(figures["gpu.available"], bool)
+    assert figures["trust.pictures"] > 10 and "not there" in figures["gpu.none"]

@@ -12,11 +12,11 @@ from tiny_world import tiny_world
 
 import twin
 from twin import progress
-from twin.config import TaskConfig
+from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.audit import EVENTS, Findings, Seen, audit
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
-from twin.env.lightings import HELD_OUT, TRAINING, Light, LightSets, draw_light
+from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.physics import HuskyPhysics
 from twin.env.randomisation import Draw, Nominal, Ranges
 from twin.env.scene_model import episode_spec
@@ -284,6 +284,21 @@ def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
     assert told["codec"] == "h264" and 20 < told["frames"] < 60
     assert main([str(scene.scene.root), "--task", "moon", "--quiet"]) == 2
     assert "task 'moon': unknown; there are route" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (["--seed", "-1"], "seed = -1: expected 0 or more"),
+        (["--obstacles", "²"], "--obstacles '²': expected a number"),
+        (["--obstacles", "-1"], "--obstacles '-1': expected a number"),
+        (["--lighting", "day:night:30"], "share 30 is not from 0 to 1"),
+    ],
+)
+def test_a_film_of_nothing_possible_is_one_line(scene, capsys, option, words):
+    assert main([str(scene.scene.root), "--task", "ahead", "--quiet", *option]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and words in error and error.count("\n") == 1
 
 
 # ---- audit

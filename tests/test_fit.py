@@ -269,3 +269,10 @@ def test_a_device_that_is_not_there_is_an_input_error(monkeypatch, value, messag
     monkeypatch.setenv("TWIN_DEVICE", value)
     with pytest.raises(InputError, match=message):
         compute.device()
+
+
+def test_a_field_that_no_camera_sees_is_not_baked(cameras):
+    config = replace(CONFIG, steps=2, near_plane=100.0)  # [m] everything is nearer
+    field, _ = fit(cameras, floor_points(cameras), config)
+    with pytest.raises(InputError, match=r"nothing to bake.*near_plane"):
+        bake(field, TrainingPixels(cameras, SparsePoints.empty(), WIDTH), steps=1)

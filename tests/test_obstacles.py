@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from twin.config import OBSTACLE_KINDS, ObstacleConfig, load_config
+from twin.config import OBSTACLE_KINDS, ObstacleConfig
+from twin.config_file import load_config
 from twin.env import obstacles as module
 from twin.env.obstacles import add_obstacles, ground_height, place, pose_at, random_obstacles
 from twin.errors import InputError

@@ -8,10 +8,11 @@ from textured import SIZE, K, filmed_corridor, picture, pose_at
 
 import twin
 from twin import progress
+from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints
 from twin.geometry.images import psnr, read_image, write_image
-from twin.nerf.added import AddedLighting, added_lightings
+from twin.nerf.added import AddedLighting, added_lightings, check_name
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.field import RadianceField, untrained
 from twin.nerf.lightings import Lightings
@@ -133,3 +134,19 @@ def test_plain_lightings_take_more_too():
     assert np.array_equal(more.embedding("a:b:0.25"), np.full(3, 0.25, np.float32))
     with pytest.raises(InputError, match="another build"):
         more.embedding("c")
+
+
+@pytest.mark.parametrize("share", ["30", "nan", "inf", "-0.1", "1.01"])
+def test_a_share_of_a_mixture_is_from_0_to_1(share):
+    mine = Lightings(("a", "b"), np.eye(2, dtype=np.float32), (), np.zeros((0, 2), np.float32))
+    for end in ("0", "1"):
+        assert np.array_equal(mine.embedding(f"a:b:{end}"), mine.embedding("ab"[int(end)]))
+    with pytest.raises(InputError, match=rf"share {share} is not from 0 to 1; give a:b:0\.3 for 30 %") as error:
+        mine.embedding(f"a:b:{share}")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", RESERVED_LIGHTINGS)
+def test_what_means_a_light_drawn_at_random_is_no_name(name):
+    with pytest.raises(InputError, match=rf"--name '{name}': has a meaning of its own"):
+        check_name(name, ("day",))

@@ -7,7 +7,7 @@ import pytest
 from tiny_world import tiny_config, tiny_scene
 
 from twin.build import PIPELINE, _depends
-from twin.config import load_config
+from twin.config_file import load_config
 from twin.errors import InputError
 from twin.mjcf.export import run
 from twin.mjcf.world import World

@@ -1,4 +1,4 @@
-"""Stage `cameras`: pairs, outliers and undistortion as laws; the whole stage on a small rendered street."""
+"""Stage `cameras`: the whole of it on a small rendered street, what it refuses, and how its worker ends."""
 
 import contextlib
 import dataclasses
@@ -14,14 +14,11 @@ import pycolmap
 import pytest
 
 from twin.capture import sfm, worker
-from twin.capture.outliers import path_outliers
-from twin.capture.pairs import SEQUENCE_STEPS, expanded_pairs, frame_signatures, near_pairs, probe_pairs, sequence_pairs
 from twin.capture.types import Capture, SourceInfo
-from twin.capture.undistort import pinhole_of, undistortion_map, write_pinhole_image
 from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
-from twin.geometry.images import psnr, read_image, write_image
+from twin.geometry.images import write_image
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at, rotation_angle, umeyama
 from twin.scene import SceneDir
@@ -286,158 +283,3 @@ def _wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.1)
-
-
-# --- pairs ------------------------------------------------------------------------------------------------------------
-
-
-def test_sequence_stays_within_a_source() -> None:
-    source = np.array([0] * 5 + [1] * 4)
-    pairs = sequence_pairs(source)
-    assert (0, 1) in pairs and (0, 4) in pairs and (5, 8) in pairs
-    assert all(source[i] == source[j] and i < j and j - i in SEQUENCE_STEPS for i, j in pairs)
-
-
-def test_films_at_different_speeds_are_tied_where_they_show_the_same() -> None:
-    # The second film shows at frame q what the first shows at p = q² / 40: slow first, fast later.
-    source = np.array([0] * 40 + [1] * 40)
-    same = {int(q * q / 40): q for q in range(40)}
-    probes = {(p, 40 + q) for p, q in same.items() if p % 3 == 0} | {(5, 75)}
-    inliers = dict.fromkeys(probes, 100) | {(5, 75): 3}
-    pairs = expanded_pairs(source, probes, inliers, min_inliers=25)
-    for p, q in same.items():
-        assert any((p, 40 + q + d) in pairs for d in (-1, 0, 1)), (p, q)
-    assert (5, 75) not in pairs
-
-
-def test_without_anchors_films_are_tied_by_share_of_length() -> None:
-    pairs = expanded_pairs(np.array([0] * 10 + [1] * 19), {(0, 20)}, {}, min_inliers=25)
-    assert all((i, 10 + 2 * i) in pairs for i in range(10))
-
-
-def test_near_cameras_that_nothing_ties_are_paired() -> None:
-    # Out along x for 30 frames and back beside it, looking the same way: the ends of the film meet its start.
-    out = [look_at(np.array([x, 0.0, 1]), np.array([x, 9.0, 1])) for x in range(30)]
-    back = [look_at(np.array([x, 0.5, 1]), np.array([x, 9.5, 1])) for x in range(29, -1, -1)]
-    away = [look_at(np.array([3.0, 0.1, 1]), np.array([3.0, -9.0, 1]))]
-    poses = np.array(out + back + away)
-    tried = sequence_pairs(np.zeros(61, np.int64))
-    pairs = near_pairs(poses, np.arange(61), tried, reach=1.0, most=2)
-    assert (2, 57) in pairs
-    assert not pairs & tried
-    assert not any(60 in pair for pair in pairs)  # it looks the other way
-
-
-def test_signatures_find_the_same_place_under_another_light() -> None:
-    rng = np.random.default_rng(0)
-    places = [rng.integers(0, 200, (80, 128)) for _ in range(8)]
-    views = [
-        np.clip(place[rng.permutation(80)[:60]] + shift + rng.integers(-9, 9, (60, 128)), 0, 255).astype(np.uint8)
-        for shift in (0, 25)
-        for place in places
-    ]
-    source = np.repeat([0, 1], 8)
-    signatures = frame_signatures(views, source, rng)
-    similarity = signatures[:8] @ signatures[8:].T
-    assert np.mean(similarity.argmax(1) == np.arange(8)) >= 0.75
-    probes = probe_pairs(source, signatures)
-    assert sum((i, 8 + i) in probes for i in range(8)) == 8
-    assert frame_signatures([np.zeros((0, 128), np.uint8)] * 3, np.zeros(3, np.int64), rng).max() == 0
-
-
-# --- outliers ---------------------------------------------------------------------------------------------------------
-
-
-def _turning_path(count: int = 50) -> np.ndarray:
-    """30 m straight, then a right turn of 6 m radius, about a metre per frame, with centimetres of shake."""
-    s = np.linspace(0.0, 48.0, count)
-    angle = np.clip((s - 30.0) / 6.0, 0.0, np.pi / 2)
-    past = np.maximum(s - 30.0 - 3.0 * np.pi, 0.0)
-    eyes = np.stack(
-        [np.minimum(s, 30.0) + 6.0 * np.sin(angle), -6.0 * (1 - np.cos(angle)) - past, 1.2 + 0.03 * np.sin(3 * s)], 1
-    )
-    ahead = np.stack([np.cos(angle), -np.sin(angle), 0 * s - 0.1], 1)
-    return np.array([look_at(e, e + a) for e, a in zip(eyes, ahead, strict=True)])
-
-
-def test_a_turning_path_has_no_outliers() -> None:
-    assert not path_outliers(_turning_path(), 0.3).any()
-
-
-def test_a_path_with_stops_and_gaps_has_no_outliers() -> None:
-    path = _turning_path(100)
-    kept = np.random.default_rng(1).random(100) < 0.6
-    assert not path_outliers(path[kept], 0.3).any()
-
-
-@pytest.mark.parametrize("frame", [0, 7, 33, 49])
-def test_a_frame_beside_the_path_is_found_and_no_other(frame: int) -> None:
-    path = _turning_path()
-    path[frame, :3, 3] += [0.3, -0.9, 0.4]
-    assert np.flatnonzero(path_outliers(path, 0.3)).tolist() == [frame]
-
-
-def test_a_twisted_frame_is_found() -> None:
-    path = _turning_path()
-    path[20, :3, :3] = path[20, :3, :3] @ look_at(np.zeros(3), np.array([0.3, 1.0, 0.2]))[:3, :3]
-    assert np.flatnonzero(path_outliers(path, 0.3)).tolist() == [20]
-
-
-def test_two_outliers_side_by_side_are_found() -> None:
-    path = _turning_path()
-    path[20, :3, 3] += [0, 5.0, 0]
-    path[21, :3, 3] += [0, -3.0, 1]
-    assert np.flatnonzero(path_outliers(path, 0.3)).tolist() == [20, 21]
-
-
-def test_photos_in_no_order_have_no_outliers() -> None:
-    path = _turning_path()
-    assert not path_outliers(path[np.random.default_rng(0).permutation(50)], 0.3).any()
-    assert not path_outliers(path[:4], 0.3).any()
-
-
-# --- undistortion -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("model", "params"),
-    [
-        ("SIMPLE_RADIAL", [300.0, 160.0, 120.0, -0.15]),
-        ("OPENCV", [300.0, 290.0, 165.0, 118.0, 0.08, -0.02, 0.002, -0.001]),
-        ("OPENCV_FISHEYE", [200.0, 200.0, 160.0, 120.0, 0.01, 0.0, 0.0, 0.0]),
-    ],
-)
-def test_undistorted_pixels_see_along_the_same_ray(model: str, params: list[float]) -> None:
-    camera = pycolmap.Camera(model=model, params=params, width=320, height=240)
-    pinhole = pinhole_of(camera)
-    mapping = undistortion_map(camera, pinhole)
-    assert mapping is not None and mapping.shape == (240, 320, 2)
-    assert mapping.min() >= -0.51 and (mapping.reshape(-1, 2).max(0) <= [319.51, 239.51]).all()  # nothing to fill in
-    rays = np.asarray(camera.cam_from_img(mapping.reshape(-1, 2).astype(np.float64) + 0.5))
-    wanted = unproject(pixel_grid(320, 240), np.array(pinhole)).reshape(-1, 3)[:, :2]
-    np.testing.assert_allclose(rays, wanted, atol=2e-4)
-
-
-def test_undistortion_undoes_distortion(tmp_path: Path) -> None:
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", params=[300.0, 160.0, 120.0, 0.1], width=320, height=240)
-
-    def picture(rays: np.ndarray) -> np.ndarray:
-        return (127 + 60 * np.sin(9 * rays[..., 0]) + 60 * np.cos(7 * rays[..., 1])).astype(np.uint8)
-
-    raw_rays = np.asarray(camera.cam_from_img(pixel_grid(320, 240).reshape(-1, 2))).reshape(240, 320, 2)
-    write_image(tmp_path / "raw.png", picture(raw_rays))
-    pinhole = pinhole_of(camera)
-    write_pinhole_image(tmp_path / "raw.png", tmp_path / "a" / "flat.png", undistortion_map(camera, pinhole))
-    expected = picture(unproject(pixel_grid(320, 240), np.array(pinhole))[..., :2])
-    flat = read_image(tmp_path / "a" / "flat.png")[..., 0]
-    assert psnr(flat / 255.0, expected / 255.0) > 45.0
-
-
-def test_a_pinhole_image_is_left_alone(tmp_path: Path) -> None:
-    camera = pycolmap.Camera(model="PINHOLE", params=[300.0, 301.0, 160.0, 120.0], width=320, height=240)
-    assert pinhole_of(camera) == (300.0, 301.0, 160.0, 120.0)
-    assert undistortion_map(camera, pinhole_of(camera)) is None
-    image = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
-    write_image(tmp_path / "raw.png", image)
-    write_pinhole_image(tmp_path / "raw.png", tmp_path / "flat.png", None)
-    np.testing.assert_array_equal(read_image(tmp_path / "flat.png"), image)

@@ -293,7 +293,7 @@ def test_no_resumption_drives_what_validation_or_another_seed_drives(scene, tmp_
     built, seen = twin.load_scene(scene), []
     for seed in (0, 1):
         folder = tmp_path / str(seed)
-        for steps in (400, 800):
+        for steps in (160, 320):
             run(built, folder, replace(SHORT, seed=seed, steps=steps, starts=1000, checkpoints=1))
         seen += [int(row["seed"]) for row in rows(folder / "episodes.csv")]
     assert len(set(seen)) == len(seen) > 8

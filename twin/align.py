@@ -18,7 +18,7 @@ from typing import Any
 from twin import progress
 from twin.alignment.aligned import Alignment, align, robot_toml
 from twin.alignment.logs import read_log
-from twin.config import ROBOT_TOML, load_config, parse, read_robot
+from twin.config_file import ROBOT_TOML, load_config, parse, read_robot
 from twin.errors import InputError, refuse
 from twin.robot import HuskyParams
 from twin.scene import SceneDir, digest_file, write_json, write_text

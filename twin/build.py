@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from twin import progress
-from twin.config import SceneConfig, load_config
+from twin.config import SceneConfig
+from twin.config_file import load_config
 from twin.errors import InputError, refuse
 from twin.memory import PeakMemory
 from twin.scene import STAGES, SceneDir, digest_file, write_json

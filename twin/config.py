@@ -1,24 +1,17 @@
 """What a user may say in `scene.toml`: one frozen dataclass per stage, every field with its unit and its default.
 
 A *source* is one film (or photo folder, or posed image set) under one *lighting*. Several sources may share a lighting.
-Unknown keys are refused with the nearest valid name, so that a typo never silently becomes a default.
+How such a file is read and checked is in `config_file.py`.
 """
 
-import dataclasses
-import difflib
-import tomllib
-import types
-import typing
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
-from twin.errors import InputError
 from twin.robot import HuskyParams
 
-ROBOT_TOML = "robot.toml"
-
-_MOST_SEED = 2**31 - 1  # that structure from motion takes
+TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
+"""Said where a lighting's name could be: one drawn at random, as `twin/env/lightings.py` has it."""
+RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
+"""So no lighting may be called so."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +33,7 @@ class SourceConfig:
     path: str = ""
     """Video file, image folder, COLMAP model folder or transforms.json, relative to the scene folder."""
     lighting: str = ""
-    """Its name; by default the file's stem."""
+    """Its name, none of `RESERVED_LIGHTINGS`; by default the file's stem."""
     kind: str = "auto"
     """auto, video, images, colmap or transforms."""
     images: str = ""
@@ -278,168 +271,3 @@ class SceneConfig:
     review: ReviewConfig = field(default_factory=ReviewConfig)
     task: tuple[TaskConfig, ...] = ()
     obstacle: tuple[ObstacleConfig, ...] = ()
-
-
-def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
-    """Reads `scene.toml` and, for `[robot]`, the `robot.toml` beside it; applies `section.key=value` overrides.
-
-    Raises:
-        InputError: no such file, wrong TOML, unknown key, wrong type, or a value out of range.
-    """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"no scene.toml at {path}; write one, or run python -m twin.new SCENE VIDEO...") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    for override in overrides:
-        _apply_override(table, override)
-    if isinstance(table.get("robot", {}), dict):
-        table["robot"] = read_robot(path.parent / ROBOT_TOML) | table.get("robot", {})
-    config = parse(SceneConfig, table, str(path))
-    if not config.name:
-        config = dataclasses.replace(config, name=path.resolve().parent.name)
-    _check(config, path)
-    return config
-
-
-def read_robot(path: Path) -> dict[str, Any]:
-    """The table in a `robot.toml`, checked; empty where there is no such file. Raises InputError."""
-    if not path.exists():
-        return {}
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    parse(HuskyParams, table, str(path))
-    return table
-
-
-def _apply_override(table: dict[str, Any], override: str) -> None:
-    key, equals, text = override.partition("=")
-    names = key.strip().split(".")
-    if not equals or not all(names):
-        raise InputError(f"--set {override!r}: expected section.key=value, such as nerf.steps=4000")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text
-    for name in names[:-1]:
-        table = table.setdefault(name, {})
-        if not isinstance(table, dict):
-            raise InputError(f"--set {override!r}: {name} is not a section")
-    table[names[-1]] = value
-
-
-def parse(kind: type, table: Any, where: str) -> Any:
-    """A frozen dataclass of `kind` from a TOML table, checked key by key. Raises InputError."""
-    if not isinstance(table, dict):
-        raise InputError(f"{where}: expected a table, got {table!r}")
-    hints = typing.get_type_hints(kind)
-    for key in table:
-        if key not in hints:
-            near = difflib.get_close_matches(key, list(hints), n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(hints))}"
-            raise InputError(f"{where}: unknown key {key!r}; {hint}")
-    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
-    try:
-        return kind(**values)
-    except InputError as error:  # a dataclass that checks its own values
-        raise InputError(f"{where}: {error}") from None
-
-
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    origin = typing.get_origin(hint)
-    if origin in (typing.Union, types.UnionType):
-        hint = next(option for option in typing.get_args(hint) if option is not type(None))
-        origin = typing.get_origin(hint)
-    if dataclasses.is_dataclass(hint):
-        return parse(typing.cast(type, hint), value, where)
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise InputError(f"{where}: expected a list, got {value!r}")
-        return tuple(_convert(typing.get_args(hint)[0], item, where) for item in value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not hint:
-        raise InputError(f"{where}: expected {hint.__name__}, got {value!r}")
-    if hint is float and value != value:
-        raise InputError(f"{where}: expected a number, got nan")
-    return value
-
-
-def scale_sources(metric: MetricConfig) -> tuple[str, ...]:
-    """Names of the scale sources that are given: camera_height, distance, gps, marker, poses_are_metric."""
-    given = {
-        "camera_height": metric.camera_height > 0.0,
-        "distance": metric.distance is not None,
-        "gps": metric.gps,
-        "marker": metric.marker is not None,
-        "poses_are_metric": metric.poses_are_metric,
-    }
-    return tuple(name for name, is_given in given.items() if is_given)
-
-
-def _check(config: SceneConfig, path: Path) -> None:
-    if not config.source:
-        raise InputError(f"{path}: no [[source]] given; add one per film, with path = and lighting =")
-    if not 0 <= config.seed <= _MOST_SEED:
-        raise InputError(f"{path}: seed = {config.seed}; expected 0 to {_MOST_SEED}")
-    for source in config.source:
-        if not source.path:
-            raise InputError(f"{path}: a [[source]] has no path; give the video or the image folder")
-        if source.kind not in ("auto", "video", "images", "colmap", "transforms"):
-            raise InputError(f"{path}: kind = {source.kind!r}; expected auto, video, images, colmap or transforms")
-    for task in config.task:
-        if not task.name or task.start < 0.0 or not task.length > 0.0:
-            raise InputError(
-                f"{path}: a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
-                "expected a name, start ≥ 0 and length > 0 [m]"
-            )
-    for section, key, low in (
-        ("capture", "fps", 1e-3),
-        ("capture", "held_out_every", 2),
-        ("capture", "max_frames", 2),
-        ("nerf", "steps", 1),
-        ("nerf", "rays", 1),
-        ("metric", "camera_height", 0.0),
-        ("mesh", "voxel", 1e-3),
-        ("mesh", "ground_cell", 1e-3),
-        ("mjcf", "half_width", 0.1),
-        ("mjcf", "hfield_cell", 1e-3),
-        ("review", "fps", 1),
-        ("review", "speed", 1e-2),
-    ):
-        value = getattr(getattr(config, section), key)
-        if not value >= low:
-            raise InputError(f"{path}: {section}.{key} = {value}; expected at least {low:g}")
-    _check_obstacles(config.obstacle, path)
-    given = scale_sources(config.metric)
-    if len(given) != 1 and not (not given and any(source.camera_height > 0.0 for source in config.source)):
-        # Checked before anything runs, so that nobody waits minutes to learn it.
-        raise InputError(
-            f"{path}: [metric] gives {'no scale' if not given else ' and '.join(given)}; give exactly one of "
-            "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
-            "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true"
-        )
-
-
-def _check_obstacles(obstacles: tuple[ObstacleConfig, ...], path: Path) -> None:
-    for one in obstacles:
-        if one.kind not in OBSTACLE_KINDS:
-            near = difflib.get_close_matches(one.kind, OBSTACLE_KINDS, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"expected {', '.join(OBSTACLE_KINDS)}"
-            raise InputError(f"{path}: [[obstacle]] kind = {one.kind!r}; {hint}")
-        for key, lengths, meaning in (("to", (0, 2), "station and lateral [m]"), ("color", (0, 3), "red, green, blue")):
-            if len(getattr(one, key)) not in lengths:
-                raise InputError(f"{path}: [[obstacle]] {key} = {list(getattr(one, key))}; expected {meaning}")
-        if len(one.size) not in (0, 3) or any(not side > 0.0 for side in one.size):
-            raise InputError(f"{path}: [[obstacle]] size = {list(one.size)}; expected length, width, height > 0 [m]")
-        if not all(0.0 <= c <= 1.0 for c in one.color):
-            raise InputError(f"{path}: [[obstacle]] color = {list(one.color)}; expected values from 0 to 1")
-        if one.to and not one.speed > 0.0:
-            raise InputError(f"{path}: [[obstacle]] speed = {one.speed}; expected more than 0 where it moves")
-    names = [one.name for one in obstacles if one.name]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: two [[obstacle]] are named {twice!r}; give each a name of its own")

@@ -48,13 +48,15 @@ def film(
         The film's path, and the episode.
 
     Raises:
-        InputError: the scene, task, policy or an option is not to be had.
+        InputError: the scene, task, policy or an option is not to be had, or the seed is negative.
     """
     from twin.env.drivers import Driver, PolicyDriver, RouteDriver
     from twin.env.episode import record
     from twin.report.episode_film import film_episode
     from twin.report.review import surroundings
 
+    if seed < 0:
+        raise InputError(f"seed = {seed}: expected 0 or more")
     scene = load_scene(root)
     driver: Driver = RouteDriver()
     who = "scripted driver"
@@ -134,7 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _obstacles(text: str) -> str | int:
     if text == "scene":
         return text
-    if not text.isdigit():
+    if not text.isdecimal():  # "²" is a digit, too
         raise InputError(f"--obstacles {text!r}: expected a number, or 'scene' for those of scene.toml")
     return int(text)
 

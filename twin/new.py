@@ -4,18 +4,26 @@
 
 writes `scenes/my_road/scene.toml`, with every line a user is likely to want, and copies the films into `input/`.
 `python -m twin.build scenes/my_road` builds it.
+
+A *posed image set* is a `transforms.json` or a COLMAP model, which names images that lie elsewhere. Its *root* is the
+nearest folder that has all of it below; from there the files it needs are copied, where they were below it.
 """
 
 import argparse
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
 
-from twin.capture.formats import detect_kind
+from twin.capture.colmap import find_model
+from twin.capture.formats import ImageSet, detect_kind, files_named, read_colmap, read_transforms
 from twin.capture.video import probe
+from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError, refuse
 from twin.scene import SceneDir, digest_file, write_text
+
+_POSED = ("colmap", "transforms")
 
 _HEAD = """\
 # What twin.build knows of this place. Every other setting has a default: see twin/config.py.
@@ -61,7 +69,8 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
         The path of `scene.toml`.
 
     Raises:
-        InputError: a scene is there already, a film cannot be read, or the height is impossible.
+        InputError: a scene is there already, a film cannot be read, a posed image set's images are not to be found, or
+            the height is impossible.
     """
     scene = SceneDir(root)
     if scene.config_file.exists():
@@ -71,14 +80,18 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
     for film in films:
         if not film.exists():
             raise InputError(f"{film}: no such film; give the path of a video file or an image folder")
-        if detect_kind(film) == "video":
+        kind = detect_kind(film)
+        if kind == "video":
             probe(film)
+        elif kind in _POSED:
+            _image_set(film)
     inputs = root / "input"
     inputs.mkdir(parents=True, exist_ok=True)
     text = _HEAD.format(name=_quoted(root.resolve().name))
     for film in films:
-        copy = _copied(film.resolve(), inputs)
-        text += _SOURCE.format(path=_quoted(f"input/{copy.name}"), lighting=_quoted(_lighting(copy)))
+        path = _brought(film, inputs)
+        lighting = _lighting(path, detect_kind(film))
+        text += _SOURCE.format(path=_quoted(("input" / path).as_posix()), lighting=_quoted(lighting))
     given = f"{camera_height:<14g}" if camera_height is not None else None
     line = f"camera_height = {given} # lens above the ground [m], carried at a constant height"
     if given is None:
@@ -87,32 +100,86 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
     return scene.config_file
 
 
+def _brought(film: Path, inputs: Path) -> Path:
+    """Where a film (or folder, or posed image set) is under `input/`, relative to it; copied unless it is there."""
+    film, inputs = (Path(os.path.normpath(path.absolute())) for path in (film, inputs))
+    if film.is_relative_to(inputs):
+        return film.relative_to(inputs)
+    return _copied_set(film, inputs) if detect_kind(film) in _POSED else _copied(film, inputs)
+
+
 def _copied(film: Path, inputs: Path) -> Path:
     """A copy of a film (or folder) under `input/`; what is there already is kept and reused where it is the same."""
     copy, number = inputs / film.name, 2
     while copy.exists() and not _is_same(film, copy):
         copy, number = inputs / f"{film.stem}_{number}{film.suffix}", number + 1
-    if copy.exists():
-        return copy
-    aside = copy.with_name(copy.name + ".partial")  # an interrupted copy never passes for a film
-    if film.is_dir():
-        shutil.rmtree(aside, ignore_errors=True)
-        shutil.copytree(film, aside)
-    else:
-        shutil.copyfile(film, aside)
-    aside.replace(copy)
-    return copy
+    if not copy.exists():
+        aside = copy.with_name(copy.name + ".partial")  # an interrupted copy never passes for a film
+        if film.is_dir():
+            shutil.rmtree(aside, ignore_errors=True)
+            shutil.copytree(film, aside)
+        else:
+            shutil.copyfile(film, aside)
+        aside.replace(copy)
+    return copy.relative_to(inputs)
 
 
 def _is_same(film: Path, copy: Path) -> bool:
-    if film == copy.resolve():
-        return True
     both_files = film.is_file() and copy.is_file() and film.stat().st_size == copy.stat().st_size
     return both_files and digest_file(film) == digest_file(copy)
 
 
-def _lighting(copy: Path) -> str:
-    return copy.stem.replace(":", "_").replace("/", "_")
+def _copied_set(film: Path, inputs: Path) -> Path:
+    """A copy of a posed image set under `input/`, from its root on."""
+    root, files = _posed_files(film)
+    copy, number = inputs / root.name, 2
+    while copy.exists():
+        copy, number = inputs / f"{root.name}_{number}", number + 1
+    aside = copy.with_name(copy.name + ".partial")
+    shutil.rmtree(aside, ignore_errors=True)
+    for file in files:
+        place = aside / file.relative_to(root)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, place)
+    within = film.relative_to(root)
+    outside = [path for path in _image_set(aside / within).paths if not path.is_relative_to(aside)]
+    if outside:
+        shutil.rmtree(aside)
+        raise InputError(f"{film}: names images by absolute paths, such as {outside[0]}; make them relative to it")
+    aside.replace(copy)
+    return Path(copy.name) / within
+
+
+def _image_set(film: Path) -> ImageSet:
+    """A posed image set. Raises InputError where its images are not to be found."""
+    try:
+        return read_colmap(film) if detect_kind(film) == "colmap" else read_transforms(film)
+    except InputError as error:
+        raise InputError(str(error).replace("set images =", "put them beside it, or set images =")) from None
+
+
+def _posed_files(film: Path) -> tuple[Path, list[Path]]:
+    """The root of a posed image set, and the files that are needed of it."""
+    model = find_model(film) if film.is_dir() else None
+    if model is not None:
+        files = [path for path in model.iterdir() if path.is_file()]
+    else:
+        table = film / "transforms.json" if film.is_dir() else film
+        files = [table, *files_named(table)]
+    files = [Path(os.path.normpath(file)) for file in (*files, *_image_set(film).paths)]
+    root = Path(os.path.commonpath([film if film.is_dir() else film.parent, *files]))
+    if root == root.parent:
+        raise InputError(
+            f"{film}: its images, such as {files[-1]}, lie too far from it; put them in a folder beside it"
+        )
+    return root, list(dict.fromkeys(files))
+
+
+def _lighting(path: Path, kind: str) -> str:
+    """A lighting's name for a path under `input/`: that of the film, or of the root of a posed image set."""
+    name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
+    name = name.replace(":", "_").replace("/", "_")
+    return f"{name}_light" if name in RESERVED_LIGHTINGS else name
 
 
 def _quoted(text: str) -> str:

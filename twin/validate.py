@@ -282,7 +282,7 @@ def _digest(path: Path, source: str) -> str:
 
 
 def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
-    from twin.config import load_config
+    from twin.config_file import load_config
     from twin.env.stretches import find_task
 
     world, config = twin.world(), load_config(twin.scene.config_file)

@@ -18,7 +18,7 @@ from twin.capture.masks import Masks, read_mask
 from twin.capture.photos import read_photos
 from twin.capture.types import Capture
 from twin.capture.video import FilmCount, damage_note, read_film
-from twin.config import CaptureConfig, SceneConfig, SourceConfig
+from twin.config import RESERVED_LIGHTINGS, CaptureConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
 from twin.scene import SceneDir
 
@@ -33,10 +33,11 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         InputError: an unreadable or impossible input, or fewer than two usable frames in all.
     """
     names = source_names([source.path for source in config.source])
+    lightings = [_lighting(source) for source in config.source]
     kept = []
-    for name, source in zip(names, config.source, strict=True):
+    for name, lighting, source in zip(names, lightings, config.source, strict=True):
         with FrameWriter(out, name) as writer:
-            kept.append(_read_source(scene.root, name, source, config.capture, writer))
+            kept.append(_read_source(scene.root, name, lighting, source, config.capture, writer))
     total = sum(len(one.index) for one in kept)
     if total < 2:
         what = "frame" if total == 1 else "frames"
@@ -82,12 +83,23 @@ def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
     return held_out
 
 
-def _read_source(root: Path, name: str, source: SourceConfig, config: CaptureConfig, writer: FrameWriter) -> Kept:
-    path = root / source.path
-    kind = detect_kind(path) if source.kind == "auto" or not path.exists() else source.kind
+def _lighting(source: SourceConfig) -> str:
     lighting = source.lighting or _stem(source.path)
     if set(lighting) & set(":/"):
         raise InputError(f"lighting = {lighting!r}: ':' and '/' have a meaning of their own; choose a plain name")
+    if lighting in RESERVED_LIGHTINGS:
+        raise InputError(
+            f"{source.path}: lighting = {lighting!r} has a meaning of its own, a light drawn at random; choose another "
+            "name, such as morning"
+        )
+    return lighting
+
+
+def _read_source(
+    root: Path, name: str, lighting: str, source: SourceConfig, config: CaptureConfig, writer: FrameWriter
+) -> Kept:
+    path = root / source.path
+    kind = detect_kind(path) if source.kind == "auto" or not path.exists() else source.kind
     masks = Masks(root / source.mask) if source.mask else None
     task = Task(path, name, lighting, kind, source, config, masks, writer)
     images = root / source.images if source.images else None

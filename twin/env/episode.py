@@ -9,7 +9,8 @@ import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import ObstacleConfig, parse
+from twin.config import ObstacleConfig
+from twin.config_file import parse
 from twin.env.dm import control
 from twin.env.drivers import Driver
 from twin.scene import read_json, write_json

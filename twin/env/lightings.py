@@ -27,12 +27,11 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
 from twin.nerf.baked import BakedField
 
 Floats = NDArray[np.float32]
-
-TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 
 _SEED = 20_240_315  # of the anchors; a constant, so that every run on a build has the same sets
 _DRAWN = 200  # lights that anchors are chosen among
@@ -159,7 +158,7 @@ def draw_light(
     if not drift:
         return Light(name, start)
     other, end = _one(wanted, sets, rng)
-    if isinstance(wanted, str) and wanted not in (TRAINING, HELD_OUT, ANY):
+    if isinstance(wanted, str) and wanted not in RESERVED_LIGHTINGS:
         names = [n for n in sets.field.lightings if n != wanted]
         if not names:
             raise InputError(f"lighting {wanted!r} cannot drift: the field has no other; give lighting_drift=False")

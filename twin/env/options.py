@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from twin.config import ObstacleConfig
+from twin.config import TRAINING, ObstacleConfig
 from twin.env.camera_effects import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
-from twin.env.lightings import TRAINING
 from twin.env.randomisation import Ranges
 from twin.errors import InputError
 

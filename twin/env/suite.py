@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from dm_env import specs
 
-from twin.config import load_config
+from twin.config_file import load_config
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles

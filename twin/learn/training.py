@@ -31,7 +31,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from twin.env.lightings import ANY, HELD_OUT, TRAINING
+from twin.config import ANY, HELD_OUT, TRAINING
 from twin.env.options import NERF, STEERING, Rewards
 from twin.env.suite import fingerprint
 from twin.errors import InputError

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import parse
+from twin.config_file import parse
 from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
 from twin.scene import read_json, write_json
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.scene import SceneDir, read_json, write_json
 
@@ -42,6 +43,10 @@ def check_name(name: str, filmed: tuple[str, ...]) -> None:
     """Raises InputError where a name cannot be that of an added lighting: it names a file, and a part of a mixture."""
     if not _NAME.fullmatch(name):
         raise InputError(f"--name {name!r}: expected letters, digits and _ . - only, such as afternoon")
+    if name in RESERVED_LIGHTINGS:
+        raise InputError(
+            f"--name {name!r}: has a meaning of its own, a light drawn at random; choose another, such as afternoon"
+        )
     if name in filmed:
         raise InputError(f"--name {name!r}: the place was filmed under a lighting of this name; choose another")
 

@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
+from twin.errors import InputError
 from twin.nerf import network
 from twin.nerf.baked import BakedField
 from twin.nerf.compute import parallel, single_threaded_torch, view
@@ -48,11 +49,19 @@ def bake(
         field: A trained field.
         pixels: The frames it was trained on.
         seed: Of the fine-tuning's batches.
-        steps: Of fine-tuning.
+        steps: Of fine-tuning, at least 1.
         most_bricks: Cells grow until there are no more bricks than this; 9,000 are 105 MB.
+
+    Raises:
+        InputError: no camera sees anything in the field.
     """
     began = time.perf_counter()
     near, far = _matter(field, pixels)
+    if not len(near) and not len(far):
+        raise InputError(
+            "no training camera sees anything in the trained field, so there is nothing to bake; raise nerf.steps, or "
+            "lower nerf.near_plane or set nerf.near_half_extent = 0 where these were changed"
+        )
     layout, slots = _layout(field, near, far, most_bricks)
     values = _sample(field, layout, slots)
     tuner = _Tuner(field, pixels, layout, slots, values, steps, seed)
@@ -214,7 +223,7 @@ class _Tuner:
                 errors.append(sum(parallel(go, range(_SHARDS), self.field.where)) / _SHARDS)
                 parallel(update, range(parts), self.field.where)
                 progress.update()
-        return float(-10 * np.log10(np.mean(errors[-max(1, steps // 10) :]))) if errors else float("nan")
+        return float(-10 * np.log10(np.mean(errors[-max(1, steps // 10) :])))
 
     def _shard(self, shard: int, colour: torch.Tensor, step: int) -> float:
         f, ws = self.field, self.ws

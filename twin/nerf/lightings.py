@@ -36,7 +36,7 @@ class Lightings:
         """The embedding of a lighting, a frame or a mixture, shape (dim,).
 
         Raises:
-            InputError: an unknown name, or a mixture that is not `a:b:share`.
+            InputError: an unknown name, or a mixture that is not `a:b:share` with a share from 0 to 1.
         """
         if lighting in self.names:
             return self.vectors[self.names.index(lighting)]
@@ -48,6 +48,11 @@ class Lightings:
                 s = float(share)
             except ValueError:
                 raise InputError(f"lighting {lighting!r}: {share!r} is no number; expected a:b:share") from None
+            if not 0.0 <= s <= 1.0:
+                raise InputError(
+                    f"lighting {lighting!r}: the share {share} is not from 0 to 1; give {a}:{b}:0.3 for 30 % of the "
+                    f"way from {a} to {b}"
+                )
             return ((1.0 - s) * self.embedding(a) + s * self.embedding(b)).astype(np.float32)
         if lighting in self.stale:
             raise InputError(

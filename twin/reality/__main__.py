@@ -14,10 +14,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from twin.config import HELD_OUT
 from twin.errors import InputError, refuse
 from twin.reality import drive, log
 from twin.reality import place as places
-from twin.reality.drive import HELD_OUT, TASKS
+from twin.reality.drive import TASKS
 from twin.reality.film import CAMERA_HEIGHT, Plan, depths, shoot
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import HALF_WIDTH, Film, Truth

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import HELD_OUT
 from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
 from twin.env.tasks import CAMERA
@@ -37,8 +38,6 @@ from twin.report.trials import (
 from twin.scene import digest_file, read_json, write_json, write_text
 
 TASKS = ("straight", "right_turn")
-HELD_OUT = "held-out"
-"""The twin's lighting that results are compared with, as it knows none of reality's by name."""
 
 _FIRST_SEED = 7_000_000  # of the first trial
 _PER_WEATHER = 10_000  # seeds, and most trials of a policy

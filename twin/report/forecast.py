@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from twin.config import parse
+from twin.config_file import parse
 from twin.errors import InputError
 from twin.report import ranking
 from twin.report.bootstrap import DRAWS

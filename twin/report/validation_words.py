@@ -5,7 +5,7 @@
 
 from typing import Any
 
-from twin.env.lightings import ANY, HELD_OUT, TRAINING
+from twin.config import ANY, HELD_OUT, TRAINING
 from twin.report.forecast import Estimate
 from twin.report.forecast_words import show
 from twin.report.words import Caution, Verdict, listing

@@ -1,0 +1,128 @@
+"""The verb that starts a scene: what it writes can be loaded and built."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filmed_wall import HEIGHT, WIDTH, film, views
+
+from twin.build import build
+from twin.config_file import load_config
+from twin.geometry.images import write_image
+from twin.new import main as new_main
+
+
+def test_new_writes_a_scene_that_loads_and_never_overwrites(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    day = film(tmp_path / "day.mp4", views([5 * i for i in range(4)]))
+    dusk = film(tmp_path / 'other/du"sk.mp4', views([5 * i for i in range(4)]))
+    root = tmp_path / "scenes" / "road"
+    assert new_main([str(root), str(day), str(dusk), "--camera-height", "1.2"]) == 0
+    config = load_config(root / "scene.toml")
+    assert config.name == "road" and config.metric.camera_height == 1.2
+    assert [(s.path, s.lighting) for s in config.source] == [("input/day.mp4", "day"), ('input/du"sk.mp4', 'du"sk')]
+    assert (root / "input/day.mp4").read_bytes() == day.read_bytes()
+    before = (root / "scene.toml").read_text()
+    for line in before.splitlines():  # every commented line is a setting that exists
+        if line.startswith("# ") and " = " in line and "[fx" not in line:
+            (tmp_path / "one.toml").write_text(_uncommented(before, line))
+            load_config(tmp_path / "one.toml")
+    capsys.readouterr()
+    assert new_main([str(root), str(day)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and "already" in error and (root / "scene.toml").read_text() == before
+
+
+def _uncommented(text: str, line: str) -> str:
+    scales = ("# gps", "# poses", "# marker", "# distance")
+    if line.startswith(scales):
+        text = text.replace("camera_height = 1.2", "# camera_height = 1.2")
+    return text.replace(line, line.removeprefix("# "), 1)
+
+
+@pytest.mark.parametrize("arguments", [["absent.mp4"], ["text.mp4"], ["day.mp4", "--camera-height", "-1"]])
+def test_new_refuses_what_cannot_be_built(
+    tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    film(tmp_path / "day.mp4", views([0, 5, 10]))
+    (tmp_path / "text.mp4").write_text("no film")
+    assert new_main(["scene", *arguments]) == 2
+    assert capsys.readouterr().err.startswith("error: ") and not (tmp_path / "scene/scene.toml").exists()
+
+
+def _transforms(folder: Path, name: str = "transforms.json", prefix: str = "images/") -> Path:
+    """A posed image set of three views, its images where `prefix` says."""
+    frames = []
+    for i, picture in enumerate(views([0, 9, 18])):
+        write_image(folder / prefix / f"{i}.png", picture)
+        frames.append({"file_path": f"{prefix}{i}.png", "transform_matrix": np.eye(4).tolist()})
+    (folder / name).write_text(json.dumps({"frames": frames, "fl_x": 150.0}))
+    return folder / name
+
+
+def _colmap(root: Path) -> Path:
+    """A COLMAP workspace of three views; its model, in text."""
+    model = root / "sparse/0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 150 150 80 60\n")
+    lines = []
+    for i, picture in enumerate(views([0, 9, 18])):
+        write_image(root / f"images/left/{i}.png", picture)
+        lines += [f"{i + 1} 1 0 0 0 {0.1 * i} 0 0 1 left/{i}.png", ""]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (root / "database.db").write_bytes(b"what no build needs")
+    return model
+
+
+@pytest.mark.parametrize("given", ["transforms.json", "its folder", "images elsewhere", "model", "workspace"])
+def test_a_posed_image_set_is_copied_with_its_images_and_can_be_built(tmp_path: Path, given: str) -> None:
+    data = tmp_path / "data/fox"
+    if given in ("model", "workspace"):
+        given_path = _colmap(data) if given == "model" else _colmap(data).parents[1]
+        path = "input/fox/sparse/0" if given == "model" else "input/fox"
+    elif given == "images elsewhere":
+        given_path, path = _transforms(data / "nerf", "poses.json", "../photos/"), "input/fox/nerf/poses.json"
+    else:
+        table = _transforms(data)
+        given_path, path = (table, "input/fox/transforms.json") if given == "transforms.json" else (data, "input/fox")
+    root = tmp_path / "scene"
+    assert new_main([str(root), str(given_path), "--camera-height", "1.2"]) == 0
+    (source,) = load_config(root / "scene.toml").source
+    assert (source.path, source.lighting) == (path, "fox")
+    shutil.rmtree(tmp_path / "data")  # the scene stands alone
+    report = build(root, until="capture")
+    assert report["capture"]["frames"] == 3 and report["capture"]["posed"]
+    assert not list((root / "input").rglob("*.db")) and not list((root / "input").glob("*.partial"))
+
+
+def test_a_posed_image_set_in_the_scene_stays_where_it_is(tmp_path: Path) -> None:
+    table = _transforms(tmp_path / "scene/input/fox")
+    assert new_main([str(tmp_path / "scene"), str(table), "--camera-height", "1.2"]) == 0
+    (source,) = load_config(tmp_path / "scene/scene.toml").source
+    assert (source.path, source.lighting) == ("input/fox/transforms.json", "fox")
+    assert [path.name for path in (tmp_path / "scene/input").iterdir()] == ["fox"]
+
+
+def test_a_posed_image_set_without_its_images_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    table, model = _transforms(tmp_path / "a"), _colmap(tmp_path / "b")
+    shutil.rmtree(tmp_path / "a/images")
+    shutil.rmtree(tmp_path / "b/images")
+    absolute = _transforms(tmp_path / "c", prefix=f"{tmp_path / 'c'}/")
+    for given, words in (
+        (table, "none of its 3 images"),
+        (model, "none of its 3 images"),
+        (absolute, "absolute paths"),
+    ):
+        assert new_main([str(tmp_path / "scene"), str(given)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ") and words in error and error.count("\n") == 1
+        assert not (tmp_path / "scene/scene.toml").exists() and not list((tmp_path / "scene").glob("input/*"))
+
+
+@pytest.mark.parametrize("name", ["training", "any"])
+def test_a_lighting_s_name_means_no_other_light(tmp_path: Path, name: str) -> None:
+    day = film(tmp_path / f"{name}.mp4", views([5 * i for i in range(4)]))
+    assert new_main([str(tmp_path / "scene"), str(day), "--camera-height", "1.2"]) == 0
+    assert build(tmp_path / "scene", until="capture")["capture"]["frames"] >= 2

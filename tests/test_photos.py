@@ -1,0 +1,121 @@
+"""Photos and posed image sets: which are kept, what their headers and poses are taken for, which are refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views
+from PIL import ExifTags, Image
+
+from twin.capture.photos import photo_times, regular_choice
+from twin.config import SourceConfig
+from twin.geometry.images import read_image, write_image
+
+
+def test_photos_are_kept_in_order_without_exact_duplicates(tmp_path: Path) -> None:
+    for i, frame in enumerate(views([5 * i for i in range(11)])):
+        write_image(tmp_path / f"photos/p{i}.png", frame)
+    write_image(tmp_path / "photos/p11.png", read_image(tmp_path / "photos/p3.png"))
+    capture, metrics, out = captured(tmp_path, [SourceConfig(path="photos")])
+    assert metrics["sources"]["photos"]["duplicates"] == 1 and len(capture.names) == 11
+    np.testing.assert_array_equal(read_image(out / "images/photos/000010.png"), views([50])[0])
+    few = captured(tmp_path, [SourceConfig(path="photos")], frames=4)[0].names
+    assert few == ("photos/000000", "photos/000004", "photos/000007", "photos/000011")
+    assert not capture.sources[0].calibrated and capture.sources[0].camera_params == ()
+
+
+def test_a_photo_is_turned_upright_and_its_header_is_used(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    for i, frame in enumerate(views([9 * i for i in range(3)])):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 6  # turn a quarter clockwise to show it
+        photo = exif.get_ifd(ExifTags.IFD.Exif)
+        photo[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+        photo[ExifTags.Base.DateTimeOriginal] = f"2024:05:01 12:00:{10 + 2 * i}"
+        gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        gps[ExifTags.GPS.GPSLatitudeRef], gps[ExifTags.GPS.GPSLatitude] = "N", (55.0, 30.0, 0.0)
+        gps[ExifTags.GPS.GPSLongitudeRef], gps[ExifTags.GPS.GPSLongitude] = "E", (13.0, 15.0, 0.0)
+        Image.fromarray(frame).save(tmp_path / f"photos/{i}.jpg", quality=95, exif=exif)
+    capture, metrics, out = captured(tmp_path, [SourceConfig(path="photos")])
+    kept = read_image(out / "images/photos/000001.png").astype(int)
+    assert np.abs(kept - np.rot90(views([9])[0], -1)).mean() < 6.0
+    np.testing.assert_allclose(capture.times, (0.0, 2.0, 4.0))
+    np.testing.assert_allclose(capture.gps, [(55.5, 13.25, np.nan)] * 3)
+    focal = 26.0 / np.hypot(36, 24) * np.hypot(WIDTH, HEIGHT)
+    np.testing.assert_allclose(capture.sources[0].camera_params, (focal, HEIGHT / 2, WIDTH / 2, 0.0))
+    assert capture.sources[0].camera_model == "SIMPLE_RADIAL" and not capture.sources[0].calibrated
+    assert metrics["with_gps"] == 3
+
+
+@pytest.mark.parametrize(("keep", "words"), [(0.0, "0 bytes"), (0.5, "cut off")])
+def test_a_damaged_photo_is_named(tmp_path: Path, keep: float, words: str) -> None:
+    for i, frame in enumerate(views([5 * i for i in range(3)])):
+        write_image(tmp_path / f"photos/{i}.jpg", frame)
+    path = tmp_path / "photos/1.jpg"
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
+    refused(tmp_path, SourceConfig(path="photos"), rf"1\.jpg.*{words}")
+
+
+def test_photos_of_two_shapes_are_refused(tmp_path: Path) -> None:
+    for i, frame in enumerate(views([0, 9])):
+        write_image(tmp_path / f"photos/{i}.png", frame if i else frame.swapaxes(0, 1))
+    refused(tmp_path, SourceConfig(path="photos"), "source of their own")
+
+
+def _posed(tmp_path: Path, per_frame: list[dict[str, Any]], **top: Any) -> None:
+    frames = []
+    for i, extra in enumerate(per_frame):
+        write_image(tmp_path / f"posed/{i}.png", views([9 * i])[0])
+        frames.append({"file_path": f"{i}.png", "transform_matrix": np.eye(4).tolist(), **extra})
+    (tmp_path / "posed/transforms.json").write_text(json.dumps({"frames": frames, **top}))
+
+
+def test_poses_and_intrinsics_of_images_half_their_size(tmp_path: Path) -> None:
+    _posed(tmp_path, [{}] * 3, fl_x=300.0, fl_y=310.0, cx=158.0, cy=122.0, w=2 * WIDTH, h=2 * HEIGHT, k1=0.1)
+    capture, metrics, _ = captured(tmp_path, [SourceConfig(path="posed")])
+    assert metrics["posed"] and capture.camera_to_world is not None
+    np.testing.assert_allclose(capture.intrinsics, [(150.0, 155.0, 79.0, 61.0)] * 3)  # type: ignore[arg-type]
+    np.testing.assert_allclose(capture.camera_to_world, [np.diag([1.0, -1.0, -1.0, 1.0])] * 3)
+    assert capture.sources[0].camera_model == "OPENCV" and capture.sources[0].calibrated
+    np.testing.assert_allclose(capture.sources[0].camera_params, (150.0, 155.0, 79.0, 61.0, 0.1, 0.0, 0.0, 0.0))
+
+
+def test_lenses_that_differ_in_distortion_are_flattened(tmp_path: Path) -> None:
+    _posed(tmp_path, [{"k1": -0.3}, {"k1": -0.2}, {"k1": 0.0, "k2": 0.0}], fl_x=150.0, w=WIDTH, h=HEIGHT)
+    capture, _, out = captured(tmp_path, [SourceConfig(path="posed")])
+    assert capture.sources[0].camera_model == "PINHOLE" and capture.intrinsics is not None
+    assert len({tuple(k) for k in capture.intrinsics.round(3)}) == 3
+    np.testing.assert_array_equal(read_image(out / "images/posed/000002.png"), views([18])[0])
+    assert (read_image(out / "images/posed/000000.png") != views([0])[0]).any()
+
+
+def test_poses_count_only_where_every_source_brings_them(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    _posed(tmp_path, [{}] * 3, fl_x=150.0)
+    film(tmp_path / "film.mp4", views([5 * i for i in range(6)]))
+    capture, metrics, _ = captured(tmp_path, [SourceConfig(path="posed"), SourceConfig(path="film.mp4")], frames=6)
+    assert capture.camera_to_world is None and capture.intrinsics is None and not metrics["posed"]
+    assert capture.sources[0].calibrated  # its lens is still known
+    assert "film brings none" in capsys.readouterr().err
+
+
+def test_photo_times_need_a_clock_that_rises() -> None:
+    assert photo_times([10.0, 11.5, 12.0], [0, 1, 2]) == [0.0, 1.5, 2.0]
+    for clock in ([10.0, 10.0, 12.0], [10.0, 9.0, 12.0], [10.0, None, 12.0]):
+        assert photo_times(clock, [0, 2, 3]) == [0.0, 2.0, 3.0]
+
+
+def test_a_regular_choice_has_both_ends() -> None:
+    assert regular_choice(10, 4).tolist() == [0, 3, 6, 9] and regular_choice(3, 4).tolist() == [0, 1, 2]
+
+
+@pytest.mark.realdata
+def test_photos_with_gps_and_a_posed_set(tmp_path: Path, real_data: Path) -> None:
+    capture, _, _ = captured(tmp_path, [SourceConfig(path=str(real_data / "lund_street/images"))], max_size=256)
+    assert len(capture.names) == 29 and np.isfinite(capture.gps).all()
+    fox = SourceConfig(path=str(real_data / "fox/transforms_orig_1080x1920.json"))
+    capture, metrics, _ = captured(tmp_path, [fox])
+    source = next(iter(metrics["sources"].values()))
+    assert (source["kept"], source["missing"], source["width"]) == (50, 17, 540) and capture.intrinsics is not None
+    np.testing.assert_allclose(capture.intrinsics[0], (687.76, 687.245, 277.279, 482.634))

@@ -1,0 +1,55 @@
+"""From a distorted picture to the pinhole's."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from twin.capture.undistort import pinhole_of, undistortion_map, write_pinhole_image
+from twin.geometry.cameras import pixel_grid, unproject
+from twin.geometry.images import psnr, read_image, write_image
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", [300.0, 160.0, 120.0, -0.15]),
+        ("OPENCV", [300.0, 290.0, 165.0, 118.0, 0.08, -0.02, 0.002, -0.001]),
+        ("OPENCV_FISHEYE", [200.0, 200.0, 160.0, 120.0, 0.01, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_undistorted_pixels_see_along_the_same_ray(model: str, params: list[float]) -> None:
+    camera = pycolmap.Camera(model=model, params=params, width=320, height=240)
+    pinhole = pinhole_of(camera)
+    mapping = undistortion_map(camera, pinhole)
+    assert mapping is not None and mapping.shape == (240, 320, 2)
+    assert mapping.min() >= -0.51 and (mapping.reshape(-1, 2).max(0) <= [319.51, 239.51]).all()  # nothing to fill in
+    rays = np.asarray(camera.cam_from_img(mapping.reshape(-1, 2).astype(np.float64) + 0.5))
+    wanted = unproject(pixel_grid(320, 240), np.array(pinhole)).reshape(-1, 3)[:, :2]
+    np.testing.assert_allclose(rays, wanted, atol=2e-4)
+
+
+def test_undistortion_undoes_distortion(tmp_path: Path) -> None:
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", params=[300.0, 160.0, 120.0, 0.1], width=320, height=240)
+
+    def picture(rays: np.ndarray) -> np.ndarray:
+        return (127 + 60 * np.sin(9 * rays[..., 0]) + 60 * np.cos(7 * rays[..., 1])).astype(np.uint8)
+
+    raw_rays = np.asarray(camera.cam_from_img(pixel_grid(320, 240).reshape(-1, 2))).reshape(240, 320, 2)
+    write_image(tmp_path / "raw.png", picture(raw_rays))
+    pinhole = pinhole_of(camera)
+    write_pinhole_image(tmp_path / "raw.png", tmp_path / "a" / "flat.png", undistortion_map(camera, pinhole))
+    expected = picture(unproject(pixel_grid(320, 240), np.array(pinhole))[..., :2])
+    flat = read_image(tmp_path / "a" / "flat.png")[..., 0]
+    assert psnr(flat / 255.0, expected / 255.0) > 45.0
+
+
+def test_a_pinhole_image_is_left_alone(tmp_path: Path) -> None:
+    camera = pycolmap.Camera(model="PINHOLE", params=[300.0, 301.0, 160.0, 120.0], width=320, height=240)
+    assert pinhole_of(camera) == (300.0, 301.0, 160.0, 120.0)
+    assert undistortion_map(camera, pinhole_of(camera)) is None
+    image = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    write_image(tmp_path / "raw.png", image)
+    write_pinhole_image(tmp_path / "raw.png", tmp_path / "flat.png", None)
+    np.testing.assert_array_equal(read_image(tmp_path / "flat.png"), image)
