@@ -4,7 +4,6 @@ This is the standard pipeline that a radiance field is compared with. `mujoco_wa
 same camera as the field's pictures; its light is the model's own, whatever lighting is asked for.
 """
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -13,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.cores import cores
 from twin.env.camera_effects import CameraEffects
 from twin.env.obstacle_shapes import OBSTACLE_GROUP
 from twin.env.obstacle_view import camera_intrinsics, camera_pose
@@ -40,9 +40,8 @@ class SimulatorView:
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         # One after the other, as Warp compiles kernels when they are first used.
-        self._painters = [_Painter(model, size, self._rays) for _ in range(min(worlds, cores))]
+        self._painters = [_Painter(model, size, self._rays) for _ in range(min(worlds, cores()))]
         self._pool = ThreadPoolExecutor(len(self._painters))
 
     def render(
