@@ -1,19 +1,22 @@
 """The laws of the build verb, on a pipeline of stages that take no time."""
 
 import errno
+import importlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import textwrap
 import time
 import types
+from pathlib import Path
 
 import pytest
 
 from twin import build as verb
-from twin.config import SceneConfig, SourceConfig
+from twin.config import MjcfConfig, SceneConfig, SourceConfig
 from twin.scene import SceneDir
 from twin.stamp import Stamp
 
@@ -64,6 +67,30 @@ def test_runs_once_then_only_what_a_change_touches(pipeline):
     assert _rerun(pipeline) == ["cameras", "field"]
     assert _rerun(pipeline, "mesh.voxel=0.3") == []
     assert _rerun(pipeline, "seed=5") == ["capture", "cameras", "field"]
+
+
+def test_what_a_stage_reads_of_the_configuration_is_in_a_key():
+    """Its own, or that of a stage before it, through whose result it comes."""
+    sections = {f.name for f in verb.dataclasses.fields(SceneConfig)} - {"name", "seed"}
+    keys: dict[str, set[str]] = {}
+    for stage in verb.PIPELINE:
+        keys[stage.name] = set(stage.config).union(*(keys[name] for name in stage.upstream))
+        source = Path(importlib.import_module(stage.module).__file__).read_text(encoding="utf-8")
+        reads = {match for match in re.findall(r"\bconfig\.(\w+)(?:\.(\w+))?", source) if match[0] in sections}
+        assert reads, stage.name
+        missing = {".".join(filter(None, r)) for r in reads if not {r[0], ".".join(r)} & keys[stage.name]}
+        assert not missing, f"{stage.name} reads {missing}"
+
+
+def test_a_field_is_made_anew_where_a_drive_becomes_none():
+    """Without a route the camera's height is not held to be constant."""
+    (stage,) = (one for one in verb.PIPELINE if one.name == "field")
+    stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
+    drive, object_filmed, wider = (
+        verb.key_of(verb._depends(stage, SceneConfig(mjcf=mjcf), {}, stamps))
+        for mjcf in (MjcfConfig(), MjcfConfig(route=False), MjcfConfig(half_width=2.0))
+    )
+    assert drive != object_filmed and drive == wider
 
 
 def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):

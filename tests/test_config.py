@@ -41,6 +41,8 @@ def test_nested_table_and_integer_for_float(tmp_path):
         (_MINIMAL + 'kind = "film"\n', "expected auto, video"),
         ("[[source]]\n", "no path"),
         ("seed = 1\n", "no [[source]]"),
+        ("seed = -1\n" + _MINIMAL, "seed = -1; expected 0 to 2147483647"),
+        ("seed = 2147483648\n" + _MINIMAL, "seed = 2147483648; expected 0 to 2147483647"),
         ("seed = \n", "not valid TOML"),
         ("[source]\npath='a'\n", "expected a list"),
     ],

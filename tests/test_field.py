@@ -210,6 +210,24 @@ def test_samples_are_sorted_partition_the_ray_and_find_the_surface(field):
     assert (np.abs(t - hit[:, None]) < 0.5).mean() > 0.7
 
 
+@pytest.mark.parametrize("seed", [0, 3, 2147, 2148, 12345, 2**31 - 1])
+def test_samples_are_jittered_whatever_the_seed(field, seed):
+    """Scene seeds as training and baking combine them with their step."""
+    solid_below(field, 0.0)
+    ws = Workspace(field.layout, 64, 16, "cpu")
+    ws.origins[:] = torch.tensor([-2.0, -2.0, 1.5])
+    ws.directions[:] = torch.tensor([0.6, 0.0, -0.8])
+
+    def distances(step: int | None) -> np.ndarray:
+        field.sample(ws, 0, 64, 0.05, seed=None if step is None else seed * 1_000_003 + step)
+        return ws.distances.numpy().copy()
+
+    middles, one, again, other = distances(None), distances(5), distances(5), distances(6)
+    assert np.array_equal(one, again)
+    assert (one != middles).mean() > 0.9 and (one != other).mean() > 0.9
+    assert np.ptp(one, axis=0).max() > 0.1  # every ray has its own
+
+
 def test_a_sighting_draws_samples_to_it(field):
     ws = Workspace(field.layout, 8, 16, "cpu")
     ws.origins[:] = torch.tensor([0.0, -2.0, 0.5])

@@ -232,6 +232,51 @@ def test_camera_latency_shows_the_past():
     assert np.linalg.norm(delayed[:3, 3] - positions[-1]) > 0.05
 
 
+def test_all_that_is_seen_is_of_the_same_past():
+    """To the small step; between two looks, which are 10 ms apart, to a hair."""
+    latency, step = 0.026, 0.002
+    prompt, fine, coarse = on_a_plane(), *(on_a_plane(HuskyParams(camera_latency=latency)) for _ in range(2))
+    past = [prompt.data.qpos.copy()]
+    for k in range(600):
+        for physics, wanted in ((prompt, True), (fine, True), (coarse, k % 50 == 0)):
+            if k % 50 == 0:
+                physics.command(1.0, 0.5)
+            if wanted:
+                physics.step(step if physics is not coarse else 50 * step)
+        past.append(prompt.data.qpos.copy())
+        then = max(0, len(past) - 1 - round(latency / step))
+        np.testing.assert_array_equal(fine.seen.qpos, past[then])
+        assert fine.seen.time == pytest.approx(step * then, abs=1e-9)
+        if k % 50 == 49:
+            np.testing.assert_allclose(coarse.seen.qpos, past[then], atol=2e-4)
+            assert coarse.seen.time == pytest.approx(step * then, abs=1e-9)
+    assert np.linalg.norm(fine.seen.qpos[:2] - fine.data.qpos[:2]) > 0.02
+    assert prompt.seen is prompt.data
+
+
+@pytest.mark.parametrize("latency", [0.03, 0.113])
+def test_what_moves_is_seen_where_it_was(latency):
+    spec = mujoco.MjSpec()
+    set_options(spec)
+    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1))
+    spec.worldbody.add_body(name="walker", mocap=True).add_geom(size=(0.1, 0.1, 0.1), pos=(0, 0, 1))
+    params = HuskyParams(camera_latency=latency)
+    add_husky(spec, params=params)
+    physics = HuskyPhysics(spec.compile(), params)
+
+    def walk(time: float) -> None:
+        physics.data.mocap_pos[0] = 3.0 + 2.0 * time, 1.0, 0.0
+
+    walk(0.0)
+    physics.surroundings = walk
+    physics.begin()
+    for k in range(5):
+        physics.step()
+        time = max(0.0, 0.1 * (k + 1) - latency)
+        assert physics.seen.time == pytest.approx(time, abs=1e-9)
+        np.testing.assert_allclose(physics.seen.body("walker").xpos, [3.0 + 2.0 * time, 1.0, 0.0])
+
+
 def test_no_latency_is_now():
     physics = on_a_plane()
     for _ in range(3):

@@ -188,7 +188,7 @@ def test_the_robot_does_not_see_itself_in_its_usual_camera():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     index = model.camera("front").id
-    view = ObstacleView(model, camera_intrinsics(model, index, (160, 90)), (160, 90))
+    view = ObstacleView(model, index, (160, 90))
     assert len(view.geoms) > 20
     assert view.in_view(data, camera_pose(data, index)) is None
 

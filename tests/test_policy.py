@@ -158,6 +158,7 @@ DAMAGE = {
     "no network": (lambda f: edit(f, network=3), "policy.json: "),
     "no such size": (lambda f: edit(f, network__features=-1), "whole numbers"),
     "a huge size": (lambda f: edit(f, network__features=10**9), "whole numbers"),
+    "one side": (lambda f: edit(f, network__size=[16]), "not a width and a height"),
     "no such control": (lambda f: edit(f, control__thrust=1.0), "thrust"),
     "no such speed": (lambda f: edit(f, control__speed="fast"), "speed = 'fast'"),
     "no such action": (lambda f: edit(f, control__action="fly"), "fly"),
@@ -224,12 +225,12 @@ def test_onnx_files_that_are_no_policies_are_refused(tmp_path):
         ("gray", {"shape": ("n", 4, 90, 160)}, "one input"),
         ("kind", {"kind": TensorProto.DOUBLE}, "uint8 or float32"),
         ("elsewhere", {"external": True}, "other files"),
+        ("three", {"actions": 3}, "1 or 2"),
+        ("four_at_once", {"shape": (4, 12, 90, 160)}, "n open or 1"),
     ):
         with pytest.raises(InputError, match=words) as caught:
             load_policy(foreign(tmp_path / f"{name}.onnx", **settings))
         assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match=r"expected.*finite"):
-        load_policy(foreign(tmp_path / "three.onnx", actions=3)).actions(pictures(1))
     (tmp_path / "text.onnx").write_text("hello")
     (tmp_path / "empty.onnx").write_bytes(b"")
     whole = foreign(tmp_path / "whole.onnx").read_bytes()
@@ -249,11 +250,12 @@ def test_an_onnx_file_with_a_damaged_note_is_refused(tmp_path):
 
 
 def test_callables_drive(tmp_path, monkeypatch):
-    (tmp_path / "my_driver.py").write_text("import numpy as np\ndef act(pixels):\n    return [pixels.mean() / 255]\n")
+    code = "import numpy as np\nspeed = 1.0\ndef act(pixels):\n    return [pixels.mean() / 255]\n"
+    (tmp_path / "my_driver.py").write_text(code)
     monkeypatch.chdir(tmp_path)
     policy, stacks = load_policy("my_driver:act"), pictures(2)
     np.testing.assert_allclose(policy(stacks[0]), stacks[0].mean() / 255, rtol=1e-6)
-    for name in ("my_driver:none", "no_module_of_that_name:act", "nothing"):
+    for name in ("my_driver:none", "no_module_of_that_name:act", "nothing", ":act", "my_driver:speed"):
         with pytest.raises(InputError):
             load_policy(name)
 

@@ -195,18 +195,21 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
     out = tmp_path / "real" / "results.csv"
     stack = np.zeros((12, 90, 160), np.uint8)
     assert load_policy(left)(stack) == pytest.approx(0.9) and load_policy(ahead)(stack) == pytest.approx(0.001)
-    drive.run([left, ahead], "straight", ["rain", "haze"], 2, out)
+    drive.run([left, ahead, left], "straight", ["rain", "haze", "rain"], 2, out)
     twin = [Cell(policy, "straight", "held-out", 10, 5) for policy in ("left", "ahead")]
     cells = read_results(out, twin)
     trials = read_trials(out.with_name("results_trials.csv"))
     assert len(trials) == 8 and len(cells) == 4
+    starts = {(t.lighting, t.seed) for t in trials}
+    assert len(starts) == len({seed for _, seed in starts}) == 4  # alike for both policies, others in other weather
     for cell in cells:
         mine = [t for t in trials if (t.policy, t.lighting) == (cell.policy, cell.lighting)]
         assert (cell.trials, cell.successes) == (len(mine), sum(t.success for t in mine))
         assert cell.twin_key == (cell.policy, "straight", "held-out")
     before = out.with_name("results_trials.csv").read_text()
+    third = max(t.seed for t in trials if t.lighting == "rain") + 1
     drive.run([left], "straight", ["rain"], 3, out, films=tmp_path / "films")
-    assert [film.name for film in (tmp_path / "films").iterdir()] == ["left_straight_rain_7000002.mp4"]
+    assert [film.name for film in (tmp_path / "films").iterdir()] == [f"left_straight_rain_{third}.mp4"]
     after = out.with_name("results_trials.csv").read_text()
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
     written(left, 0.5)

@@ -258,6 +258,71 @@ def test_the_verb(scene, capsys):
     assert "dusk" in capsys.readouterr().err
 
 
+def test_a_finished_run_is_left_as_it_is(scene, tmp_path):
+    from twin.learn.training import train as run
+
+    built = twin.load_scene(scene)
+    run(built, tmp_path, replace(SHORT, steps=8))
+    before = {
+        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and "tensorboard" not in path.parts
+    }
+    for steps in (8, 4):
+        run(built, tmp_path, replace(SHORT, steps=steps))
+    assert before == {path: path.read_bytes() for path in before}
+
+
+def test_nothing_is_noted_of_a_run_that_could_not_begin(scene, capsys):
+    common = [str(scene), "--run", "typo", "--quiet", "--worlds", "2", "--steps", "4"]
+    assert train.main([*common, "--task", "strait"]) == 2
+    assert train.main([*common, "--task", "ahead", "--lighting", "dusk"]) == 2
+    assert train.main([*common, "--task", "ahead"]) == 0
+    assert capsys.readouterr().err.count("error: ") == 2
+
+
+def test_the_last_policy_is_a_checkpoint(scene, tmp_path):
+    from twin.learn.training import train as run
+
+    run(twin.load_scene(scene), tmp_path, replace(SHORT, steps=80, checkpoints=2))
+    assert [path.name for path in sorted((tmp_path / "checkpoints").iterdir())] == ["000000040", "000000080"]
+
+
+def test_no_resumption_drives_what_validation_or_another_seed_drives(scene, tmp_path):
+    """Not the seeds of episodes that the former `seed + 1_000_003 * resumptions` shared with validation's."""
+    from twin.learn.training import train as run
+
+    built, seen = twin.load_scene(scene), []
+    for seed in (0, 1):
+        folder = tmp_path / str(seed)
+        for steps in (400, 800):
+            run(built, folder, replace(SHORT, seed=seed, steps=steps, starts=1000, checkpoints=1))
+        seen += [int(row["seed"]) for row in rows(folder / "episodes.csv")]
+    assert len(set(seen)) == len(seen) > 8
+    first = {int(np.random.default_rng(k).integers(2**63)) for k in [*range(20), *range(1_000_000, 1_000_200)]}
+    assert not first & set(seen)
+
+
+def test_a_changed_road_is_another_run(scene, tmp_path):
+    from twin.learn.training import train as run
+
+    built, toml = twin.load_scene(scene), scene / "scene.toml"
+    run(built, tmp_path, replace(SHORT, steps=8))
+    text = toml.read_text()
+    try:
+        toml.write_text(text + '\n[[obstacle]]\nkind = "cone"\nstation = 2.0\n')
+        with pytest.raises(InputError, match="obstacles changed"):
+            run(built, tmp_path, replace(SHORT, steps=16))
+    finally:
+        toml.write_text(text)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"seed": -1}, {"steps": 0}, {"worlds": 0}, {"updates": 0.0}, {"colours": -1.0}, {"lighting": "held-out"}]
+)
+def test_what_no_training_can_be_is_refused(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        TrainConfig(**wrong)
+
+
 def test_a_run_that_is_asked_to_stop_saves_and_goes_on(scene, tmp_path):
     from twin.learn.training import train as run
 

@@ -139,6 +139,27 @@ def test_another_policy_of_the_same_name_is_refused(fresh, tmp_path):
         run(fresh, "ahead", str(tmp_path / "ahead"))
 
 
+def test_what_is_named_twice_is_driven_once(fresh):
+    said = validate.validate(fresh, ["ahead", "ahead"], "ahead", ["day", "day"], 1)
+    assert [c["trials"] for c in said["cells"]] == [1]
+    assert len(read_trials(fresh / "validation" / "episodes.csv")) == 1
+
+
+def test_a_changed_road_is_not_mixed_with_what_was_driven(fresh):
+    run(fresh, "ahead", lightings=["day"], episodes=1)
+    toml = fresh / "scene.toml"
+    text = toml.read_text()
+    try:
+        toml.write_text(text + '\n[[obstacle]]\nkind = "cone"\nstation = 2.0\n')
+        with pytest.raises(InputError, match="obstacles or photo changed"):
+            run(fresh, "left", lightings=["day"], episodes=1)
+        run(fresh, "left", lightings=["night"], episodes=1)  # of which nothing was driven yet
+    finally:
+        toml.write_text(text)
+    with pytest.raises(InputError, match="under night from before"):
+        run(fresh, "left", lightings=["night"], episodes=2)
+
+
 def test_the_worst_light_is_proved_on_fresh_episodes(fresh, monkeypatch):
     monkeypatch.setattr(validate, "_LIGHTS", 4)
     monkeypatch.setattr(validate, "_LOOKS", 1)

@@ -48,9 +48,9 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.stage", 3, ("nerf",), ("cameras", "metric")),
+    Stage("field", "twin.nerf.stage", 3, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 2, ("mesh", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
-    Stage("mjcf", "twin.mjcf.export", 2, ("mjcf", "robot"), ("metric", "mesh")),
+    Stage("mjcf", "twin.mjcf.export", 3, ("mjcf", "robot"), ("metric", "mesh")),
     Stage("review", "twin.report.review", 3, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
 )
 

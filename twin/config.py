@@ -18,6 +18,8 @@ from twin.robot import HuskyParams
 
 ROBOT_TOML = "robot.toml"
 
+_MOST_SEED = 2**31 - 1  # that structure from motion takes
+
 
 @dataclass(frozen=True)
 class CalibrationConfig:
@@ -263,6 +265,7 @@ class SceneConfig:
 
     name: str = ""
     seed: int = 0
+    """Of all randomness in a build, from 0 to 2³¹ − 1."""
     source: tuple[SourceConfig, ...] = ()
     capture: CaptureConfig = field(default_factory=CaptureConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
@@ -380,6 +383,8 @@ def scale_sources(metric: MetricConfig) -> tuple[str, ...]:
 def _check(config: SceneConfig, path: Path) -> None:
     if not config.source:
         raise InputError(f"{path}: no [[source]] given; add one per film, with path = and lighting =")
+    if not 0 <= config.seed <= _MOST_SEED:
+        raise InputError(f"{path}: seed = {config.seed}; expected 0 to {_MOST_SEED}")
     for source in config.source:
         if not source.path:
             raise InputError(f"{path}: a [[source]] has no path; give the video or the image folder")

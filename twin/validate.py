@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from twin import progress
+from twin.env.suite import fingerprint
 from twin.errors import InputError, refuse
 from twin.learn.judging import CHUNK, Chunk, Driven, campaign
 from twin.learn.policy import JSON, find_policy, load_policy
@@ -25,7 +26,7 @@ from twin.report.validation import failure_map, lines, summary, typical_episode,
 from twin.report.validation_page import Curve, write_validation_page
 from twin.scene import SceneDir, digest_file, digest_json, read_json, write_json, write_text
 
-_FIRST_SEED = 1_000_000  # of validation; training's are small
+_FIRST_SEED = 1_000_000  # of validation
 _SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
 _LIGHTS, _LOOKS, _FINALISTS = 16, 4, 4  # lights drawn, episodes in each, and how many are looked at more closely
 
@@ -55,7 +56,6 @@ class Campaign:
         """
         self._scene, self.task, self.path, self._policies = str(twin.scene.root.resolve()), task, path, policies
         self._processes, self._ray = processes, ray
-        _mend(path)
         self._done = {_key(t): t for t in read_trials(path)} if path.exists() and _has_rows(path) else {}
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
@@ -126,7 +126,10 @@ def validate(
     twin = load_scene(root)
     folder = twin.scene.validation
     policies = _policies(root, sources, trust)
-    _check_same(folder / "validated.json", twin, policies)
+    lightings = tuple(dict.fromkeys(lightings))
+    _mend(folder / "episodes.csv")
+    _mend(folder / "worst.csv")
+    _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
     todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
     seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
     driven = todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
@@ -231,27 +234,44 @@ def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tupl
     for source in sources:
         where = find_policy(root, source)
         name = load_policy(where, trust).name
-        if name in out:
+        if out.get(name, (where, trust)) != (where, trust):
             raise InputError(f"two policies are named {name!r}: {out[name][0]} and {where}; rename one")
         out[name] = (where, trust)
     return out
 
 
-def _check_same(path: Path, twin: Twin, policies: dict[str, tuple[str, bool]]) -> None:
-    """Notes which policies and which build the table is of; refuses others of the same name."""
-    field = digest_file(twin.scene.stamp("field"))
-    noted: dict[str, Any] = read_json(path) if path.exists() else {"field": field, "policies": {}}
-    if noted["field"] != field:
-        raise InputError(f"{path.parent} is of another build of this scene; move it away to validate anew")
+def _check_same(
+    folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, tuple[str, bool]]
+) -> None:
+    """Notes which policies the tables are of, and which roads (a task under a lighting); refuses others so named."""
+    path = folder / "validated.json"
+    noted: dict[str, Any] = read_json(path) if path.exists() else {"roads": {}, "policies": {}}
+    tables = [folder / "episodes.csv", folder / "worst.csv"]
+    trials = [trial for table in tables if table.exists() and _has_rows(table) for trial in read_trials(table)]
+    driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}
+    for lighting in lightings:
+        road, digest = _road(task, lighting), fingerprint(twin, task, lighting)
+        if noted["roads"].get(road, digest) != digest and road in driven:
+            raise InputError(
+                f"{folder} has episodes of {task} under {lighting} from before the scene was built anew, or its task, "
+                "obstacles or photo changed; move it away to validate anew"
+            )
+        noted["roads"][road] = digest
     for name, (source, _) in policies.items():
         digest = _digest(Path(source), source)
-        if noted["policies"].setdefault(name, digest) != digest:
+        if noted["policies"].get(name, digest) != digest and name in driven:
             raise InputError(
-                f"policy {name!r} was validated as another file than {source} is now; move {path.parent} away, or "
+                f"policy {name!r} was validated as another file than {source} is now; move {folder} away, or "
                 "copy the policy to another name"
             )
-    path.parent.mkdir(parents=True, exist_ok=True)
+        noted["policies"][name] = digest
+    folder.mkdir(parents=True, exist_ok=True)
     write_json(path, noted)
+
+
+def _road(task: str, lighting: str) -> str:
+    """What episodes were driven on; all drawn lights are one's, as they come from one field."""
+    return f"{task}, {'drawn' if lighting.startswith('drawn_') else lighting}"
 
 
 def _digest(path: Path, source: str) -> str:

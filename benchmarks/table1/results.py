@@ -7,10 +7,9 @@ from typing import Any
 from plan import PAPER, SETUPS, TASKS, Run
 
 from twin.report.statistics import wilson
-from twin.report.trials import Trial, read_trials
+from twin.report.trials import RECENT, Trial, read_trials
 from twin.scene import read_json
 
-RECENT = 100  # episodes that success in training is taken over
 FORECAST = (
     "pearson",
     "spearman",
@@ -45,7 +44,7 @@ def table(results: dict[str, Any]) -> str:
         lines.append(f"| paper | {setup} | " + " | ".join(_numbers(PAPER[setup, task]) for task in TASKS) + " |")
         ours = []
         for task in TASKS:
-            some = [r for r in results["runs"] if (r["setup"], r["task"]) == (setup, TASKS[task])]
+            some = [r for r in results["runs"] if r["finished"] and (r["setup"], r["task"]) == (setup, TASKS[task])]
             parts = [[r["train"] for r in some], *([r["policies"][0][k] for r in some] for k in ("validate", "real"))]
             ours.append(" / ".join(_together(part) for part in parts) + f" ({len(some)} runs)")
         lines.append(f"| ours | {setup} | " + " | ".join(ours) + " |")

@@ -78,6 +78,11 @@ class DrivePhysics(dm_mujoco.Physics):
         return self.robot.base_to_world
 
     @property
+    def seen(self) -> mujoco.MjData:
+        """Time and poses of everything when the newest picture was taken; see `HuskyPhysics.seen`."""
+        return self.robot.seen
+
+    @property
     def camera_to_world(self) -> Array:
         """Of the front camera when its newest picture was taken, OpenCV axes, shape (4, 4)."""
         return self.robot.delayed_camera_to_world

@@ -74,11 +74,14 @@ def find_callable(name: str) -> Policy:
         InputError: there is none of that name.
     """
     module, _, function = name.partition(":")
-    if not function:
+    if not (module and function):
         raise InputError(f"policy {name!r}: expected module:function, a callable of pixels (3 · stack, h, w)")
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:
-        return getattr(importlib.import_module(module), function)
+        found = getattr(importlib.import_module(module), function)
     except (ModuleNotFoundError, AttributeError) as error:
         raise InputError(f"policy {name!r}: {error}") from None
+    if not callable(found):
+        raise InputError(f"policy {name!r}: {found!r} cannot be called; expected a function of pixels")
+    return found

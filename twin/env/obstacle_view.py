@@ -1,4 +1,5 @@
-"""What of a MuJoCo model a camera sees besides the field: obstacles, other robots, the robot's own body.
+"""What of a MuJoCo model a camera sees besides the field: obstacles, other robots, the robot's own body without what
+the camera is built into.
 
 `mujoco_warp`'s ray caster draws them, without OpenGL, from a small model of their geoms alone. It is given only the
 rays it needs: of the pixels that some geom's box may cover, one each, and at edges four each, so that outlines come
@@ -17,12 +18,12 @@ from numpy.typing import NDArray
 from twin.env.light import Light
 from twin.env.obstacle_shapes import OBSTACLE_GROUP
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
-from twin.mjcf.husky_look import LOOK_GROUP
+from twin.mjcf.husky_look import LOOK_GROUP, camera_parts
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-_NEAR = 0.02  # [m] z-depth before which nothing is drawn: the camera's own housing begins behind it
+_NEAR = 0.02  # [m] z-depth before which nothing is drawn
 _SMALL = 800  # [px] of which all are sampled as those at edges are: a second cast would cost more than it saves
 _QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] of the samples at edges
 _CORNERS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
@@ -63,19 +64,20 @@ def camera_pose(data: mujoco.MjData, camera: int) -> Array:
 class ObstacleView:
     """Draws the obstacles and robots of one model, one world at a time. Not for two threads at once."""
 
-    def __init__(self, model: mujoco.MjModel, intrinsics: Array, size: tuple[int, int]):
+    def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
         """
         Args:
             model: Its geoms of the obstacles' group and of the robot's looks are drawn.
-            intrinsics: fx, fy, cx, cy of the camera [px], shape (4,).
+            camera: Of the model; where it is, is told when something is drawn.
             size: Width, height of the picture [px].
         """
         import mujoco_warp as mjw  # slow to import
 
-        self._mjw, self.size, self._intrinsics = mjw, size, intrinsics
-        self.geoms = np.flatnonzero(
-            np.isin(model.geom_group, (OBSTACLE_GROUP, LOOK_GROUP)) & (_rgba(model)[:, 3] > 0.0)
-        )
+        self._mjw, self.size = mjw, size
+        self._intrinsics = intrinsics = camera_intrinsics(model, camera, size)
+        shown = np.isin(model.geom_group, (OBSTACLE_GROUP, LOOK_GROUP)) & (_rgba(model)[:, 3] > 0.0)
+        shown[camera_parts(model, camera)] = False
+        self.geoms = np.flatnonzero(shown)
         owners = model.body_rootid[model.geom_bodyid[self.geoms]]
         self._bodies, self._owner = np.unique(owners, return_inverse=True)
         self._colors = _rgba(model)[self.geoms, :3]

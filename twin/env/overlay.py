@@ -56,7 +56,7 @@ class Overlay:
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         # One after the other, as Warp compiles kernels when they are first used.
-        self._painters = [_Painter(model, field, self.intrinsics, size) for _ in range(min(worlds, cores()))]
+        self._painters = [_Painter(model, field, self._camera, size) for _ in range(min(worlds, cores()))]
         self._pool = ThreadPoolExecutor(len(self._painters)) if len(self._painters) > 1 else None
         self._shadows = Shadows(model, self._painters[0].view.geoms)
         self._route, self._shaded, self._lock = route_of(model), shaded, threading.Lock()
@@ -68,24 +68,21 @@ class Overlay:
         datas: Sequence[mujoco.MjData],
         lighting: Lighting | Sequence[Lighting],
         effects: Sequence[CameraEffects] | None = None,
-        poses: Array | None = None,
     ) -> Rendering:
         """What the front camera of every world sees.
 
         Args:
-            datas: Of every world, with poses of geoms and cameras as of now (`mj_forward` or `mj_kinematics` and
-                `mj_camlight` after the last step).
+            datas: Of every world, with its time and the poses of geoms and cameras when the picture is taken
+                (`mj_forward` or `mj_kinematics` and `mj_camlight` after the last step; `HuskyPhysics.seen`).
             lighting: As `BakedField.render` takes it: one, or one per world.
             effects: What the camera of each world adds, where it is not perfect.
-            poses: camera_to_world of each, OpenCV axes, where the pictures are older than the datas; shape (n, 4, 4).
 
         Raises:
             InputError: an unknown lighting, or more worlds than stated.
         """
         if len(datas) > self.worlds:
             raise InputError(f"{len(datas)} worlds to render; expected at most {self.worlds}, as it was made for")
-        if poses is None:
-            poses = np.stack([camera_pose(data, self._camera) for data in datas])
+        poses = np.stack([camera_pose(data, self._camera) for data in datas])
         if effects is not None:
             poses = np.stack([e.shaken(p, d.time) for e, p, d in zip(effects, poses, datas, strict=True)])
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
@@ -132,9 +129,9 @@ class Overlay:
 class _Painter:
     """What one thread draws and marches with."""
 
-    def __init__(self, model: mujoco.MjModel, field: BakedField, intrinsics: Array, size: tuple[int, int]):
-        self.view = ObstacleView(model, intrinsics, size)
-        self._field, self._intrinsics = field, intrinsics
+    def __init__(self, model: mujoco.MjModel, field: BakedField, camera: int, size: tuple[int, int]):
+        self.view = ObstacleView(model, camera, size)
+        self._field, self._intrinsics = field, camera_intrinsics(model, camera, size)
         self._fronts: dict[tuple[int, int], BakedField] = {}
 
     def front(self, pose: Array, drawn: Drawn, lighting: Lighting) -> Rendering:

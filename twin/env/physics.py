@@ -3,15 +3,17 @@
 One *control step* is 0.1 s, the period of the robot's wheel controller. Within it MuJoCo takes many small steps;
 contacts are looked at several times in between, so that a short graze is not missed. *Touched* means in contact with
 any part of the robot, the ground excepted. *Latency*: a command reaches the controller `command_latency` after it was
-given, and the newest picture there is was taken `camera_latency` ago.
+given, and the newest picture there is was taken `camera_latency` ago: it shows everything, robot and obstacles, as it
+was at that *instant*.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.geometry.cameras import opencv_to_mujoco
@@ -20,9 +22,19 @@ from twin.robot import GEAR_RATIO, SIDES, WHEELS, HuskyParams
 
 Array = NDArray[np.float64]
 
-_LOOK_PERIOD = 0.01  # [s] between two looks at the contacts and at the camera's pose
+_LOOK_PERIOD = 0.01  # [s] between two looks at the contacts and at where everything is
+_SAME_TIME = 1e-6  # [s] apart are rounding errors of the clock
 _SETTLE_TIME = 0.3  # [s] on the ground after being put there
 _RAY_START = 50.0  # [m] above the ground's highest point
+
+
+class _Instant(NamedTuple):
+    """What the poses of everything follow from."""
+
+    time: float
+    qpos: Array
+    mocap_pos: Array
+    mocap_quat: Array
 
 
 class HuskyPhysics:
@@ -56,6 +68,7 @@ class HuskyPhysics:
         self._spawn = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "spawn")
         self._period_steps = round(CONTROL_PERIOD / model.opt.timestep)
         self._look_steps = max(1, round(_LOOK_PERIOD / model.opt.timestep))
+        self._seen = mujoco.MjData(model) if self.params.camera_latency else self.data
         if data is None:
             self.reset()
         else:
@@ -88,7 +101,7 @@ class HuskyPhysics:
         # Small steps until the controller runs next.
         self._until_update = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6)) % self._period_steps
         self._touched = self._touching()
-        self._views = [(self.time, self.camera_to_world)]
+        self._instants = [self._instant()]
 
     def _ground_height(self, xy: Array) -> Array:
         top = self.model.geom_pos[self._ground, 2] + _RAY_START
@@ -119,14 +132,16 @@ class HuskyPhysics:
             left, self._until_update = left - some, self._until_update - some
             touched |= self._touching()
             if self.params.camera_latency:
-                # Poses of the last small step's start, which is 2 ms too old; the last of all are made anew below.
-                self._views.append((self.time - self.model.opt.timestep, self.camera_to_world))
+                self._instants.append(self._instant())
         # Poses and contacts of the instant that is now read, rather than of the last small step's start.
         mujoco.mj_forward(self.model, self.data)
         self._touched = touched | self._touching()
-        self._views[-1] = (self.time, self.camera_to_world)
-        oldest = self.time - self.params.camera_latency - _LOOK_PERIOD
-        self._views = [view for view in self._views if view[0] > oldest - _LOOK_PERIOD]
+        oldest = self.time - self.params.camera_latency - 2 * _LOOK_PERIOD
+        self._instants = [one for one in self._instants if one.time > oldest]
+
+    def _instant(self) -> _Instant:
+        d = self.data
+        return _Instant(self.time, d.qpos.copy(), d.mocap_pos.copy(), d.mocap_quat.copy())
 
     def _touching(self) -> set[int]:
         pairs = self.data.contact.geom
@@ -177,21 +192,33 @@ class HuskyPhysics:
         return opencv_to_mujoco(_pose(self.data.cam_xpos[self._camera], self.data.cam_xmat[self._camera]))
 
     @property
+    def seen(self) -> mujoco.MjData:
+        """Time and poses of everything when the newest picture there is was taken, `camera_latency` ago.
+
+        Without latency the present; with it `qpos`, the mocap bodies and what `mj_kinematics` and `mj_camlight` make of
+        them, until this is asked for again. Nothing is older than the beginning. Between two looks, 10 ms apart, what
+        the robot does is taken for steady.
+        """
+        if not self.params.camera_latency:
+            return self.data
+        data, time = self._seen, self.time - self.params.camera_latency
+        before = max(bisect_right(self._instants, time + _SAME_TIME, key=lambda one: one.time) - 1, 0)
+        first, last = self._instants[before], self._instants[min(before + 1, len(self._instants) - 1)]
+        data.time, data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = first
+        if first.time + _SAME_TIME < time < last.time:
+            share, rate = (time - first.time) / (last.time - first.time), np.zeros(self.model.nv)
+            mujoco.mj_differentiatePos(self.model, rate, 1.0, first.qpos, last.qpos)
+            mujoco.mj_integratePos(self.model, data.qpos, rate, share)
+            data.time, data.mocap_pos[:] = time, (1.0 - share) * first.mocap_pos + share * last.mocap_pos
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_camlight(self.model, data)
+        return data
+
+    @property
     def delayed_camera_to_world(self) -> Array:
         """Of the front camera when the newest picture there is was taken, `camera_latency` ago. Shape (4, 4)."""
-        if not self.params.camera_latency:
-            return self.camera_to_world
-        time = max(self.time - self.params.camera_latency, self._views[0][0])
-        times = np.array([view[0] for view in self._views])
-        after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1)) if len(times) > 1 else 0
-        if not after:
-            return self._views[0][1]
-        pair = np.array([view[1] for view in self._views[after - 1 : after + 1]])
-        share = float(np.clip((time - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0))
-        pose = np.eye(4)
-        pose[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
-        pose[:3, 3] = (1 - share) * pair[0, :3, 3] + share * pair[1, :3, 3]
-        return pose
+        data = self.seen
+        return opencv_to_mujoco(_pose(data.cam_xpos[self._camera], data.cam_xmat[self._camera]))
 
     @property
     def wheel_position(self) -> Array:

@@ -79,9 +79,9 @@ class Pixels:
 
     def _look(self, which: Sequence[int]) -> Picture:
         physics = [self.worlds[i][0] for i in which]
-        poses = np.array([one.camera_to_world for one in physics])
-        lights = [self.lights[i].at(self.worlds[i][0].time()) for i in which]  # type: ignore[union-attr]
+        seen, poses = [one.seen for one in physics], np.array([one.camera_to_world for one in physics])
+        lights = [self.lights[i].at(data.time) for i, data in zip(which, seen, strict=True)]  # type: ignore[union-attr]
         effects = [self._effects[i] for i in which] if self.options.camera else None
-        out = self._overlay.render([one.data.ptr for one in physics], lights, effects, poses)  # type: ignore[arg-type]
+        out = self._overlay.render(seen, lights, effects)  # type: ignore[arg-type]
         self.trust[list(which)] = self._trust.of(poses, out)
         return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -1,9 +1,11 @@
 """What MuJoCo itself would show a policy: the extracted mesh in its filmed colours, the ground, obstacles, the robot.
 
 This is the standard pipeline that a radiance field is compared with. `mujoco_warp`'s ray caster draws it, through the
-same camera as the field's pictures; its light is the model's own, whatever lighting is asked for.
+same camera as the field's pictures; its light is the model's own, whatever lighting is asked for. What the camera is
+built into is left out, as it is there.
 """
 
+import copy
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -17,6 +19,8 @@ from twin.env.camera_effects import CameraEffects
 from twin.env.obstacle_shapes import OBSTACLE_GROUP
 from twin.env.obstacle_view import camera_intrinsics, camera_pose
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
+from twin.mjcf.husky import ROBOT_GROUP
+from twin.mjcf.husky_look import camera_parts
 from twin.nerf.rendering import Rendering
 
 Array = NDArray[np.float64]
@@ -40,6 +44,8 @@ class SimulatorView:
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
+        model = copy.copy(model)
+        model.geom_group[camera_parts(model, self._camera)] = ROBOT_GROUP  # which is not looked at
         # One after the other, as Warp compiles kernels when they are first used.
         self._painters = [_Painter(model, size, self._rays) for _ in range(min(worlds, cores()))]
         self._pool = ThreadPoolExecutor(len(self._painters))
@@ -49,11 +55,9 @@ class SimulatorView:
         datas: Sequence[mujoco.MjData],
         lighting: Any = None,
         effects: Sequence[CameraEffects] | None = None,
-        poses: Array | None = None,
     ) -> Rendering:
         """What the front camera of every world sees; arguments as in `Overlay.render`, the lighting has no effect."""
-        if poses is None:
-            poses = np.stack([camera_pose(data, self._camera) for data in datas])
+        poses = np.stack([camera_pose(data, self._camera) for data in datas])
         if effects is not None:
             poses = np.stack([e.shaken(p, d.time) for e, p, d in zip(effects, poses, datas, strict=True)])
         width, height = self.size

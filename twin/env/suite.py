@@ -4,6 +4,7 @@ Physics and task know nothing of pictures; `SeenDrive` adds them. Both are `dm_c
 """
 
 import copy
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from twin.errors import InputError
 from twin.loading import Twin, load_scene
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
+from twin.scene import digest_file, digest_json, read_json
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,27 @@ class Stage:
         spec = episode_spec(self.world, self.stretch.start, self.stretch.end, half_width, looks=True)
         add_obstacles(spec, self.obstacles.pool, self.world)
         return Pixels(SimulatorView(spec.compile(), size, count), None, self.trust, self.options, worlds)
+
+
+def fingerprint(twin: Twin, task: str, lighting: str) -> str:
+    """What decides an episode besides its seed and who drives, as a digest.
+
+    That is the field, the MJCF scene with its robot, the task's stretch, the obstacles of `scene.toml`, and lightings
+    from photos that `lighting` names.
+
+    Raises:
+        InputError: as `Stage.open`.
+    """
+    world, config = twin.world(), load_config(twin.scene.config_file)
+    photos = [twin.scene.lightings / f"{name}.json" for name in lighting.split(":")]
+    return digest_json(
+        {
+            "stages": [read_json(twin.scene.stamp(stage))["result"] for stage in ("field", "mjcf")],
+            "stretch": dataclasses.asdict(find_task(task, world, config.task)),
+            "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
+            "photos": [digest_file(path) for path in photos if path.exists()],
+        }
+    )
 
 
 class SeenDrive(control.Environment):

@@ -46,6 +46,8 @@ class Architecture:
 
     def __post_init__(self) -> None:
         """Raises ValueError: sizes that fit no network, or one that fits no robot's computer."""
+        if len(self.size) != 2:
+            raise ValueError(f"size = {self.size} is not a width and a height")
         numbers = [*self.size, self.stack, self.features, self.actions, *self.hidden, *sum(self.convolutions, ())]
         if not all(isinstance(n, int) and 1 <= n <= 4096 for n in numbers):
             raise ValueError("sizes are whole numbers from 1 to 4096")

@@ -35,8 +35,12 @@ def campaign_on_ray(chunks: Sequence[Chunk], address: str) -> Iterator[list[Driv
         first = str(error).splitlines()[0]
         raise InputError(f"--ray {address}: no cluster there ({first}); start one with `ray start --head`") from None
     try:
+        # No more than the largest node has, or the tasks would wait for ever.
+        cores = max((node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
+        if cores < 1:
+            raise InputError(f"--ray {address}: no node of the cluster has a core to give; start one with `ray start`")
         # Spread: by default Ray fills one node before it uses the next.
-        remote = ray.remote(num_cpus=_CORES, scheduling_strategy="SPREAD")(drive)
+        remote = ray.remote(num_cpus=int(min(_CORES, cores)), scheduling_strategy="SPREAD")(drive)
         for driven in [remote.remote(chunk) for chunk in chunks]:
             yield ray.get(driven)
     except ray.exceptions.RayTaskError as error:

@@ -39,7 +39,6 @@ class Chunk:
     lighting: str
     """See `env/lightings.py`; or `drawn_<number>`: the light that this seed draws, see `drawn_light`."""
     seeds: tuple[int, ...]
-    randomise: bool = False
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,6 @@ class Driven:
     steps: int
     trust: float
     """Mean over its pictures."""
-    low_trust: float
-    """Of the picture that is trusted least."""
 
 
 def drive(chunk: Chunk) -> list[Driven]:
@@ -64,7 +61,7 @@ def drive(chunk: Chunk) -> list[Driven]:
         InputError: the policy, scene, task or lighting is not to be had.
     """
     policy = _policy(chunk.source, chunk.trust)
-    worlds = _worlds(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting, chunk.randomise)
+    worlds = _worlds(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting)
     assert worlds.pixels is not None
     waiting = list(range(len(chunk.seeds)))
     driving: dict[int, int] = {}  # world → number of its episode
@@ -85,7 +82,7 @@ def drive(chunk: Chunk) -> list[Driven]:
         for i in [i for i, ended in zip(which, over, strict=True) if ended]:
             number, info = driving.pop(i), worlds.info(i)
             seen = trusts[number]
-            outcome = info["cause"], info["progress"], len(seen), float(np.mean(seen)), min(seen)
+            outcome = info["cause"], info["progress"], len(seen), float(np.mean(seen))
             done[number] = Driven(chunk.seeds[number], *outcome)
     return [done[number] for number in range(len(chunk.seeds))]
 
@@ -125,13 +122,13 @@ def _policy(source: str, trust: bool) -> Policy:
 
 
 @lru_cache(maxsize=1)
-def _stage(scene: str, task: str, source: str, trust: bool, randomise: bool) -> Stage:
-    return Stage.open(load_scene(scene), task, {**_policy(source, trust).options(), "randomise": randomise})
+def _stage(scene: str, task: str, source: str, trust: bool) -> Stage:
+    return Stage.open(load_scene(scene), task, _policy(source, trust).options())
 
 
 @lru_cache(maxsize=1)
-def _worlds(scene: str, task: str, source: str, trust: bool, lighting: str, randomise: bool) -> Worlds:
-    stage = _stage(scene, task, source, trust, randomise)
+def _worlds(scene: str, task: str, source: str, trust: bool, lighting: str) -> Worlds:
+    stage = _stage(scene, task, source, trust)
     drawn = _DRAWN.fullmatch(lighting)
     if drawn:
         stage = drawn_light(stage, int(drawn[1]))

@@ -222,14 +222,16 @@ def _from_onnx(path: Path) -> Policy:
     names = {one.name for one in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in names]
     shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
-    if len(inputs) != 1 or len(shapes) != 2 or len(shapes[0]) != 4 or shapes[0][1] % 3 or 0 in shapes[0][1:]:
+    fits = len(inputs) == 1 and [len(shape) for shape in shapes] == [4, 2]
+    # 0 is a size that the file leaves open.
+    if not fits or shapes[0][1] % 3 or 0 in shapes[0][1:] or shapes[0][0] > 1 or shapes[1][1] not in (1, 2):
         raise InputError(
             f"{path}: inputs and outputs {shapes}; expected one input (n, 3 · stack, height, width) and one output "
-            "(n, 1 or 2)"
+            "(n, 1 or 2), n open or 1"
         )
     _, channels, height, width = shapes[0]
     notes = {one.key: one.value for one in model.metadata_props}
-    control, trained = Control(STEERING if shapes[1][-1] == 1 else TWIST), {}
+    control, trained = Control(STEERING if shapes[1][1] == 1 else TWIST), {}
     if _NOTE in notes:
         try:
             head = _head(json.loads(notes[_NOTE]), path)
@@ -297,7 +299,10 @@ def _session(model: bytes, path: Path) -> Act:
         raise InputError(f"{path}: takes {given.type}; expected uint8 or float32 pictures of values 0 to 255")
 
     def act(stacks: Pictures) -> Floats:
-        return session.run(None, {given.name: stacks.astype(kinds[given.type], copy=False)})[0]
+        try:
+            return session.run(None, {given.name: stacks.astype(kinds[given.type], copy=False)})[0]
+        except Exception as error:
+            raise InputError(f"{path}: ONNX Runtime fails on pictures {stacks.shape}: {error}") from None
 
     return act
 

@@ -14,6 +14,7 @@
 
 import csv
 import dataclasses
+import json
 import signal
 import time
 from collections.abc import Callable
@@ -30,8 +31,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from twin.env.lightings import ANY, TRAINING
+from twin.env.lightings import ANY, HELD_OUT, TRAINING
 from twin.env.options import NERF, STEERING, Rewards
+from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.learn.architecture import Architecture, prepared
 from twin.learn.policy import Control, save_policy
@@ -40,16 +42,13 @@ from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.state import has_state, load_state, save_state
 from twin.learn.vectors import DriveVecEnv
 from twin.loading import Twin
-from twin.report.trials import csv_text
-from twin.scene import digest_file, read_json, write_json, write_text
+from twin.report.trials import RECENT, csv_text
+from twin.scene import read_json, write_json, write_text
 
 EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward")
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
-RECENT = 100
-"""Episodes that a success rate in training is taken over."""
-
 _LEAST_RATE = 0.1  # of the learning rate, at the end
-_RESUMES = 1_000_003  # seeds of worlds are moved by this at every resumption, so that no episode is driven again
+_SEEDS = 6  # with a run's seed and its resumptions so far, what worlds draw from; none drives what another drove
 
 
 @dataclass(frozen=True)
@@ -101,6 +100,19 @@ class TrainConfig:
     """Steps between two saves of everything."""
     device: str = "cpu"
 
+    def __post_init__(self) -> None:
+        """Raises InputError: a number out of range, or lights that are kept for validation."""
+        for name, least in (("seed", 0), ("steps", 1), ("worlds", 1), ("colours", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} = {getattr(self, name)}; expected {least} or more")
+        if self.updates <= 0:
+            raise InputError(f"updates = {self.updates}; expected more than 0 per step")
+        if self.lighting in (HELD_OUT, ANY):
+            raise InputError(
+                f"lighting = {self.lighting!r}: held-out lights are kept for python -m twin.validate; "
+                f"expected {TRAINING!r} or a name"
+            )
+
     @property
     def architecture(self) -> Architecture:
         actions = Control(self.action).actions
@@ -113,7 +125,7 @@ class TrainConfig:
     @property
     def varies(self) -> bool:
         """Whether the lighting does, between episodes."""
-        return self.observe == NERF and self.lighting in (TRAINING, ANY)
+        return self.observe == NERF and self.lighting == TRAINING
 
     def options(self) -> dict[str, Any]:
         """Of the environment."""
@@ -176,7 +188,6 @@ class Progress:
     steps: int
     recent: tuple[bool, ...]
     """Success of the last episodes, `RECENT` at most."""
-    steps_per_second: float
 
 
 def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progress], None] | None = None) -> None:
@@ -193,20 +204,23 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
     Raises:
         InputError: the run is another, or damaged; or what `twin.load` raises.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    _check_config(folder / "config.json", twin, config)
+    road = fingerprint(twin, config.task, config.lighting)
+    said = _as_json({**dataclasses.asdict(config), "road": road})
     go_on = has_state(folder / "state")
-    if not go_on:
+    if go_on:
+        _check_same(folder, said)
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
         for stale in ("episodes.csv", "log.csv", "state/pictures.bin"):
             (folder / stale).unlink(missing_ok=True)
         (folder / "state").mkdir(exist_ok=True)
-    elif not (folder / "state" / "pictures.bin").exists():
+    if go_on and not (folder / "state" / "pictures.bin").exists():
         raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
     worlds = PreparedVecEnv(DriveVecEnv(twin, config.task, config.worlds, config.seed, **config.options()), config.pool)
     model = _model(worlds, config, folder / "state" / "pictures.bin")
     before: dict[str, Any] = load_state(folder / "state", model) if go_on else {"wall": 0.0, "resumed": -1}
     resumed = before["resumed"] + 1
-    worlds.seed(config.seed + _RESUMES * resumed)
+    worlds.seed(int(np.random.SeedSequence([config.seed, resumed, _SEEDS]).generate_state(1, np.uint64)[0]))
     updates = max(1, round(config.updates * config.worlds))
 
     def learn() -> None:
@@ -214,13 +228,13 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
             model.train(updates, config.batch)
 
     worlds.meanwhile = learn
-    keeper = _Keeper(folder, config, twin, before["wall"], resumed, watch)
+    keeper = _Keeper(folder, config, said, twin, before["wall"], resumed, watch)
     before_us = {one: signal.signal(one, keeper.stop) for one in (signal.SIGINT, signal.SIGTERM)}
     try:
         left = config.steps - model.num_timesteps
         if left > 0:
             model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
-        keeper.save()
+            keeper.end()
     finally:
         for one, handler in before_us.items():
             signal.signal(one, handler)
@@ -263,22 +277,25 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
     return model
 
 
-def _check_config(path: Path, twin: Twin, config: TrainConfig) -> None:
-    """Writes the config of a new run; refuses another one for a run that is there."""
-    wanted = {**dataclasses.asdict(config), "field": digest_file(twin.scene.stamp("field"))}
-    # As JSON has it, for comparing.
-    wanted = {
-        k: [list(v) if isinstance(v, tuple) else v for v in x] if isinstance(x, tuple) else x for k, x in wanted.items()
-    }
-    if path.exists():
-        there = read_json(path)
-        for name in wanted:
-            if name != "steps" and there.get(name) != wanted[name]:
-                raise InputError(
-                    f"{path.parent} was trained with {name} = {there.get(name)!r}, not {wanted[name]!r}; "
-                    "go on with the same, or give another --run"
-                )
-    write_json(path, wanted)
+def _as_json(said: dict[str, Any]) -> dict[str, Any]:
+    """As it is once it has been written and read."""
+    return json.loads(json.dumps(said))
+
+
+def _check_same(folder: Path, said: dict[str, Any]) -> None:
+    """Refuses another config for a run that is there."""
+    there = read_json(folder / "config.json")
+    if there.get("road") != said["road"]:
+        raise InputError(
+            f"{folder} was trained before the scene was built anew, or its task or obstacles changed; "
+            "give another --run"
+        )
+    for name in said:
+        if name != "steps" and there.get(name) != said[name]:
+            raise InputError(
+                f"{folder} was trained with {name} = {there.get(name)!r}, not {said[name]!r}; "
+                "go on with the same, or give another --run"
+            )
 
 
 class _Keeper(BaseCallback):
@@ -288,6 +305,7 @@ class _Keeper(BaseCallback):
         self,
         folder: Path,
         config: TrainConfig,
+        said: dict[str, Any],
         twin: Twin,
         wall: float,
         resumed: int,
@@ -296,6 +314,7 @@ class _Keeper(BaseCallback):
         super().__init__()
         self.model: PixelSAC
         self._folder, self._config, self._scene, self._watch = folder, config, twin.scene.root.resolve().name, watch
+        self._said = said
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
         self._stop = False
 
@@ -309,6 +328,8 @@ class _Keeper(BaseCallback):
         return self._wall + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
+        # Not before: by now the worlds have begun, so that all that was asked for is there.
+        write_json(self._folder / "config.json", self._said)
         self._saved = self._first = self.model.num_timesteps
         self._first_updates = self.model._n_updates
         self._recent: list[bool] = _keep_rows(self._folder / "episodes.csv", EPISODE_COLUMNS, self._saved)[-RECENT:]
@@ -320,10 +341,7 @@ class _Keeper(BaseCallback):
             self.save()
         if self._stop:
             raise KeyboardInterrupt
-        every = self._config.steps / self._config.checkpoints
-        number = int(self.model.num_timesteps / every)
-        if number and self.model.num_timesteps - number * every < self._config.worlds:
-            self._save_policy(self._folder / "checkpoints" / f"{self.model.num_timesteps:09d}")
+        self._checkpoint()
 
     def _on_step(self) -> bool:
         rows = []
@@ -338,12 +356,18 @@ class _Keeper(BaseCallback):
             )
         _append(self._folder / "episodes.csv", rows)
         if self._watch:
-            elapsed = max(time.monotonic() - self._started, 1e-9)
-            speed = (self.model.num_timesteps - self._first) / elapsed
-            self._watch(Progress(self.model.num_timesteps, tuple(self._recent), speed))
+            self._watch(Progress(self.model.num_timesteps, tuple(self._recent)))
         return True
 
+    def end(self) -> None:
+        """When all steps are done."""
+        self._checkpoint()
+        self.save()
+
     def save(self) -> None:
+        """Everything; nothing where nothing was done since."""
+        if self.model.num_timesteps == self._saved:
+            return
         model, elapsed = self.model, max(time.monotonic() - self._started, 1e-9)
         logged = model.logger.name_to_value
         row = (
@@ -357,6 +381,13 @@ class _Keeper(BaseCallback):
         self._save_policy(self._folder)
         save_state(self._folder / "state", model, {"wall": self.wall, "resumed": self._resumed})
         self._saved = model.num_timesteps
+
+    def _checkpoint(self) -> None:
+        """Keeps a policy, if one is due."""
+        every = self._config.steps / self._config.checkpoints
+        number = int(self.model.num_timesteps / every)
+        if number and self.model.num_timesteps - number * every < self._config.worlds:
+            self._save_policy(self._folder / "checkpoints" / f"{self.model.num_timesteps:09d}")
 
     def _save_policy(self, folder: Path) -> None:
         c = self._config

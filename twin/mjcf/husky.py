@@ -4,7 +4,8 @@ Names, for whoever scripts it: body and free joint `base_link`; bodies and joint
 actuators `left` and `right`, commanded in wheel speed [rad/s]; camera `front` (160 × 90) and `front_native`, the same
 at its native size; site `imu`; sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`,
 `<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`;
-`chassis_dry` touches nothing.
+`chassis_dry` touches nothing. What the cameras are built into, and do not see: geoms `camera_housing`,
+`camera_bracket`, `camera_lens_left`, `camera_lens_right`.
 
 `python -m twin.mjcf.husky` writes the robot alone to `twin/assets/husky/husky.xml`, for anyone's own scene:
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 LOOK_GROUP = 1
 
+_CAMERA_PART = "camera_"  # begins the names of what carries the front camera
+
 _YELLOW = (0.96, 0.74, 0.05, 1.0)
 _BLACK = (0.06, 0.06, 0.065, 1.0)
 _DARK = (0.13, 0.13, 0.14, 1.0)
@@ -91,10 +93,21 @@ def _mast(base: mujoco.MjsBody, camera: tuple[float, float, float]) -> None:
             _tube(base, (foot, side, 0.25), (foot, side, z - 0.09), 0.014)
             _tube(base, (foot, side, z - 0.09), (foot, 0.72 * side, z - 0.04), 0.014)
         _tube(base, (foot, -0.144, z - 0.04), (foot, 0.144, z - 0.04), 0.014)
-        _tube(base, (foot, y, z - 0.04), (x - 0.03, y, z - 0.02), 0.012)
-    _box(base, (0.03, 0.175, 0.03), (x - 0.02, y, z), rgba=_STEEL)
-    for offset in (-0.06, 0.06):
-        _cylinder(base, (x - 0.01, y + offset, z), (x - 0.002, y + offset, z), 0.011, material="husky_black")
+        _tube(base, (foot, y, z - 0.04), (x - 0.03, y, z - 0.02), 0.012, name=f"{_CAMERA_PART}bracket")
+    _box(base, (0.03, 0.175, 0.03), (x - 0.02, y, z), rgba=_STEEL, name=f"{_CAMERA_PART}housing")
+    for name, offset in (("lens_right", -0.06), ("lens_left", 0.06)):
+        ends = (x - 0.01, y + offset, z), (x - 0.002, y + offset, z)
+        _cylinder(base, *ends, 0.011, material="husky_black", name=f"{_CAMERA_PART}{name}")
+
+
+def camera_parts(model: mujoco.MjModel, camera: int) -> NDArray[np.int64]:
+    """Geoms that a camera cannot see, wherever a draw or a latency puts it: what it is built into, shape (k,).
+
+    They are those of the camera's own body whose names begin with `camera_`, as `add_look` gives them: housing, lenses
+    and bracket, which in truth go where the camera goes. Another robot's are seen.
+    """
+    own = np.flatnonzero(model.geom_bodyid == model.cam_bodyid[camera])
+    return own[[model.geom(int(i)).name.startswith(_CAMERA_PART) for i in own]]
 
 
 def _geom(body: mujoco.MjsBody, kind: Any, **settings: Any) -> None:
@@ -115,8 +128,9 @@ def _cylinder(body: mujoco.MjsBody, start: Any, end: Any, radius: float, **look:
     _geom(body, mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=(*start, *end), size=(radius, 0, 0), **look)
 
 
-def _tube(body: mujoco.MjsBody, start: Any, end: Any, radius: float) -> None:
-    _geom(body, mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*start, *end), size=(radius, 0, 0), material="husky_black")
+def _tube(body: mujoco.MjsBody, start: Any, end: Any, radius: float, **settings: Any) -> None:
+    settings |= {"fromto": (*start, *end), "size": (radius, 0, 0), "material": "husky_black"}
+    _geom(body, mujoco.mjtGeom.mjGEOM_CAPSULE, **settings)
 
 
 def _hull() -> tuple[NDArray[np.float64], NDArray[np.int64]]:

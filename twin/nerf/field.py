@@ -35,6 +35,7 @@ _RENDER_SAMPLES = 24
 _HEAD_RAYS = 8192  # per batch of the head
 _RENDER_FLOOR = 0.02  # weight of unlikely places when rendering
 _QUERY_POINTS = 65536  # per batch of density queries
+_MOST_SEED = 2**31 - 1  # of a kernel, which counts in 32 bits with a sign
 
 
 class RadianceField:
@@ -103,16 +104,17 @@ class RadianceField:
         )
 
     def sample(
-        self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int = -1
+        self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int | None = None
     ) -> None:
-        """Rays → samples. See `kernels/sampler.py`."""
+        """Rays → samples. See `kernels/sampler.py`; any seed jitters them, None takes the middles."""
+        jitter = -1 if seed is None else seed & _MOST_SEED
         wp.launch(
             sampler.sample_rays,
             count,
             [
                 *(ws.w_origins, ws.w_directions, ws.w_targets, self.centre, self.inverse_half),
                 *(self.w_near_grid, self.w_far_grid, self.stop.near_cell, self.stop.far_cell),
-                *(self.layout.near_plane, floor, target_mass, seed, start),
+                *(self.layout.near_plane, floor, target_mass, jitter, start),
             ],
             [ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_ray_positions],
             device=self.where,

@@ -1,8 +1,8 @@
 """The real test: a policy file drives reality's Husky on reality's road, in weather that nobody filmed.
 
 A policy is told nothing but pictures. Its file is all that comes in from the training side; rows of trials are all that
-goes back. Trials have seeds: the k-th trial of every policy starts from the same place with the same shaking camera, so
-that policies can be compared pair by pair.
+goes back. Trials have seeds: the k-th trial in a weather starts from the same place with the same shaking camera for
+every policy, so that policies can be compared pair by pair.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
 from twin.env.tasks import CAMERA
 from twin.errors import InputError
-from twin.learn.policy import JSON, WEIGHTS, Policy, load_policy
+from twin.learn.policy import JSON, Policy, load_policy
 from twin.progress import bar
 from twin.reality import world as worlds
 from twin.reality.eye import Eye
@@ -41,6 +41,7 @@ HELD_OUT = "held-out"
 """The twin's lighting that results are compared with, as it knows none of reality's by name."""
 
 _FIRST_SEED = 7_000_000  # of the first trial
+_PER_WEATHER = 10_000  # seeds, and most trials of a policy
 _ENLARGED = 4  # times, in a film
 _COLUMNS = (*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS)
 
@@ -141,17 +142,19 @@ def run(
     for name in lightings:
         if name not in WEATHER:
             raise InputError(f"lighting {name!r}: reality's are {', '.join(WEATHER)}")
-    if trials < 1:
-        raise InputError(f"trials = {trials}; expected at least 1")
+    if not 1 <= trials <= _PER_WEATHER:
+        raise InputError(f"trials = {trials}; expected 1 to {_PER_WEATHER}")
     table = out.with_name(f"{out.stem}_trials.csv")
     loaded = [policy_file(path) for path in policies]
     _remember(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
     done = read_trials(table) if table.exists() else []
     known = {(*_key(one), one.seed) for one in done}
-    for policy in loaded:
+    for policy in {one.name: one for one in loaded}.values():
         test = Test(policy, task)
-        for lighting in lightings:
-            seeds = [_FIRST_SEED + k for k in range(trials)]
+        for lighting in dict.fromkeys(lightings):
+            # Of each weather its own, or ten starts in five weathers would pass for fifty.
+            first = _FIRST_SEED + _PER_WEATHER * list(WEATHER).index(lighting)
+            seeds = [first + k for k in range(trials)]
             missing = [seed for seed in seeds if (policy.name, task, lighting, seed) not in known]
             with bar(f"{policy.name}, {task}, {lighting}", len(missing), "trial") as progress:
                 for seed in missing:
@@ -196,7 +199,7 @@ def _remember(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -
     sums: dict[str, str] = read_json(record) if record.exists() else {}
     for policy, path in zip(policies, paths, strict=True):
         folder = path.parent if path.name == JSON else path
-        digest = digest_file(folder / WEIGHTS if folder.is_dir() else folder)
+        digest = digest_file(folder / JSON if folder.is_dir() else folder)  # which has the digest of the weights
         if sums.setdefault(policy.name, digest) != digest:
             raise InputError(
                 f"{path}: {record} says that another file drove under the name {policy.name!r}; give another --out, or "

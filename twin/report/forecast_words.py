@@ -139,6 +139,16 @@ def unknowns(forecast: Forecast) -> list[Caution]:
             out.append(Caution(f"{group.task}: no correlation is given, as there are {what}.", _NEEDED))
     if not forecast.real_trials:
         out.append(Caution("Whether the road ranks these policies as the twin does, and how much it is off.", _NEEDED))
+    on_road = {p.policy for p in forecast.pairs}
+    runs = {name.partition("/")[0] for name in on_road}
+    if len(runs) < len(on_road):
+        what = f"The {len(on_road)} policies that were driven on the road come from {len(runs)} trainings"
+        out.append(
+            Caution(
+                f"{what}; the intervals count each as one of its own.",
+                "train again with other --seed: how far trainings differ is known from these few only.",
+            )
+        )
     lightings = {name for c in forecast.candidates for name in c.lightings}
     out.append(
         Caution(

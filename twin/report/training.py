@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.report.statistics import wilson
+from twin.report.trials import RECENT
 from twin.report.validation import share
 from twin.scene import SceneDir, digest_file, read_json
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-
-RECENT = 100
-"""Episodes before a policy was saved that its success in training is taken over, as `twin.train` does."""
+from matplotlib.axes import Axes
 
 _BINS = 25
 
@@ -76,16 +75,20 @@ def binned(steps: np.ndarray, success: np.ndarray, bins: int = _BINS) -> list[tu
     return out
 
 
+def draw_curve(axes: Axes, steps: NDArray[np.int64], success: NDArray[np.int64], colour: str) -> None:
+    """The rate of success over steps with its interval; arguments as of `binned`, at least one episode."""
+    step, won, count, low, high = (np.array(column, float) for column in zip(*binned(steps, success), strict=True))
+    axes.fill_between(step, low, high, color=colour, alpha=0.2, linewidth=0, label="90 % interval")
+    axes.plot(step, won / count, ".-", color=colour, label=f"{len(steps)} episodes, {int(count[0])} a point")
+
+
 def success_curve(folder: Path) -> Path:
     """Draws `success.png` of a run: the rate of success over steps, with intervals of 90 %."""
     steps, success = read_episodes(folder)
     path = folder / "success.png"
     figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
     if len(steps):
-        curve = binned(steps, success)
-        step, won, count, low, high = (np.array(column, float) for column in zip(*curve, strict=True))
-        axes.fill_between(step, low, high, color="#1f77b4", alpha=0.2, linewidth=0, label="90 % interval")
-        axes.plot(step, won / count, ".-", color="#1f77b4", label=f"{len(steps)} episodes, {int(count[0])} a point")
+        draw_curve(axes, steps, success, "#1f77b4")
         axes.legend(loc="lower right", frameon=False)
     axes.set(xlabel="steps of all worlds", ylabel="success in training", ylim=(-0.02, 1.02), xlim=(0, None))
     axes.grid(alpha=0.3)

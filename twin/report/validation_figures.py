@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from twin.report.figures import INK, SERIES, new_figure, style
 from twin.report.forecast_figures import LIMITS, TICKS, legend_below, short
-from twin.report.training import binned
+from twin.report.training import draw_curve
 
 _ROW = 0.17  # [in] per point
 _APART = 0.18  # between two lightings of a policy, of the distance of two policies; less where there are many
@@ -47,10 +47,8 @@ def along_training(steps: NDArray[np.int64], success: NDArray[np.int64], saved: 
         saved: Steps at which the validated policies were saved.
     """
     figure, axes = new_figure(2.2)
-    step, won, count, low, high = (np.array(column, float) for column in zip(*binned(steps, success), strict=True))
     with style():
-        axes.fill_between(step, low, high, color=SERIES[0], alpha=0.2, linewidth=0)
-        axes.plot(step, won / count, ".-", color=SERIES[0])
+        draw_curve(axes, steps, success, SERIES[0])
         for one in saved:
             axes.axvline(one, color=INK, lw=0.9, ls="--")
         axes.set(xlabel="training step", ylabel="success in training", ylim=LIMITS, yticks=TICKS)

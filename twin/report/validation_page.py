@@ -104,7 +104,7 @@ def _cells(said: dict[str, Any]) -> Html:
         _lead(
             "An episode is one drive, from a start drawn at random to the goal or to a failure. All policies drive the "
             f"same episodes. Brackets are {said['confidence']:.0%} intervals: how far chance alone may have moved the "
-            "rate. “In training” is success over the last 100 episodes before the policy was saved, in which it also "
+            "rate. “In training” is success over the last 50 episodes before the policy was saved, in which it also "
             "tried things out, so that it may do better here; one that does much worse has learnt its training by "
             "heart."
         )
