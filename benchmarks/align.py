@@ -3,7 +3,8 @@ currents on asphalt beside simulated torques; as JSON where asked.
 
     python benchmarks/align.py [--data FOLDER] [--work FOLDER] [--json FILE]
 
-`--data` holds `husky_drive` and `borealtc_asphalt`. Takes some minutes. Exit status 1 where a target is missed.
+`--data` holds `husky_drive` and `borealtc_asphalt`. Takes 23 minutes on the machine of `docs/benchmarks.md`, shared.
+Exit status 1 where a target is missed.
 """
 
 import argparse

@@ -3,7 +3,8 @@
     python benchmarks/husky.py [--scene BUILT_SCENE] [--only A1 B6 ...] [--json FILE]
 
 With `--scene` also chi on that scene's ground, of that scene's robot, and the steps per second in it. The whole takes
-about a minute and a half. Exit status 1 where a row fails that should pass, or a control passes that should fail.
+40 s on the machine of `docs/benchmarks.md`. Exit status 1 where a row fails that
+should pass, or a control passes that should fail.
 """
 
 import argparse

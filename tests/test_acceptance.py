@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from twin.env.acceptance import grounds
+from twin.env.acceptance.drive import drive, on_ground
+from twin.env.acceptance.ground import chi_on
 from twin.env.acceptance.rows import Row, Subject
 from twin.env.acceptance.table import CONTROLS, MEASURES
+from twin.robot import TRACK, HuskyParams
 
 _TABLE = {f"{letter}{n + 1}" for letter, count in zip("ABCDE", (2, 8, 3, 6, 4), strict=True) for n in range(count)}
 
@@ -25,6 +28,33 @@ def test_no_row_is_left_out():
 def test_negative_control(control):
     for key in control.fails:
         assert not all(row.passed for row in MEASURES[key](control.subject)), key
+
+
+ALIGNED = Subject(
+    HuskyParams(
+        friction=0.25,
+        spin_friction=0.02,
+        slip_stiffness=0.025,
+        ground_viscosity=4.0,
+        separation_multiplier=1.4,
+        max_yaw_rate=0.5,
+        max_speed=0.4,
+    )
+)
+"""Ground and controller as a log may show them."""
+
+
+def test_the_subject_s_own_ground_and_controller_are_measured():
+    for model in (ALIGNED.plane(), on_ground(grounds.level(), ALIGNED.params)):
+        assert (model.opt.impratio, model.opt.viscosity) == (0.025, 4.0)
+    assert ALIGNED.turn(1.0).wheel_difference == pytest.approx(0.5 * 1.4 * TRACK, rel=0.02)
+    assert ALIGNED.turn(1.0, separation_multiplier=1.2).wheel_difference == pytest.approx(0.5 * 1.2 * TRACK, rel=0.02)
+    line = np.array([[-5.0, 0.0], [5.0, 0.0]])
+    (row,) = chi_on(ALIGNED, grounds.level(), (0.0, 0.0, 0.0), line, "a level field")
+    assert row.value == pytest.approx(ALIGNED.turn(1.0, seconds=2.0).chi, rel=0.03)
+    assert row.value < drive(ALIGNED.plane(), 0.0, 1.0).chi - 0.05  # the published controller would turn it faster
+    fastest = {r.quantity: r.value for r in MEASURES["D1 D2 D3 D5"](ALIGNED)}["fastest wheel"]
+    assert fastest == pytest.approx(0.4, rel=0.02)
 
 
 def test_a_number_that_is_none_fails():

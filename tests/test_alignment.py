@@ -1,5 +1,6 @@
 """Alignment: logs in, what they show of a robot out. Truth is a simulated robot's own parameters."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,12 +8,13 @@ import numpy as np
 import pytest
 from drive_logs import columns, write_csv
 
-from twin.align import main
+from twin.align import main, summary
 from twin.alignment import commands, currents, ground, kinematics, logs, slope
-from twin.alignment.aligned import align, robot_toml
+from twin.alignment.aligned import Alignment, align, robot_toml
 from twin.alignment.checks import check
-from twin.alignment.identify import Parameter, bend, fit
+from twin.alignment.identify import Fit, Parameter, bend, fit
 from twin.alignment.kinematics import Icr
+from twin.alignment.score import Prediction
 from twin.config_file import parse, read_robot
 from twin.env.controller import Controller
 from twin.errors import InputError
@@ -190,6 +192,36 @@ def test_identified_are_what_residuals_move():
     assert "another log" in found.refused["nothing"]
 
 
+def test_nothing_identified_is_a_fit_too():
+    table = [Parameter(name, 3.0, 1.0, -10, 10, 7.0, "") for name in ("a", "b")]
+    noise = np.random.default_rng(0).normal(size=(50, 1, 1))
+    found = fit(table, lambda v: noise + 0 * (v["a"] + v["b"]), np.arange(50))
+    assert found.values == {"a": 7.0, "b": 7.0}
+    assert not found.errors and set(found.refused) == {"a", "b"}
+    assert found.cost == pytest.approx(np.log1p(noise**2).mean())
+
+
+@pytest.mark.parametrize("kept", [0, 1])
+def test_parameters_may_go_one_by_one(kept):
+    """Each shows only as long as the next one is not at its usual value, and the last one hardly shows."""
+    rng = np.random.default_rng(1)
+    names = list("abcdefg")
+    x, noise = rng.normal(size=(7, 400)), 0.1 * rng.normal(size=400)
+    table = [Parameter(name, 1.0, 1.0, -10, 10, 0.0, "") for name in names]
+
+    def error(v: dict[str, float]) -> np.ndarray:
+        shown = [*(float(v[after] != 0.0) for after in names[1:]), 0.005]
+        shown[0] = shown[0] or float(kept)
+        off = (np.array([v[name] for name in names]) - 1.0) * shown
+        return (off @ x + noise)[:, None, None]
+
+    found = fit(table, error, np.arange(400))
+    assert set(found.errors) == set(names[:kept]) and set(found.refused) == set(names[kept:])
+    if kept:
+        assert found.values["a"] == pytest.approx(1.0, abs=0.03)
+        assert found.errors["a"] == pytest.approx(0.1 / 20, rel=0.2)
+
+
 def test_two_that_do_the_same_are_not_both_identified():
     rng = np.random.default_rng(0)
     x, noise = rng.normal(size=200), 0.1 * rng.normal(size=200)
@@ -203,7 +235,7 @@ def test_two_that_do_the_same_are_not_both_identified():
 def test_a_known_robot_is_recovered(drive, tmp_path):
     """Drive with known parameters, fit, and get them back; held-out windows are met far better than by kinematics."""
     windows = logs.cut(drive, "log")
-    result = align(windows, HuskyParams(), "log")
+    result = align(windows, HuskyParams())
     found = result.identified
     for name, tolerance in {
         "command_latency": 0.05,
@@ -232,6 +264,84 @@ def test_a_known_robot_is_recovered(drive, tmp_path):
     assert robot.camera_pitch == 7.0
     assert robot.friction == pytest.approx(result.robot.friction, rel=1e-4)
     assert robot.center_of_mass == pytest.approx(result.robot.center_of_mass, abs=1e-4)
+
+
+def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) -> Alignment:
+    """An alignment that nothing was fitted for: a robot, and standard errors by parameter."""
+    params = HuskyParams(**robot)
+    wheels = np.random.default_rng(0).uniform(1, 5, (40, logs.SAMPLES, 2))
+    windows = windows_of(wheels, twist=twist)
+    drive = commands.Drive.of(params, twist)
+    prediction = Prediction("made up", windows, kinematics.predict(kinematics.NOMINAL, windows), wheels + 0.1)
+    fits = [
+        Fit({}, drive_errors or {}, {}, 0.0),
+        Fit({"pose_x": 0.0, "pose_y": 0.0}, ground_errors or {}, {}, 0.0),
+    ]
+    return Alignment(windows, kinematics.NOMINAL, drive, *fits, params, *[prediction] * 4)
+
+
+@pytest.mark.parametrize("twist", [True, False])
+def test_errors_of_yaw_limits_go_by_the_multiplier(twist):
+    """ω = half speed · 2 r / (multiplier · track), and so for its error; else errors are in the field's own unit."""
+    errors = {"half_limit": 0.1, "half_acceleration": 0.4, "wheel_limit": 0.2, "latency": 0.03, "half_gain": 0.05}
+    found = aligned(twist, errors, separation_multiplier=1.875, command_latency=0.2).identified
+    per_half = 2 * WHEEL_RADIUS / (1.875 * TRACK)
+    assert found["max_yaw_rate"] == (2.0, pytest.approx(0.1 * per_half))
+    assert found["max_yaw_acceleration"] == (6.0, pytest.approx(0.4 * per_half))
+    assert found["max_wheel_speed"][1] == pytest.approx(0.2 * WHEEL_RADIUS)
+    assert found["command_latency"] == (0.2, pytest.approx(0.03))
+    assert ("separation_multiplier" in found) == twist
+    if twist:
+        assert found["separation_multiplier"] == (1.875, pytest.approx(0.05))
+
+
+def test_what_of_a_vector_was_not_fitted_is_said():
+    result = aligned(ground_errors={"center_of_mass_x": 0.003, "radius_left": 0.001, "radius_right": 0.002})
+    assert result.identified["center_of_mass"][1] == (0.003, None, None)
+    assert "# ± 0.003, not fitted, not fitted\n" in robot_toml(result, {}, "log")
+    assert "± 0.003, not fitted, not fitted" in summary(result)
+    assert "# ± 0.001, 0.002\n" in robot_toml(result, {}, "log")
+    told = json.loads(json.dumps(result.figures()))["robot"]
+    assert told["center_of_mass"]["standard_error"] == [0.003, None, None]
+
+
+def test_a_log_that_shows_nothing_is_said_to():
+    result = aligned()
+    assert "fitted: nothing" in summary(result)
+    text = robot_toml(result, {"friction": 0.3}, "log")
+    assert "nothing in it could be identified" in text and "friction = 0.3\n" in text
+
+
+def test_a_scene_that_overrules_what_was_fitted_is_warned_of(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("twin.align.align", lambda *_: aligned(ground_errors={"friction": 0.01, "spin_friction": 0.01}))
+    monkeypatch.setattr("twin.align.check", lambda *_: None)
+    monkeypatch.setattr("twin.alignment.plots.draw", lambda *_: None)
+    scene, log = tmp_path / "x", tmp_path / "log.npz"
+    scene.mkdir()
+    (scene / "scene.toml").write_text(
+        '[[source]]\npath = "a.mp4"\n[metric]\ncamera_height = 1.2\n[robot]\nfriction = 0.5\nmax_speed = 0.9\n'
+    )
+    np.savez(log, **columns(HuskyParams(), 4.0, seed=0))
+    for target in (scene, scene / "scene.toml", scene / "robot.toml"):  # the last one written by the first
+        assert main([str(target), str(log)]) == 0
+        assert "overrules what was fitted: friction;" in capsys.readouterr().out, target
+    assert main([str(scene), str(log), "--out", str(tmp_path / "out")]) == 0
+    assert "overrules what was fitted" not in capsys.readouterr().out  # what lies there is not the scene's
+
+
+@pytest.mark.parametrize("out", ["file/out", "taken"])
+def test_a_folder_that_cannot_be_written_is_refused_before_the_fit(out, drive, tmp_path, monkeypatch, capsys):
+    def never(*_):
+        raise AssertionError("fitted before the folder was made")
+
+    monkeypatch.setattr("twin.align.align", never)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "alignment").write_text("")
+    np.savez(tmp_path / "log.npz", **drive)
+    assert main(["husky", str(tmp_path / "log.npz"), "--out", str(tmp_path / out), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and str(tmp_path / out) in said and "--out" in said
 
 
 def _bad(table: dict[str, np.ndarray], **changes) -> dict[str, np.ndarray]:
@@ -266,6 +376,14 @@ BAD = {
     ),
     "missing": (lambda t: {k: v for k, v in t.items() if k != "left_wheel_vel"}, r"no column left_wheel_vel among"),
     "short": (lambda t: {k: v[:400] for k, v in t.items()}, r"windows of 2 s to fit to .*expected at least 20 and 10"),
+    "ns": (
+        lambda t: _bad(t, time=1.7e18 + 1e9 * t["time"]),
+        r"rows are 5e\+07 s apart .*expected 0\.0005 to 0\.5 s; time looks like ns; divide it by 1e9",
+    ),
+    "µs": (lambda t: _bad(t, time=1e6 * t["time"]), r"time looks like µs; divide it by 1e6"),
+    "ms": (lambda t: _bad(t, time=1e3 * t["time"]), r"rows are 50 s apart .*time looks like ms; divide it by 1e3"),
+    "slow": (lambda t: {k: v[::12] for k, v in t.items()}, r"rows are 0\.6 s apart .*record at least 2 rows a second"),
+    "hours": (lambda t: _bad(t, time=t["time"] / 3600), r"rows are 1\.39e-05 s apart .*; give time in s$"),
     "lengths": (lambda t: _bad(t, x=t["x"][:-1]), r"columns of different lengths"),
 }
 
@@ -325,6 +443,18 @@ def test_gaps_are_left_out(drive):
     windows = logs.cut({name: column[keep] for name, column in drive.items()}, "log")
     assert len(windows) == 74 - 3
     assert (~windows.follows).sum() == 2  # the first, and the first after the gap
+
+
+def test_a_gap_costs_nothing(drive):
+    """One row before the clock was set: two seconds of the log are lost to the grid at most, and no memory."""
+    late = {name: np.concatenate([column[:1], column]) for name, column in drive.items()}
+    late["time"][1:] += 1.7e9
+    windows = logs.cut(late, "log")
+    whole = logs.cut(drive, "log")
+    assert len(windows) == len(whole)
+    np.testing.assert_allclose(windows.wheels, whole.wheels, atol=1e-9)
+    assert windows.follows.tolist() == whole.follows.tolist()
+    assert (windows.fitting.sum() - whole.fitting.sum()) in range(-3, 4)
 
 
 def test_bag_is_the_same_log(drive, tmp_path):

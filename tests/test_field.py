@@ -311,12 +311,10 @@ def test_embeddings_by_name_by_frame_and_mixed(field):
     day, night = field.embedding("day"), field.embedding("night")
     np.testing.assert_allclose(field.embedding("day:night:0.25"), 0.75 * day + 0.25 * night, rtol=1e-6)
     residual = field.appearance.residuals[1].numpy()
-    np.testing.assert_allclose(field.frame_embedding("day/000001"), day + residual, rtol=1e-6)
+    np.testing.assert_allclose(field.embedding("day/000001"), day + residual, rtol=1e-6)
     for wrong in ("dusk", "day:night:much", "day:dusk:0.5"):
         with pytest.raises(InputError):
             field.embedding(wrong)
-    with pytest.raises(InputError, match="trained on"):
-        field.frame_embedding("day")
 
 
 def test_near_box_holds_the_cameras_and_what_lies_ahead():

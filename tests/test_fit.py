@@ -18,10 +18,11 @@ from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
-from twin.nerf.evaluate import evaluate, fit_embedding_to_image
+from twin.nerf.evaluate import evaluate, fit_embedding
 from twin.nerf.field import RadianceField
 from twin.nerf.fit import Trainer, bending, fit, free_segments
 from twin.nerf.stage import constant_height, run
+from twin.nerf.workspace import CameraArrays
 from twin.progress import set_quiet
 from twin.scene import SceneDir, write_json
 
@@ -212,7 +213,11 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
     assert np.median(np.abs(result.depth[0, lower] / floor_depth - 1.0)) < 0.2
 
     picture = ground_picture(cameras.camera_to_world[i], 0.7)
-    fitted = fit_embedding_to_image(field, picture, cameras.camera_to_world[i], K, "day")
+    one = CameraArrays(cameras.camera_to_world[i : i + 1], K[None], field.where)
+    pixels = np.stack([column.ravel() + 0.5 for column in np.mgrid[:HEIGHT, :WIDTH][::-1]], -1)
+    features, harmonics, _, _ = field.trace(one, np.zeros(len(pixels), int), pixels)
+    colours = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
+    fitted = fit_embedding(field, features, harmonics, colours, field.embedding("day"))
     seen = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), fitted).rgb[0]
     assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
 

@@ -2,6 +2,7 @@
 
 import re
 import zipfile
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -10,10 +11,11 @@ from tiny_world import box, tiny_config, tiny_ground, tiny_route, tiny_scene, ti
 
 from twin.errors import InputError
 from twin.geometry.images import read_image
+from twin.mjcf.check import check_portable
 from twin.mjcf.export import add_ground, compacted, covered_by_ground, film_camera, rest_pose, run
 from twin.mjcf.files import face_tiles
 from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest, point_at, total_turn
-from twin.robot import BASE_HEIGHT, CAMERA_SIZE
+from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams
 
 
 @pytest.fixture(scope="module")
@@ -213,6 +215,64 @@ def test_a_start_inside_something_solid_is_refused(tmp_path):
     out.mkdir()
     with pytest.raises(InputError, match="does not rest"):
         run(scene, tiny_config(), out)
+
+
+def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
+    """The tiny scene on a plane that falls towards the robot's back, and what its export says."""
+    scene = tiny_scene(tmp_path, **scene_arguments)
+    flat = tiny_ground()
+    x = np.broadcast_to(np.arange(flat.height.shape[1]) * flat.cell, flat.height.shape)
+    ground = type(flat)(np.tan(np.radians(degrees)) * x, flat.origin, flat.cell, flat.measured, flat.rgb)
+    ground.save(scene.stage("mesh"))
+    np.savez(scene.stage("mesh") / "route.npz", xy=tiny_route(), z=ground.at(tiny_route()))
+    out = scene.stage("mjcf")
+    out.mkdir()
+    return out, run(scene, replace(tiny_config(), robot=robot), out)
+
+
+SOFT = HuskyParams(friction=0.25, spin_friction=0.02, slip_stiffness=1 / 40, ground_viscosity=5.0)
+"""As fitted on soft ground: tyres that creep down any slope."""
+
+
+@pytest.mark.parametrize("degrees", [2.0, 5.0, 12.0])
+@pytest.mark.parametrize("servo_gain", [HuskyParams.servo_gain, 20.0])
+def test_a_robot_fitted_on_soft_ground_starts_on_a_slope(tmp_path, degrees, servo_gain):
+    out, metrics = on_a_slope(tmp_path, degrees, replace(SOFT, servo_gain=servo_gain))
+    world = World.load(out)
+    start = tiny_route()[0] - [BASE_HEIGHT * np.sin(np.radians(degrees)), 0.0]  # wheels at the route's start
+    assert np.hypot(*(world.spawn[:2] - start)) < 0.005  # and not where it would have crept to
+    assert metrics["spawn_drift_m"] > 0.004  # it does creep, and that is told
+    assert world.model().opt.impratio == pytest.approx(1 / 40)  # what is shipped is as soft as was fitted
+
+
+def test_something_solid_at_the_start_is_refused_on_soft_ground_too(tmp_path):
+    with pytest.raises(InputError, match=r"something solid is there: raise mesh\.obstacle_height"):
+        on_a_slope(tmp_path, 2.0, SOFT, boxes=((0.4, 0.3, 0.2),))
+
+
+def test_a_start_too_steep_for_the_tyres_is_refused_for_that(tmp_path):
+    with pytest.raises(InputError, match=r"falls by 18\.0°, expected at most 14\.0° .*friction 0\.25.*"):
+        on_a_slope(tmp_path, 18.0, SOFT)
+
+
+@pytest.mark.parametrize(
+    ("written", "instead"),
+    [
+        ('impratio="10"', 'impratio="0.01"'),
+        ('<geom name="ground" pos="', '<geom name="ground" margin="0.02" pos="'),
+        ('cone="elliptic"', 'cone="pyramidal"'),
+    ],
+)
+def test_a_copy_that_moves_otherwise_is_a_bug_of_the_exporter(tmp_path, written, instead):
+    """On a steep start, so that the robot's weight tells on the tyres."""
+    out, _ = on_a_slope(tmp_path, 25.0, HuskyParams())
+    built = World.load(out).model()
+    assert check_portable(out, built)["spawn_drift_m"] < 0.005
+    text = (out / "scene.xml").read_text()
+    assert text.count(written) == 1
+    (out / "scene.xml").write_text(text.replace(written, instead))
+    with pytest.raises(RuntimeError, match="moves otherwise"):
+        check_portable(out, built)
 
 
 def test_rest_pose_follows_the_slope():

@@ -11,12 +11,14 @@ next build uses, and `alignment/` with `align.json` and four pictures.
 
 import argparse
 import sys
+import tempfile
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from twin import progress
-from twin.alignment.aligned import Alignment, align, robot_toml
+from twin.alignment.aligned import Alignment, align, robot_toml, told_error
+from twin.alignment.checks import check
 from twin.alignment.logs import read_log
 from twin.config_file import ROBOT_TOML, load_config, parse, read_robot
 from twin.errors import InputError, refuse
@@ -47,9 +49,11 @@ def run(target: str, log: Path, out: Path | None = None, use_slope: bool = True)
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")
     windows = read_log(log)
     progress.say(f"{log}: {len(windows)} windows, {int(windows.fitting.sum())} to fit to, the others to score on")
-    result = align(windows, params, str(log), use_slope, progress.say)
+    check(windows, str(log))
     pictures = folder / FOLDER
-    pictures.mkdir(parents=True, exist_ok=True)
+    _writable(pictures)
+    _writable(folder)
+    result = align(windows, params, use_slope, progress.say)
 
     from twin.alignment.plots import draw
 
@@ -74,12 +78,26 @@ def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
     return load_config(SceneDir(root).config_file).robot, read_robot(root / ROBOT_TOML), root
 
 
-def hidden(target: str, result: Alignment) -> list[str]:
-    """Fitted fields that `[robot]` in the scene's own `scene.toml` overrules."""
-    path = SceneDir(Path(target)).config_file
+def _writable(folder: Path) -> None:
+    """Makes a folder, and writes a file there and takes it away again."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written to: {error}; give another folder with --out") from None
+
+
+def hidden(folder: Path, result: Alignment) -> list[str]:
+    """Fitted fields that `[robot]` of the `scene.toml` beside the written `robot.toml`, if there is one, overrules."""
+    path = SceneDir(folder).config_file
     if not path.exists():
         return []
-    return sorted(set(tomllib.loads(path.read_text(encoding="utf-8")).get("robot", {})) & set(result.identified))
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    return sorted(set(table.get("robot", {})) & set(result.identified))
 
 
 def summary(result: Alignment) -> str:
@@ -93,11 +111,10 @@ def summary(result: Alignment) -> str:
             f"{prediction.name:36} {s.position_m:7.3f} m {s.yaw_deg:5.1f}° {s.position_m_p90:8.3f} m "
             f"{s.yaw_deg_p90:6.1f}°  {wheels}"
         )
-    rows.append("fitted:")
+    rows.append("fitted:" if result.identified else "fitted: nothing, for the log shows nothing of the robot")
     for name, (value, error) in result.identified.items():
         told = ", ".join(f"{v:.4g}" for v in value) if isinstance(value, tuple) else f"{value:.4g}"
-        off = ", ".join(f"{e:.2g}" for e in error) if isinstance(error, tuple) else f"{error:.2g}"
-        rows.append(f"  {name} = {told} ± {off}")
+        rows.append(f"  {name} = {told} ± {told_error(error)}")
     if result.refused:
         rows.append("left alone, for this log does not show them:")
         rows += [f"  {line}" for line in result.refused]
@@ -123,11 +140,11 @@ def main(arguments: list[str] | None = None) -> int:
     progress.set_quiet(options.quiet)
     try:
         result, folder = run(options.robot, options.log, options.out, not options.level)
+        overruled = hidden(folder, result)
     except (InputError, OSError) as error:
         return refuse(error)
     if not options.quiet:
         print(summary(result))
-        overruled = hidden(options.robot, result)
         if overruled:
             print(f"scene.toml's [robot] overrules what was fitted: {', '.join(overruled)}; remove it there to use it")
         print(f"wrote {folder / ROBOT_TOML}; look at {folder / FOLDER}")

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.alignment import ground, slope
-from twin.alignment.checks import check
 from twin.alignment.commands import Drive, fit_drive
 from twin.alignment.identify import Fit
 from twin.alignment.kinematics import NOMINAL, Icr, fit_icr, predict
@@ -63,16 +62,23 @@ class Alignment:
     """As fitted, the ground taken for level."""
 
     @property
-    def identified(self) -> dict[str, tuple[float | tuple[float, ...], float | tuple[float, ...]]]:
-        """Fields of HuskyParams that the log identified: value and standard error, a number each or as many."""
+    def identified(self) -> dict[str, tuple[float | tuple[float, ...], float | tuple[float | None, ...]]]:
+        """Fields of HuskyParams that the log identified: value and standard error, a number each or as many.
+
+        Errors of yaw rate and acceleration are those at the separation multiplier found; of a vector's components
+        those that were not fitted have None.
+        """
         out: dict[str, tuple[Any, Any]] = {}
-        units = Drive(*[1.0] * len(Drive.__dataclass_fields__)).robot(self.robot, self.windows.twist)
+        twist = self.windows.twist
+        here = self.drive.robot(self.robot, twist)
         for field, (name,) in _DRIVE_FIELDS.items():
-            if name in self.drive_fit.errors and (self.windows.twist or field != "separation_multiplier"):
-                out[field] = getattr(self.robot, field), self.drive_fit.errors[name] * abs(units[field])
+            if name in self.drive_fit.errors and (twist or field != "separation_multiplier"):
+                # Every field is in proportion to what shows it.
+                off = replace(self.drive, **{name: getattr(self.drive, name) + self.drive_fit.errors[name]})
+                out[field] = getattr(self.robot, field), abs(off.robot(self.robot, twist)[field] - here[field])
         for field, names in _GROUND_FIELDS.items():
-            errors = [self.ground_fit.errors.get(name, 0.0) for name in names]
-            if not any(name in self.ground_fit.errors for name in names):
+            errors: list[Any] = [self.ground_fit.errors.get(name) for name in names]
+            if all(error is None for error in errors):
                 continue
             value = getattr(self.robot, field)
             if names[0].startswith("log10_"):
@@ -139,16 +145,11 @@ class Alignment:
 def align(
     windows: Windows,
     params: HuskyParams,
-    where: str,
     use_slope: bool = True,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Alignment:
-    """Fits baseline, drive, tyres and ground to the even groups of a log, and predicts all of it.
-
-    Raises:
-        InputError: the log cannot be used, see `checks`.
-    """
-    check(windows, where)
+    """Fits baseline, drive, tyres and ground to the even groups of a log that `checks.check` let pass, and predicts all
+    of it."""
     if not use_slope:
         windows = without_acceleration(windows)
     icr = fit_icr(windows.of(windows.fitting))
@@ -192,8 +193,9 @@ def robot_toml(alignment: Alignment, kept: dict[str, Any], log: str) -> str:
     lines = [
         f"# Fitted to {Path(log).name} by python -m twin.align; on {scoring} windows it was not fitted to the robot is "
         f"off by {ours.position_m:.3f} m and {ours.yaw_deg:.1f}° after 2 s (median).",
+        *([] if identified else ["# But nothing in it could be identified: what follows stood here before."]),
         *(f"{name} = {_toml(value)}" for name, value in kept.items() if name not in identified),
-        *(f"{name} = {_toml(value)}  # ± {_told(error)}" for name, (value, error) in identified.items()),
+        *(f"{name} = {_toml(value)}  # ± {told_error(error)}" for name, (value, error) in identified.items()),
     ]
     return "\n".join(lines) + "\n"
 
@@ -211,12 +213,16 @@ def _toml(value: Any) -> str:
     return text if any(c in text for c in ".einf") else text + ".0"
 
 
-def _told(error: float | tuple[float, ...]) -> str:
-    return ", ".join(f"{e:.2g}" for e in error) if isinstance(error, tuple) else f"{error:.2g}"
+def told_error(error: float | tuple[float | None, ...]) -> str:
+    """A standard error in words."""
+    each = error if isinstance(error, tuple) else (error,)
+    return ", ".join("not fitted" if e is None else f"{e:.2g}" for e in each)
 
 
 def _plain(value: Any) -> Any:
-    return [float(f"{v:.6g}") for v in value] if isinstance(value, tuple) else float(f"{value:.6g}")
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return None if value is None else float(f"{value:.6g}")
 
 
 def _quantiles(values: Array) -> dict[str, float] | None:

@@ -3,7 +3,8 @@
 A *parameter* has a span: how far from its usual value it may well be, known without any log (one standard deviation).
 The *rule*: a parameter is identified if its standard error, all others being free, is at most half its span. Of those
 that are not, the least certain one goes back to its usual value, the rest is judged anew, and what is left is fitted
-again. Before the first fit, far from the best values, only hopeless ones go: those uncertain by ten times their span.
+again, until a fit leaves none to go. Before the first fit, far from the best values, only hopeless ones go: those
+uncertain by ten times their span.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
 any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible
@@ -24,7 +25,6 @@ Array = NDArray[np.float64]
 SHARE = 0.5  # of its span that a parameter's standard error may be
 _HOPELESS = 10.0  # the same before the first fit
 _STEP = 0.05  # of its span, for differences
-_MAX_ROUNDS = 4  # of fitting and judging
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,10 @@ def fit(
             moved = point.copy()
             moved[i] += step
             columns.append((at(moved, names) - now) / step)
-        return np.stack(columns, -1)
+        return np.stack(columns, -1) if columns else np.empty((*now.shape, 0))
 
-    for attempt in range(_MAX_ROUNDS):
+    fitted = False
+    while True:  # comes to an end, as a parameter less is fitted every time
         names = list(free)
         point = np.array([values[name] for name in names])
         now = at(point, names)
@@ -100,7 +101,7 @@ def fit(
             errors = _standard_errors(jacobian, now, groups, np.array([free[n].span for n in names]))
             relative = errors / [free[n].span for n in names]
             worst = int(np.argmax(relative)) if names else -1
-            if worst < 0 or relative[worst] <= (SHARE if attempt else _HOPELESS):
+            if worst < 0 or relative[worst] <= (SHARE if fitted else _HOPELESS):
                 break
             p = free.pop(names.pop(worst))
             values[p.name] = p.usual
@@ -109,12 +110,12 @@ def fit(
                 + f": standard error {_told(errors[worst])}, wanted at most {SHARE * p.span:.3g}; needs {p.cure}"
             )
             jacobian = np.delete(jacobian, worst, -1)
-        if attempt and len(names) == len(point):  # nothing dropped after a fit
+        if (fitted or not names) and len(names) == len(point):  # nothing dropped after a fit, or nothing left to fit
             cost = float((bend(now) ** 2).sum() / len(now))
             return Fit(values, dict(zip(names, errors.tolist(), strict=True)), refused, cost)
-        progress(f"fitting {', '.join(names) or 'nothing'}")
         if not names:
             continue
+        progress(f"fitting {', '.join(names)}")
         # In spans from where the search begins: SciPy's first step is then one span at most, and its tolerances mean
         # the same for every parameter.
         spans = np.array([free[n].span for n in names])
@@ -141,7 +142,7 @@ def fit(
             max_nfev=evaluations,
         )
         values |= dict(zip(names, (origin + found.x * spans).tolist(), strict=True))
-    raise ArithmeticError(f"parameters were still dropped after {_MAX_ROUNDS} fits: {', '.join(refused)}")
+        fitted = True
 
 
 def _standard_errors(jacobian: Array, error: Array, groups: NDArray[np.int64], spans: Array) -> Array:

@@ -29,7 +29,8 @@ Array = NDArray[np.float64]
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-MAX_GAP = 0.5  # [s] between two rows of a table; a window that touches a longer one is left out
+MAX_GAP = 0.5  # [s] between two rows of a table; a window that reaches into a longer one is left out
+MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds would show
 
 _TICK = 1e-6  # [s] instants nearer than this are the same
 _GROUP_WINDOWS = 3  # of a table without groups: six seconds
@@ -144,7 +145,7 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
         where: What to call the log in an error.
 
     Raises:
-        InputError: a column is missing or not a number throughout, or time does not increase.
+        InputError: a column is missing or not a number throughout, or time does not increase or cannot be in seconds.
     """
     twist = all(name in columns for name in TWIST)
     commands = TWIST if twist else WHEEL_COMMANDS
@@ -165,16 +166,10 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
             f"{where}: time goes from {time[i]:.3f} to {time[i + 1]:.3f} s at row {i + 2}; expected it to increase; "
             "sort the rows and drop those that repeat a time"
         )
-    span = time[-1] - time[0] if len(time) else 0.0
-    starts = DURATION * np.arange(int(span / DURATION + _TICK)) + (time[0] if len(time) else 0.0)
-    instants = starts[:, None] + PERIOD * np.arange(SAMPLES + 1)
+    order = _gapless(time, where)
+    begin = time[0] if len(time) else 0.0
+    instants = begin + DURATION * order[:, None] + PERIOD * np.arange(SAMPLES + 1)
     rows = np.maximum(np.searchsorted(time, instants.ravel() + _TICK, side="right") - 1, 0).reshape(instants.shape)
-    last = np.minimum(rows[:, -1] + 1, len(time) - 1) if len(rows) else np.zeros(0, int)
-    whole = np.array(
-        [np.diff(time[a : b + 1]).max(initial=0) <= MAX_GAP for a, b in zip(rows[:, 0], last, strict=True)], bool
-    )
-    order = np.arange(len(starts))[whole]
-    rows = rows[whole]
     pose = np.stack([data[name] for name in POSE], -1)
     pose[:, 2] = np.unwrap(pose[:, 2])
     group = data["group"][rows[:, 0]].astype(int) if groups else order // _GROUP_WINDOWS
@@ -191,6 +186,32 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
         np.diff(order, prepend=-2) == 1,
         sampled(accelerations) if accelerations else None,
     )
+
+
+def _gapless(time: Array, where: str) -> NDArray[np.int64]:
+    """Which of the windows that begin every `DURATION` [s] from the first row on have no gap in them, shape (n,).
+
+    Raises:
+        InputError: by its rows' median interval time is not in seconds, or there are too few rows a second.
+    """
+    if len(time) < 2:
+        return np.zeros(0, np.int64)
+    steps = np.diff(time)
+    interval = float(np.median(steps))
+    if not MIN_INTERVAL <= interval <= MAX_GAP:
+        units = {"ms": 3, "µs": 6, "ns": 9}
+        fits = [(u, n) for u, n in units.items() if 4 * MIN_INTERVAL <= interval / 10**n <= MAX_GAP]
+        cure = f"record at least {1 / MAX_GAP:g} rows a second" if interval > MAX_GAP else "give time in s"
+        if fits:
+            cure = f"time looks like {fits[0][0]}; divide it by 1e{fits[0][1]}"
+        raise InputError(
+            f"{where}: rows are {interval:.3g} s apart (median), expected {MIN_INTERVAL:g} to {MAX_GAP:g} s; {cure}"
+        )
+    after = np.flatnonzero(steps > MAX_GAP) + 1  # a stretch without gaps begins
+    first, last = time[np.append(0, after)], time[np.append(after - 1, len(time) - 1)]
+    low = np.ceil((first - time[0]) / DURATION - _TICK).astype(np.int64)
+    high = np.floor((last - time[0]) / DURATION + _TICK).astype(np.int64)
+    return np.concatenate([np.arange(a, b) for a, b in zip(low, high, strict=True)])
 
 
 def _published_windows(columns: dict[str, Array], where: str) -> Windows:

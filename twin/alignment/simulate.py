@@ -2,12 +2,11 @@
 
 Each starts rolling: the robot stands settled on the plane, gets the wheel speeds that the log starts with, and holds
 them for `LEAD` before time starts, so that body and tyres are in the motion that goes with them. Then the servo is told
-what the controller makes of the log's commands (`commands.targets`), or what the wheels did. Nothing else of the log
-enters but the slope. `mujoco.rollout` steps windows in threads; gravity is tilted rather than the plane.
+what the controller makes of the log's commands (`commands.targets`). Nothing else of the log enters but the slope.
+`mujoco.rollout` steps windows in threads; gravity is tilted rather than the plane.
 """
 
 import copy
-import os
 from dataclasses import dataclass
 
 import mujoco
@@ -16,8 +15,9 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from twin.alignment.commands import AHEAD, STEP
-from twin.alignment.logs import PERIOD, SAMPLES, Windows
+from twin.alignment.logs import PERIOD, SAMPLES
 from twin.alignment.slope import GRAVITY
+from twin.cores import cores
 from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.husky_look import LOOK_GROUP
 from twin.robot import WHEELS, HuskyParams
@@ -77,7 +77,7 @@ def drive(params: HuskyParams, told: Array, start: Array, slope: Array, timestep
     limit = model.actuator_ctrlrange[0, 1]
     states, joints = _starts(model, params, np.clip(start, -limit, limit))
     models = _tilted(model, slope)
-    threads = min(os.cpu_count() or 1, len(told))
+    threads = min(cores(), len(told))
     states, sensors = rollout.rollout(models, [mujoco.MjData(model) for _ in range(threads)], states, control)
     torque = [model.sensor(f"{side}_torque").adr[0] for side in ("left", "right")]
     torques = sensors[:, lead:, torque]
@@ -90,15 +90,6 @@ def drive(params: HuskyParams, told: Array, start: Array, slope: Array, timestep
         np.stack([velocity[:, :k, joints[[i, i + 2]]].mean(-1) for i in (0, 1)], -1),
         torques[:, : (k - 1) * per_sample].reshape(n, k - 1, per_sample, 2).mean(2),
     )
-
-
-def told_by_wheels(windows: Windows) -> Array:
-    """What servos without lag are to be told so that the wheels do what they did, shape as `drive` takes it."""
-    wheels = np.concatenate([windows.wheels, np.repeat(windows.wheels[:, -1:], AHEAD, 1)], 1)
-    position = np.arange(round((SAMPLES + AHEAD) * PERIOD / STEP)) * STEP / PERIOD
-    before = np.minimum(position.astype(int), SAMPLES + AHEAD - 2)
-    share = (position - before)[:, None]
-    return wheels[:, before] * (1 - share) + wheels[:, before + 1] * share
 
 
 def _starts(model: mujoco.MjModel, params: HuskyParams, start: Array) -> tuple[Array, NDArray[np.int64]]:

@@ -26,8 +26,7 @@ from twin.env.physics import HuskyPhysics
 from twin.env.scene_model import episode_spec
 from twin.env.stretches import Stretch
 from twin.env.suite import Stage
-from twin.mjcf.export import PART_GROUP
-from twin.mjcf.world import World, heading_error, nearest, point_at
+from twin.mjcf.world import PART_GROUP, World, heading_error, nearest, point_at
 from twin.progress import bar
 from twin.robot import BASE_HEIGHT
 

@@ -8,7 +8,6 @@ through exactly what it would alone.
 at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock.
 """
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.cores import cores
 from twin.env.dm import control
 from twin.env.suite import Stage
 
@@ -56,8 +56,7 @@ class Worlds:
         step = stage.options.control_timestep
         self._environments = [control.Environment(p, t, control_timestep=step) for p, t in parts]
         self._steps: list[dm_env.TimeStep | None] = [None] * len(parts)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        threads = min(cores, len(parts))
+        threads = min(cores(), len(parts))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         spec = self._environments[0].action_spec()
         self._low, self._high = spec.minimum, spec.maximum

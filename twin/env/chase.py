@@ -1,15 +1,13 @@
-"""Pictures of a recorded drive: a chase camera behind the robot, and a map from above. No OpenGL and no display.
+"""Pictures of a drive from a chase camera behind the robot. No OpenGL and no display.
 
 `mujoco_warp`'s ray caster draws the scene twice: as it looks (ground, visual mesh, robot), and the convex collision
 parts alone with their identities. The parts are blended over the picture, half transparent and with outlines, wherever
 they are not hidden behind what is seen.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
-import cv2
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +17,7 @@ from twin.env.obstacle_shapes import OBSTACLE_GROUP
 from twin.env.obstacles import add_obstacles, place
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.poses import look_at
-from twin.mjcf.world import World, corridor_edges
-
-if TYPE_CHECKING:
-    from twin.env.follower import Drive
+from twin.mjcf.world import World
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -36,8 +31,6 @@ _PART_ALPHA = 0.45
 _EDGE_RGB = (20, 20, 30)
 # A part hugs the visual mesh: what lies this far behind the visible surface still counts as seen [m].
 _SKIN = 0.6
-_MAP_MARGIN = 6.0  # [m] around the route
-_MAP_HEIGHT = 60.0  # [m] above the route
 
 
 class SceneCamera:
@@ -47,14 +40,12 @@ class SceneCamera:
         self,
         world: World,
         size: tuple[int, int],
-        ortho_height: float = 0.0,
         obstacles: Sequence[ObstacleConfig] = (),
     ) -> None:
         """
         Args:
             world: The scene.
             size: Width, height of the pictures [px].
-            ortho_height: Height of what an orthographic camera sees [m]; 0 = perspective.
             obstacles: What stands or moves in it besides.
         """
         import mujoco_warp as mjw  # slow to import, and only needed where pictures are made
@@ -64,9 +55,7 @@ class SceneCamera:
         spec = mujoco.MjSpec.from_file(str(world.model_path))
         self._obstacles = tuple(obstacles)
         add_obstacles(spec, self._obstacles, world)
-        camera = spec.worldbody.add_camera(name="free", fovy=ortho_height or _FOVY)
-        if ortho_height:
-            camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
+        spec.worldbody.add_camera(name="free", fovy=_FOVY)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.size = size
@@ -161,53 +150,7 @@ def chase_poses(base_to_world: Array) -> Array:
     return np.array(poses)
 
 
-def chase_frames(world: World, drive: "Drive", size: tuple[int, int], every: int = 1) -> Iterator[Picture]:
-    """The drive from a chase camera, one picture per `every` control steps (0.1 s), the last instant included.
-
-    Args:
-        world: The scene it was driven in.
-        drive: The recorded drive.
-        size: Width, height [px].
-        every: Control steps between pictures.
-    """
-    camera = SceneCamera(world, size)
-    poses = chase_poses(drive.base_to_world)
-    for i in frame_indices(len(drive.times), every):
-        yield camera.render(drive.qpos[i], poses[i])
-
-
 def frame_indices(count: int, every: int) -> list[int]:
     """0, every, 2·every, ... and count − 1."""
     indices = list(range(0, count, every))
     return indices if indices[-1] == count - 1 else [*indices, count - 1]
-
-
-def map_view(world: World, drive: "Drive | None", size: tuple[int, int]) -> Picture:
-    """The scene from straight above, north (y) up, with corridor, route and driven path drawn in. Shape (h, w, 3)."""
-    width, height = size
-    low, high = world.route[:, :2].min(0) - _MAP_MARGIN, world.route[:, :2].max(0) + _MAP_MARGIN
-    center = (low + high) / 2
-    extent = max(high[1] - low[1], (high[0] - low[0]) * height / width)
-    camera = SceneCamera(world, size, ortho_height=float(extent))
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[:3, 3] = *center, world.route[:, 2].max() + _MAP_HEIGHT
-    qpos = drive.qpos[0] if drive is not None else camera.model.key("spawn").qpos
-    picture = camera.render(qpos, pose)
-
-    def pixels(line: Array) -> NDArray[np.int32]:
-        offset = (line[:, :2] - center) * [1.0, -1.0] * height / extent + np.array([width, height]) / 2
-        return np.round(offset * 16).astype(np.int32)[:, None]
-
-    lines: list[tuple[Array, tuple[int, int, int]]] = [
-        (edge, (240, 230, 60)) for edge in corridor_edges(world.route, world.half_width)
-    ]
-    lines.append((world.route, (60, 220, 80)))
-    if drive is not None:
-        lines.append((drive.base_to_world[:, :3, 3], (230, 40, 40)))
-    picture = np.ascontiguousarray(picture)
-    for line, color in lines:
-        cv2.polylines(picture, [pixels(line)], False, color, 1, cv2.LINE_AA, shift=4)
-    for point, color in ((world.route[:1], (60, 220, 80)), (world.goal[None], (230, 40, 40))):
-        u, v = pixels(point)[0, 0]
-        cv2.circle(picture, (int(u), int(v)), 5 * 16, color, 2, cv2.LINE_AA, shift=4)
-    return picture

@@ -6,7 +6,6 @@ obstacle, and behind the uncovered share of a pixel at its edge, the field is as
 """
 
 import copy
-import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.cores import cores
 from twin.env.camera_effects import CameraEffects, rolled_off
 from twin.env.light import FieldLight, Light
 from twin.env.obstacle_view import Drawn, ObstacleView, camera_intrinsics, camera_pose
@@ -55,9 +55,8 @@ class Overlay:
         self.size, self.worlds, self._field = size, worlds, field
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         # One after the other, as Warp compiles kernels when they are first used.
-        self._painters = [_Painter(model, field, self._camera, size) for _ in range(min(worlds, cores))]
+        self._painters = [_Painter(model, field, self._camera, size) for _ in range(min(worlds, cores()))]
         self._pool = ThreadPoolExecutor(len(self._painters)) if len(self._painters) > 1 else None
         self._shadows = Shadows(model, self._painters[0].view.geoms)
         self._route, self._shaded, self._lock = route_of(model), shaded, threading.Lock()

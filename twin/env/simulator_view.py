@@ -6,7 +6,6 @@ built into is left out, as it is there.
 """
 
 import copy
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -15,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.cores import cores
 from twin.env.camera_effects import CameraEffects
 from twin.env.obstacle_shapes import OBSTACLE_GROUP
 from twin.env.obstacle_view import camera_intrinsics, camera_pose
@@ -46,9 +46,8 @@ class SimulatorView:
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
         model = copy.copy(model)
         model.geom_group[camera_parts(model, self._camera)] = ROBOT_GROUP  # which is not looked at
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         # One after the other, as Warp compiles kernels when they are first used.
-        self._painters = [_Painter(model, size, self._rays) for _ in range(min(worlds, cores))]
+        self._painters = [_Painter(model, size, self._rays) for _ in range(min(worlds, cores()))]
         self._pool = ThreadPoolExecutor(len(self._painters))
 
     def render(

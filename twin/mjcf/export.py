@@ -5,8 +5,6 @@ Geom groups: 0 ground, 1 the robot's looks, 2 the visual mesh (touches nothing),
 folder may be moved, zipped, or handed to anyone who has plain MuJoCo.
 """
 
-import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +20,14 @@ from twin.errors import InputError
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import write_image
 from twin.mjcf import husky
+from twin.mjcf.check import check_portable, touched_names
 from twin.mjcf.files import face_tiles, write_hfield, write_obj
 from twin.mjcf.world import (
+    GROUND_GROUP,
+    PART_GROUP,
+    ROUTE_GROUP,
     SCENE_XML,
+    VISUAL_GROUP,
     World,
     arc_lengths,
     corridor_edges,
@@ -37,16 +40,11 @@ from twin.scene import SceneDir
 
 Array = NDArray[np.float64]
 
-GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
-
 _HFIELD_BASE = 1.0  # [m] of solid below the lowest point, so that nothing tunnels through
 _GROUND_SKIN = 0.15  # [m] above the height field: visual mesh below this is left to the field's own texture
 _SETTLE_TIME = 2.0  # [s]
 _MIN_ROUTE = 2.0  # [m]
-_REST_STEPS = 200  # of the check after writing
-_REST_DRIFT = 0.005  # [m] a robot that "stays put" may creep in that check
 _SITE_SPACING = 1.0  # [m] between the route's sites
-_CLEARANCE_RANGE = 5.0  # [m] within which parts are looked for around the spawn
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         Metrics for the report.
 
     Raises:
-        InputError: the route is too short, starts off the ground, or the robot does not come to rest at its start.
+        InputError: the route is too short, starts off the ground or where it is too steep to stand, or something solid
+            pushes the robot away there.
     """
     mesh = scene.stage("mesh")
     ground = Ground.load(mesh)
@@ -103,13 +102,13 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     route = load_route(mesh / "route.npz") if config.mjcf.route else None
     metrics: dict[str, Any] = {"parts": len(parts.vertices), "visual_faces": faces, "has_route": route is not None}
     if route is None:
-        (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
+        built = _write(spec, out)
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
     else:
         camera = config.robot.camera(film_camera(Cameras.load(scene.stage("metric"))))
         spawn, blocked = _add_robot(spec, ground, route, config.robot, camera)
         _add_route(spec, route, config.mjcf.half_width)
-        (out / SCENE_XML).write_text(_to_xml(spec), encoding="utf-8")
+        built = _write(spec, out)
         world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot)
         world.save()
         metrics |= {
@@ -118,7 +117,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
             "half_width_m": config.mjcf.half_width,
             "camera_intrinsics_px": world.intrinsics.tolist(),
         }
-    metrics |= check_portable(out, with_robot=route is not None)
+    metrics |= check_portable(out, built)
     if route is not None:
         metrics["spawn_touched"] = sorted(blocked | set(metrics["spawn_touched"]))
     return metrics
@@ -303,8 +302,15 @@ def _add_robot(
             f"the route starts {edge.min():.2f} m from the edge of the ground, expected at least 1 m; raise mesh.margin"
         )
     position, quaternion = rest_pose(ground.at, route[0, :2], yaw)
+    x, y = quaternion[1:3]
+    fall, steepest = np.degrees(np.arccos(1 - 2 * (x * x + y * y))), np.degrees(np.arctan(params.friction))
+    if fall >= steepest:
+        raise InputError(
+            f"the ground at the route's start falls by {fall:.1f}°, expected at most {steepest:.1f}° for tyres of "
+            f"friction {params.friction:g} to hold; film from a flatter start, or raise the robot's friction"
+        )
     husky.add_husky(spec, position, quaternion, params, camera)
-    model = spec.compile()
+    model = husky.held(spec.compile())
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     blocked = touched_names(model, data)
@@ -340,64 +346,7 @@ def _add_route(spec: mujoco.MjSpec, route: Array, half_width: float) -> None:
     )
 
 
-def _to_xml(spec: mujoco.MjSpec) -> str:
-    spec.compile()
-    return spec.to_xml()
-
-
-def check_portable(folder: Path, with_robot: bool) -> dict[str, Any]:
-    """Loads a moved copy of the scene in plain MuJoCo; the robot must stay put there. Returns metrics.
-
-    Raises:
-        RuntimeError: the copy differs, or the robot creeps away: a bug of the exporter.
-    """
-    with tempfile.TemporaryDirectory(prefix="twin-moved-") as temporary:
-        moved = Path(temporary) / "elsewhere"
-        shutil.copytree(folder, moved)
-        model = mujoco.MjModel.from_xml_path(str(moved / SCENE_XML))
-    metrics: dict[str, Any] = {
-        "geoms": int(model.ngeom),
-        "xml_bytes": (folder / SCENE_XML).stat().st_size,
-        "assets_bytes": sum(path.stat().st_size for path in (folder / "assets").iterdir()),
-    }
-    if not with_robot:
-        return metrics
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
-    mujoco.mj_forward(model, data)
-    touched = touched_names(model, data)
-    metrics["spawn_clearance_m"] = spawn_clearance(model, data)
-    start = data.qpos[:3].copy()
-    for _ in range(_REST_STEPS):
-        mujoco.mj_step(model, data)
-        touched |= touched_names(model, data)
-    drift = float(np.linalg.norm(data.qpos[:3] - start))
-    if drift > _REST_DRIFT:
-        raise RuntimeError(f"the robot creeps {drift:.3f} m in {_REST_STEPS} steps at the route's start")
-    return metrics | {"spawn_touched": sorted(touched), "spawn_drift_m": drift}
-
-
-def robot_geoms(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Which geoms belong to the robot, shape (ngeom,)."""
-    return model.body_rootid[model.geom_bodyid] == model.body("base_link").id
-
-
-def touched_names(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
-    """Names of the geoms that the robot touches now, besides the ground."""
-    pairs = data.contact.geom
-    mine = robot_geoms(model)[pairs]
-    other = pairs[mine[:, 0] != mine[:, 1]][~mine[mine[:, 0] != mine[:, 1]]]
-    return {model.geom(int(i)).name for i in np.unique(other)} - {"ground"}
-
-
-def spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
-    """Distance from the robot to the nearest convex part [m]; None where none is within 5 m."""
-    robot = np.flatnonzero(robot_geoms(model) & (model.geom_contype > 0))
-    parts = np.flatnonzero(model.geom_group == PART_GROUP)
-    center = data.body("base_link").xpos
-    near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + _CLEARANCE_RANGE]
-    distances = [
-        mujoco.mj_geomDistance(model, data, int(a), int(b), _CLEARANCE_RANGE, None) for a in robot for b in near
-    ]
-    best = min(distances, default=_CLEARANCE_RANGE)
-    return float(best) if best < _CLEARANCE_RANGE else None
+def _write(spec: mujoco.MjSpec, out: Path) -> mujoco.MjModel:
+    model = spec.compile()
+    (out / SCENE_XML).write_text(spec.to_xml(), encoding="utf-8")
+    return model

@@ -134,6 +134,17 @@ def add_husky(
     add_look(spec, base, wheels, params.camera_position, params.wheel_radius, WHEEL_WIDTH)
 
 
+def held(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Changes a model whose tyres or servos are softer than the published ones, which would creep down the least slope,
+    so that its robot stands still as the published one does; returns it."""
+    model.opt.impratio = max(model.opt.impratio, HuskyParams.slip_stiffness)
+    for side in SIDES:
+        drive = model.actuator(side)
+        drive.gainprm[0] = max(drive.gainprm[0], HuskyParams.servo_gain)
+        drive.biasprm[2] = -drive.gainprm[0]
+    return model
+
+
 def wheel_centers() -> Array:
     """Wheel hubs in the base [m], shape (4, 3), ordered as WHEELS."""
     x, y = WHEELBASE / 2, TRACK / 2

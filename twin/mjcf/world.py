@@ -19,6 +19,8 @@ from twin.scene import read_json, write_json
 Array = NDArray[np.float64]
 
 SCENE_XML = "scene.xml"
+GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
+"""Geom groups, and that of the sites along the route."""
 
 
 @dataclass(frozen=True)

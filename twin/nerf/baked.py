@@ -6,7 +6,6 @@ baked field shows its place under every lighting.
 """
 
 import itertools
-import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file
 from safetensors.numpy import save as to_bytes
 
+from twin.cores import cores
 from twin.errors import InputError
 from twin.geometry.cameras import Posed, resized
 from twin.nerf.kernels import march as kernels
@@ -116,7 +116,7 @@ class BakedField:
         self._weights = w
         self._bias_of = p["head.0.bias"], p["head.0"][rows:]
         load_kernels([kernels.approach, self._march, self._shade], where)
-        self._threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._threads = cores()
         self._pool = ThreadPoolExecutor(self._threads) if where == "cpu" and self._threads > 1 else None
 
     @property

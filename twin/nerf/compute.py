@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import torch
 import warp as wp
 
+from twin.cores import cores
 from twin.errors import InputError
 
 T = TypeVar("T")
@@ -38,11 +39,6 @@ def device() -> str:
     if wanted == "cuda" and not has_cuda:
         raise InputError("device cuda: no CUDA device is visible to torch and warp; use --device cpu")
     return wanted or ("cuda" if has_cuda else "cpu")
-
-
-def cores() -> int:
-    """CPU cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def parallel(work: Callable[[int], T], items: Iterable[int], where: str) -> list[T]:

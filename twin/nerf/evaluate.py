@@ -57,36 +57,6 @@ def fit_embedding(
     return embedding.detach().cpu().numpy()
 
 
-def fit_embedding_to_image(
-    field: RadianceField,
-    image: NDArray,
-    camera_to_world: NDArray,
-    intrinsics: NDArray,
-    lighting: str,
-    mask: NDArray[np.bool_] | None = None,
-    max_rays: int = 20_000,
-) -> NDArray[np.float32]:
-    """The embedding of one picture of the place, shape (dim,).
-
-    Args:
-        image: RGB in [0, 1], shape (h, w, 3).
-        camera_to_world: OpenCV axes, shape (4, 4).
-        intrinsics: fx, fy, cx, cy [px] at the image's size, shape (4,).
-        lighting: Name of the lighting to start from.
-        mask: True = use, shape (h, w).
-        max_rays: Pixels used at most, spread evenly.
-    """
-    height, width = image.shape[:2]
-    use = np.flatnonzero(np.ones((height, width), bool) if mask is None else mask)
-    use = use[:: max(1, len(use) // max_rays)]
-    row, column = np.divmod(use, width)
-    pixel = np.stack([column + 0.5, row + 0.5], -1)
-    cameras = CameraArrays(np.asarray(camera_to_world)[None], np.asarray(intrinsics)[None], field.where)
-    features, harmonics, _, _ = field.trace(cameras, np.zeros(len(use), int), pixel)
-    colours = torch.as_tensor(image.reshape(-1, 3)[use].astype(np.float32), device=field.where)
-    return fit_embedding(field, features, harmonics, colours, field.embedding(lighting))
-
-
 def score_frame(
     field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
 ) -> dict[str, float]:

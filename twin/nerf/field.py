@@ -91,12 +91,6 @@ class RadianceField:
         """See `Lightings.added`."""
         self.appearance = self.appearance.added(more, stale)
 
-    def frame_embedding(self, name: str) -> NDArray[np.float32]:
-        """The embedding of a training frame, shape (dim,). Raises InputError where it was not trained on."""
-        if name not in self.appearance.frames:
-            raise InputError(f"frame {name!r}: not among the {len(self.appearance.frames)} frames trained on")
-        return self.appearance.embedding(name)
-
     # ---- the passes of a batch; each works on rays [start, start + count) of a workspace
 
     def cast(self, ws: Workspace, cameras: CameraArrays, start: int, count: int) -> None:

@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 from twin.assets.ground import Ground
 from twin.assets.obstacles import HEADROOM
 from twin.geometry.cameras import Cameras, Viewpoints, opencv_to_mujoco, pixel_grid, project, unproject
-from twin.mjcf.export import GROUND_GROUP, PART_GROUP, Parts
-from twin.mjcf.world import CAMERA_SIZE, World, arc_lengths, point_at
+from twin.mjcf.export import Parts
+from twin.mjcf.world import CAMERA_SIZE, GROUND_GROUP, PART_GROUP, World, arc_lengths, point_at
 from twin.nerf.rendering import FAR, Field
 from twin.progress import track
 

@@ -29,7 +29,7 @@ SETTLE_TIME = 0.5  # [s] at rest before a drive
 def on_plane(params: HuskyParams | None = None, edit: Edit | None = None) -> mujoco.MjModel:
     """The Husky on an endless plane."""
     spec = mujoco.MjSpec()
-    set_options(spec)
+    set_options(spec, params)
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1))
     add_husky(spec, params=params)
     if edit is not None:
@@ -46,7 +46,7 @@ def on_ground(
 ) -> mujoco.MjModel:
     """The Husky on a height field, at x, y [m] and yaw [rad]."""
     spec = mujoco.MjSpec()
-    set_options(spec)
+    set_options(spec, params)
     with tempfile.TemporaryDirectory(prefix="twin-ground-") as folder:
         spec.modelfiledir = spec.meshdir = spec.texturedir = folder
         add_ground(spec, ground, Path(folder), cell)

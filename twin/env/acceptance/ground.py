@@ -19,15 +19,15 @@ Array = NDArray[np.float64]
 def flat_ground(subject: Subject) -> list[Row]:
     """E1 and E2 on a height field without relief, and on what the pipeline makes of noisy data of a flat road."""
     rows = []
-    turn, straight = subject.turn(), drive(subject.plane(), 1.0, 0.0, 1.0, 1.0)
+    turn, straight = subject.turn(), drive(subject.plane(), 1.0, 0.0, 1.0, 1.0, subject.params)
     for label, ground in (
         ("level field", grounds.level()),
         ("flat road reconstructed", grounds.reconstructed(np.random.default_rng(0))),
     ):
         model = on_ground(ground, subject.params, subject.edit, start=(-5.0, 0.37, 0.1))
-        run = drive(model, 1.0, 0.0, skip=1.0, seconds=5.0)
-        arc = drive(model, 0.5, 0.5, skip=1.5, seconds=2.0)
-        spot = drive(model, 0.0, 1.0, skip=1.5, seconds=1.5)
+        run = drive(model, 1.0, 0.0, 1.0, 5.0, subject.params)
+        arc = drive(model, 0.5, 0.5, 1.5, 2.0, subject.params)
+        spot = drive(model, 0.0, 1.0, 1.5, 1.5, subject.params)
         pitching = math.degrees(_rms(run.per_frame(run.pose[:, 4])))
         more, more_straight = spot.power.mean() - turn.power.mean(), run.power.mean() - straight.power.mean()
         share = float(spot.power.mean() / turn.power.mean())
@@ -55,7 +55,8 @@ def reconstructed_ground(subject: Subject) -> list[Row]:
 def chi_on(subject: Subject, ground: Ground, start: tuple[float, float, float], line: Array, label: str) -> list[Row]:
     """Row E3 on any ground: the robot starts at x, y [m], yaw [rad]; `line` (m, ≥2) is where roughness is measured."""
     rms, length = grounds.roughness(ground, line)
-    turn = drive(on_ground(ground, subject.params, subject.edit, start), 0.0, 1.0, 1.5, 2.0 * math.pi)
+    model = on_ground(ground, subject.params, subject.edit, start)
+    turn = drive(model, 0.0, 1.0, 1.5, 2.0 * math.pi, subject.params)
     quantity = f"chi on {label} (rms {1000 * rms:.1f} mm, correlation length {length:.2f} m)"
     return [Row("E3", quantity, turn.chi, 1.6, 2.3)]
 
@@ -70,7 +71,7 @@ def halved_step(subject: Subject) -> list[Row]:
 
     def turns(of: Subject) -> dict[str, Recording]:
         field = on_ground(grounds.level(), of.params, of.edit)
-        return {"plane": of.turn(), "height field": drive(field, 0.0, 1.0, 1.5, 2.0 * math.pi)}
+        return {"plane": of.turn(), "height field": drive(field, 0.0, 1.0, 1.5, 2.0 * math.pi, of.params)}
 
     rows = []
     fine = turns(replace(subject, edit=halve))
@@ -95,8 +96,8 @@ def plates(subject: Subject) -> list[Row]:
         spec.geom("ground").pos = (0.0, 0.0, -0.2)
 
     model = on_plane(subject.params, lay)
-    run = drive(model, 1.0, 0.0, skip=1.0, seconds=5.0)
-    arc = drive(model, 0.5, 0.5, skip=1.0, seconds=2.0)
+    run = drive(model, 1.0, 0.0, 1.0, 5.0, subject.params)
+    arc = drive(model, 0.5, 0.5, 1.0, 2.0, subject.params)
     return [
         Row("P1", "jolt over flush plates, 1 m/s", run.jolt, 0.0, 1.0, "m/s²"),
         Row("P1", "jolt over flush plates on R = 1 m", arc.jolt, 0.0, 1.0, "m/s²"),
@@ -115,7 +116,7 @@ def ramp(subject: Subject) -> list[Row]:
         _convex(spec, "part_wedge", np.array([[x, y, z] for y in (-1.0, 1.0) for x, z in side]))
         _convex(spec, "part_platform", _box((1.0 + run_up, -1.0, 0.0), (3.0, 2.0, height)))
 
-    up = drive(on_plane(subject.params, put), 0.5, 0.0, skip=0.1, seconds=8.0)
+    up = drive(on_plane(subject.params, put), 0.5, 0.0, 0.1, 8.0, subject.params)
     climbing = np.degrees(up.pose[:, 4])
     at_top = up.pose[-1, 2] - up.pose[0, 2]
     speed = np.linalg.norm(np.gradient(up.pose[:, :3], up.timestep, axis=0), axis=1)

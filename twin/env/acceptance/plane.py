@@ -171,7 +171,7 @@ def stall(subject: Subject) -> list[Row]:
 
 def straight(subject: Subject) -> list[Row]:
     """D1, D2, D3 and D5 over 10 m at 1 m/s."""
-    run = drive(subject.plane(), 1.0, 0.0, skip=1.0, seconds=10.0)
+    run = drive(subject.plane(), 1.0, 0.0, skip=1.0, seconds=10.0, params=subject.params)
     speed = float((run.pose[-1, 0] - run.pose[0, 0]) / (run.timestep * (len(run.pose) - 1)))
     rolled = float(run.wheel.mean() * WHEEL_RADIUS)
     expected = subject.params.rolling_resistance * MASS * GRAVITY * speed

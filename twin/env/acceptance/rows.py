@@ -47,4 +47,4 @@ class Subject:
         self, yaw_rate: float = 1.0, v: float = 0.0, skip: float = 1.5, seconds: float = 1.0, **changes: Any
     ) -> Recording:
         """Turning on a plane: ω [rad/s], v [m/s], `seconds` recorded after `skip` [s], some parameters changed."""
-        return drive(self.plane(**changes), v, yaw_rate, skip, seconds)
+        return drive(self.plane(**changes), v, yaw_rate, skip, seconds, replace(self.params, **changes))
