@@ -103,7 +103,7 @@ def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
     assert set(found) == {"r", "r/5"}
     for name, step in (("r", 3000), ("r/5", 1500)):
         won = [success for at, success in rows if at <= step][-RECENT:]
-        assert {k: found[name][k] for k in ("successes", "trials")} == {"successes": sum(won), "trials": 100}
+        assert {k: found[name][k] for k in ("successes", "trials")} == {"successes": sum(won), "trials": RECENT}
     assert found["r"]["low"] < found["r"]["rate"] < found["r"]["high"] and found["r/5"]["run"] == "r"
     # The run was trained on, or is another one: its curve is not that of the policy that was validated.
     write_json(heads["r"], {"trained": {"step": 4000}})
