@@ -32,7 +32,7 @@ from twin.report.validation_words import (
 from twin.report.words import listing
 from twin.scene import SceneDir, write_text
 
-_STYLE = ".whole, td code { white-space:nowrap }\nimg { background:#fff }\n"
+_STYLE = ".whole, td code { white-space:nowrap }\ntd:last-child { overflow-wrap:normal }\nimg { background:#fff }\n"
 
 Section = tuple[str, str, Html]
 
