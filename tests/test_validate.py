@@ -160,6 +160,15 @@ def test_a_changed_road_is_not_mixed_with_what_was_driven(fresh):
         run(fresh, "left", lightings=["night"], episodes=2)
 
 
+def test_a_table_of_which_nothing_is_noted_is_not_added_to(fresh):
+    """As one that an earlier version wrote, which noted no roads."""
+    run(fresh, "ahead", lightings=["day"], episodes=1)
+    path = fresh / "validation" / "validated.json"
+    path.write_text(json.dumps({"field": "made up", "policies": json.loads(path.read_text())["policies"]}))
+    with pytest.raises(InputError, match="under day from before"):
+        run(fresh, "ahead", lightings=["day"], episodes=2)
+
+
 def test_the_worst_light_is_proved_on_fresh_episodes(fresh, monkeypatch):
     monkeypatch.setattr(validate, "_LIGHTS", 4)
     monkeypatch.setattr(validate, "_LOOKS", 1)

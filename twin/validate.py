@@ -245,13 +245,13 @@ def _check_same(
 ) -> None:
     """Notes which policies the tables are of, and which roads (a task under a lighting); refuses others so named."""
     path = folder / "validated.json"
-    noted: dict[str, Any] = read_json(path) if path.exists() else {"roads": {}, "policies": {}}
+    noted: dict[str, Any] = {"roads": {}, "policies": {}} | (read_json(path) if path.exists() else {})
     tables = [folder / "episodes.csv", folder / "worst.csv"]
     trials = [trial for table in tables if table.exists() and _has_rows(table) for trial in read_trials(table)]
     driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}
     for lighting in lightings:
         road, digest = _road(task, lighting), fingerprint(twin, task, lighting)
-        if noted["roads"].get(road, digest) != digest and road in driven:
+        if road in driven and noted["roads"].get(road) != digest:
             raise InputError(
                 f"{folder} has episodes of {task} under {lighting} from before the scene was built anew, or its task, "
                 "obstacles or photo changed; move it away to validate anew"
@@ -259,7 +259,7 @@ def _check_same(
         noted["roads"][road] = digest
     for name, (source, _) in policies.items():
         digest = _digest(Path(source), source)
-        if noted["policies"].get(name, digest) != digest and name in driven:
+        if name in driven and noted["policies"].get(name) != digest:
             raise InputError(
                 f"policy {name!r} was validated as another file than {source} is now; move {folder} away, or "
                 "copy the policy to another name"
