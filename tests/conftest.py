@@ -1,8 +1,10 @@
-"""Where the real captures are."""
+"""What tests of several files ask for."""
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from drive_logs import SOFT, columns
 
 _DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -13,3 +15,9 @@ def real_data() -> Path:
     if not _DATA.is_dir():
         pytest.skip(f"no real captures at {_DATA.parent.name}/{_DATA.name} beside the project")
     return _DATA
+
+
+@pytest.fixture(scope="session")
+def drive() -> dict[str, np.ndarray]:
+    """Two and a half minutes on soft ground."""
+    return columns(SOFT, 150.0, seed=1)

@@ -12,6 +12,20 @@ from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.robot import WHEELS, HuskyParams
 
 RATE = 0.05  # [s]
+SOFT = HuskyParams(
+    friction=0.45,
+    spin_friction=0.03,
+    ground_viscosity=4.0,
+    slip_stiffness=0.2,
+    center_of_mass=(-0.06, 0.0, 0.062),
+    command_latency=0.2,
+    servo_lag=0.12,
+    max_acceleration=2.0,
+    max_yaw_acceleration=3.0,
+    max_yaw_rate=1.4,
+    separation_multiplier=1.6,
+)
+"""On soft ground."""
 
 
 def columns(params: HuskyParams, duration: float, seed: int, strong: bool = True) -> dict[str, NDArray]:

@@ -6,39 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_logs import columns, write_csv
+from drive_logs import SOFT, columns
 
 from twin.align import main, summary
 from twin.alignment import commands, currents, ground, kinematics, logs, slope
 from twin.alignment.aligned import Alignment, align, robot_toml
-from twin.alignment.checks import check
 from twin.alignment.identify import Fit, Parameter, bend, fit
 from twin.alignment.kinematics import Icr
 from twin.alignment.score import Prediction
 from twin.config_file import parse, read_robot
 from twin.env.controller import Controller
-from twin.errors import InputError
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
-
-SOFT = HuskyParams(
-    friction=0.45,
-    spin_friction=0.03,
-    ground_viscosity=4.0,
-    slip_stiffness=0.2,
-    center_of_mass=(-0.06, 0.0, 0.062),
-    command_latency=0.2,
-    servo_lag=0.12,
-    max_acceleration=2.0,
-    max_yaw_acceleration=3.0,
-    max_yaw_rate=1.4,
-    separation_multiplier=1.6,
-)
-
-
-@pytest.fixture(scope="module")
-def drive() -> dict[str, np.ndarray]:
-    """Two and a half minutes on soft ground."""
-    return columns(SOFT, 150.0, seed=1)
 
 
 def windows_of(wheels: np.ndarray, poses: np.ndarray | None = None, **others) -> logs.Windows:
@@ -344,70 +322,6 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_fit(out, drive, t
     assert said.count("\n") == 1 and str(tmp_path / out) in said and "--out" in said
 
 
-def _bad(table: dict[str, np.ndarray], **changes) -> dict[str, np.ndarray]:
-    return table | changes
-
-
-def _with_nan(column: np.ndarray) -> np.ndarray:
-    column = column.copy()
-    column[37] = np.nan
-    return column
-
-
-BAD = {
-    "nan": (lambda t: _bad(t, yaw=_with_nan(t["yaw"])), r"yaw is nan at row 38 .*cut those rows out"),
-    "time": (
-        lambda t: _bad(t, time=np.where(np.arange(len(t["time"])) == 50, 0.0, t["time"])),
-        r"time goes from 2\.450 to 0\.000 s at row 51; expected it to increase",
-    ),
-    "yaw in degrees": (lambda t: _bad(t, yaw=np.degrees(t["yaw"])), r"yaw looks like degrees; multiply it by π/180"),
-    "yaw too small": (lambda t: _bad(t, yaw=np.radians(t["yaw"])), r"yaw looks π/180 times too small"),
-    "wheels in degrees": (
-        lambda t: _bad(t, **{n: np.degrees(t[n]) for n in logs.WHEEL_SPEEDS}),
-        r"wheel speeds look like °/s; multiply them by π/180",
-    ),
-    "wheels in m/s": (
-        lambda t: _bad(t, **{n: t[n] * WHEEL_RADIUS for n in logs.WHEEL_SPEEDS}),
-        r"wheel speeds look like m/s",
-    ),
-    "command in degrees": (
-        lambda t: _bad(t, cmd_yaw_rate=np.degrees(t["cmd_yaw_rate"])),
-        r"cmd_yaw_rate looks like degrees",
-    ),
-    "missing": (lambda t: {k: v for k, v in t.items() if k != "left_wheel_vel"}, r"no column left_wheel_vel among"),
-    "short": (lambda t: {k: v[:400] for k, v in t.items()}, r"windows of 2 s to fit to .*expected at least 20 and 10"),
-    "ns": (
-        lambda t: _bad(t, time=1.7e18 + 1e9 * t["time"]),
-        r"rows are 5e\+07 s apart .*expected 0\.0005 to 0\.5 s; time looks like ns; divide it by 1e9",
-    ),
-    "µs": (lambda t: _bad(t, time=1e6 * t["time"]), r"time looks like µs; divide it by 1e6"),
-    "ms": (lambda t: _bad(t, time=1e3 * t["time"]), r"rows are 50 s apart .*time looks like ms; divide it by 1e3"),
-    "slow": (lambda t: {k: v[::12] for k, v in t.items()}, r"rows are 0\.6 s apart .*record at least 2 rows a second"),
-    "hours": (lambda t: _bad(t, time=t["time"] / 3600), r"rows are 1\.39e-05 s apart .*; give time in s$"),
-    "lengths": (lambda t: _bad(t, x=t["x"][:-1]), r"columns of different lengths"),
-}
-
-
-@pytest.mark.parametrize("kind", BAD)
-def test_bad_logs_get_one_line(kind, drive, tmp_path, capsys):
-    change, message = BAD[kind]
-    path = tmp_path / "log.npz"
-    np.savez(path, **change(drive))
-    assert main(["husky", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    import re
-
-    assert re.search(message, said), said
-    assert not (tmp_path / "out").exists()
-
-
-def test_too_few_turns(tmp_path):
-    table = columns(HuskyParams(), 130.0, seed=2, strong=False)
-    with pytest.raises(InputError, match=r"0 windows turn left and 0 right .*drive more turns"):
-        check(logs.cut(table, "log"), "log")
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -420,62 +334,6 @@ def test_bad_arguments(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
     assert message in capsys.readouterr().err
-
-
-def test_csv_and_npz_are_the_same_log(drive, tmp_path):
-    np.savez(tmp_path / "log.npz", **drive)
-    one = logs.read_log(write_csv(tmp_path / "log.csv", drive))
-    other = logs.read_log(tmp_path / "log.npz")
-    assert np.array_equal(one.poses, other.poses)
-    assert np.array_equal(one.wheels, other.wheels)
-    assert one.follows[1:].all()
-    assert len(one) == 74
-
-
-def test_nothing_in_an_npz_runs_code(tmp_path):
-    np.savez(tmp_path / "log.npz", time=np.array([{"a": 1}], object))
-    with pytest.raises(InputError, match=r"not an \.npz of plain arrays"):
-        logs.read_log(tmp_path / "log.npz")
-
-
-def test_gaps_are_left_out(drive):
-    keep = (drive["time"] < 20.0) | (drive["time"] > 23.0)
-    windows = logs.cut({name: column[keep] for name, column in drive.items()}, "log")
-    assert len(windows) == 74 - 3
-    assert (~windows.follows).sum() == 2  # the first, and the first after the gap
-
-
-def test_a_gap_costs_nothing(drive):
-    """One row before the clock was set: two seconds of the log are lost to the grid at most, and no memory."""
-    late = {name: np.concatenate([column[:1], column]) for name, column in drive.items()}
-    late["time"][1:] += 1.7e9
-    windows = logs.cut(late, "log")
-    whole = logs.cut(drive, "log")
-    assert len(windows) == len(whole)
-    np.testing.assert_allclose(windows.wheels, whole.wheels, atol=1e-9)
-    assert windows.follows.tolist() == whole.follows.tolist()
-    assert (windows.fitting.sum() - whole.fitting.sum()) in range(-3, 4)
-
-
-def test_bag_is_the_same_log(drive, tmp_path):
-    pytest.importorskip("rosbags")
-    from ros_bag import write_bag
-
-    rows = {name: column[:900] for name, column in drive.items()}
-    bag = logs.read_log(write_bag(tmp_path / "bag", rows))
-    table = logs.cut(rows, "log")
-    assert len(bag) == len(table)
-    for name in ("commands", "wheels", "poses", "acceleration"):
-        assert getattr(bag, name) == pytest.approx(getattr(table, name), abs=1e-6), name
-
-
-def test_a_bag_without_commands(drive, tmp_path):
-    pytest.importorskip("rosbags")
-    from ros_bag import write_bag
-
-    bag = write_bag(tmp_path / "bag", {name: column[:50] for name, column in drive.items()}, without=("commands",))
-    with pytest.raises(InputError, match=r"no topic with commands .*record it"):
-        logs.read_log(bag)
 
 
 def test_effort_of_motors():
@@ -496,20 +354,6 @@ def test_rolling_resistance_that_currents_show_is_found():
     amps = np.concatenate([np.ones((40, 2)), np.full((40, 2), [effort.inner, effort.outer])])
     found = currents.rolling_resistance_of(currents.Steady(speeds, amps), HuskyParams())
     assert found == pytest.approx(0.05, rel=0.05)
-
-
-@pytest.mark.realdata
-def test_published_windows_are_read(real_data: Path):
-    windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
-    assert len(windows) == 402
-    assert set(windows.groups % 2) == {0, 1}
-    check(windows, "log")
-    # The IMU's axes after reading: it is pushed forward when wheels speed up, and into the turn.
-    motion = kinematics.fit_icr(windows).motion(windows.wheels)
-    speeding = np.gradient(motion[..., 0], logs.PERIOD, axis=1).ravel()
-    inward = (motion[..., 0] * motion[..., 2]).ravel()
-    assert np.corrcoef(speeding, windows.acceleration[..., 0].ravel())[0, 1] > 0.1
-    assert np.corrcoef(inward, windows.acceleration[..., 1].ravel())[0, 1] > 0.08
 
 
 @pytest.mark.realdata

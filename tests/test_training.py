@@ -30,7 +30,7 @@ from twin.learn.policy import load_policy, save_policy
 from twin.learn.replay import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.state import load_state, save_state
-from twin.learn.training import TrainConfig
+from twin.learn.train_config import TrainConfig
 
 SIZE = (32, 18)
 TINY = Architecture(SIZE, 2, 2, ((8, 5, 3),), 16, (32, 32), 1)

@@ -24,14 +24,15 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         try:
             from twin.learn import training
+            from twin.learn.train_config import PRESETS, TrainConfig
         except ImportError as error:
             raise InputError(f"training needs more: pip install .[learn] ({error})") from None
         from twin.report.statistics import wilson
         from twin.report.training import success_curve
 
-        names = {field.name for field in dataclasses.fields(training.TrainConfig)}
+        names = {field.name for field in dataclasses.fields(TrainConfig)}
         asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
-        config = training.TrainConfig(**{**training.PRESETS[given.preset], **asked})
+        config = TrainConfig(**{**PRESETS[given.preset], **asked})
         folder = given.scene / "runs" / given.run
         with progress.bar("train", config.steps, "step") as bar:
 

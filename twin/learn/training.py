@@ -31,15 +31,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from twin.config import ANY, HELD_OUT, TRAINING
-from twin.env.options import NERF, STEERING, Rewards
 from twin.env.suite import fingerprint
 from twin.errors import InputError
-from twin.learn.architecture import Architecture, prepared
-from twin.learn.policy import Control, save_policy
+from twin.learn.architecture import prepared
+from twin.learn.policy import save_policy
 from twin.learn.replay import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.state import has_state, load_state, save_state
+from twin.learn.train_config import TrainConfig
 from twin.learn.vectors import DriveVecEnv
 from twin.loading import Twin
 from twin.report.trials import RECENT, csv_text
@@ -49,110 +48,6 @@ EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "pr
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
 _LEAST_RATE = 0.1  # of the learning rate, at the end
 _SEEDS = 6  # with a run's seed and its resumptions so far, what worlds draw from; none drives what another drove
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """What a training is. The defaults are the preset for a CPU."""
-
-    task: str = "straight"
-    observe: str = NERF
-    """nerf, or simulator: MuJoCo's own picture of the extracted mesh."""
-    lighting: str = TRAINING
-    """See `env/lightings.py`; the default varies between episodes."""
-    seed: int = 0
-    steps: int = 60_000
-    worlds: int = 8
-    action: str = STEERING
-    """steering (at `speed`) or twist."""
-    speed: float = 1.0
-    """[m/s]"""
-    yaw_rate: float = 1.0
-    """[rad/s]"""
-    randomise: bool = False
-    """Another robot in every episode."""
-    pool: int = 2
-    convolutions: tuple[tuple[int, int, int], ...] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
-    """Channels, kernel, stride."""
-    features: int = 64
-    hidden: tuple[int, ...] = (256, 256)
-    batch: int = 128
-    buffer: int = 50_000
-    """Transitions."""
-    starts: int = 1_000
-    """Steps at random before learning begins."""
-    updates: float = 0.5
-    """Per step."""
-    gamma: float = 0.97
-    """Discount per step: what is 33 steps (3 s) away counts a third."""
-    learning_rate: float = 5e-4
-    """In the first half of the training; see `_model`."""
-    tau: float = 0.01
-    """Share by which the target critics follow, per update."""
-    shift: int = 2
-    """Random shift of pictures in updates [px of the small ones]."""
-    colours: float = 1.0
-    """Strength of the random weather laid over pictures in updates (see `colours.py`) where the lighting varies. One
-    lighting and the simulator's pictures are learnt as they are."""
-    checkpoints: int = 20
-    """Policies kept along the way."""
-    save_every: int = 4_000
-    """Steps between two saves of everything."""
-    device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        """Raises InputError: a number out of range, or lights that are kept for validation."""
-        for name, least in (("seed", 0), ("steps", 1), ("worlds", 1), ("colours", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} = {getattr(self, name)}; expected {least} or more")
-        if self.updates <= 0:
-            raise InputError(f"updates = {self.updates}; expected more than 0 per step")
-        if self.lighting in (HELD_OUT, ANY):
-            raise InputError(
-                f"lighting = {self.lighting!r}: held-out lights are kept for python -m twin.validate; "
-                f"expected {TRAINING!r} or a name"
-            )
-
-    @property
-    def architecture(self) -> Architecture:
-        actions = Control(self.action).actions
-        return Architecture((160, 90), 4, self.pool, self.convolutions, self.features, self.hidden, actions)
-
-    @property
-    def control(self) -> Control:
-        return Control(self.action, self.speed, self.yaw_rate)
-
-    @property
-    def varies(self) -> bool:
-        """Whether the lighting does, between episodes."""
-        return self.observe == NERF and self.lighting == TRAINING
-
-    def options(self) -> dict[str, Any]:
-        """Of the environment."""
-        # Worth what surviving for ever would be. With nothing to be had behind it, a policy that is paid by the step
-        # learns to linger before the goal, and rather leaves the road there than to arrive.
-        goal = Rewards(goal=Rewards.step * self.gamma / (1.0 - self.gamma))
-        lit = {"lighting": self.lighting, "observe": self.observe, "randomise": self.randomise}
-        return {**dataclasses.asdict(self.control), **lit, "rewards": goal}
-
-
-PRESETS: dict[str, dict[str, Any]] = {
-    "cpu": {},
-    # The paper's input at full resolution. Not measured on a GPU yet.
-    "gpu": {
-        "pool": 1,
-        "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
-        "features": 100,
-        "hidden": (512, 512),
-        "worlds": 32,
-        "batch": 256,
-        "buffer": 100_000,
-        "steps": 120_000,
-        "updates": 0.5,
-        "shift": 4,
-        "device": "cuda",
-    },
-}
 
 
 class PreparedVecEnv(VecEnvWrapper):
