@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from drive_logs import SOFT, columns
 
+from twin import progress
+
 _DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(autouse=True)
+def loud() -> None:
+    """What a test reads of standard error does not depend on the tests before it: quiet is a state of the process."""
+    progress.set_quiet(False)
 
 
 @pytest.fixture(scope="session")

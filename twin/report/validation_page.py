@@ -32,7 +32,10 @@ from twin.report.validation_words import (
 from twin.report.words import listing
 from twin.scene import SceneDir, write_text
 
-_STYLE = ".whole, td code { white-space:nowrap }\ntd:last-child { overflow-wrap:normal }\nimg { background:#fff }\n"
+_STYLE = """.whole, td code { white-space:nowrap }
+th, td { overflow-wrap:normal } #better td:last-child { overflow-wrap:anywhere; min-width:9em }
+img { background:#fff }
+"""
 
 Section = tuple[str, str, Html]
 
@@ -139,20 +142,23 @@ def _training(trained: dict[str, Any] | None) -> Html:
 def _better(said: dict[str, Any]) -> list[Section]:
     if not said["pairs"]:
         return []
+    several = len(tasks(said)) > 1
     rows = [
         [
             element("code", p["a"]),
             element("code", p["b"]),
-            p["task"],
+            *([p["task"]] if several else []),
             str(p["episodes"]),
             str(p["only_a"]),
             str(p["only_b"]),
             chance_words(p["p"]),
-            element("span", pair_words(p), class_="whole"),
+            pair_words(p),
         ]
         for p in said["pairs"]
     ]
-    heads = ["first", "second", "task", "episodes", "only first arrived", "only second", "by luck", "verdict"]
+    numbers = ["episodes", "only first arrived", "only second", "by luck"]
+    heads = ["first", "second", *(["task"] if several else []), *numbers, "verdict"]
+    numeric = tuple(heads.index(name) for name in numbers)
     lead = (
         "Two policies are compared on the episodes that both drove, where start, robot and light were the same. Only "
         "those tell them apart in which one arrived and the other did not. “By luck” is how often two equally good "
@@ -163,7 +169,7 @@ def _better(said: dict[str, Any]) -> list[Section]:
             f"Were all of them equally good, luck would still call {LUCK * len(rows):.1f} of these {len(rows)} "
             "comparisons a difference."
         )
-    return [("better", "Which policy is better?", join(_lead(lead), table(heads, rows, (3, 4, 5, 6))))]
+    return [("better", "Which policy is better?", join(_lead(lead), table(heads, rows, numeric)))]
 
 
 def _worst(said: dict[str, Any]) -> list[Section]:
