@@ -46,7 +46,7 @@ def timed_fit(cameras: Cameras, points: SparsePoints, config: NerfConfig, steps:
     from twin.nerf.fit import fit
 
     began = time.perf_counter()
-    field, metrics = fit(cameras, points, replace(config, steps=steps))
+    field, metrics, _ = fit(cameras, points, replace(config, steps=steps))
     wall = time.perf_counter() - began
     return field, wall, Pace(wall - metrics["seconds_train"], metrics["seconds_train"] / steps)
 

@@ -16,12 +16,14 @@ from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.audit import EVENTS, Findings, Seen, audit
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
+from twin.env.haze import Haze
 from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.physics import HuskyPhysics
 from twin.env.randomisation import Draw, Nominal, Ranges
 from twin.env.scene_model import episode_spec
 from twin.env.stretches import find_task, tasks
 from twin.env.suite import Stage
+from twin.env.tasks import Drive
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.film import main
@@ -183,9 +185,53 @@ def test_smaller_wheels_drive_slower_and_latency_later(scene):
 
 
 def test_ranges_that_make_no_sense_are_refused():
-    for ranges in ({"friction": (0.0, 1.0)}, {"payload": (-1.0, 0.0)}, {"latency": (0.2, 0.1)}):
+    wrong = [{"friction": (0.0, 1.0)}, {"payload": (-1.0, 0.0)}, {"latency": (0.2, 0.1)}, {"extinction": (-0.1, 0.0)}]
+    for ranges in (*wrong, {"bystanders": (-1, 2)}):
         with pytest.raises(InputError):
             Ranges(**ranges)
+
+
+def test_haze_hides_by_distance_and_spares_what_is_near():
+    depth = np.array([[1000.0, 1000.0], [20.0, 2.0]], np.float32)
+    rgb = np.array([[[0.8] * 3, [0.6] * 3], [[0.1] * 3, [0.1] * 3]], np.float32)
+    lengths = np.full((2, 2), 1.5, np.float32)
+    np.testing.assert_array_equal(Haze(0.0).over(rgb, depth, lengths), rgb)
+    hazy = Haze(0.05).over(rgb, depth, lengths)
+    np.testing.assert_allclose(hazy[0], 0.7, atol=1e-6)  # the horizon, whose mean is the airlight
+    for column, metres in ((0, 30.0), (1, 3.0)):
+        kept = np.exp(-0.05 * metres)
+        np.testing.assert_allclose(hazy[1, column], kept * 0.1 + (1 - kept) * 0.7, rtol=1e-5)
+    np.testing.assert_allclose(Haze(0.05, 0.5).over(rgb, depth, lengths)[0], 0.35, atol=1e-6)
+    air = Haze(0.05)
+    air.over(rgb, depth, lengths)
+    np.testing.assert_allclose(air.over(0.0 * rgb, depth, lengths)[0], 0.7, atol=1e-6)  # that of the first picture
+    near = np.ones_like(depth)
+    np.testing.assert_allclose(Haze(1e3).over(rgb, near, lengths)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
+
+
+def test_randomised_episodes_have_hazy_air_and_bystanders(scene):
+    still = dict.fromkeys(("friction", "wheel_radius", "airlight"), (1.0, 1.0))
+    still |= dict.fromkeys(("payload", "latency", "camera_shift", "camera_turn", "bystanders"), (0.0, 0.0))
+
+    def first(seed: int = 3, **ranges) -> tuple[np.ndarray, Drive]:
+        environment = twin.load(scene, "ahead", seed, lighting="day", **SMALL, randomise=Ranges(**(still | ranges)))
+        step = environment.reset()
+        return step.observation["pixels"][-1].astype(float), environment.task
+
+    clear, task = first(extinction=(0.0, 0.0))
+    plain = twin.load(scene, "ahead", 3, lighting="day", **SMALL).reset().observation["pixels"][-1]
+    np.testing.assert_array_equal(clear, plain)
+    assert task.obstacles == ()
+    hazy, task = first(extinction=(0.2, 0.2))
+    assert hazy.std() < 0.9 * clear.std() and task.draw.record()["extinction"] == pytest.approx(0.2)
+    differ = []
+    for seed in range(4):  # not all of them are in view of the first picture
+        crowded, task = first(seed, extinction=(0.0, 0.0), bystanders=(4, 4))
+        assert len(task.obstacles) == 4
+        differ.append(not np.array_equal(crowded, first(seed, extinction=(0.0, 0.0))[0]))
+    assert any(differ)
+    rng = np.random.default_rng(0)
+    assert {Ranges(bystanders=(0, 3)).draw(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
 
 
 # ---- the model of an episode

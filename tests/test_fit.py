@@ -197,7 +197,7 @@ def test_another_seed_is_another_field(cameras):
 
 def test_it_learns_the_floor_and_both_lightings(cameras):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, metrics = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    field, metrics, _ = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
     metrics |= evaluate(field, cameras, WIDTH)
     assert metrics["n"] == {"day": 1, "night": 1}
     assert metrics["train_psnr"] > 17.0
@@ -242,7 +242,7 @@ def test_the_stage_writes_a_field_that_loads(cameras, tmp_path):
 
 def test_a_baked_field_shows_what_the_field_shows(cameras):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, _ = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    field, _, _ = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     baked, facts = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
     again, _ = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
@@ -278,6 +278,6 @@ def test_a_device_that_is_not_there_is_an_input_error(monkeypatch, value, messag
 
 def test_a_field_that_no_camera_sees_is_not_baked(cameras):
     config = replace(CONFIG, steps=2, near_plane=100.0)  # [m] everything is nearer
-    field, _ = fit(cameras, floor_points(cameras), config)
+    field, _, _ = fit(cameras, floor_points(cameras), config)
     with pytest.raises(InputError, match=r"nothing to bake.*near_plane"):
         bake(field, TrainingPixels(cameras, SparsePoints.empty(), WIDTH), steps=1)

@@ -264,6 +264,7 @@ def test_sources_have_unique_plain_names() -> None:
         (SourceConfig(path="input/held-out.mp4"), "'held-out' has a meaning of its own"),
         (SourceConfig(path="any"), "'any' has a meaning of its own"),
         (SourceConfig(path="a.mp4", lighting="day:night"), "choose a plain name"),
+        (SourceConfig(path="a.mp4", lighting="day+randomised"), "choose a plain name"),
     ],
 )
 def test_a_lighting_that_would_mean_something_else_is_refused_before_anything_is_read(

@@ -121,7 +121,7 @@ def test_a_posed_image_set_without_its_images_is_refused(tmp_path: Path, capsys:
         assert not (tmp_path / "scene/scene.toml").exists() and not list((tmp_path / "scene").glob("input/*"))
 
 
-@pytest.mark.parametrize("name", ["training", "any"])
+@pytest.mark.parametrize("name", ["training", "any", "day+randomised"])
 def test_a_lighting_s_name_means_no_other_light(tmp_path: Path, name: str) -> None:
     day = film(tmp_path / f"{name}.mp4", views([5 * i for i in range(4)]))
     assert new_main([str(tmp_path / "scene"), str(day), "--camera-height", "1.2"]) == 0

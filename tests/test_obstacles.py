@@ -1,5 +1,7 @@
 """Obstacles: where they stand, how they move, and that MuJoCo knows them."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.config_file import load_config
 from twin.env import obstacles as module
-from twin.env.obstacles import add_obstacles, ground_height, place, pose_at, random_obstacles
+from twin.env.obstacles import add_obstacles, bystanders, ground_height, place, pose_at, random_obstacles
 from twin.errors import InputError
 from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.world import World, arc_lengths, nearest
@@ -138,6 +140,20 @@ def test_random_ones_leave_a_way_past_and_repeat_with_the_seed(world):
             assert abs(one.lateral) + world.half_width - module.RADIUS[one.kind] > 0.34
     with pytest.raises(InputError, match="at most"):
         random_obstacles(world, np.random.default_rng(0), 500)
+
+
+def test_bystanders_stand_where_no_robot_in_the_corridor_can_touch_them(world):
+    bend = np.linspace(0.0, np.pi, 60)
+    tight = np.column_stack([3.0 * np.sin(bend), 3.0 - 3.0 * np.cos(bend), 0.0 * bend])  # the inside has no room
+    for route in (world.route, tight):
+        there = replace(world, route=route)
+        drawn = bystanders(there, np.random.default_rng(3), 6)
+        assert drawn == bystanders(there, np.random.default_rng(3), 6) != bystanders(there, np.random.default_rng(4), 6)
+        for seed in range(40):
+            for one in bystanders(there, np.random.default_rng(seed), 6):
+                x, y, _ = module.pose_at(one, route, 0.0)
+                free = np.hypot(*(route[:, :2] - (x, y)).T).min() - module.RADIUS[one.kind]
+                assert there.half_width + 0.34 < free < there.half_width + 3.2
 
 
 def test_scene_toml_names_them(tmp_path):

@@ -196,7 +196,7 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
     stack = np.zeros((12, 90, 160), np.uint8)
     assert load_policy(left)(stack) == pytest.approx(0.9) and load_policy(ahead)(stack) == pytest.approx(0.001)
     drive.run([left, ahead, left], "straight", ["rain", "haze", "rain"], 2, out)
-    twin = [Cell(policy, "straight", "held-out", 10, 5) for policy in ("left", "ahead")]
+    twin = [Cell(policy, "straight", "held-out+randomised", 10, 5) for policy in ("left", "ahead")]
     cells = read_results(out, twin)
     trials = read_trials(out.with_name("results_trials.csv"))
     assert len(trials) == 8 and len(cells) == 4
@@ -205,7 +205,7 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
     for cell in cells:
         mine = [t for t in trials if (t.policy, t.lighting) == (cell.policy, cell.lighting)]
         assert (cell.trials, cell.successes) == (len(mine), sum(t.success for t in mine))
-        assert cell.twin_key == (cell.policy, "straight", "held-out")
+        assert cell.twin_key == (cell.policy, "straight", "held-out+randomised")
     before = out.with_name("results_trials.csv").read_text()
     third = max(t.seed for t in trials if t.lighting == "rain") + 1
     drive.run([left], "straight", ["rain"], 3, out, films=tmp_path / "films")

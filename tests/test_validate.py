@@ -12,6 +12,7 @@ from tiny_runs import SMALL, tiny_runs
 from tiny_twin import tiny_twin
 
 from twin import load_scene, progress, validate
+from twin.env.randomisation import Ranges, asked
 from twin.env.suite import Stage
 from twin.errors import InputError
 from twin.learn import judging
@@ -83,6 +84,19 @@ def test_drawn_lights_do_not_depend_on_those_before(scene):
 def run(scene: Path, *policies: str, lightings=("day", "night"), episodes=5) -> str:
     validate.validate(scene, policies, "ahead", lightings, episodes)
     return (scene / "validation" / "episodes.csv").read_text()
+
+
+def test_randomised_episodes_begin_like_the_others_with_another_robot(scene):
+    seeds = range(6)
+    plain, drawn = drive(chunk(scene, seeds)), drive(chunk(scene, seeds, "day+randomised"))
+    assert [one.seed for one in drawn] == list(seeds)
+    assert [one.progress for one in plain] != [one.progress for one in drawn]
+    assert drive(chunk(scene, [2], "day+randomised")) == [drawn[2]]
+    assert drive(chunk(scene, seeds)) == plain
+    stage = Stage.open(scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")})
+    assert stage.options.lighting == "day" and stage.options.randomise == Ranges()
+    with pytest.raises(InputError, match="randomized"):
+        drive(chunk(scene, [0], "day+randomized"))
 
 
 def test_a_killed_validation_ends_with_the_same_table(fresh, monkeypatch):

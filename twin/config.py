@@ -11,6 +11,8 @@ from twin.robot import HuskyParams
 TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 """Said where a lighting's name could be: one drawn at random, as `twin/env/lightings.py` has it."""
 RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
+RANDOMISED = "+randomised"
+"""Ends the name of a lighting in tables: driven in that light, and all else drawn for every episode, too."""
 """So no lighting may be called so."""
 
 
@@ -145,6 +147,9 @@ class NerfConfig:
     """Bricks of the baked field at most; 9,000 are some 105 MB. Its cells are as fine as that allows."""
     max_width: int = 480
     """Images are trained at this longer side [px]."""
+    refine_cameras: bool = False
+    """Let the frames move a little while training, for cameras that are worth less than the pictures. Only the field is
+    trained so: all else keeps the cameras of structure from motion."""
     learning_rate: float = 3e-2
     appearance_dim: int = 32
     levels: int = 8

@@ -108,10 +108,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
     parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function; a script unless given")
     parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
-    parser.add_argument("--lighting", default=None, help="a name, a mixture a:b:0.3, training, held-out or any")
+    parser.add_argument(
+        "--lighting",
+        default=None,
+        help="a name, a mixture a:b:0.3, training, held-out or any; any of them with +randomised",
+    )
     parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
     parser.add_argument("--obstacles", default="scene", help="how many at random; those of scene.toml unless given")
-    parser.add_argument("--randomise", action="store_true", help="another robot than the nominal one, by the seed")
+    parser.add_argument("--randomise", action="store_true", help="robot, air and bystanders drawn by the seed")
     parser.add_argument("--seed", type=int, default=0, help="of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; by default in SCENE/films")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -124,7 +128,9 @@ def main(arguments: list[str] | None = None) -> int:
             "obstacles": _obstacles(given.obstacles),
         }
         if given.lighting:
-            options["lighting"] = given.lighting
+            from twin.env.randomisation import asked
+
+            options |= {name: value for name, value in asked(given.lighting).items() if value}
         path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
     except (InputError, OSError) as error:
         return refuse(error)

@@ -58,7 +58,8 @@ results.csv, one line per policy and lighting:
   runs/nerf,dusk,10,6
 
 Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task. Light that
-the twin does not know by name is compared with one that it does, named in a column twin_lighting, such as held-out.
+the twin does not know by name is compared with one that it does, named in a column twin_lighting, such as
+held-out+randomised.
 """
 
 

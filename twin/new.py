@@ -19,7 +19,7 @@ from pathlib import Path
 from twin.capture.colmap import find_model
 from twin.capture.formats import ImageSet, detect_kind, files_named, read_colmap, read_transforms
 from twin.capture.video import probe
-from twin.config import RESERVED_LIGHTINGS
+from twin.config import RANDOMISED, RESERVED_LIGHTINGS
 from twin.errors import InputError, refuse
 from twin.scene import SceneDir, digest_file, write_text
 
@@ -178,7 +178,7 @@ def _posed_files(film: Path) -> tuple[Path, list[Path]]:
 def _lighting(path: Path, kind: str) -> str:
     """A lighting's name for a path under `input/`: that of the film, or of the root of a posed image set."""
     name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
-    name = name.replace(":", "_").replace("/", "_")
+    name = name.replace(":", "_").replace("/", "_").removesuffix(RANDOMISED)
     return f"{name}_light" if name in RESERVED_LIGHTINGS else name
 
 

@@ -72,7 +72,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--updates", type=float, help="of the networks per step")
     parser.add_argument("--colours", type=float, help="strength of random weather in updates; 1 where lighting varies")
     parser.add_argument("--seed", type=int, help="of everything drawn")
-    parser.add_argument("--randomise", action="store_true", default=None, help="another robot in every episode")
+    parser.add_argument(
+        "--randomise",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="another robot in every episode and, where the lighting varies, haze and bystanders (the default)",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
     return parser
 

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from twin import progress
+from twin.config import HELD_OUT, RANDOMISED
+from twin.env.randomisation import asked
 from twin.env.suite import fingerprint
 from twin.errors import InputError, refuse
 from twin.learn.judging import CHUNK, Chunk, Driven, campaign
@@ -25,6 +27,9 @@ from twin.report.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, rea
 from twin.report.validation import failure_map, lines, summary, typical_episode, worst_episode
 from twin.report.validation_page import Curve, write_validation_page
 from twin.scene import SceneDir, digest_file, digest_json, read_json, write_json, write_text
+
+DEFAULT_LIGHTINGS = (HELD_OUT, HELD_OUT + RANDOMISED)
+"""As the place was filmed but for its light; and nearer to what a road does."""
 
 _FIRST_SEED = 1_000_000  # of validation
 _SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
@@ -109,7 +114,7 @@ def validate(
     root: Path,
     sources: Sequence[str],
     task: str = "straight",
-    lightings: Sequence[str] = ("held-out",),
+    lightings: Sequence[str] = DEFAULT_LIGHTINGS,
     episodes: int = 100,
     worst: bool = False,
     trust: bool = False,
@@ -186,7 +191,7 @@ def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[T
         path = folder / "films" / trial.policy / film_name(trial.task, trial.lighting, trial.seed)
         poster = path.with_suffix(".jpg")
         if not poster.exists():
-            episode = film(root, trial.task, source, trial.seed, path, trust, lighting=trial.lighting)[1]
+            episode = film(root, trial.task, source, trial.seed, path, trust, **asked(trial.lighting))[1]
             if (episode.cause, len(episode.times) - 1) != (trial.cause, trial.steps):
                 path.unlink()
                 raise InputError(
@@ -315,7 +320,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--lightings", nargs="+", default=["held-out"], help="names, mixtures a:b:0.3, held-out, any")
+    parser.add_argument(
+        "--lightings",
+        nargs="+",
+        default=list(DEFAULT_LIGHTINGS),
+        help="names, mixtures a:b:0.3, held-out, any; any of them with +randomised (default: %(default)s)",
+    )
     parser.add_argument("--episodes", type=int, default=100, help="per policy and lighting; 100 unless given")
     parser.add_argument("--worst", action="store_true", help="search for the light in which each policy fares worst")
     parser.add_argument("--films", action="store_true", help="film each policy's typical and worst episode")

@@ -18,7 +18,7 @@ from twin.capture.masks import Masks, read_mask
 from twin.capture.photos import read_photos
 from twin.capture.types import Capture
 from twin.capture.video import FilmCount, damage_note, read_film
-from twin.config import RESERVED_LIGHTINGS, CaptureConfig, SceneConfig, SourceConfig
+from twin.config import RANDOMISED, RESERVED_LIGHTINGS, CaptureConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
 from twin.scene import SceneDir
 
@@ -85,8 +85,10 @@ def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
 
 def _lighting(source: SourceConfig) -> str:
     lighting = source.lighting or _stem(source.path)
-    if set(lighting) & set(":/"):
-        raise InputError(f"lighting = {lighting!r}: ':' and '/' have a meaning of their own; choose a plain name")
+    if set(lighting) & set(":/") or lighting.endswith(RANDOMISED):
+        raise InputError(
+            f"lighting = {lighting!r}: ':', '/' and '{RANDOMISED}' have a meaning of their own; choose a plain name"
+        )
     if lighting in RESERVED_LIGHTINGS:
         raise InputError(
             f"{source.path}: lighting = {lighting!r} has a meaning of its own, a light drawn at random; choose another "

@@ -28,6 +28,8 @@ _PARKED = -100.0  # [m] below the ground, where nothing sees or touches it
 _ROBOT_HALF_WIDTH = 0.34  # [m]
 _PASSAGE = 0.15  # [m] that a robot has to spare beside a random obstacle
 _BESIDE = 0.5  # [m] beyond the corridor's edge at which random obstacles still stand
+_TRIES = 20  # draws for a bystander
+_STRIP = 2.5  # [m] beside the corridor in which bystanders stand
 _CLEAR_ENDS = (4.0, 3.0)  # [m] of the route's start and end that random obstacles leave free
 _SPACING = 4.0  # [m] of the route between random obstacles, if there is room
 _SINK = 0.01  # [m] into the ground, so that no light shows below
@@ -179,4 +181,32 @@ def random_obstacles(
         lateral = rng.uniform(nearest, max(nearest, world.half_width + _BESIDE) + radius) * rng.choice([-1.0, 1.0])
         yaw = float(rng.uniform(-180.0, 180.0)) if kind in STANDING else 0.0
         out.append(ObstacleConfig(f"random_{k}", kind, float(station), float(lateral), yaw))
+    return tuple(out)
+
+
+def bystanders(
+    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STANDING
+) -> tuple[ObstacleConfig, ...]:
+    """Things that stand beside the corridor where no robot within it can touch them: as if they had been moved there.
+
+    The same generator state gives the same ones; they are named `random_<number>`.
+
+    Args:
+        world: Has route and corridor.
+        rng: Decides where and what.
+        count: How many; fewer where a winding route leaves no room.
+        kinds: Which kinds may be drawn.
+    """
+    route, out = world.route[:, :2], []
+    length = float(arc_lengths(world.route)[-1])
+    for k in range(count):
+        kind = str(rng.choice(list(kinds)))
+        nearest = world.half_width + _ROBOT_HALF_WIDTH + _PASSAGE + RADIUS[kind]
+        for _ in range(_TRIES):
+            station = float(rng.uniform(0.0, length))
+            lateral = float(rng.uniform(nearest, nearest + _STRIP) * rng.choice([-1.0, 1.0]))
+            # Inside a bend, what is beside one part of the route may be on another.
+            if np.linalg.norm(route - _spot(route, station, lateral), axis=1).min() >= nearest - _PASSAGE:
+                out.append(ObstacleConfig(f"random_{k}", kind, station, lateral, float(rng.uniform(-180.0, 180.0))))
+                break
     return tuple(out)

@@ -1,7 +1,10 @@
-"""What of the robot differs from episode to episode: tyre friction, payload, latency, camera pose and wheel radius.
+"""What differs from episode to episode: the robot, the air, and things beside the corridor.
 
-*Ranges* say how far each may be from the robot as it was built; a *draw* is what one episode got, every value uniform
-in its range and independent of the others. A draw is applied to the episode's own copy of the MuJoCo model.
+Of the robot tyre friction, payload, latency, camera pose and wheel radius differ; the air is hazy (see `haze.py`); and
+*bystanders*, things where nothing is driven, stand as if they had been moved there.
+
+*Ranges* say how far each may be from what was built and filmed; a *draw* is what one episode got, every value uniform
+in its range and independent of the others. What is the robot's is applied to the episode's own copy of the model.
 """
 
 from dataclasses import asdict, dataclass
@@ -11,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import RANDOMISED
 from twin.env.scene_model import PAYLOAD
 from twin.errors import InputError
 
@@ -38,6 +42,12 @@ class Ranges:
     """Of the front camera about each of its axes [°]."""
     wheel_radius: Range = (0.98, 1.02)
     """As a share of the robot's own; its controller does not know."""
+    extinction: Range = (0.0, 0.05)
+    """Of the air [1/m], added to the film's; 0.05 is a visibility of 60 m."""
+    airlight: Range = (0.85, 1.15)
+    """How bright the haze is, as a share of the sky at the horizon."""
+    bystanders: Range = (0, 4)
+    """Things beside the corridor: cones, boxes, bollards in any colour."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in asdict(self).items():
@@ -46,7 +56,7 @@ class Ranges:
         for name in ("friction", "wheel_radius"):
             if not getattr(self, name)[0] > 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected more than 0")
-        for name in ("payload", "latency"):
+        for name in ("payload", "latency", "extinction", "airlight", "bystanders"):
             if not getattr(self, name)[0] >= 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
 
@@ -59,12 +69,15 @@ class Ranges:
             camera_shift=tuple(rng.uniform(*self.camera_shift, 3).tolist()),
             camera_turn=tuple(rng.uniform(*self.camera_turn, 3).tolist()),
             wheel_radius=float(rng.uniform(*self.wheel_radius)),
+            extinction=float(rng.uniform(*self.extinction)),
+            airlight=float(rng.uniform(*self.airlight)),
+            bystanders=int(rng.integers(round(self.bystanders[0]), round(self.bystanders[1]) + 1)),
         )
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What one episode got; units as in `Ranges`. The default is the robot as built."""
+    """What one episode got; units as in `Ranges`. The default is the robot as built, in the place as filmed."""
 
     friction: float = 1.0
     payload: float = 0.0
@@ -72,10 +85,19 @@ class Draw:
     camera_shift: tuple[float, ...] = (0.0, 0.0, 0.0)
     camera_turn: tuple[float, ...] = (0.0, 0.0, 0.0)
     wheel_radius: float = 1.0
+    extinction: float = 0.0
+    airlight: float = 1.0
+    bystanders: int = 0
 
     def record(self) -> dict[str, Any]:
         """For the episode's record, JSON-able."""
         return asdict(self)
+
+
+def asked(lighting: str) -> dict[str, Any]:
+    """Options of an environment for the name of a lighting in tables, such as `held-out+randomised`."""
+    plain = lighting.removesuffix(RANDOMISED)
+    return {"lighting": plain, "randomise": Ranges() if plain != lighting else None}
 
 
 class Nominal:

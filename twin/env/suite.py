@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from dm_env import specs
 
+from twin.config import RANDOMISED
 from twin.config_file import load_config
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
@@ -58,7 +59,8 @@ class Stage:
         config = load_config(twin.scene.config_file)
         stretch = find_task(task, world, config.task)
         wanted = config.obstacle if isinstance(parsed.obstacles, str) else parsed.obstacles
-        obstacles = EpisodeObstacles(wanted, world, stretch)
+        beside = round(parsed.randomise.bystanders[1]) if parsed.randomise else 0
+        obstacles = EpisodeObstacles(wanted, world, stretch, beside)
         spec = episode_spec(world, stretch.start, stretch.end, parsed.half_width or world.half_width)
         add_obstacles(spec, obstacles.pool, world)
         trust = Trust(twin.cameras()) if parsed.pixels else None
@@ -93,7 +95,7 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
         InputError: as `Stage.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
-    photos = [twin.scene.lightings / f"{name}.json" for name in lighting.split(":")]
+    photos = [twin.scene.lightings / f"{name}.json" for name in lighting.removesuffix(RANDOMISED).split(":")]
     return digest_json(
         {
             "stages": [read_json(twin.scene.stamp(stage))["result"] for stage in ("field", "mjcf")],

@@ -93,7 +93,7 @@ class Drive(control.Task):
             self._nominal.apply(self.draw, physics.model.ptr)
         params = self.world.robot
         physics.set_robot(replace(params, command_latency=params.command_latency + self.draw.latency))
-        self.obstacles = self._obstacles.draw(self.rng(OBSTACLES))
+        self.obstacles = self._obstacles.draw(self.rng(OBSTACLES), self.draw.bystanders)
         physics.robot.surroundings = Surroundings(self.obstacles, physics.data.ptr)
         rng = self.rng(START)
         for _ in range(_START_TRIES):

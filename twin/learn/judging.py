@@ -16,6 +16,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from twin.env.batch import Worlds
+from twin.env.randomisation import Ranges, asked
 from twin.env.suite import Stage
 from twin.learn.policy import Policy, load_policy
 from twin.loading import load_scene
@@ -37,7 +38,8 @@ class Chunk:
     """See `load_policy`."""
     trust: bool
     lighting: str
-    """See `env/lightings.py`; or `drawn_<number>`: the light that this seed draws, see `drawn_light`."""
+    """See `env/lightings.py`; or `drawn_<number>`: the light that this seed draws, see `drawn_light`. With
+    `+randomised` robot, air and bystanders are drawn for every episode, too, see `env/randomisation.py`."""
     seeds: tuple[int, ...]
 
 
@@ -122,16 +124,16 @@ def _policy(source: str, trust: bool) -> Policy:
 
 
 @lru_cache(maxsize=1)
-def _stage(scene: str, task: str, source: str, trust: bool) -> Stage:
-    return Stage.open(load_scene(scene), task, _policy(source, trust).options())
+def _stage(scene: str, task: str, source: str, trust: bool, randomise: Ranges | None) -> Stage:
+    return Stage.open(load_scene(scene), task, {**_policy(source, trust).options(), "randomise": randomise})
 
 
 @lru_cache(maxsize=1)
 def _worlds(scene: str, task: str, source: str, trust: bool, lighting: str) -> Worlds:
-    stage = _stage(scene, task, source, trust)
-    drawn = _DRAWN.fullmatch(lighting)
+    options = asked(lighting)
+    stage = _stage(scene, task, source, trust, options["randomise"])
+    drawn = _DRAWN.fullmatch(options["lighting"])
     if drawn:
         stage = drawn_light(stage, int(drawn[1]))
-    return Worlds(
-        dataclasses.replace(stage, options=dataclasses.replace(stage.options, lighting=lighting)), [None] * _WORLDS
-    )
+    lit = dataclasses.replace(stage.options, lighting=options["lighting"])
+    return Worlds(dataclasses.replace(stage, options=lit), [None] * _WORLDS)

@@ -9,6 +9,7 @@ from typing import Any
 
 from twin.config import ANY, HELD_OUT, TRAINING
 from twin.env.options import NERF, STEERING, Rewards
+from twin.env.randomisation import Ranges
 from twin.errors import InputError
 from twin.learn.architecture import Architecture
 from twin.learn.policy import Control
@@ -32,8 +33,10 @@ class TrainConfig:
     """[m/s]"""
     yaw_rate: float = 1.0
     """[rad/s]"""
-    randomise: bool = False
-    """Another robot in every episode."""
+    centring: float = 1.0
+    """Share of what a step is worth that is lost at the corridor's edge; none on the route."""
+    randomise: bool = True
+    """Another robot in every episode; and where the lighting varies, hazy air and bystanders, too."""
     pool: int = 2
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
     """Channels, kernel, stride."""
@@ -94,9 +97,12 @@ class TrainConfig:
         """Of the environment."""
         # Worth what surviving for ever would be. With nothing to be had behind it, a policy that is paid by the step
         # learns to linger before the goal, and rather leaves the road there than to arrive.
-        goal = Rewards(goal=Rewards.step * self.gamma / (1.0 - self.gamma))
-        lit = {"lighting": self.lighting, "observe": self.observe, "randomise": self.randomise}
-        return {**dataclasses.asdict(self.control), **lit, "rewards": goal}
+        # And where only leaving the road costs, it drives anywhere on it: beside the kerb one surprise is enough.
+        goal = Rewards.step * self.gamma / (1.0 - self.gamma)
+        rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step)
+        ranges = Ranges() if self.varies else Ranges(extinction=(0.0, 0.0), bystanders=(0, 0))
+        lit = {"lighting": self.lighting, "observe": self.observe, "randomise": ranges if self.randomise else None}
+        return {**dataclasses.asdict(self.control), **lit, "rewards": rewards}
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -26,6 +26,7 @@ from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import RadianceField, untrained
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
+from twin.nerf.refine import Refinement
 from twin.nerf.sampling import COARSEST, Space, space_of_cameras
 from twin.nerf.stereo import stereo_sightings
 from twin.nerf.workspace import CameraArrays, Layout, Workspace
@@ -98,11 +99,18 @@ class Trainer:
         )
         appearance = initial_appearance(self.lightings, train.names, frame_lighting, config.appearance_dim, seed)
         self.field = untrained(layout, appearance, seed, where)
-        self.arrays = CameraArrays(train.camera_to_world, self.pixels.intrinsics, where)
         self.rng = np.random.default_rng([seed, 2])
         self.rays = -(-config.rays // _SHARDS) * _SHARDS
         self.ws = Workspace(layout, self.rays, config.samples, where, _SHARDS * _FREE_POINTS, training=True)
         self.free = free_segments(train, config.near_plane)
+        self.refinement: Refinement | None = None
+        """How the frames move; None where they do not."""
+        if config.refine_cameras:
+            near = self._near(space)
+            self.refinement = Refinement(train.camera_to_world, self.pixels.intrinsics, near, self.ws)
+            self.arrays = self.refinement.arrays
+        else:
+            self.arrays = CameraArrays(train.camera_to_world, self.pixels.intrinsics, where)
 
         f = self.field
         self.small = {**f.parameters, "vectors": f.appearance.vectors, "residuals": f.appearance.residuals}
@@ -122,11 +130,14 @@ class Trainer:
 
     def _growth(self, space: Space) -> float:
         """Ratio of one level's cells to the next finer one's, such that the finest suits the frames."""
-        seen = self.pixels.points.distance
-        distance = float(np.quantile(seen, 0.05)) if len(seen) else 0.25 * space.scale
-        cell = _CELL_PIXELS * distance / float(np.median(self.pixels.intrinsics[:, 0]))
+        cell = _CELL_PIXELS * self._near(space) / float(np.median(self.pixels.intrinsics[:, 0]))
         ratio = 4.0 * space.scale / cell / COARSEST
         return float(np.clip(ratio ** (1.0 / max(1, self.config.levels - 1)), *_GROWTH_RANGE))
+
+    def _near(self, space: Space) -> float:
+        """How far what is near is from the cameras [m]."""
+        seen = self.pixels.points.distance
+        return float(np.quantile(seen, 0.05)) if len(seen) else 0.25 * space.scale
 
     @property
     def done(self) -> bool:
@@ -160,6 +171,8 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = _NETWORK_RATE * rate
         self.optimiser.step()
+        if self._refines:
+            self.refinement.step(rate)  # type: ignore[union-attr]
         self.steps_done += 1
         return sum(r[0] for r in results) / _SHARDS
 
@@ -211,6 +224,8 @@ class Trainer:
                 device=self.where,
             )
             first, second = self._trunk_backward(samples)
+            if self._refines:
+                self.refinement.backward(f, start, count)  # type: ignore[union-attr]
             if free:
                 more = self._free_backward(first_free)
                 first, second = first + more[0], second + more[1]
@@ -222,6 +237,11 @@ class Trainer:
                 device=self.where,
             )
             return float((error**2).mean()), [first, second, *gradients[2:]]
+
+    @property
+    def _refines(self) -> bool:
+        """Whether cameras move yet: at first the field knows less than they do."""
+        return self.refinement is not None and self.steps_done >= _EXPLORE * self.config.steps
 
     def _trunk_backward(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         ws = self.ws
@@ -345,8 +365,8 @@ def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
 
 def fit(
     cameras: Cameras, points: SparsePoints, config: NerfConfig, seed: int = 0, camera_height: float = 0.0
-) -> tuple[RadianceField, dict[str, Any]]:
-    """Trains a field and returns it with what there is to say of the training.
+) -> tuple[RadianceField, dict[str, Any], Cameras]:
+    """Trains a field; it, what there is to say of the training, and the cameras that it fits.
 
     `camera_height` [m] is that of a camera carried at constant height over the ground, 0 where it was not.
     """
@@ -366,16 +386,23 @@ def fit(
                 curve.append([trainer.steps_done, round(-10 * math.log10(mean), 3)])
             progress.update()
     seconds = time.perf_counter() - began
-    field = trainer.finish()
+    field, moved = trainer.finish(), None
+    if trainer.refinement:
+        cameras, moved = trainer.refinement.refined(cameras)
     small = sum(t.numel() for t in trainer.small.values())
-    return field, {
-        "steps": config.steps,
-        "seconds_train": round(seconds, 2),
-        "rays_per_second": round(config.steps * trainer.rays / seconds, 1),
-        "train_psnr": curve[-1][1],
-        "parameters": int(field.table.numel() + small),
-        "sightings_points": len(trainer.pixels.points.frame),
-        "sightings_path": len(trainer.pixels.path.frame),
-        "stereo": trainer.stereo,
-        "curve": curve,
-    }
+    return (
+        field,
+        {
+            "steps": config.steps,
+            "seconds_train": round(seconds, 2),
+            "rays_per_second": round(config.steps * trainer.rays / seconds, 1),
+            "train_psnr": curve[-1][1],
+            "parameters": int(field.table.numel() + small),
+            "sightings_points": len(trainer.pixels.points.frame),
+            "sightings_path": len(trainer.pixels.path.frame),
+            "stereo": trainer.stereo,
+            "cameras_moved": moved,
+            "curve": curve,
+        },
+        cameras,
+    )

@@ -35,7 +35,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    field, metrics = fit(cameras, points, config.nerf, config.seed, height)
+    field, metrics, cameras = fit(cameras, points, config.nerf, config.seed, height)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)

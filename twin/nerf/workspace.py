@@ -100,7 +100,12 @@ class CameraArrays:
     """Cameras as the ray kernel wants them."""
 
     def __init__(self, camera_to_world: NDArray, intrinsics: NDArray, where: str):
-        pose = np.asarray(camera_to_world, np.float64)
-        self.rotation: Any = wp.array(pose[:, :3, :3].astype(np.float32), dtype=wp.mat33f, device=where)
-        self.position: Any = wp.array(pose[:, :3, 3].astype(np.float32), dtype=wp.vec3f, device=where)
+        self._where = where
+        self.set_poses(camera_to_world)
         self.intrinsics: Any = wp.array(np.asarray(intrinsics, np.float32), dtype=wp.vec4f, device=where)
+
+    def set_poses(self, camera_to_world: NDArray) -> None:
+        """Moves the cameras; shape (n, 4, 4)."""
+        pose = np.asarray(camera_to_world, np.float64)
+        self.rotation: Any = wp.array(pose[:, :3, :3].astype(np.float32), dtype=wp.mat33f, device=self._where)
+        self.position: Any = wp.array(pose[:, :3, 3].astype(np.float32), dtype=wp.vec3f, device=self._where)

@@ -14,7 +14,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from twin.config import HELD_OUT
+from twin.config import HELD_OUT, RANDOMISED
 from twin.errors import InputError, refuse
 from twin.reality import drive, log
 from twin.reality import place as places
@@ -76,7 +76,9 @@ def main(given: list[str] | None = None) -> int:
         "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
     )
     command.add_argument(
-        "--twin-lighting", default=HELD_OUT, help="the twin's lighting to compare with (default %(default)s)"
+        "--twin-lighting",
+        default=HELD_OUT + RANDOMISED,
+        help="the twin's lighting to compare with (default %(default)s)",
     )
     command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
     command = commands.add_parser("log", help="a drive log of the world's Husky, for twin.align")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import HELD_OUT
+from twin.config import HELD_OUT, RANDOMISED
 from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
 from twin.env.tasks import CAMERA
@@ -117,7 +117,7 @@ def run(
     lightings: Sequence[str],
     trials: int,
     out: Path,
-    twin_lighting: str = HELD_OUT,
+    twin_lighting: str = HELD_OUT + RANDOMISED,
     films: Path | None = None,
 ) -> list[Trial]:
     """Drives what is not yet in the table of trials, and sums all of it up.

@@ -153,7 +153,7 @@ def unknowns(forecast: Forecast) -> list[Caution]:
     out.append(
         Caution(
             f"How the policies do in light that is not like {listing(sorted(lightings))}.",
-            "validate under --lightings held-out, film the place in that light, or add a photo with twin.relight.",
+            "validate under held-out+randomised, film the place in that light, or add a photo with twin.relight.",
         )
     )
     for task in forecast.tasks:

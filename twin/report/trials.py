@@ -7,7 +7,8 @@ policy, task and lighting. In the twin every trial is a row of `validation/episo
     policy,lighting,trials,successes            further columns, if wanted: task, twin_lighting
 
 `task` is needed only where a policy was validated on several. `twin_lighting` names the lighting of the twin that the
-cell is compared with, for light that the twin does not know by name: `dusk_on_monday` compared with `held-out`.
+cell is compared with, for light that the twin does not know by name: `dusk_on_monday` compared with
+`held-out+randomised`.
 """
 
 import csv

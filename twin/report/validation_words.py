@@ -5,7 +5,7 @@
 
 from typing import Any
 
-from twin.config import ANY, HELD_OUT, TRAINING
+from twin.config import ANY, HELD_OUT, RANDOMISED, TRAINING
 from twin.report.forecast import Estimate
 from twin.report.forecast_words import show
 from twin.report.words import Caution, Verdict, listing
@@ -45,6 +45,9 @@ def why(cell: dict[str, Any]) -> str:
 
 def light_words(lighting: str) -> str:
     """What a lighting of the tables is."""
+    if lighting.endswith(RANDOMISED):
+        plain = light_words(lighting.removesuffix(RANDOMISED))
+        return f"{plain}; and for every episode another robot, hazy air, and things beside the corridor"
     if lighting.startswith("drawn_"):
         return f"light number {lighting[6:]} of those drawn in the search"
     if lighting.count(":") == 2:

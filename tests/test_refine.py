@@ -1,0 +1,143 @@
+"""Camera refinement: gradients against finite differences, and cameras that were moved find back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from test_fit import CONFIG, floor_points, make_cameras
+
+from twin.geometry.cameras import Cameras
+from twin.nerf.compute import single_threaded_torch
+from twin.nerf.fit import Trainer, fit
+from twin.nerf.kernels import space
+from twin.nerf.refine import Refinement, corrected
+
+REFINING = replace(CONFIG, refine_cameras=True)
+
+
+@pytest.fixture(autouse=True)
+def on_cpu(monkeypatch):
+    monkeypatch.setenv("TWIN_DEVICE", "cpu")
+
+
+@pytest.fixture
+def cameras(tmp_path) -> Cameras:
+    return make_cameras(tmp_path)
+
+
+def test_a_correction_turns_a_camera_about_its_centre_and_shifts_it():
+    pose = torch.eye(4, dtype=torch.float64)[None].repeat(2, 1, 1)
+    pose[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    turn = torch.tensor([[0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    shift = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], dtype=torch.float64)
+    out = corrected(pose, turn, shift).numpy()
+    np.testing.assert_allclose(out[0, :3, 0], [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(out[:, :3, 3], [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0]])
+
+
+def test_gradients_are_those_of_finite_differences(cameras):
+    """Of Σ wᵢ·featureᵢ along rays whose samples keep their distances, in the near box and outside."""
+    trainer = Trainer(cameras, floor_points(cameras), REFINING, 0, "cpu")
+    ws, field, refinement = trainer.ws, trainer.field, trainer.refinement
+    assert refinement is not None
+    rng = np.random.default_rng(0)
+    field.table.copy_(torch.as_tensor(rng.normal(size=field.table.shape)))
+    ws.camera.copy_(torch.as_tensor(rng.integers(14, size=ws.rays)))
+    ws.pixel.copy_(torch.as_tensor(rng.uniform(2, 22, (ws.rays, 2))))
+    rows = ws.rays * ws.samples
+    weights = torch.as_tensor(rng.normal(size=(rows, ws.features.shape[1])), dtype=torch.float32)
+    field.cast(ws, trainer.arrays, 0, ws.rays)
+    ws.distances.copy_(torch.as_tensor(np.sort(rng.uniform(0.2, 6.0, ws.distances.shape), 1)))
+    centre, half = torch.tensor(field.layout.centre), torch.tensor(field.layout.half)
+
+    def value(origin: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        """Of every ray, shape (n,)."""
+        metres = (origin[:, None] + ws.distances[..., None] * direction[:, None]).reshape(-1, 3).contiguous()
+        points = wp.from_torch(metres, dtype=wp.vec3f)
+        wp.launch(space.contract_points, rows, [points, field.centre, field.inverse_half, 0], [ws.w_positions])
+        field.query(ws, 0, rows)
+        return (ws.features[:rows].double() * weights).sum(1).view(ws.rays, -1).sum(1)
+
+    value(ws.origins, ws.directions)
+    ws.features_grad[:rows].copy_(weights)
+    refinement.backward(field, 0, ws.rays)
+    metres = ws.origins[:, None] + ws.distances[..., None] * ws.directions[:, None]
+    outside = (((metres - centre) / half).abs().amax(-1) > 1.0).sum()
+    assert 50 < outside < rows - 50
+    for axis in range(3):
+        for which, step in ((0, 1e-3), (1, 5e-5)):
+            sides = []
+            for sign in (1.0, -1.0):
+                moved = [ws.origins.clone(), ws.directions.clone()]
+                moved[which][:, axis] += sign * step
+                sides.append(value(*moved))
+            numeric = (sides[0] - sides[1]) / (2.0 * step)
+            error = (refinement._ray_grad[which, :, axis] - numeric).abs() / numeric.abs().median()
+            # Some samples straddle the border of a cell, where the gradient jumps.
+            assert error.median() < 0.02
+
+
+def test_frames_that_were_turned_find_back_in_a_field_that_is_right(cameras, monkeypatch):
+    config = replace(REFINING, steps=300, rays=512, samples=12, levels=4, log2_table=12, stereo=False, sightings=0.0)
+    trainer = Trainer(cameras, floor_points(cameras), config, 0, "cpu", camera_height=1.5)
+    refinement, given = trainer.refinement, trainer.pixels.cameras.camera_to_world
+    assert refinement is not None
+    turn = np.random.default_rng(4).normal(0, 0.05, (len(given), 3))
+    turn = torch.as_tensor(turn - turn.mean(0))
+
+    def error() -> float:
+        """Median angle between the cameras and the true ones, but for what is common to all [rad]."""
+        relative = refinement.arrays.rotation.numpy() @ given[:, :3, :3].transpose(0, 2, 1)
+        angles = np.stack([relative[:, 2, 1], relative[:, 0, 2], relative[:, 1, 0]], 1)
+        return float(np.median(np.linalg.norm(angles - angles.mean(0), axis=1)))
+
+    with single_threaded_torch(), monkeypatch.context() as still:
+        still.setattr(Trainer, "_refines", False)
+        while not trainer.done:
+            trainer.step()
+    refinement._given = corrected(torch.as_tensor(given), turn, torch.zeros_like(turn))
+    refinement.arrays.set_poses(refinement._given.numpy())
+    wrong = error()
+    monkeypatch.setattr(trainer, "_update", lambda *_: None)  # the field stays
+    monkeypatch.setattr(trainer.optimiser, "step", lambda: None)
+    monkeypatch.setattr(trainer, "rate", lambda: 0.5)
+    with single_threaded_torch():
+        errors = [trainer.step() for _ in range(150)]
+    assert error() < 0.6 * wrong
+    assert np.mean(errors[-30:]) < 0.8 * np.mean(errors[:30])
+
+
+def test_cameras_stay_where_no_refinement_is_asked_for(cameras):
+    _, metrics, same = fit(cameras, floor_points(cameras), CONFIG, camera_height=1.5)
+    assert metrics["cameras_moved"] is None and same is cameras
+    _, metrics, moved = fit(cameras, floor_points(cameras), REFINING, camera_height=1.5)
+    assert metrics["cameras_moved"]["most_m"] > 0.0 and moved.names == cameras.names
+    assert not np.array_equal(moved.camera_to_world, cameras.camera_to_world)
+
+
+def test_frames_not_trained_on_move_with_their_neighbours(cameras):
+    refinement = Trainer(cameras, floor_points(cameras), REFINING, 0, "cpu").refinement
+    assert isinstance(refinement, Refinement)
+    with torch.no_grad():
+        refinement.shift[:, 0] = torch.arange(14.0) / 10.0
+    found, said = refinement.refined(cameras)
+    shift = (found.camera_to_world - cameras.camera_to_world)[:, 0, 3]
+    np.testing.assert_allclose(shift[~cameras.held_out], np.arange(14) / 10.0, atol=1e-6)
+    for i in np.flatnonzero(cameras.held_out):
+        np.testing.assert_allclose(shift[i], (shift[i - 1] + shift[i + 1]) / 2, atol=1e-6)
+    assert said["most_m"] == pytest.approx(1.3) and said["most_deg"] == 0.0
+
+
+def test_two_refinements_are_equal_bit_by_bit(cameras):
+    def once() -> tuple[torch.Tensor, torch.Tensor]:
+        trainer = Trainer(cameras, floor_points(cameras), REFINING, 5, "cpu")
+        with single_threaded_torch():
+            while not trainer.done:
+                trainer.step()
+        assert trainer.refinement is not None
+        return trainer.refinement.turn.detach(), trainer.field.table
+
+    first, second = once(), once()
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True)) and first[0].abs().max() > 0.0
