@@ -8,6 +8,7 @@ chosen here and thus before anything is known of how they drive.
 from dataclasses import dataclass
 from pathlib import Path
 
+from twin.config import HELD_OUT, RANDOMISED
 from twin.report.statistics import MIN_TRIALS
 from twin.scene import read_json
 
@@ -19,11 +20,13 @@ SETUPS: dict[str, tuple[str, ...]] = {
     "varied": (),
 }
 """Name → options of `twin.train`."""
-STEPS = {"straight": 40_000, "right": 40_000}
+STEPS = {"straight": 20_000, "right": 20_000}
 SHARES = (0.25, 0.5)
 """Of a run's steps, at which checkpoints are taken for the forecast."""
 EPISODES = 50
-"""In the twin, per policy, in held-out lightings."""
+"""In the twin, per policy and lighting."""
+LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMISED), "checkpoint": (HELD_OUT + RANDOMISED,)}
+"""Of the twin. The latter is what reality is compared with; the former, for finished policies, is the paper's."""
 TRIALS = {"final": 10, "checkpoint": MIN_TRIALS}
 """In reality, per policy and weather; there are five. From fewer than MIN_TRIALS nothing is forecast."""
 PAPER: dict[tuple[str, str], tuple[float, float, float]] = {

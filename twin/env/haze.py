@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 _FAR = 40.0  # [m] what is farther has nearly the horizon's colour
+_HIGH = 100.0  # [m] that haze reaches at most: it lies low, so the sky shines through
 _FEW = 0.01  # share of a picture that must be so far for its colour to count
 
 
@@ -37,7 +38,7 @@ class Haze:
             depth: z-depth [m], shape (height, width).
             lengths: Of the pixels' rays where z = 1, shape (height, width).
         """
-        distance = depth * lengths
+        distance = np.minimum(depth * lengths, np.float32(_HIGH))
         if self._airlight is None:
             self._airlight = np.minimum(self._gain * _horizon(rgb, distance), np.float32(1.0))
         kept = np.exp(-self._extinction * distance)[..., None]

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from twin.cores import cores
 from twin.env.camera_effects import CameraEffects, rolled_off
-from twin.env.haze import Haze
 from twin.env.light import FieldLight, Light
 from twin.env.obstacle_view import Drawn, ObstacleView, camera_intrinsics, camera_pose
 from twin.env.obstacles import route_of
 from twin.env.shadow import Shadows
+from twin.env.weather import Weather
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.baked import BakedField
@@ -63,14 +63,13 @@ class Overlay:
         self._route, self._shaded, self._lock = route_of(model), shaded, threading.Lock()
         self._lights = FieldLight(field, self._route) if shaded and self._shadows.bodies else None
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
-        self._lengths = np.linalg.norm(self._rays, axis=-1).astype(np.float32)
 
     def render(
         self,
         datas: Sequence[mujoco.MjData],
         lighting: Lighting | Sequence[Lighting],
         effects: Sequence[CameraEffects] | None = None,
-        air: Sequence[Haze | None] = (),
+        weather: Sequence[Weather | None] = (),
     ) -> Rendering:
         """What the front camera of every world sees.
 
@@ -79,7 +78,7 @@ class Overlay:
                 (`mj_forward` or `mj_kinematics` and `mj_camlight` after the last step; `HuskyPhysics.seen`).
             lighting: As `BakedField.render` takes it: one, or one per world.
             effects: What the camera of each world adds, where it is not perfect.
-            air: What it looks through in each world, where that is not clear.
+            weather: Of each world, where it is another than the film's.
 
         Raises:
             InputError: an unknown lighting, or more worlds than stated.
@@ -101,9 +100,9 @@ class Overlay:
             paint(0)
         else:
             list(self._pool.map(paint, range(len(self._painters))))
-        for k, haze in enumerate(air):
-            if haze:
-                out.rgb[k] = haze.over(out.rgb[k], out.depth[k], self._lengths)
+        for k, sky in enumerate(weather):
+            if sky:
+                out.rgb[k] = sky.over(out.rgb[k], out.depth[k], self._rays, poses[k])
         for k, effect in enumerate(effects or ()):
             out.rgb[k] = effect.exposed(out.rgb[k], out.depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return out

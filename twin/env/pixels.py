@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from twin.env.camera_effects import CameraEffects
 from twin.env.dm_physics import DrivePhysics
-from twin.env.haze import Haze
 from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.options import SIMULATOR, Options
 from twin.env.overlay import Overlay
 from twin.env.simulator_view import SimulatorView
-from twin.env.tasks import CAMERA, LIGHT, Drive
+from twin.env.tasks import CAMERA, LIGHT, SHADE, Drive
 from twin.env.trust import Trust
+from twin.env.weather import Weather
 from twin.nerf.baked import BakedField
 
 Picture = NDArray[np.uint8]
@@ -51,7 +51,7 @@ class Pixels:
         """Shape (n, stack, 3, height, width): colours first, as networks want them."""
         self.lights: list[Light | None] = [None] * len(self.worlds)
         self._effects: list[CameraEffects | None] = [None] * len(self.worlds)
-        self._air: list[Haze | None] = [None] * len(self.worlds)
+        self._weather: list[Weather | None] = [None] * len(self.worlds)
         self.trust = np.zeros(len(self.worlds))
         """Of each world's newest picture, in [0, 1], shape (n,)."""
 
@@ -65,7 +65,7 @@ class Pixels:
                 self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
             if o.camera:
                 self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
-            self._air[i] = Haze(task.draw.extinction, task.draw.airlight) if task.draw.extinction else None
+            self._weather[i] = Weather(task.draw, task.rng(SHADE)) if o.randomise else None
         if len(which):
             self.stacks[list(which)] = self._look(which)[:, None]
 
@@ -85,7 +85,7 @@ class Pixels:
         seen, poses = [one.seen for one in physics], np.array([one.camera_to_world for one in physics])
         lights = [self.lights[i].at(data.time) for i, data in zip(which, seen, strict=True)]  # type: ignore[union-attr]
         effects = [self._effects[i] for i in which] if self.options.camera else None
-        air = [self._air[i] for i in which]
-        out = self._overlay.render(seen, lights, effects, air)  # type: ignore[arg-type]
+        weather = [self._weather[i] for i in which]
+        out = self._overlay.render(seen, lights, effects, weather)  # type: ignore[arg-type]
         self.trust[list(which)] = self._trust.of(poses, out)
         return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

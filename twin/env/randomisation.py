@@ -1,7 +1,8 @@
-"""What differs from episode to episode: the robot, the air, and things beside the corridor.
+"""What differs from episode to episode: the robot, the air, shadows, and things beside the corridor.
 
-Of the robot tyre friction, payload, latency, camera pose and wheel radius differ; the air is hazy (see `haze.py`); and
-*bystanders*, things where nothing is driven, stand as if they had been moved there.
+Of the robot tyre friction, payload, latency, camera pose and wheel radius differ; the air is hazy (see `haze.py`);
+shadows lie where the film had none (see `shade.py`); and *bystanders*, things where nothing is driven, stand as if they
+had been moved there.
 
 *Ranges* say how far each may be from what was built and filmed; a *draw* is what one episode got, every value uniform
 in its range and independent of the others. What is the robot's is applied to the episode's own copy of the model.
@@ -46,6 +47,8 @@ class Ranges:
     """Of the air [1/m], added to the film's; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
     """How bright the haze is, as a share of the sky at the horizon."""
+    shade: Range = (0.0, 0.75)
+    """Share of a colour that is lost where shadows lie that the film did not have."""
     bystanders: Range = (0, 4)
     """Things beside the corridor: cones, boxes, bollards in any colour."""
 
@@ -56,7 +59,7 @@ class Ranges:
         for name in ("friction", "wheel_radius"):
             if not getattr(self, name)[0] > 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected more than 0")
-        for name in ("payload", "latency", "extinction", "airlight", "bystanders"):
+        for name in ("payload", "latency", "extinction", "airlight", "shade", "bystanders"):
             if not getattr(self, name)[0] >= 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
 
@@ -71,6 +74,7 @@ class Ranges:
             wheel_radius=float(rng.uniform(*self.wheel_radius)),
             extinction=float(rng.uniform(*self.extinction)),
             airlight=float(rng.uniform(*self.airlight)),
+            shade=float(rng.uniform(*self.shade)),
             bystanders=int(rng.integers(round(self.bystanders[0]), round(self.bystanders[1]) + 1)),
         )
 
@@ -87,6 +91,7 @@ class Draw:
     wheel_radius: float = 1.0
     extinction: float = 0.0
     airlight: float = 1.0
+    shade: float = 0.0
     bystanders: int = 0
 
     def record(self) -> dict[str, Any]:

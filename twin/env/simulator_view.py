@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from twin.cores import cores
 from twin.env.camera_effects import CameraEffects
-from twin.env.haze import Haze
 from twin.env.obstacle_shapes import OBSTACLE_GROUP
 from twin.env.obstacle_view import camera_intrinsics, camera_pose
+from twin.env.weather import Weather
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.mjcf.husky import ROBOT_GROUP
 from twin.mjcf.husky_look import camera_parts
@@ -45,7 +45,6 @@ class SimulatorView:
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
-        self._lengths = np.linalg.norm(self._rays, axis=-1).astype(np.float32)
         model = copy.copy(model)
         model.geom_group[camera_parts(model, self._camera)] = ROBOT_GROUP  # which is not looked at
         # One after the other, as Warp compiles kernels when they are first used.
@@ -57,7 +56,7 @@ class SimulatorView:
         datas: Sequence[mujoco.MjData],
         lighting: Any = None,
         effects: Sequence[CameraEffects] | None = None,
-        air: Sequence[Haze | None] = (),
+        weather: Sequence[Weather | None] = (),
     ) -> Rendering:
         """What the front camera of every world sees; arguments as in `Overlay.render`, the lighting has no effect."""
         poses = np.stack([camera_pose(data, self._camera) for data in datas])
@@ -72,9 +71,10 @@ class SimulatorView:
                 rgb[k], depth[k] = self._painters[number].draw(datas[k], poses[k])
 
         list(self._pool.map(paint, range(len(self._painters))))
-        for k, haze in enumerate(air):
-            if haze:
-                rgb[k] = haze.over(rgb[k], np.where(depth[k] > 0.0, depth[k], np.float32(FAR)), self._lengths)
+        for k, sky in enumerate(weather):
+            if sky:
+                far = np.where(depth[k] > 0.0, depth[k], np.float32(FAR))
+                rgb[k] = sky.over(rgb[k], far, self._rays, poses[k])
         for k, effect in enumerate(effects or ()):
             rgb[k] = effect.exposed(rgb[k], depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return Rendering(rgb, depth, (depth > 0.0).astype(np.float32))

@@ -100,7 +100,7 @@ class TrainConfig:
         # And where only leaving the road costs, it drives anywhere on it: beside the kerb one surprise is enough.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step)
-        ranges = Ranges() if self.varies else Ranges(extinction=(0.0, 0.0), bystanders=(0, 0))
+        ranges = Ranges() if self.varies else Ranges(extinction=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
         lit = {"lighting": self.lighting, "observe": self.observe, "randomise": ranges if self.randomise else None}
         return {**dataclasses.asdict(self.control), **lit, "rewards": rewards}
 

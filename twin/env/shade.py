@@ -1,0 +1,71 @@
+"""Shadows that the film did not have, such as another sun throws: dark patches that lie in the place and stay there.
+
+What throws them is not there. A *pattern* of light and dark, drawn for an episode, fills the plane z = 0 and is carried
+through space along the rays of a sun, drawn too, so that ground, kerbs and walls are crossed by it as by a shadow. The
+lower the sun, the longer the patches; some are broken up, as those of leaves are.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+_SIDE = 256  # texels of a pattern, which repeats itself
+_TEXEL = 0.1  # [m] across the sun's direction
+_BLOBS = (0.4, 2.0)  # [m] smallest and largest radius of patches
+_LEAVES = 0.15  # [m] of the holes in broken ones
+_SUN = (10.0, 55.0)  # [°] elevation
+_COVER = (0.2, 0.6)  # share of the plane in the dark
+_REACH = 40.0  # [m] of depth up to which patches are seen
+_SKY = np.array([1.0, 0.95, 0.85], np.float32)  # what is left in a shadow is the sky's light, which is bluer
+
+
+class Shade:
+    """The shadows of one episode."""
+
+    def __init__(self, strength: float, rng: np.random.Generator) -> None:
+        """
+        Args:
+            strength: Share of a colour that is lost in full shadow.
+            rng: Of the episode.
+        """
+        elevation, azimuth = np.deg2rad(rng.uniform(*_SUN)), rng.uniform(0.0, 2.0 * np.pi)
+        along = np.array([np.cos(azimuth), np.sin(azimuth)])
+        self._slant = along / np.tan(elevation)
+        long = max(1.0, 1.0 / np.tan(elevation))
+        self._to_texel = np.stack([along / long, [-along[1], along[0]]]) / _TEXEL
+        self._loss: Floats = np.float32(strength) * _SKY
+        radius = np.exp(rng.uniform(*np.log(_BLOBS)))
+        self._pattern = _patches(rng, radius / _TEXEL, rng.uniform(*_COVER))
+        if rng.random() < 0.5:
+            self._pattern = self._pattern * _patches(rng, _LEAVES / _TEXEL, 0.6)
+
+    def over(self, rgb: Floats, depth: Floats, rays: Array, pose: Array) -> Floats:
+        """A picture with the shadows in it.
+
+        Args:
+            rgb: Shape (height, width, 3).
+            depth: z-depth [m], shape (height, width).
+            rays: Of the pixels, in the camera, with z = 1, shape (height, width, 3).
+            pose: camera_to_world, OpenCV axes, shape (4, 4).
+        """
+        points = (rays * np.minimum(depth, _REACH)[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+        flat = points[..., :2] - points[..., 2:] * self._slant
+        across, down = np.moveaxis(flat @ self._to_texel.T % _SIDE, -1, 0).astype(np.float32)
+        dark = cv2.remap(self._pattern, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32)
+        dark[depth >= _REACH] = 0.0
+        return rgb * (np.float32(1.0) - dark[..., None] * self._loss)
+
+
+def _patches(rng: np.random.Generator, radius: float, cover: float) -> Floats:
+    """A pattern, 1 in the dark, of patches of about a radius [texels] that cover a share of it; shape (side, side)."""
+    # Smoothed as on a torus, so that it repeats itself without a seam.
+    frequency = np.fft.fftfreq(_SIDE)[:, None] ** 2 + np.fft.rfftfreq(_SIDE) ** 2
+    smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)
+    noise = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(_SIDE, _SIDE))) * smooth, (_SIDE, _SIDE))
+    noise /= noise.std()
+    # An edge as wide as a third of the patch's radius is as soft as a tree's at some metres.
+    edge = 0.15
+    return np.clip((noise - np.quantile(noise, 1.0 - cover)) / edge + 0.5, 0.0, 1.0).astype(np.float32)
