@@ -4,8 +4,9 @@
 
 films reality and builds its twin in SCENE (unless that is done), trains the three setups on both tasks, validates
 every policy in the twin under held-out lightings, as filmed and with all else drawn anew, drives them in reality under
-weather that neither has seen, and forecasts. Every step is a command of `twin`, goes on where it was cut off, and adds to what is there: the same call
-with more seeds keeps all runs. `results.json` beside this file holds every run. Setups, sizes, checkpoints: `plan.py`.
+weather that neither has seen, and forecasts. Every step is a command of `twin`, goes on where it was cut off, and adds
+to what is there: the same call with more seeds keeps all runs. `results.json` beside this file holds every run. Setups,
+sizes, checkpoints: `plan.py`.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from plan import EPISODES, SETUPS, STEPS, TASKS, TRIALS, Run, runs
+from plan import EPISODES, LIGHTINGS, SETUPS, STEPS, TASKS, TRIALS, Run, runs
 from results import collect, table
 
 STAGES = ("train", "validate", "real", "forecast")
@@ -44,10 +45,12 @@ def train(scene: Path, run: Run) -> None:
 
 
 def validate(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
-    policies = [str(path) for run in every if run.task == task for path in _policies(scene, run)]
-    if policies:
-        options = ("--lightings", "held-out", "--episodes", str(EPISODES), "--processes", str(jobs))
-        verb("twin.validate", scene, "--task", TASKS[task], "--policy", *policies, *options)
+    mine = [_policies(scene, run) for run in every if run.task == task]
+    finals, checkpoints = [final for final, *_ in mine], [path for _, *rest in mine for path in rest]
+    for which, policies in (("final", finals), ("checkpoint", checkpoints)):
+        if policies:
+            options = ("--lightings", *LIGHTINGS[which], "--episodes", str(EPISODES), "--processes", str(jobs))
+            verb("twin.validate", scene, "--task", TASKS[task], "--policy", *policies, *options)
 
 
 def real(scene: Path, run: Run) -> None:

@@ -6,10 +6,12 @@ from typing import Any
 
 from plan import PAPER, SETUPS, TASKS, Run
 
+from twin.config import RANDOMISED
 from twin.report.statistics import wilson
 from twin.report.trials import RECENT, Trial, read_trials
 from twin.scene import read_json
 
+_JUDGED = ("validate", "validate_randomised", "real")
 FORECAST = (
     "pearson",
     "spearman",
@@ -39,13 +41,14 @@ def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
 
 def table(results: dict[str, Any]) -> str:
     """The paper's table with ours beside it, in Markdown; finished policies of all seeds together."""
-    lines = ["| | | straight: train / validate / real | right turn: train / validate / real |", "|---|---|---|---|"]
+    told = "train / validate / (ours: the same, randomised) / real"
+    lines = [f"| | | straight: {told} | right turn: {told} |", "|---|---|---|---|"]
     for setup in SETUPS:
         lines.append(f"| paper | {setup} | " + " | ".join(_numbers(PAPER[setup, task]) for task in TASKS) + " |")
         ours = []
         for task in TASKS:
             some = [r for r in results["runs"] if r["finished"] and (r["setup"], r["task"]) == (setup, TASKS[task])]
-            parts = [[r["train"] for r in some], *([r["policies"][0][k] for r in some] for k in ("validate", "real"))]
+            parts = [[r["train"] for r in some], *([r["policies"][0][k] for r in some] for k in _JUDGED)]
             ours.append(" / ".join(_together(part) for part in parts) + f" ({len(some)} runs)")
         lines.append(f"| ours | {setup} | " + " | ".join(ours) + " |")
     return "\n".join(lines)
@@ -80,7 +83,9 @@ def _training(folder: Path) -> dict[str, Any]:
 
 def _judged(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
     out: dict[str, Any] = {"policy": name}
-    for where, trials in (("validate", twin), ("real", real)):
+    drawn = [trial for trial in twin if trial.lighting.endswith(RANDOMISED)]
+    plain = [trial for trial in twin if not trial.lighting.endswith(RANDOMISED)]
+    for where, trials in zip(_JUDGED, (plain, drawn, real), strict=True):
         mine = [trial for trial in trials if trial.policy == name]
         out[where] = _rate([trial.success for trial in mine]) | {
             "by_lighting": {
