@@ -232,6 +232,28 @@ def test_starts_are_spread_as_stated(scene):
     assert np.allclose(along, 0.5, atol=0.1)
 
 
+def test_every_second_episode_may_start_on_the_way(scene):
+    plain = twin.load(scene, "route", pixels=False)
+    environment = twin.load(scene, "route", pixels=False, start_along=0.6)
+    length = environment.task.stretch.length
+    starts = []
+    for seed in range(80):
+        for one in (plain, environment):
+            one.task.seed(seed)
+            one.reset()
+        info = environment.task.info(environment.physics)
+        starts.append(info["start"])
+        assert info["progress"] == pytest.approx(info["start"], abs=0.1)
+        assert abs(info["cross_track"]) < 0.32 and environment.task.cause == ""
+        if not info["start"]:
+            np.testing.assert_array_equal(environment.physics.planar_pose, plain.physics.planar_pose)
+    share = np.array(starts) / length
+    assert 0.35 < (share == 0.0).mean() < 0.65
+    assert 0.5 < share.max() <= 0.6 and np.std(share[share > 0.0]) > 0.1
+    with pytest.raises(InputError, match="start_along"):
+        twin.load(scene, "route", pixels=False, start_along=1.0)
+
+
 def test_light_and_robot_do_not_move_the_start(scene):
     """Two policies, or two lightings, can be compared on the same episodes."""
     poses = []

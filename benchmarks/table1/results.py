@@ -8,6 +8,7 @@ from plan import PAPER, SETUPS, TASKS, Run
 
 from twin.config import RANDOMISED
 from twin.report.statistics import wilson
+from twin.report.training import read_episodes
 from twin.report.trials import RECENT, Trial, read_trials
 from twin.scene import read_json
 
@@ -69,15 +70,14 @@ def _together(parts: list[dict[str, Any]]) -> str:
 def _training(folder: Path) -> dict[str, Any]:
     with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
-    with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
-        episodes = [row["success"] == "1" for row in csv.DictReader(file)]
+    success = read_episodes(folder)[1]
     return {
         "steps": int(last["step"]),
         "updates": int(last["updates"]),
         "wall_s": float(last["wall_s"]),
         "memory_mb": float(last["memory_mb"]),
-        "episodes": len(episodes),
-        "train": _rate(episodes[-RECENT:]),
+        "whole_episodes": len(success),
+        "train": _rate((success[-RECENT:] == 1).tolist()),
     }
 
 

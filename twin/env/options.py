@@ -64,6 +64,8 @@ class Options:
     """The robot starts beside the route by a distance uniform within ± this [m]..."""
     start_heading: float = 10.0
     """... and turned away from its heading by an angle uniform within ± this [°]."""
+    start_along: float = 0.0
+    """Every second episode starts on the way instead, uniform up to this share of the stretch."""
     observe: str = NERF
     """nerf: pictures of the field; simulator: MuJoCo's own of the extracted mesh, in its own light."""
     lighting: str | Sequence[str] = TRAINING
@@ -117,6 +119,8 @@ def parse_options(given: dict[str, Any]) -> Options:
     for name in ("start_offset", "start_heading"):
         if not getattr(options, name) >= 0.0:
             raise InputError(f"{name} = {getattr(options, name)}; expected at least 0")
+    if not 0.0 <= options.start_along < 1.0:
+        raise InputError(f"start_along = {options.start_along}; expected 0 or more, and less than 1")
     if options.obstacles != "scene" and isinstance(options.obstacles, str):
         raise InputError(f"obstacles = {options.obstacles!r}; expected 'scene', a number, or ObstacleConfigs")
     if len(options.size) != 2 or min(options.size) < 8:

@@ -75,6 +75,7 @@ class Drive(control.Task):
         """Of the episode under way."""
         self.cause = ""
         """Why the episode ended; empty while it goes on."""
+        self._began = stretch.start
 
     def seed(self, seed: int | None) -> None:
         """Starts another sequence of episodes."""
@@ -106,7 +107,7 @@ class Drive(control.Task):
                 "move the obstacle or the start"
             )
         self.cause, self._stood = "", 0.0
-        foot, self.cross_track = nearest(self._route, physics.planar_pose[:2], self._around(self.stretch.start))
+        foot, self.cross_track = nearest(self._route, physics.planar_pose[:2], self._around(self._began))
         self._foot = self._before = float(foot)
         self._last_moved = physics.planar_pose[:2]
 
@@ -179,6 +180,7 @@ class Drive(control.Task):
         return {
             "cause": self.cause,
             "is_success": self.cause == "goal",
+            "start": self._began - self.stretch.start,
             "progress": self.progress,
             "cross_track": float(self.cross_track),
             "speed": physics.speed,
@@ -195,9 +197,11 @@ class Drive(control.Task):
 
     def _start(self, rng: np.random.Generator) -> tuple[float, float, float]:
         """x, y [m] and yaw [rad]."""
-        o, s = self.options, self.stretch.start
+        o = self.options
         offset = rng.uniform(-o.start_offset, o.start_offset)
         turn = np.deg2rad(rng.uniform(-o.start_heading, o.start_heading))
+        on_the_way = max(0.0, rng.uniform(-1.0, 1.0)) if o.start_along else 0.0
+        s = self._began = self.stretch.start + on_the_way * o.start_along * self.stretch.length
         heading = float(heading_at(self._route, s))
         x, y = point_at(self._route, s) + offset * np.array([-np.sin(heading), np.cos(heading)])
         return float(x), float(y), heading + float(turn)

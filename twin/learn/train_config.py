@@ -35,6 +35,9 @@ class TrainConfig:
     """[rad/s]"""
     centring: float = 1.0
     """Share of what a step is worth that is lost at the corridor's edge; none on the route."""
+    start_along: float = 0.9
+    """Every second episode starts on the way, beside the route and askew, up to this share of the stretch: else a
+    policy that has learnt to stay in the middle never sees again how to get back there."""
     randomise: bool = True
     """Another robot in every episode; and where the lighting varies, hazy air and bystanders, too."""
     pool: int = 2
@@ -102,7 +105,7 @@ class TrainConfig:
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step)
         ranges = Ranges() if self.varies else Ranges(extinction=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
         lit = {"lighting": self.lighting, "observe": self.observe, "randomise": ranges if self.randomise else None}
-        return {**dataclasses.asdict(self.control), **lit, "rewards": rewards}
+        return {**dataclasses.asdict(self.control), **lit, "rewards": rewards, "start_along": self.start_along}
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -44,7 +44,7 @@ from twin.loading import Twin
 from twin.report.trials import RECENT, csv_text
 from twin.scene import read_json, write_json, write_text
 
-EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward")
+EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m")
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
 _LEAST_RATE = 0.1  # of the learning rate, at the end
 _SEEDS = 6  # with a run's seed and its resumptions so far, what worlds draw from; none drives what another drove
@@ -82,7 +82,7 @@ class Progress:
 
     steps: int
     recent: tuple[bool, ...]
-    """Success of the last episodes, `RECENT` at most."""
+    """Success of the last episodes from the beginning of the stretch, `RECENT` at most."""
 
 
 def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progress], None] | None = None) -> None:
@@ -241,12 +241,13 @@ class _Keeper(BaseCallback):
     def _on_step(self) -> bool:
         rows = []
         for info in (one for one in self.locals["infos"] if "episode" in one):
-            self._recent = [*self._recent, info["is_success"]][-RECENT:]
+            if not info["start"]:
+                self._recent = [*self._recent, info["is_success"]][-RECENT:]
             rows.append(
                 (
                     *(self.model.num_timesteps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"]),
                     *(int(info["is_success"]), info["cause"], f"{info['progress']:.2f}"),
-                    *(info["episode"]["l"], f"{info['episode']['r']:.3f}"),
+                    *(info["episode"]["l"], f"{info['episode']['r']:.3f}", f"{info['start']:.2f}"),
                 )
             )
         _append(self._folder / "episodes.csv", rows)
@@ -305,11 +306,14 @@ def _append(path: Path, rows: list[tuple]) -> None:
 
 
 def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
-    """Makes a table, or drops what was written after the save; the successes of what is kept."""
+    """Makes a table, or drops what was written after the save; the successes of whole episodes among what is kept."""
     rows: list[list[str]] = []
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
             # A line that was being written when the training was killed is not whole.
             rows = [row for row in list(csv.reader(file))[1:] if len(row) == len(columns) and int(row[0]) <= steps]
     write_text(path, csv_text(columns, rows))
-    return [row[columns.index("success")] == "1" for row in rows] if "success" in columns else []
+    if "success" not in columns:
+        return []
+    success, start = columns.index("success"), columns.index("start_m")
+    return [row[success] == "1" for row in rows if float(row[start]) == 0.0]

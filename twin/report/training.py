@@ -52,9 +52,13 @@ def trainings(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def read_episodes(folder: Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Of a run: the steps at which episodes ended, ascending, and success, 0 or 1; both of shape (n,)."""
+    """Of a run: the steps at which episodes ended, ascending, and success, 0 or 1; both of shape (n,).
+
+    Episodes that started on the way are left out, as they are easier.
+    """
     with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
-        rows = [(int(row["step"]), int(row["success"])) for row in csv.DictReader(file)]
+        whole = [row for row in csv.DictReader(file) if float(row.get("start_m") or 0.0) == 0.0]  # of before: none
+    rows = [(int(row["step"]), int(row["success"])) for row in whole]
     steps, success = np.array(rows, np.int64).reshape(-1, 2).T
     return steps, success
 
