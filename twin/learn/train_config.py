@@ -25,7 +25,7 @@ class TrainConfig:
     lighting: str = TRAINING
     """See `env/lightings.py`; the default varies between episodes."""
     seed: int = 0
-    steps: int = 60_000
+    steps: int = 12_000
     worlds: int = 8
     action: str = STEERING
     """steering (at `speed`) or twist."""
