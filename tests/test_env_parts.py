@@ -252,12 +252,15 @@ def test_randomised_episodes_have_hazy_air_and_bystanders(scene):
     assert task.obstacles == ()
     hazy, task = first(extinction=(0.2, 0.2))
     assert hazy.std() < 0.9 * clear.std() and task.draw.record()["extinction"] == pytest.approx(0.2)
+    wide = twin.load(scene, "ahead", 0, pixels=False, half_width=3.0, randomise=Ranges(bystanders=(4, 4)))
+    wide.reset()
+    assert all(abs(one.lateral) > 3.6 for one in wide.task.obstacles)
     shaded, _ = first(extinction=(0.0, 0.0), shade=(0.6, 0.6))
     assert (shaded <= clear).all() and (shaded < clear).any()
     differ = []
     for seed in range(4):  # not all of them are in view of the first picture
         crowded, task = first(seed, extinction=(0.0, 0.0), bystanders=(4, 4))
-        assert len(task.obstacles) == 4
+        assert len(task.obstacles) == 4 and all(one.name.startswith("beside_") and one.color for one in task.obstacles)
         differ.append(not np.array_equal(crowded, first(seed, extinction=(0.0, 0.0))[0]))
     assert any(differ)
     rng = np.random.default_rng(0)

@@ -208,7 +208,8 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
         assert cell.twin_key == (cell.policy, "straight", "held-out+randomised")
     before = out.with_name("results_trials.csv").read_text()
     third = max(t.seed for t in trials if t.lighting == "rain") + 1
-    drive.run([left], "straight", ["rain"], 3, out, films=tmp_path / "films")
+    drive.run([left], "straight", ["rain"], 3, out, "sun", films=tmp_path / "films")
+    assert {cell.twin_lighting for cell in read_results(out, twin)} == {"held-out+randomised"}  # as it was before
     assert [film.name for film in (tmp_path / "films").iterdir()] == [f"left_straight_rain_{third}.mp4"]
     after = out.with_name("results_trials.csv").read_text()
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1

@@ -24,6 +24,7 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import progress, train
+from twin.env.randomisation import Ranges
 from twin.errors import InputError
 from twin.learn.architecture import Architecture, levelled, prepared
 from twin.learn.policy import load_policy, save_policy
@@ -31,6 +32,10 @@ from twin.learn.replay import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.state import load_state, save_state
 from twin.learn.train_config import TrainConfig
+from twin.learn.training import EPISODE_COLUMNS, _check_same, _keep_rows
+from twin.report.training import read_episodes
+from twin.report.trials import csv_text
+from twin.scene import write_json
 
 SIZE = (32, 18)
 TINY = Architecture(SIZE, 2, 2, ((8, 5, 3),), 16, (32, 32), 1)
@@ -350,3 +355,31 @@ def test_arriving_is_worth_what_surviving_for_ever_would_be():
     for_ever = sum(rewards.step * config.gamma**k for k in range(2000))
     assert rewards.step + rewards.goal == pytest.approx(for_ever)
     assert (rewards.collision, rewards.out_of_bounds) == (-4.0, -5.0)
+
+
+def test_episodes_that_began_on_the_way_do_not_count(tmp_path):
+    some = [("8", 1, "0.00"), ("16", 0, "7.50"), ("24", 0, "0.00"), ("32", 1, "0.10"), ("40", 1, "0.00")]
+    rows = [[step, "1.0", "7", "training", str(won), "goal", "3.0", "8", "1.0", start] for step, won, start in some]
+    (tmp_path / "episodes.csv").write_text(csv_text(EPISODE_COLUMNS, rows))
+    steps, success = read_episodes(tmp_path)
+    assert steps.tolist() == [8, 24, 40] and success.tolist() == [1, 0, 1]
+    assert _keep_rows(tmp_path / "episodes.csv", EPISODE_COLUMNS, 32) == [True, False]
+    assert (tmp_path / "episodes.csv").read_text().count("\n") == 5  # all that was driven is kept
+    before = [row[:-1] for row in rows]  # as trainings of before wrote them
+    (tmp_path / "episodes.csv").write_text(csv_text(EPISODE_COLUMNS[:-1], before))
+    assert read_episodes(tmp_path)[1].tolist() == [1, 0, 0, 1, 1]
+
+
+def test_a_run_of_an_earlier_version_is_told_to_be_one(tmp_path):
+    write_json(tmp_path / "config.json", {"road": "x", "steps": 8})
+    with pytest.raises(InputError, match="by an earlier version, which had no centring; give another --run"):
+        _check_same(tmp_path, {"road": "x", "steps": 8, "centring": 1.0})
+    _check_same(tmp_path, {"road": "x", "steps": 9})
+
+
+def test_setups_vary_what_they_say():
+    varied, day = TrainConfig().options(), TrainConfig(lighting="day").options()
+    assert varied["randomise"] == Ranges() and TrainConfig(randomise=False).options()["randomise"] is None
+    assert day["randomise"] == Ranges(extinction=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
+    assert TrainConfig(observe="simulator").options()["randomise"] == day["randomise"]
+    assert varied["rewards"].cross_track == -varied["rewards"].step and varied["start_along"] > 0.0

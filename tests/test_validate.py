@@ -13,7 +13,7 @@ from tiny_twin import tiny_twin
 
 from twin import load_scene, progress, validate
 from twin.env.randomisation import Ranges, asked
-from twin.env.suite import Stage
+from twin.env.suite import Stage, fingerprint
 from twin.errors import InputError
 from twin.learn import judging
 from twin.learn.judging import Chunk, campaign, drawn_light, drive
@@ -86,12 +86,13 @@ def run(scene: Path, *policies: str, lightings=("day", "night"), episodes=5) -> 
     return (scene / "validation" / "episodes.csv").read_text()
 
 
-def test_randomised_episodes_begin_like_the_others_with_another_robot(scene):
+def test_randomised_episodes_are_others_and_repeat(scene):
     seeds = range(6)
     plain, drawn = drive(chunk(scene, seeds)), drive(chunk(scene, seeds, "day+randomised"))
     assert [one.seed for one in drawn] == list(seeds)
     assert [one.progress for one in plain] != [one.progress for one in drawn]
     assert drive(chunk(scene, [2], "day+randomised")) == [drawn[2]]
+    assert fingerprint(load_scene(scene), "ahead", "day") != fingerprint(load_scene(scene), "ahead", "day+randomised")
     assert drive(chunk(scene, seeds)) == plain
     stage = Stage.open(scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")})
     assert stage.options.lighting == "day" and stage.options.randomise == Ranges()

@@ -121,6 +121,8 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for name in stage.config:
         section, _, key = name.partition(".")
         settings[name] = table[section][key] if key else table[section]
+    if not settings.get("nerf", {}).get("refine_cameras", True):
+        del settings["nerf"]["refine_cameras"]  # came later: without it a field is what it was before
     return {
         "stage": stage.name,
         "version": stage.version,

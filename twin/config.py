@@ -11,9 +11,9 @@ from twin.robot import HuskyParams
 TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 """Said where a lighting's name could be: one drawn at random, as `twin/env/lightings.py` has it."""
 RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
+"""So no lighting may be called so."""
 RANDOMISED = "+randomised"
 """Ends the name of a lighting in tables: driven in that light, and all else drawn for every episode, too."""
-"""So no lighting may be called so."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,9 @@ class NerfConfig:
     max_width: int = 480
     """Images are trained at this longer side [px]."""
     refine_cameras: bool = False
-    """Let the frames move a little while training, for cameras that are worth less than the pictures. Only the field is
-    trained so: all else keeps the cameras of structure from motion."""
+    """Let the frames move a little while training, for cameras that are worth less than the pictures. The field and its
+    scores are of the moved cameras; pictures in the report and photos of `twin.relight` keep those of structure from
+    motion, and so are off by what `field.cameras_moved` in the report says."""
     learning_rate: float = 3e-2
     appearance_dim: int = 32
     levels: int = 8

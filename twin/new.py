@@ -178,7 +178,7 @@ def _posed_files(film: Path) -> tuple[Path, list[Path]]:
 def _lighting(path: Path, kind: str) -> str:
     """A lighting's name for a path under `input/`: that of the film, or of the root of a posed image set."""
     name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
-    name = name.replace(":", "_").replace("/", "_").removesuffix(RANDOMISED)
+    name = name.replace(":", "_").replace("/", "_").replace(RANDOMISED, RANDOMISED.replace("+", "_"))
     return f"{name}_light" if name in RESERVED_LIGHTINGS else name
 
 

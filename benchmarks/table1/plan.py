@@ -60,8 +60,13 @@ class Run:
         return [some[-1] for some in picked if some]
 
     def finished(self, scene: Path) -> bool:
-        path = self.folder(scene) / "policy.json"
-        return path.exists() and read_json(path)["trained"]["step"] >= STEPS[self.task]
+        path, steps = self.folder(scene), STEPS[self.task]
+        if not (path / "policy.json").exists():
+            return False
+        asked, done = read_json(path / "config.json")["steps"], read_json(path / "policy.json")["trained"]["step"]
+        if asked != steps:  # the learning rate falls by the steps asked for: a longer run is another training
+            raise SystemExit(f"{path} is a run of {asked} steps, not of {steps}; move it away")
+        return done >= steps
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:

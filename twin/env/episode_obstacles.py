@@ -3,7 +3,7 @@
 A compiled model cannot gain bodies, so for random obstacles it holds a *pool*: as many of every kind as there may be.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import mujoco
@@ -32,34 +32,42 @@ class EpisodeObstacles:
         self._count = wanted if isinstance(wanted, int) else 0
         self._given = () if isinstance(wanted, int) else tuple(wanted)
         self._beside = beside
+        self._colors = np.random.default_rng(_COLORS).uniform(0.05, 0.9, (len(STANDING), beside, 3))
         s = np.append(np.arange(stretch.start, stretch.end, _STEP), stretch.end)
         self._along, self._start = replace(world, route=point_at(world.route, s)), stretch.start
 
     @property
     def pool(self) -> tuple[ObstacleConfig, ...]:
         """What the model must hold."""
-        colors = np.random.default_rng(_COLORS).uniform(0.05, 0.9, (len(STANDING), self._beside, 3))
-        drawn = [ObstacleConfig(f"{kind}_{k}", kind) for kind in STANDING for k in range(self._count)]
-        drawn += [
-            ObstacleConfig(f"beside_{kind}_{k}", kind, color=tuple(colors[j, k].tolist()))
-            for j, kind in enumerate(STANDING)
-            for k in range(self._beside)
-        ]
-        return (*self._given, *drawn)
+        standing = [_standing(kind, k) for kind in STANDING for k in range(self._count)]
+        return (*self._given, *standing, *(self._bystander(kind, k) for kind in STANDING for k in range(self._beside)))
 
     def draw(self, rng: np.random.Generator, beside: int = 0) -> tuple[ObstacleConfig, ...]:
         """Those of one episode, with so many beside the corridor."""
-        out = self._named(random_obstacles(self._along, rng, self._count), "") if self._count else []
-        out += self._named(bystanders(self._along, rng, beside), "beside_") if beside else []
-        return (*self._given, *out)
+        standing = random_obstacles(self._along, rng, self._count) if self._count else ()
+        return (
+            *self._given,
+            *self._placed(standing, _standing),
+            *self._placed(bystanders(self._along, rng, beside), self._bystander),
+        )
 
-    def _named(self, drawn: Sequence[ObstacleConfig], prefix: str) -> list[ObstacleConfig]:
-        """By the names they have in the pool."""
+    def _placed(
+        self, drawn: Sequence[ObstacleConfig], of_pool: Callable[[str, int], ObstacleConfig]
+    ) -> list[ObstacleConfig]:
+        """Those of the pool where others were drawn."""
         out: list[ObstacleConfig] = []
         for one in drawn:
-            number = sum(other.kind == one.kind for other in out)
-            out.append(replace(one, name=f"{prefix}{one.kind}_{number}", station=one.station + self._start))
+            mine = of_pool(one.kind, sum(other.kind == one.kind for other in out))
+            out.append(replace(mine, station=one.station + self._start, lateral=one.lateral, yaw=one.yaw))
         return out
+
+    def _bystander(self, kind: str, number: int) -> ObstacleConfig:
+        color = self._colors[STANDING.index(kind), number]
+        return ObstacleConfig(f"beside_{kind}_{number}", kind, color=tuple(color.tolist()))
+
+
+def _standing(kind: str, number: int) -> ObstacleConfig:
+    return ObstacleConfig(f"{kind}_{number}", kind)
 
 
 class Surroundings:

@@ -5,8 +5,9 @@
 
 Actions are in [-1, 1], which spans what the dm_control environment allows in metres and radians. Observations are
 pictures, uint8, (3 · stack, height, width), the newest three channels last; with `pixels=False` the driver's state.
-`info` says `cause` (why the episode ended, or nothing), `is_success`, `progress` [m], `cross_track` [m], `lighting`,
-`trust`, `randomisation`, `episode_seed`, `speed` [m/s], `touched`.
+`info` says `cause` (why the episode ended, or nothing), `is_success`, `progress` [m], `start` [m] (how far along
+the stretch it began), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed` [m/s] and
+`touched`.
 """
 
 from collections.abc import Sequence

@@ -29,6 +29,7 @@ _ROBOT_HALF_WIDTH = 0.34  # [m]
 _PASSAGE = 0.15  # [m] that a robot has to spare beside a random obstacle
 _BESIDE = 0.5  # [m] beyond the corridor's edge at which random obstacles still stand
 _TRIES = 20  # draws for a bystander
+_ROBOT_RADIUS = 0.6  # [m] from its base to the farthest corner
 _STRIP = 2.5  # [m] beside the corridor in which bystanders stand
 _CLEAR_ENDS = (4.0, 3.0)  # [m] of the route's start and end that random obstacles leave free
 _SPACING = 4.0  # [m] of the route between random obstacles, if there is room
@@ -201,12 +202,12 @@ def bystanders(
     length = float(arc_lengths(world.route)[-1])
     for k in range(count):
         kind = str(rng.choice(list(kinds)))
-        nearest = world.half_width + _ROBOT_HALF_WIDTH + _PASSAGE + RADIUS[kind]
+        nearest = world.half_width + _ROBOT_RADIUS + RADIUS[kind]
         for _ in range(_TRIES):
             station = float(rng.uniform(0.0, length))
             lateral = float(rng.uniform(nearest, nearest + _STRIP) * rng.choice([-1.0, 1.0]))
             # Inside a bend, what is beside one part of the route may be on another.
-            if np.linalg.norm(route - _spot(route, station, lateral), axis=1).min() >= nearest - _PASSAGE:
+            if np.linalg.norm(route - _spot(route, station, lateral), axis=1).min() >= nearest:
                 out.append(ObstacleConfig(f"random_{k}", kind, station, lateral, float(rng.uniform(-180.0, 180.0))))
                 break
     return tuple(out)

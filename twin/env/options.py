@@ -77,7 +77,8 @@ class Options:
     camera: CameraOptions | None = None
     """What makes the camera imperfect: vibration, exposure, blur. None: nothing."""
     randomise: Ranges | None = None
-    """How far the robot differs from episode to episode; None: it does not. `True` stands for the default ranges."""
+    """How far robot, weather and bystanders differ from episode to episode; None: they do not. `True` stands for the
+    default ranges."""
 
 
 def parse_options(given: dict[str, Any]) -> Options:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import RANDOMISED
 from twin.env.camera_effects import CameraEffects
 from twin.env.dm_physics import DrivePhysics
 from twin.env.lightings import Light, LightSets, draw_light
@@ -76,9 +77,10 @@ class Pixels:
             self.stacks[index] = np.concatenate([self.stacks[index][:, 1:], self._look(which)[:, None]], 1)
 
     def info(self, i: int) -> dict[str, Any]:
-        """What is to be told of world i's picture: `lighting`, `trust`."""
+        """What is to be told of world i's picture: `lighting`, as tables name it, and `trust`."""
         light = self.lights[i]
-        return {"lighting": light.name if light else "", "trust": float(self.trust[i])}
+        name = light.name + (RANDOMISED if self.options.randomise else "") if light else ""
+        return {"lighting": name, "trust": float(self.trust[i])}
 
     def _look(self, which: Sequence[int]) -> Picture:
         physics = [self.worlds[i][0] for i in which]

@@ -23,6 +23,7 @@ from twin.env.obstacles import add_obstacles
 from twin.env.options import NERF, Options, parse_options
 from twin.env.overlay import Overlay
 from twin.env.pixels import Pixels
+from twin.env.randomisation import Ranges
 from twin.env.scene_model import episode_spec
 from twin.env.simulator_view import SimulatorView
 from twin.env.stretches import Stretch, find_task
@@ -60,8 +61,9 @@ class Stage:
         stretch = find_task(task, world, config.task)
         wanted = config.obstacle if isinstance(parsed.obstacles, str) else parsed.obstacles
         beside = round(parsed.randomise.bystanders[1]) if parsed.randomise else 0
-        obstacles = EpisodeObstacles(wanted, world, stretch, beside)
-        spec = episode_spec(world, stretch.start, stretch.end, parsed.half_width or world.half_width)
+        half_width = parsed.half_width or world.half_width
+        obstacles = EpisodeObstacles(wanted, dataclasses.replace(world, half_width=half_width), stretch, beside)
+        spec = episode_spec(world, stretch.start, stretch.end, half_width)
         add_obstacles(spec, obstacles.pool, world)
         trust = Trust(twin.cameras()) if parsed.pixels else None
         field = twin.field() if parsed.pixels and parsed.observe == NERF else None
@@ -88,19 +90,21 @@ class Stage:
 def fingerprint(twin: Twin, task: str, lighting: str) -> str:
     """What decides an episode besides its seed and who drives, as a digest.
 
-    That is the field, the MJCF scene with its robot, the task's stretch, the obstacles of `scene.toml`, and lightings
-    from photos that `lighting` names.
+    That is the field, the MJCF scene with its robot, the task's stretch, the obstacles of `scene.toml`, lightings from
+    photos that `lighting` names, and what is drawn where it ends in `+randomised`.
 
     Raises:
         InputError: as `Stage.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
+    drawn = dataclasses.asdict(Ranges()) if lighting.endswith(RANDOMISED) else {}
     photos = [twin.scene.lightings / f"{name}.json" for name in lighting.removesuffix(RANDOMISED).split(":")]
     return digest_json(
         {
             "stages": [read_json(twin.scene.stamp(stage))["result"] for stage in ("field", "mjcf")],
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
+            **({"randomise": drawn} if drawn else {}),
             "photos": [digest_file(path) for path in photos if path.exists()],
         }
     )

@@ -31,6 +31,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from twin.config import RANDOMISED
 from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.learn.architecture import prepared
@@ -99,7 +100,7 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
     Raises:
         InputError: the run is another, or damaged; or what `twin.load` raises.
     """
-    road = fingerprint(twin, config.task, config.lighting)
+    road = fingerprint(twin, config.task, config.lighting + (RANDOMISED if config.randomise else ""))
     said = _as_json({**dataclasses.asdict(config), "road": road})
     go_on = has_state(folder / "state")
     if go_on:
@@ -180,7 +181,10 @@ def _as_json(said: dict[str, Any]) -> dict[str, Any]:
 def _check_same(folder: Path, said: dict[str, Any]) -> None:
     """Refuses another config for a run that is there."""
     there = read_json(folder / "config.json")
-    if there.get("road") != said["road"]:
+    new = [name for name in said if name not in there]
+    if new:
+        raise InputError(f"{folder} was trained by an earlier version, which had no {new[0]}; give another --run")
+    if there["road"] != said["road"]:
         raise InputError(
             f"{folder} was trained before the scene was built anew, or its task or obstacles changed; "
             "give another --run"

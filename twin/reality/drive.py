@@ -5,6 +5,7 @@ goes back. Trials have seeds: the k-th trial in a weather starts from the same p
 every policy, so that policies can be compared pair by pair.
 """
 
+import csv
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -129,7 +130,7 @@ def run(
         trials: Per policy and lighting.
         out: Gets the results as `twin.forecast` reads them; `<name>_trials.csv` beside it gets a row per trial, and
             `<name>_policies.json` the sums of the files that were driven with.
-        twin_lighting: Goes into the results' column of this name.
+        twin_lighting: Goes into the results' column of this name, in rows that are new.
         films: Gets a film of every trial, of what the robot saw.
 
     Returns:
@@ -181,9 +182,14 @@ def _key(trial: Trial) -> tuple[str, str, str]:
 
 
 def _write(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) -> None:
+    compared: dict[tuple[str, str, str], str] = {}  # what a cell was compared with before, it still is
+    if out.exists():
+        with out.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                compared[row["policy"], row["task"], row["lighting"]] = row["twin_lighting"]
     rows = [
-        (cell.policy, cell.lighting, str(cell.trials), str(cell.successes), cell.task, twin_lighting)
-        for cell in tally(trials)
+        (c.policy, c.lighting, str(c.trials), str(c.successes), c.task, compared.get(c.key, twin_lighting))
+        for c in tally(trials)
     ]
     for path, text in (
         (table, csv_text(EPISODE_COLUMNS, [trial.row() for trial in trials])),

@@ -153,7 +153,8 @@ def unknowns(forecast: Forecast) -> list[Caution]:
     out.append(
         Caution(
             f"How the policies do in light that is not like {listing(sorted(lightings))}.",
-            "validate under held-out+randomised, film the place in that light, or add a photo with twin.relight.",
+            "validate under further ones (any, mixtures, +randomised), film the place in that light, or add a photo "
+            "with twin.relight.",
         )
     )
     for task in forecast.tasks:
@@ -171,7 +172,8 @@ def unknowns(forecast: Forecast) -> list[Caution]:
             out.append(Caution(what, "drive all of them under the same ones; the rates mix policy with light."))
     out.append(
         Caution(
-            "What the twin does not have: other traffic, weather, wet ground, and whatever changed since the films.",
+            "What the twin does not have: other traffic, wet ground, weather but for haze and shadows, and whatever "
+            "else changed since the films.",
             "only real trials tell; spread them over days.",
         )
     )

@@ -29,8 +29,8 @@ CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "lo
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
 """That `results.csv` must have."""
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting")
-RECENT = 50
-"""Episodes that a success rate in training is taken over; a training on a CPU has some 150."""
+RECENT = 20
+"""Whole episodes that a success rate in training is taken over; a training on a CPU has some 40."""
 
 _VALIDATE = "python -m twin.validate"
 

@@ -107,8 +107,8 @@ def _cells(said: dict[str, Any]) -> Html:
         _lead(
             "An episode is one drive, from a start drawn at random to the goal or to a failure. All policies drive the "
             f"same episodes. Brackets are {said['confidence']:.0%} intervals: how far chance alone may have moved the "
-            "rate. “In training” is success over the last 50 episodes before the policy was saved, in which it also "
-            "tried things out, so that it may do better here; one that does much worse has learnt its training by "
+            "rate. “In training” is success over the last 20 whole episodes before the policy was saved, in which it "
+            "also tried things out, so that it may do better here; one that does much worse has learnt its training by "
             "heart."
         )
     ]
@@ -278,8 +278,8 @@ def _curves(said: dict[str, Any], curves: Sequence[Curve]) -> list[Section]:
         saved = [t["step"] for t in said["training"].values() if t["run"] == curve.run]
         charts.append(_chart(curve.run, svg(draw.along_training(curve.steps, curve.success, sorted(saved)))))
     lead = (
-        "Success over the steps of training, in the episodes that the policy learnt from, with 90% intervals. Dashed "
-        "lines are where the policies were saved that are validated here."
+        "Success over the steps of training, in the episodes from start to goal that the policy learnt from, with 90% "
+        "intervals. Dashed lines are where the policies were saved that are validated here."
     )
     return [("training", "How they were trained", join(_lead(lead), element("div", *charts, class_="charts")))]
 
