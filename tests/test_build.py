@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from twin import build as verb
-from twin.config import MjcfConfig, SceneConfig, SourceConfig
+from twin.config import MjcfConfig, NerfConfig, SceneConfig, SourceConfig
 from twin.scene import SceneDir
 from twin.stamp import Stamp
 
@@ -91,6 +91,16 @@ def test_a_field_is_made_anew_where_a_drive_becomes_none():
         for mjcf in (MjcfConfig(), MjcfConfig(route=False), MjcfConfig(half_width=2.0))
     )
     assert drive != object_filmed and drive == wider
+
+
+def test_refinement_makes_a_field_anew_and_fields_of_before_stay():
+    (stage,) = (one for one in verb.PIPELINE if one.name == "field")
+    stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
+    plain, refined = (
+        verb._depends(stage, SceneConfig(nerf=NerfConfig(refine_cameras=on)), {}, stamps) for on in (False, True)
+    )
+    assert "refine_cameras" not in plain["config"]["nerf"]  # as keys were before there was such a setting
+    assert verb.key_of(plain) != verb.key_of(refined)
 
 
 def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):

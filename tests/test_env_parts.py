@@ -16,19 +16,16 @@ from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.audit import EVENTS, Findings, Seen, audit
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
-from twin.env.haze import Haze
 from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.physics import HuskyPhysics
 from twin.env.randomisation import Draw, Nominal, Ranges
 from twin.env.scene_model import episode_spec
-from twin.env.shade import Shade
 from twin.env.stretches import find_task, tasks
 from twin.env.suite import Stage
-from twin.env.tasks import Drive
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.film import main
-from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
+from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
@@ -190,81 +187,6 @@ def test_ranges_that_make_no_sense_are_refused():
     for ranges in (*wrong, {"bystanders": (-1, 2)}):
         with pytest.raises(InputError):
             Ranges(**ranges)
-
-
-def test_haze_hides_by_distance_and_spares_what_is_near():
-    depth = np.array([[1000.0, 1000.0], [20.0, 2.0]], np.float32)
-    rgb = np.array([[[0.8] * 3, [0.6] * 3], [[0.1] * 3, [0.1] * 3]], np.float32)
-    lengths = np.full((2, 2), 1.5, np.float32)
-    np.testing.assert_array_equal(Haze(0.0).over(rgb, depth, lengths), rgb)
-    hazy = Haze(0.05).over(rgb, depth, lengths)
-    np.testing.assert_allclose(hazy[0], 0.7, atol=1e-3)  # the horizon, whose mean is the airlight
-    for column, metres in ((0, 30.0), (1, 3.0)):
-        kept = np.exp(-0.05 * metres)
-        np.testing.assert_allclose(hazy[1, column], kept * 0.1 + (1 - kept) * 0.7, rtol=1e-5)
-    np.testing.assert_allclose(Haze(0.05, 0.5).over(rgb, depth, lengths)[0], 0.35, atol=4e-3)
-    air = Haze(0.05)
-    air.over(rgb, depth, lengths)
-    np.testing.assert_allclose(air.over(0.0 * rgb, depth, lengths)[0], 0.7, atol=6e-3)  # that of the first picture
-    near = np.ones_like(depth)
-    np.testing.assert_allclose(Haze(1e3).over(rgb, near, lengths)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
-
-
-def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
-    intrinsics = np.array([20.0, 20.0, 16.0, 12.0])
-    rays = unproject(pixel_grid(32, 24), intrinsics)
-    rgb = np.ones((24, 32, 3), np.float32)
-
-    def seen(shade: Shade, x: float) -> tuple[np.ndarray, np.ndarray]:
-        """A camera that looks straight down on z = 0 from 2 m: how light it is, and where."""
-        pose = np.diag([1.0, -1.0, -1.0, 1.0])
-        pose[:3, 3] = x, 0.0, 2.0
-        depth = np.full((24, 32), 2.0, np.float32)
-        return shade.over(rgb, depth, rays, pose), (rays * 2.0)[..., 0] + x
-
-    covers = []
-    for seed in range(30):
-        shade = Shade(0.5, np.random.default_rng(seed))
-        light, x = seen(shade, 0.0)
-        assert light.min() >= 0.5 and light.max() <= 1.0
-        moved, there = seen(shade, 0.5)  # five pixels further
-        np.testing.assert_allclose(there[:, :-5], x[:, 5:], atol=1e-9)
-        np.testing.assert_allclose(moved[:, :-5], light[:, 5:], atol=1e-4)
-        covers.append(float((light[..., 0] < 0.75).mean()))
-        np.testing.assert_array_equal(
-            Shade(0.5, np.random.default_rng(seed)).over(rgb, x * 0 + 1e3, rays, np.eye(4)), rgb
-        )
-    assert 0.1 < np.mean(covers) < 0.6 and np.std(covers) > 0.1
-
-
-def test_randomised_episodes_have_hazy_air_and_bystanders(scene):
-    still = dict.fromkeys(("friction", "wheel_radius", "airlight"), (1.0, 1.0))
-    still |= dict.fromkeys(("payload", "latency", "camera_shift", "camera_turn", "shade", "bystanders"), (0.0, 0.0))
-
-    def first(seed: int = 3, **ranges) -> tuple[np.ndarray, Drive]:
-        environment = twin.load(scene, "ahead", seed, lighting="day", **SMALL, randomise=Ranges(**(still | ranges)))
-        step = environment.reset()
-        return step.observation["pixels"][-1].astype(float), environment.task
-
-    clear, task = first(extinction=(0.0, 0.0))
-    plain = twin.load(scene, "ahead", 3, lighting="day", **SMALL).reset().observation["pixels"][-1]
-    np.testing.assert_array_equal(clear, plain)
-    assert task.obstacles == ()
-    hazy, task = first(extinction=(0.2, 0.2))
-    assert hazy.std() < 0.9 * clear.std() and task.draw.record()["extinction"] == pytest.approx(0.2)
-    wide = twin.load(scene, "ahead", 0, pixels=False, half_width=3.0, randomise=Ranges(bystanders=(4, 4)))
-    wide.reset()
-    assert all(abs(one.lateral) > 3.6 for one in wide.task.obstacles)
-    shaded, _ = first(extinction=(0.0, 0.0), shade=(0.6, 0.6))
-    assert (shaded <= clear).all() and (shaded < clear).any()
-    differ = []
-    for seed in range(4):  # not all of them are in view of the first picture
-        crowded, task = first(seed, extinction=(0.0, 0.0), bystanders=(4, 4))
-        assert len(task.obstacles) == 4 and all(one.name.startswith("beside_") and one.color for one in task.obstacles)
-        differ.append(not np.array_equal(crowded, first(seed, extinction=(0.0, 0.0))[0]))
-    assert any(differ)
-    rng = np.random.default_rng(0)
-    assert {Ranges(bystanders=(0, 3)).draw(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
 
 
 # ---- the model of an episode

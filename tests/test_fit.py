@@ -20,7 +20,8 @@ from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
 from twin.nerf.evaluate import evaluate, fit_embedding
 from twin.nerf.field import RadianceField
-from twin.nerf.fit import Trainer, bending, fit, free_segments
+from twin.nerf.fit import Trainer, fit, free_segments
+from twin.nerf.losses import bending
 from twin.nerf.stage import constant_height, run
 from twin.nerf.workspace import CameraArrays
 from twin.progress import set_quiet

@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
         "--randomise",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="another robot in every episode and, where the lighting varies, haze and bystanders (the default)",
+        help="another robot in every episode and, where the lighting varies, weather and bystanders (the default)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
     return parser

@@ -57,7 +57,8 @@ def read_episodes(folder: Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     Episodes that started on the way are left out, as they are easier.
     """
     with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
-        whole = [row for row in csv.DictReader(file) if float(row.get("start_m") or 0.0) == 0.0]  # of before: none
+        # Runs of before have no such column: all their episodes were whole.
+        whole = [row for row in csv.DictReader(file) if float(row.get("start_m") or 0.0) == 0.0]
     rows = [(int(row["step"]), int(row["success"])) for row in whole]
     steps, success = np.array(rows, np.int64).reshape(-1, 2).T
     return steps, success

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from twin.report import validation_figures as draw
 from twin.report.figures import svg
 from twin.report.markup import Html, caution, data_url, document, element, join, picture, table
+from twin.report.trials import RECENT
 from twin.report.validation_words import (
     FAILURES,
     LUCK,
@@ -107,9 +108,9 @@ def _cells(said: dict[str, Any]) -> Html:
         _lead(
             "An episode is one drive, from a start drawn at random to the goal or to a failure. All policies drive the "
             f"same episodes. Brackets are {said['confidence']:.0%} intervals: how far chance alone may have moved the "
-            "rate. “In training” is success over the last 20 whole episodes before the policy was saved, in which it "
-            "also tried things out, so that it may do better here; one that does much worse has learnt its training by "
-            "heart."
+            f"rate. “In training” is success over the last {RECENT} whole episodes before the policy was saved, in "
+            "which it also tried things out, so that it may do better here; one that does much worse has learnt its "
+            "training by heart."
         )
     ]
     for task in tasks(said):
