@@ -204,6 +204,24 @@ def test_every_cause_ends_an_episode_with_its_reward_and_discount(scene, tmp_pat
     }
 
 
+@pytest.mark.parametrize("action, act", [("twist", [1.0, 0.25]), ("steering", [0.25])])
+def test_steering_and_being_off_the_route_cost_what_is_said(scene, action, act):
+    """A quarter of the way to one side of [-0.5, 0.5] rad/s is half of what can be asked for."""
+    terms = {"step": 1.0, "steering": -0.5, "cross_track": -0.2}
+    options = {"pixels": False, "action": action, "yaw_rate": 0.5, "rewards": terms, "start_offset": 0.3}
+    environment = twin.load(scene, "bend", seed=0, **options)
+    environment.reset()
+    for sign in (1.0, -1.0):
+        asked = np.array(act) * ([1.0] * (len(act) - 1) + [sign])
+        reward = environment.step(asked).reward
+        off = abs(float(environment.task.cross_track)) / environment.task.half_width
+        assert off > 0.01
+        assert reward == pytest.approx(1.0 - 0.5 * 0.5**2 - 0.2 * off)
+    straight = environment.step(np.array([*act[:-1], 0.0])).reward
+    off = abs(float(environment.task.cross_track)) / environment.task.half_width
+    assert straight == pytest.approx(1.0 - 0.2 * off)
+
+
 def test_a_driver_told_the_poses_arrives_and_a_blind_one_does_not(scene):
     environment = twin.load(scene, "bend", pixels=False, randomise=True)
     causes = []

@@ -24,6 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         try:
             from twin.learn import training
+            from twin.learn.choosing import choose
             from twin.learn.train_config import PRESETS, TrainConfig
         except ImportError as error:
             raise InputError(f"training needs more: pip install .[learn] ({error})") from None
@@ -46,7 +47,9 @@ def main(arguments: list[str] | None = None) -> int:
                         f"success {sum(now.recent)}/{len(now.recent)} ({low:.2f} to {high:.2f})", refresh=False
                     )
 
-            training.train(load_scene(given.scene), folder, config, watch)
+            twin = load_scene(given.scene)
+            training.train(twin, folder, config, watch)
+        chosen = choose(twin, folder, config)["chosen"]
         picture = success_curve(folder)
     except (InputError, OSError) as error:
         return refuse(error)
@@ -54,7 +57,12 @@ def main(arguments: list[str] | None = None) -> int:
         print("stopped; the same command goes on from here", file=sys.stderr)
         return 130
     if not given.quiet:
-        print(f"{folder}: policy after {config.steps} steps; success along the training: {picture}")
+        won, trials = chosen["successes"], chosen["trials"]
+        low, high = wilson(won, trials)
+        print(
+            f"{folder}: the policy of step {chosen['step']}, which without exploring arrives in {won} of {trials} "
+            f"episodes like those of the training ({low:.2f} to {high:.2f}); success along it: {picture}"
+        )
     return 0
 
 
@@ -70,6 +78,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--steps", type=int, help="control steps of all worlds together")
     parser.add_argument("--worlds", type=int, help="how many are driven at once")
     parser.add_argument("--updates", type=float, help="of the networks per step")
+    parser.add_argument("--steering", type=float, help="share of a step's worth that full steering costs")
+    parser.add_argument("--entropy", type=float, help="of an action [nat]")
     parser.add_argument("--colours", type=float, help="strength of random weather in updates; 1 where lighting varies")
     parser.add_argument("--seed", type=int, help="of everything drawn")
     parser.add_argument(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from twin.config import HELD_OUT, RANDOMISED
 from twin.report.statistics import MIN_TRIALS
+from twin.report.training import CHOICE
 from twin.scene import read_json
 
 TASKS = {"straight": "straight", "right": "right_turn"}
@@ -61,12 +62,12 @@ class Run:
 
     def finished(self, scene: Path) -> bool:
         path, steps = self.folder(scene), STEPS[self.task]
-        if not (path / "policy.json").exists():
+        if not (path / "config.json").exists():
             return False
-        asked, done = read_json(path / "config.json")["steps"], read_json(path / "policy.json")["trained"]["step"]
+        asked = read_json(path / "config.json")["steps"]
         if asked != steps:  # the learning rate falls by the steps asked for: a longer run is another training
             raise SystemExit(f"{path} is a run of {asked} steps, not of {steps}; move it away")
-        return done >= steps
+        return (path / CHOICE).exists()
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:

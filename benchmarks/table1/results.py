@@ -8,7 +8,7 @@ from plan import PAPER, SETUPS, TASKS, Run
 
 from twin.config import RANDOMISED
 from twin.report.statistics import wilson
-from twin.report.training import read_episodes
+from twin.report.training import CHOICE, read_episodes
 from twin.report.trials import RECENT, Trial, read_trials
 from twin.scene import read_json
 
@@ -77,7 +77,8 @@ def _training(folder: Path) -> dict[str, Any]:
         "wall_s": float(last["wall_s"]),
         "memory_mb": float(last["memory_mb"]),
         "whole_episodes": len(success),
-        "train": _rate((success[-RECENT:] == 1).tolist()),
+        "exploring": _rate((success[-RECENT:] == 1).tolist()),
+        "train": read_json(folder / CHOICE)["chosen"] if (folder / CHOICE).exists() else _rate([]),
     }
 
 

@@ -35,6 +35,8 @@ class Rewards:
     """Per metre along the route, backwards negative."""
     cross_track: float = 0.0
     """Per step, times the distance from the route as a share of the corridor's half width; negative punishes."""
+    steering: float = 0.0
+    """Per step, times the square of the yaw rate asked for as a share of the largest; negative punishes."""
 
 
 @dataclass(frozen=True)

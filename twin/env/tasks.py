@@ -106,13 +106,14 @@ class Drive(control.Task):
                 f"task {self.stretch.name!r}: the robot touches {', '.join(physics.touched)} wherever it starts; "
                 "move the obstacle or the start"
             )
-        self.cause, self._stood = "", 0.0
+        self.cause, self._stood, self._steering = "", 0.0, 0.0
         foot, self.cross_track = nearest(self._route, physics.planar_pose[:2], self._around(self._began))
         self._foot = self._before = float(foot)
         self._last_moved = physics.planar_pose[:2]
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
         action = np.clip(np.asarray(action, float), *self._bounds())
+        self._steering = float(action[-1]) / self.options.yaw_rate
         if self.options.action == STEERING:
             physics.robot.command(self.options.speed, float(action[0]))
         else:
@@ -132,7 +133,8 @@ class Drive(control.Task):
         if self.cause in ("", "goal"):
             reward += terms.step
         off = min(1.0, abs(float(self.cross_track)) / self.half_width)
-        return float(reward + terms.progress * (self._foot - self._before) + terms.cross_track * off)
+        reward += terms.progress * (self._foot - self._before) + terms.cross_track * off
+        return float(reward + terms.steering * self._steering**2)
 
     def get_termination(self, physics: DrivePhysics) -> float | None:
         if not self.cause:

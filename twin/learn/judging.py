@@ -7,7 +7,7 @@ meets the same start, robot and light. So policies are compared on the same epis
 
 import dataclasses
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -54,6 +54,8 @@ class Driven:
     steps: int
     trust: float
     """Mean over its pictures."""
+    reward: float
+    """Sum."""
 
 
 def drive(chunk: Chunk) -> list[Driven]:
@@ -62,31 +64,47 @@ def drive(chunk: Chunk) -> list[Driven]:
     Raises:
         InputError: the policy, scene, task or lighting is not to be had.
     """
-    policy = _policy(chunk.source, chunk.trust)
     worlds = _worlds(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting)
+    return episodes(_policy(chunk.source, chunk.trust), worlds, chunk.seeds)
+
+
+def episodes(
+    policy: Policy, worlds: Worlds, seeds: Sequence[int], watch: Callable[[], object] = lambda: None
+) -> list[Driven]:
+    """Drives an episode of every seed, as many at once as there are worlds; in the order of the seeds.
+
+    Args:
+        policy: What drives.
+        worlds: With pictures; what they are at is dropped.
+        seeds: Of the episodes.
+        watch: Is called when an episode has ended.
+    """
     assert worlds.pixels is not None
-    waiting = list(range(len(chunk.seeds)))
+    waiting = list(range(len(seeds)))
     driving: dict[int, int] = {}  # world → number of its episode
-    trusts: list[list[float]] = [[] for _ in chunk.seeds]
+    trusts: list[list[float]] = [[] for _ in seeds]
+    rewards = np.zeros(len(seeds))
     done: dict[int, Driven] = {}
     while waiting or driving:
         free = [i for i in range(len(worlds)) if i not in driving][: len(waiting)]
         for i in free:
             driving[i] = waiting.pop(0)
-            worlds.seed(i, chunk.seeds[driving[i]])
+            worlds.seed(i, seeds[driving[i]])
         worlds.begin(free)
         which = sorted(driving)
         for i in which:
             trusts[driving[i]].append(float(worlds.pixels.trust[i]))
         pictures = worlds.observation()
         # One by one: in a batch the sums are done in another order, and the last bit decides who meets the kerb.
-        over = worlds.step(np.stack([policy(pictures[i]) for i in which]), which).over
-        for i in [i for i, ended in zip(which, over, strict=True) if ended]:
+        out = worlds.step(np.stack([policy(pictures[i]) for i in which]), which)
+        rewards[[driving[i] for i in which]] += out.reward
+        for i in [i for i, ended in zip(which, out.over, strict=True) if ended]:
             number, info = driving.pop(i), worlds.info(i)
             seen = trusts[number]
-            outcome = info["cause"], info["progress"], len(seen), float(np.mean(seen))
-            done[number] = Driven(chunk.seeds[number], *outcome)
-    return [done[number] for number in range(len(chunk.seeds))]
+            outcome = info["cause"], info["progress"], len(seen), float(np.mean(seen)), float(rewards[number])
+            done[number] = Driven(seeds[number], *outcome)
+            watch()
+    return [done[number] for number in range(len(seeds))]
 
 
 def campaign(chunks: Sequence[Chunk], processes: int = 1) -> Iterator[list[Driven]]:

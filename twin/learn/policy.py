@@ -16,6 +16,7 @@ of these files can run code, except where the user says that a file is to be tru
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,6 +144,13 @@ def save_policy(
     (folder / ONNX).write_bytes(onnx_bytes(architecture, weights, {_NOTE: note}))
     sums = {"weights_sha256": digest_file(folder / WEIGHTS)}
     write_json(folder / JSON, {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained})
+
+
+def copy_policy(source: Path, folder: Path) -> None:
+    """Puts a policy folder's files in the place of another's; policy.json comes last, as in `save_policy`."""
+    (folder / JSON).unlink(missing_ok=True)
+    for name in (WEIGHTS, ONNX, JSON):
+        shutil.copyfile(source / name, folder / name)
 
 
 def find_policy(root: Path, source: str) -> str:

@@ -35,6 +35,10 @@ class TrainConfig:
     """[rad/s]"""
     centring: float = 1.0
     """Share of what a step is worth that is lost at the corridor's edge; none on the route."""
+    steering: float = 0.5
+    """Share of what a step is worth that is lost by steering as hard as can be."""
+    entropy: float = -1.0
+    """Of an action, that is aimed at [nat]; -1 is a spread of 0.09 of the largest, 0 of 0.24."""
     start_along: float = 0.9
     """Every second episode starts on the way, beside the route and askew, up to this share of the stretch: else a
     policy that has learnt to stay in the middle never sees again how to get back there."""
@@ -65,13 +69,15 @@ class TrainConfig:
     lighting and the simulator's pictures are learnt as they are."""
     checkpoints: int = 20
     """Policies kept along the way."""
+    trials: int = 12
+    """Episodes that each of the last policies drives without exploring, to choose the best; see `choosing.py`."""
     save_every: int = 4_000
     """Steps between two saves of everything."""
     device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Raises InputError: a number out of range, or lights that are kept for validation."""
-        for name, least in (("seed", 0), ("steps", 1), ("worlds", 1), ("colours", 0)):
+        for name, least in (("seed", 0), ("steps", 1), ("worlds", 1), ("trials", 1), ("colours", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} = {getattr(self, name)}; expected {least} or more")
         if self.updates <= 0:
@@ -102,7 +108,7 @@ class TrainConfig:
         # learns to linger before the goal, and rather leaves the road there than to arrive.
         # And where only leaving the road costs, it drives anywhere on it: beside the kerb one surprise is enough.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
-        rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step)
+        rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.varies else Ranges(extinction=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
         lit = {"lighting": self.lighting, "observe": self.observe, "randomise": ranges if self.randomise else None}
         return {**dataclasses.asdict(self.control), **lit, "rewards": rewards, "start_along": self.start_along}

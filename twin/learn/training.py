@@ -151,6 +151,7 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
         train_freq=1,
         gradient_steps=0,  # see `meanwhile`
         ent_coef="auto_0.1",
+        target_entropy=config.entropy,
         replay_buffer_class=FrameReplayBuffer,
         replay_buffer_kwargs={
             "file": pictures,

@@ -18,6 +18,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
+CHOICE = "choice.json"
+"""Of a run: what its last policies did without exploring, and which is the run's; see `learn/choosing.py`."""
 _BINS = 25
 
 
@@ -87,14 +89,29 @@ def draw_curve(axes: Axes, steps: NDArray[np.int64], success: NDArray[np.int64],
     axes.plot(step, won / count, ".-", color=colour, label=f"{len(steps)} episodes, {int(count[0])} a point")
 
 
+def _draw_choice(axes: Axes, choice: dict[str, Any]) -> None:
+    tried, chosen = choice["candidates"], choice["chosen"]
+    shares = [one["successes"] / one["trials"] for one in tried]
+    label = f"without exploring, {tried[0]['trials']} episodes each"
+    axes.plot([one["step"] for one in tried], shares, "o", color="#d95f02", fillstyle="none", label=label)
+    rate = chosen["successes"] / chosen["trials"]
+    low, high = wilson(chosen["successes"], chosen["trials"])
+    label = f"the chosen one, {chosen['trials']} more"
+    bars = [[rate - low], [high - rate]]
+    axes.errorbar(chosen["step"], rate, bars, fmt="o", color="#d95f02", capsize=3, label=label)
+
+
 def success_curve(folder: Path) -> Path:
-    """Draws `success.png` of a run: the rate of success over steps, with intervals of 90 %."""
+    """Draws `success.png` of a run: success over steps, with intervals of 90 %, and the choice at its end."""
     steps, success = read_episodes(folder)
     path = folder / "success.png"
     figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
     if len(steps):
         draw_curve(axes, steps, success, "#1f77b4")
-        axes.legend(loc="lower right", frameon=False)
+    if (folder / CHOICE).exists():
+        _draw_choice(axes, read_json(folder / CHOICE))
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper left", frameon=False, fontsize=8)
     axes.set(xlabel="steps of all worlds", ylabel="success in training", ylim=(-0.02, 1.02), xlim=(0, None))
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

@@ -1,0 +1,108 @@
+"""Of a training's late policies the one that drives best is the run's, whatever it was that came last."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+
+from test_training import SHORT
+from tiny_twin import tiny_twin
+
+import twin
+from twin import progress
+from twin.learn import choosing
+from twin.learn.judging import Driven, episodes
+from twin.learn.policy import load_policy
+from twin.learn.training import train
+from twin.report.training import CHOICE, success_curve
+
+CONFIG = replace(SHORT, steps=160, save_every=160, checkpoints=8, trials=3)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
+
+
+@pytest.fixture(scope="module")
+def run(scene, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    train(scene, folder, CONFIG)
+    return folder
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Episodes that end as is said: by step of the policy, how many arrive and what each earns."""
+    script: dict[int, tuple[int, float]] = {}
+    asked: list[tuple[int, tuple[int, ...]]] = []
+
+    def pretend(policy, worlds, seeds, watch):
+        step = policy.trained["step"]
+        asked.append((step, tuple(seeds)))
+        won, reward = script.get(step, (0, 0.0))
+        return [
+            Driven(seed, "goal" if i < won else "out_of_bounds", 1.0, 9, 1.0, reward) for i, seed in enumerate(seeds)
+        ]
+
+    monkeypatch.setattr(choosing, "episodes", pretend)
+    return script, asked
+
+
+def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
+    script, asked = scripted
+    (run / CHOICE).unlink(missing_ok=True)
+    script |= {120: (2, 1.0), 140: (2, 1.5), 160: (1, 9.0), 40: (3, 9.0)}
+    choice = choosing.choose(scene, run, CONFIG)
+    assert [one["step"] for one in choice["candidates"]] == [100, 120, 140, 160]  # of the second half
+    assert choice["chosen"]["step"] == 140  # of those with most successes, the one that earns most
+    for name in ("policy.json", "policy.safetensors", "policy.onnx"):
+        assert (run / name).read_bytes() == (run / "checkpoints" / "000000140" / name).read_bytes()
+    assert load_policy(run).trained["step"] == 140
+    shared = {seeds for _, seeds in asked[:-1]}
+    assert len(shared) == 1 and len(next(iter(shared))) == CONFIG.trials  # all drive the same episodes
+    step, fresh = asked[-1]
+    assert step == 140 and len(fresh) == choosing.FRESH and not set(fresh) & set(next(iter(shared)))
+    assert success_curve(run).exists()
+
+
+def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, scripted):
+    _, asked = scripted
+    (run / CHOICE).unlink(missing_ok=True)
+    first = choosing.choose(scene, run, CONFIG)
+    count = len(asked)
+    assert choosing.choose(scene, run, CONFIG) == first and len(asked) == count
+    assert json.loads((run / CHOICE).read_text()) == first
+    longer = replace(CONFIG, steps=200)
+    train(scene, run, longer)
+    assert choosing.choose(scene, run, longer)["steps"] == 200
+    assert [one["step"] for one in choosing.choose(scene, run, longer)["candidates"]][-1] == 200
+
+
+def test_candidates_are_few_and_the_last_is_one(tmp_path):
+    for step in range(1000, 21000, 1000):
+        (tmp_path / f"{step:09d}").mkdir()
+    found = [int(path.name) for path in choosing._candidates(tmp_path, 20_000)]
+    assert found == [12000, 14000, 16000, 18000, 20000]
+
+
+def test_they_drive_as_the_training_had_it_but_from_the_start(scene, run, monkeypatch):
+    """Whole episodes, in the training's light, and driven as often as they are asked for with the same end."""
+    seen = []
+
+    def spy(policy, worlds, seeds, watch):
+        seen.append((worlds.options.start_along, worlds.options.lighting, worlds.options.randomise))
+        driven = episodes(policy, worlds, seeds[:2], watch)
+        assert driven == episodes(policy, worlds, seeds[:2], watch)
+        assert all(np.isfinite(one.reward) and one.steps > 0 for one in driven)
+        return driven
+
+    (run / CHOICE).unlink(missing_ok=True)
+    monkeypatch.setattr(choosing, "episodes", spy)
+    choosing.choose(scene, run, CONFIG)
+    assert set(map(str, seen)) == {str((0.0, "day", CONFIG.options()["randomise"]))}
