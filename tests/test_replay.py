@@ -10,7 +10,7 @@ from gymnasium import spaces
 from twin.errors import InputError
 from twin.learn.replay import FrameReplayBuffer
 
-WORLDS, STACK, SIZE = 3, 4, (5, 7)
+WORLDS, STACK, SIZE, STATES = 3, 4, (5, 7), 2
 SPACE = spaces.Box(0, 255, (3 * STACK, *SIZE), np.uint8)
 ACTION = spaces.Box(-1, 1, (2,), np.float32)
 
@@ -23,6 +23,7 @@ class NaiveWorlds:
         self.observation = np.stack([self.first() for _ in range(WORLDS)])
         self.left = self.rng.integers(1, longest + 1, WORLDS)
         self.seen: list[list[tuple]] = [[] for _ in range(WORLDS)]
+        self.state = np.full((WORLDS, STATES), np.nan, np.float32)
 
     def first(self) -> np.ndarray:
         return np.tile(self.rng.integers(0, 256, (3, *SIZE), np.uint8), (STACK, 1, 1))
@@ -35,9 +36,15 @@ class NaiveWorlds:
         self.left -= 1
         done, cut = self.left == 0, self.rng.random(WORLDS) < 0.5
         infos = [{"TimeLimit.truncated": bool(d and c)} for d, c in zip(done, cut, strict=True)]
+        states, firsts = self.rng.normal(size=(2, WORLDS, STATES)).astype(np.float32)
+        for info, state, first in zip(infos, states, firsts, strict=True):
+            info |= {"state": state, "first_state": first}
         buffer.add(before, after, action, reward, done, infos)
         for i in range(WORLDS):
-            self.seen[i].append((before[i], after[i], action[i], np.float32(reward[i]), done[i] and not cut[i]))
+            end = done[i] and not cut[i]
+            told = self.state[i].copy(), states[i]
+            self.seen[i].append((before[i], after[i], action[i], np.float32(reward[i]), end, told))
+        self.state = np.where(done[:, None], firsts, states)
         self.observation = after.copy()
         for i in np.flatnonzero(done):
             self.observation[i], self.left[i] = self.first(), self.rng.integers(1, self.longest + 1)
@@ -52,12 +59,14 @@ def check(buffer: FrameReplayBuffer, worlds: NaiveWorlds) -> int:
             row = np.array([(buffer.pos - 1 - age) % buffer.buffer_size])
             if not buffer.whole(row, np.array([world]))[0]:
                 continue
-            before, after, action, reward, end = worlds.seen[world][total - 1 - age]
+            before, after, action, reward, end, state = worlds.seen[world][total - 1 - age]
             stacks = buffer.stacks(row, np.array([world]))
             np.testing.assert_array_equal(stacks[0][0], before)
             np.testing.assert_array_equal(stacks[1][0], after)
             np.testing.assert_array_equal(buffer.actions[row[0], world], action)
             assert buffer.rewards[row[0], world] == reward and buffer.ends[row[0], world] == end
+            np.testing.assert_array_equal(buffer.states[row[0], world], state[0])
+            np.testing.assert_array_equal(buffer.states_after[row[0], world], state[1])
             count += 1
     return count
 
@@ -65,7 +74,7 @@ def check(buffer: FrameReplayBuffer, worlds: NaiveWorlds) -> int:
 @pytest.mark.parametrize("longest", [1, 2, 6, 1000])
 @pytest.mark.parametrize("steps", [3, 40, 41, 137])
 def test_stacks_are_what_went_in(longest, steps):
-    buffer = FrameReplayBuffer(40 * WORLDS, SPACE, ACTION, "cpu", WORLDS)
+    buffer = FrameReplayBuffer(40 * WORLDS, SPACE, ACTION, "cpu", WORLDS, states=STATES)
     worlds = NaiveWorlds(longest, longest)
     for _ in range(steps):
         worlds.step(buffer)
@@ -75,7 +84,7 @@ def test_stacks_are_what_went_in(longest, steps):
 
 
 def test_samples_are_transitions_and_each_comes(tmp_path):
-    buffer = FrameReplayBuffer(10 * WORLDS, SPACE, ACTION, "cpu", WORLDS, seed=5)
+    buffer = FrameReplayBuffer(10 * WORLDS, SPACE, ACTION, "cpu", WORLDS, seed=5, states=STATES)
     worlds = NaiveWorlds(0, 4)
     for _ in range(33):
         worlds.step(buffer)
@@ -85,10 +94,12 @@ def test_samples_are_transitions_and_each_comes(tmp_path):
     sample = buffer.sample(2000)
     drawn = set()
     for k in range(2000):
-        before, after, action, reward, end = there[sample.actions[k].numpy().tobytes()]
+        before, after, action, reward, end, state = there[sample.actions[k].numpy().tobytes()]
         np.testing.assert_array_equal(sample.observations[k], before)
         np.testing.assert_array_equal(sample.next_observations[k], after)
         assert sample.rewards[k].item() == reward and sample.dones[k].item() == end
+        np.testing.assert_array_equal(sample.states[k], state[0])
+        np.testing.assert_array_equal(sample.next_states[k], state[1])
         drawn.add(action.tobytes())
     assert len(drawn) == check(buffer, worlds)
 
@@ -112,7 +123,7 @@ def test_shifted_samples_are_shifted_by_so_much_with_edges_repeated():
 def test_what_was_saved_is_there_after_more_was_written(tmp_path):
     slack = 7 * WORLDS
     settings = (20 * WORLDS, SPACE, ACTION, "cpu", WORLDS)
-    buffer = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack)
+    buffer = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack, states=STATES)
     worlds = NaiveWorlds(3, 3)
     for _ in range(50):
         worlds.step(buffer)
@@ -122,12 +133,13 @@ def test_what_was_saved_is_there_after_more_was_written(tmp_path):
     saved = [list(seen) for seen in worlds.seen]
     for _ in range(7):  # as many as the slack allows, and then it is killed
         worlds.step(buffer)
-    again = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack)
+    again = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack, states=STATES)
     again.set_state(arrays, rest)
     worlds.seen = saved
     assert check(again, worlds) == count
     # It goes on with new episodes.
     worlds.observation = np.stack([worlds.first() for _ in range(WORLDS)])
+    worlds.state[:] = np.nan
     for _ in range(30):
         worlds.step(again)
     check(again, worlds)

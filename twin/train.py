@@ -88,6 +88,12 @@ def _parser() -> argparse.ArgumentParser:
         default=None,
         help="another robot in every episode and, where the lighting varies, weather and bystanders (the default)",
     )
+    parser.add_argument(
+        "--privileged",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="critics are told where the robot is (the default); the policy never is",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
     return parser
 

@@ -116,7 +116,11 @@ class Worlds:
         if self.pixels:
             n, stack, three, height, width = self.pixels.stacks.shape
             return self.pixels.stacks.reshape(n, stack * three, height, width).copy()
-        return np.stack([np.concatenate(list(step.observation.values())) for step in self._steps])  # type: ignore[union-attr]
+        return np.stack([self.state(i) for i in range(len(self))])
+
+    def state(self, i: int) -> NDArray[np.float32]:
+        """What a driver of world i that knows the map would know, see `Drive.get_observation`; shape (k,)."""
+        return np.concatenate(list(self._steps[i].observation.values()))  # type: ignore[union-attr]
 
     def info(self, i: int) -> dict[str, Any]:
         """Of world i's episode so far, JSON-able."""

@@ -24,7 +24,7 @@ from twin.scene import read_json, write_json
 FRESH = 20
 """Episodes that the chosen one drives at the end."""
 
-_CANDIDATES = 5
+_CANDIDATES = 4
 _STREAM = 7  # with a run's seed, what the seeds of these episodes are drawn from
 
 

@@ -11,21 +11,32 @@ all it held then.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from twin.errors import InputError
 from twin.learn.colours import recoloured
 
 _SHORT = 8  # mean steps of an episode; shorter ones leave less than the whole buffer to draw from
-_ROWS = ("actions", "rewards", "ends", "newest", "age")
+_ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after")
+
+
+class Samples(NamedTuple):
+    """As stable-baselines3 has them, and the states."""
+
+    observations: torch.Tensor
+    actions: torch.Tensor
+    next_observations: torch.Tensor
+    dones: torch.Tensor
+    rewards: torch.Tensor
+    states: torch.Tensor
+    next_states: torch.Tensor
 
 
 class FrameReplayBuffer(ReplayBuffer):
@@ -44,6 +55,7 @@ class FrameReplayBuffer(ReplayBuffer):
         shift: int = 0,
         colours: float = 0.0,
         seed: int = 0,
+        states: int = 0,
     ) -> None:
         """
         Args:
@@ -58,6 +70,7 @@ class FrameReplayBuffer(ReplayBuffer):
             shift: Samples are shifted by up to so many pixels each way, edges repeated: Kostrikov et al. 2020 (DrQ).
             colours: Strength of the random weather laid over half of what samples begin with, see `recoloured`.
             seed: Of what is drawn.
+            states: Numbers in the `state` of an `info`.
 
         Raises:
             InputError: a file of another size.
@@ -71,6 +84,10 @@ class FrameReplayBuffer(ReplayBuffer):
         self.actions = np.zeros((*size, self.action_dim), np.float32)
         self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
         self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self.states = np.zeros((*size, states), np.float32)
+        """Where the robot really was when a transition began; NaN in the first of a training, of which none is told."""
+        self.states_after = np.zeros((*size, states), np.float32)
+        self._state = np.full((n_envs, states), np.nan, np.float32)
         self.length = self.buffer_size + self.buffer_size // _SHORT + -(-2 * slack // n_envs) + self.stack + 2
         """Pictures on a tape."""
         shape = (n_envs, self.length, 3, height, width)
@@ -103,6 +120,10 @@ class FrameReplayBuffer(ReplayBuffer):
             self.newest[self.pos, i], self.age[self.pos, i] = self.written[i] - 1, self._ages[i]
             self._write(i, next_obs[i, -3:])
             self._ages[i] = -1 if done[i] else self._ages[i] + 1
+            if self._state.shape[1]:
+                self.states[self.pos, i] = self._state[i]
+                self.states_after[self.pos, i] = infos[i]["state"]
+                self._state[i] = infos[i]["first_state" if done[i] else "state"]
         self.actions[self.pos] = action.reshape(self.n_envs, self.action_dim)
         self.rewards[self.pos] = reward
         # What ended by a time limit would have gone on.
@@ -111,7 +132,7 @@ class FrameReplayBuffer(ReplayBuffer):
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
 
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Samples:  # type: ignore[override]
         """Draws transitions that are wholly there, each alike; stacks are uint8."""
         filled = self.buffer_size if self.full else self.pos
         row, world = np.empty(0, int), np.empty(0, int)
@@ -128,7 +149,8 @@ class FrameReplayBuffer(ReplayBuffer):
             half = batch_size // 2
             before[:half] = recoloured(before[:half], self.colours, self.rng)
         rest = self.actions[row, world], after, self.ends[row, world, None], self.rewards[row, world, None]
-        return ReplayBufferSamples(*(torch.as_tensor(part, device=self.device) for part in (before, *rest)))
+        parts = (before, *rest, self.states[row, world], self.states_after[row, world])
+        return Samples(*(torch.as_tensor(part, device=self.device) for part in parts))
 
     def whole(self, row: NDArray, world: NDArray) -> NDArray[np.bool_]:
         """Whether all pictures of transitions are still on their tapes, shapes (k,)."""
@@ -159,7 +181,7 @@ class FrameReplayBuffer(ReplayBuffer):
             getattr(self, name)[:] = arrays[name]
         self.pos, self.full = rest["pos"], rest["full"]
         self.rng.bit_generator.state = rest["rng"]
-        self._ages[:] = -1
+        self._ages[:], self._state[:] = -1, np.nan
 
     def _write(self, world: int, picture: NDArray) -> None:
         self.tapes[world, self.written[world] % self.length] = picture

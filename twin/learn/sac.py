@@ -5,6 +5,11 @@ they are (Yarats et al. 2019; Kostrikov et al. 2020); next states are encoded by
 copy (Yarats et al. 2021, DrQ-v2). So an update runs it forward twice and backward once, where stable-baselines3's own
 update, in which actor and critics have encoders of their own, has five passes forward and three backward.
 
+The simulator knows where its robot is. That *state* is privileged: the critics, which are not needed for driving, take
+it beside the features (Pinto et al. 2018, asymmetric actor-critic), so they need not first learn to see before they can
+say what anything is worth; and a linear *teller* has to tell it from the features, which shows the encoder what there
+is to see. The actor has pictures alone.
+
 What drives in the end is the *steady* actor, the running mean of the actor and its encoder: from one update to the next
 the actor swings, and a policy file written at the wrong moment leaves the road where the ones before and after do not.
 """
@@ -16,13 +21,17 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
 from twin.learn.architecture import NORM_EPSILON, Architecture, Floats
+from twin.learn.replay import FrameReplayBuffer
 
+_LOGGED = ("critic_loss", "actor_loss", "state_loss", "ent_coef", "value")
+_FARTHEST = 3.0  # times its scale: what a state is cut at
 _STEADY = 1e-3  # share of an update in the steady actor
 
 
@@ -53,6 +62,16 @@ class Encoder(BaseFeaturesExtractor):
 class DrivePolicy(SACPolicy):
     """Actor and critics with one encoder, which the critics' optimiser has."""
 
+    def __init__(self, *arguments: Any, states: int = 0, **rest: Any) -> None:
+        self._states = states
+        super().__init__(*arguments, **rest)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        """Critics take features and states."""
+        asked = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        asked["features_dim"] += self._states
+        return ContinuousCritic(**asked).to(self.device)
+
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         encoder = set(self.actor.features_extractor.parameters())
@@ -67,17 +86,33 @@ class PixelSAC(SAC):
 
     steady: Actor
 
+    def __init__(self, *arguments: Any, states: tuple[float, ...] = (), **rest: Any) -> None:
+        """
+        Args:
+            arguments: Of `SAC`.
+            states: Of every number of the replay buffer's states, how far it usually goes; none: nothing is privileged.
+            rest: Of `SAC`.
+        """
+        self._scales = states
+        super().__init__(*arguments, **rest)
+
     def _setup_model(self) -> None:
         super()._setup_model()
         self.steady = copy.deepcopy(self.actor).requires_grad_(False)
+        self._scale = torch.tensor(self._scales, device=self.device)
+        self.teller: nn.Module = nn.Identity()
+        if self._scales:
+            self.teller = nn.Linear(self.actor.features_extractor.features_dim, len(self._scales)).to(self.device)
+            self.critic.optimizer.add_param_group({"params": list(self.teller.parameters())})
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Updates all networks `gradient_steps` times."""
-        assert self.replay_buffer is not None and self.ent_coef_optimizer is not None and self.log_ent_coef is not None
+        assert isinstance(self.replay_buffer, FrameReplayBuffer)
+        assert self.ent_coef_optimizer is not None and self.log_ent_coef is not None
         assert isinstance(self.target_entropy, float)
         self.policy.set_training_mode(True)
         lead, follow = ([p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target))
-        sums = np.zeros(4)
+        sums = np.zeros(len(_LOGGED))
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         for step in range(gradient_steps):
             data = self.replay_buffer.sample(batch_size)
@@ -86,19 +121,22 @@ class PixelSAC(SAC):
                 alpha = self.log_ent_coef.exp()
                 after = self.actor.features_extractor(data.next_observations)
                 action, log_prob = self._act(after)
-                best = torch.cat([q(torch.cat([after, action], 1)) for q in self.critic_target.q_networks], 1)
+                known = torch.cat([after, self._scaled(data.next_states), action], 1)
+                best = torch.cat([q(known) for q in self.critic_target.q_networks], 1)
                 value = best.min(1, keepdim=True).values - alpha * log_prob
                 target = data.rewards + (1.0 - data.dones) * self.gamma * value
-            given = torch.cat([features, data.actions], 1)
+            states = self._scaled(data.states)
+            given = torch.cat([features, states.nan_to_num(), data.actions], 1)
             critic_loss = sum(nn.functional.mse_loss(q(given), target) for q in self.critic.q_networks) / 2
             assert isinstance(critic_loss, torch.Tensor)
             self.critic.optimizer.zero_grad()
-            critic_loss.backward()
+            state_loss = self._told(features, states)
+            (critic_loss + state_loss).backward()
             self.critic.optimizer.step()
 
             features = features.detach()
             action, log_prob = self._act(features)
-            chosen = torch.cat([features, action], 1)
+            chosen = torch.cat([features, states.nan_to_num(), action], 1)
             best = torch.cat([q(chosen) for q in self.critic.q_networks], 1).min(1, keepdim=True).values
             actor_loss = (alpha * log_prob - best).mean()
             self.actor.optimizer.zero_grad()
@@ -112,10 +150,21 @@ class PixelSAC(SAC):
             polyak_update(lead, follow, self.tau)
             done = self._n_updates + step
             polyak_update(self.actor.parameters(), self.steady.parameters(), max(_STEADY, 1.0 / (done + 1)))
-            sums += [critic_loss.item(), actor_loss.item(), alpha.item(), best.mean().item()]
+            losses = critic_loss, actor_loss, state_loss
+            sums += [*(loss.item() for loss in losses), alpha.item(), best.mean().item()]
         self._n_updates += gradient_steps
-        for name, value in zip(("critic_loss", "actor_loss", "ent_coef", "value"), sums / gradient_steps, strict=True):
+        for name, value in zip(_LOGGED, sums / gradient_steps, strict=True):
             self.logger.record(f"train/{name}", value)
+
+    def _scaled(self, states: torch.Tensor) -> torch.Tensor:
+        return (states / self._scale).clamp(-_FARTHEST, _FARTHEST)
+
+    def _told(self, features: torch.Tensor, states: torch.Tensor) -> torch.Tensor:
+        """How far what is told from features is from the states, where those are known; mean of squares."""
+        known = ~states.isnan().any(1)
+        if not (self._scales and known.any()):
+            return features.new_zeros(())
+        return nn.functional.mse_loss(self.teller(features[known]), states[known])
 
     def _act(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Drawn actions (n, actions) and the logarithm of their density (n, 1)."""

@@ -76,11 +76,15 @@ def _optimizers(model: PixelSAC) -> dict[str, torch.optim.Optimizer]:
     return {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "entropy": model.ent_coef_optimizer}
 
 
+def _modules(model: PixelSAC) -> dict[str, torch.nn.Module]:
+    return {"policy": model.policy, "steady": model.steady, "teller": model.teller}
+
+
 def _tensors(model: PixelSAC) -> dict[str, torch.Tensor]:
     assert model.log_ent_coef is not None
-    out = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
-    out |= {"log_ent_coef": model.log_ent_coef.detach(), "rng": torch.get_rng_state()}
-    out |= {f"steady.{name}": value for name, value in model.steady.state_dict().items()}
+    out = {"log_ent_coef": model.log_ent_coef.detach(), "rng": torch.get_rng_state()}
+    for name, module in _modules(model).items():
+        out |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
     for name, optimizer in _optimizers(model).items():
         for i, values in optimizer.state_dict()["state"].items():
             out |= {f"optimizer.{name}.{i}.{key}": value for key, value in values.items()}
@@ -92,10 +96,9 @@ def _tensors(model: PixelSAC) -> dict[str, torch.Tensor]:
 
 def _set_tensors(model: PixelSAC, tensors: dict[str, torch.Tensor]) -> None:
     assert model.log_ent_coef is not None
-    policy = {n.removeprefix("policy."): value for n, value in tensors.items() if n.startswith("policy.")}
-    model.policy.load_state_dict(policy)
-    steady = {n.removeprefix("steady."): value for n, value in tensors.items() if n.startswith("steady.")}
-    model.steady.load_state_dict(steady)
+    for name, module in _modules(model).items():
+        mine = {n.removeprefix(f"{name}."): value for n, value in tensors.items() if n.startswith(f"{name}.")}
+        module.load_state_dict(mine)
     with torch.no_grad():
         model.log_ent_coef.copy_(tensors["log_ent_coef"])
     for name, optimizer in _optimizers(model).items():

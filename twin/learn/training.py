@@ -159,13 +159,16 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
             "shift": config.shift,
             "colours": config.colours if config.varies else 0.0,
             "seed": config.seed,
+            "states": len(config.states),
         },
+        states=config.states,
         policy_kwargs={
             "features_extractor_class": Encoder,
             "features_extractor_kwargs": {"architecture": config.architecture},
             "net_arch": list(config.hidden),
             "share_features_extractor": True,
             "normalize_images": False,  # the encoder does
+            "states": len(config.states),
         },
         seed=config.seed,
         device=config.device,

@@ -53,7 +53,7 @@ class DriveVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
         out = self.worlds.step(self._actions)
-        infos = [self.worlds.info(i) for i in range(self.num_envs)]
+        infos = [{**self.worlds.info(i), "state": self.worlds.state(i)} for i in range(self.num_envs)]
         self._returns += out.reward
         self._lengths += 1
         over = np.flatnonzero(out.over).tolist()
@@ -67,6 +67,8 @@ class DriveVecEnv(VecEnv):
                 }
             self._returns[over], self._lengths[over] = 0.0, 0
             self.worlds.begin(over)
+            for i in over:
+                infos[i]["first_state"] = self.worlds.state(i)
         return self.worlds.observation(), out.reward.astype(np.float32), out.over, infos
 
     def close(self) -> None:
