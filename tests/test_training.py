@@ -33,6 +33,7 @@ from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.state import load_state, save_state
 from twin.learn.train_config import TrainConfig
 from twin.learn.training import EPISODE_COLUMNS, _check_same, _keep_rows
+from twin.learn.vectors import DriveVecEnv
 from twin.report.training import read_episodes
 from twin.report.trials import csv_text
 from twin.scene import write_json
@@ -55,18 +56,23 @@ class SpotEnv(gymnasium.Env):
     def step(self, action):
         reward = 1.0 - abs(float(action[0]) - (self.where / 7.0 - 1.0))
         self.count += 1
-        return self._look(), reward, False, self.count == 5, {}
+        picture = self._look()
+        unknown = np.full(1, np.nan, np.float32)  # where the next episode begins
+        return picture, reward, False, self.count == 5, {"state": self.state, "first_state": unknown}
 
     def _look(self):
         self.where = int(self.np_random.integers(15))
+        self.state = np.array([self.where / 7.0 - 1.0], np.float32)
         picture = np.zeros((6, 9, 16), np.uint8)
         picture[:, :, self.where : self.where + 2] = 255
         self.raw = picture
         return levelled(picture)
 
 
-def spot_model(folder: Path | None = None, seed: int = 0) -> PixelSAC:
+def spot_model(folder: Path | None = None, seed: int = 0, privileged: bool = False) -> PixelSAC:
     torch.set_num_threads(1)
+    states = 1 if privileged else 0
+    file = folder / "pictures.bin" if folder else None
     model = PixelSAC(
         DrivePolicy,
         DummyVecEnv([SpotEnv, SpotEnv]),
@@ -79,13 +85,15 @@ def spot_model(folder: Path | None = None, seed: int = 0) -> PixelSAC:
         gradient_steps=1,
         ent_coef="auto_0.1",
         replay_buffer_class=FrameReplayBuffer,
-        replay_buffer_kwargs={"file": folder / "pictures.bin" if folder else None, "slack": 500, "seed": seed},
+        replay_buffer_kwargs={"file": file, "slack": 500, "seed": seed, "states": states},
+        states=(1.0,) * states,
         policy_kwargs={
             "features_extractor_class": Encoder,
             "features_extractor_kwargs": {"architecture": TINY},
             "net_arch": [32, 32],
             "share_features_extractor": True,
             "normalize_images": False,
+            "states": states,
         },
         seed=seed,
         device="cpu",
@@ -94,8 +102,9 @@ def spot_model(folder: Path | None = None, seed: int = 0) -> PixelSAC:
     return model
 
 
-def test_it_learns_to_point_and_its_file_does_the_same(tmp_path):
-    model = spot_model()
+@pytest.mark.parametrize("privileged", [False, True])
+def test_it_learns_to_point_and_its_file_does_the_same(tmp_path, privileged):
+    model = spot_model(privileged=privileged)
     model.learn(1000)
     save_policy(tmp_path, TINY, TrainConfig().control, actor_weights(model, TINY), {})
     policy = load_policy(tmp_path)
@@ -112,6 +121,27 @@ def test_it_learns_to_point_and_its_file_does_the_same(tmp_path):
         errors.append(abs(action[0] - (env.where / 7.0 - 1.0)))
         untrained.append(abs(env.where / 7.0 - 1.0))
     assert np.mean(errors) < 0.5 * np.mean(untrained)
+
+
+def test_critics_are_told_the_state_and_the_encoder_learns_to_tell_it():
+    model = spot_model(privileged=True)
+    inputs = [q[0].in_features for q in (*model.critic.q_networks, *model.critic_target.q_networks)]
+    assert inputs == [TINY.features + 1 + 1] * 4 and model.actor.latent_pi[0].in_features == TINY.features
+    env = SpotEnv()
+    env.reset(seed=9)
+
+    def error() -> float:
+        out = []
+        for _ in range(60):
+            features = model.actor.features_extractor(torch.as_tensor(env._look()[None]))
+            out.append(model.teller(features).item() - env.state[0])
+        return float(np.sqrt(np.mean(np.square(out))))
+
+    before = error()
+    model.learn(600)
+    assert error() < 0.25 < before
+    assert model.replay_buffer.states[:300].shape == (300, 2, 1)
+    assert 0.15 < np.isnan(model.replay_buffer.states[:300]).mean() < 0.25  # the first of five, in these episodes
 
 
 def test_the_encoder_learns_from_the_critics_alone():
@@ -140,14 +170,15 @@ def test_scaled_weights_are_scaled_pictures():
     torch.testing.assert_close(encoder(pictures.to(torch.uint8)), expected, atol=1e-5, rtol=1e-4)
 
 
-def test_a_saved_training_goes_on_as_if_never_stopped(tmp_path):
+@pytest.mark.parametrize("privileged", [False, True])
+def test_a_saved_training_goes_on_as_if_never_stopped(tmp_path, privileged):
     """Updates after loading are, number for number, those of the model that was saved."""
     (tmp_path / "a").mkdir()
-    model = spot_model(tmp_path / "a")
+    model = spot_model(tmp_path / "a", privileged=privileged)
     model.learn(300)
     save_state(tmp_path / "a", model, {"wall": 3.0})
     at_saving = torch.get_rng_state()
-    again = spot_model(tmp_path / "a", seed=77)
+    again = spot_model(tmp_path / "a", seed=77, privileged=privileged)
     assert load_state(tmp_path / "a", again) == {"wall": 3.0}
     assert (again.num_timesteps, again._n_updates) == (model.num_timesteps, model._n_updates)
     after_loading = torch.get_rng_state()
@@ -157,6 +188,8 @@ def test_a_saved_training_goes_on_as_if_never_stopped(tmp_path):
     assert torch.equal(at_saving, after_loading)
     for (name, a), b in zip(model.policy.state_dict().items(), again.policy.state_dict().values(), strict=True):
         assert torch.equal(a, b), name
+    for a, b in zip(model.teller.parameters(), again.teller.parameters(), strict=True):
+        assert torch.equal(a, b)
     assert torch.equal(model.log_ent_coef, again.log_ent_coef)
 
 
@@ -383,3 +416,26 @@ def test_setups_vary_what_they_say():
     assert day["randomise"] == Ranges(extinction=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
     assert TrainConfig(observe="simulator").options()["randomise"] == day["randomise"]
     assert varied["rewards"].cross_track == -varied["rewards"].step and varied["start_along"] > 0.0
+    assert varied["rewards"].steering == -0.5 * varied["rewards"].step
+    assert len(TrainConfig().states) == 7 and TrainConfig(privileged=False).states == ()
+
+
+def test_states_are_what_the_world_tells(scene):
+    """Also of an episode's first picture, which comes with the last of the episode before."""
+    env = DriveVecEnv(scene, "ahead", 2, seed=3, lighting="day", time_limit=0.5, action="steering")
+    env.reset()
+    for _ in range(4):
+        *_, done, infos = env.step(np.array([[0.5], [-0.5]], np.float32))
+        assert not done.any() and all("first_state" not in info for info in infos)
+        for i, info in enumerate(infos):
+            assert info["state"].shape == (len(TrainConfig().states),)
+            assert info["state"][2] == pytest.approx(info["cross_track"], abs=1e-6)
+            assert info["state"][0] == pytest.approx(info["speed"], abs=1e-6)
+            assert np.sign(info["state"][1]) == (1, -1)[i]
+    *_, done, infos = env.step(np.zeros((2, 1), np.float32))
+    assert done.all()
+    for i, info in enumerate(infos):
+        assert info["state"][2] == pytest.approx(info["cross_track"], abs=1e-6)
+        assert info["first_state"][2] == pytest.approx(float(env.worlds.tasks[i].cross_track), abs=1e-6)
+        assert info["first_state"][0] == pytest.approx(0.0, abs=1e-3) and info["state"][0] > 0.1
+    env.close()
