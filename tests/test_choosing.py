@@ -1,6 +1,7 @@
 """Of a training's late policies the one that drives best is the run's, whatever it was that came last."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,7 +61,9 @@ def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
     script |= {120: (2, 1.0), 140: (2, 1.5), 160: (1, 9.0), 40: (3, 9.0)}
     choice = choosing.choose(scene, run, CONFIG)
     assert [one["step"] for one in choice["candidates"]] == [100, 120, 140, 160]  # of the second half
-    assert choice["chosen"]["step"] == 140  # of those with most successes, the one that earns most
+    # Of those with most successes the one that earns most; its rate is that of the fresh episodes.
+    assert choice["chosen"] == {"step": 140, "trials": choosing.FRESH, "successes": 2, "reward": 1.5}
+    assert [one["trials"] for one in choice["candidates"]] == [3, 3, 3, 3]
     for name in ("policy.json", "policy.safetensors", "policy.onnx"):
         assert (run / name).read_bytes() == (run / "checkpoints" / "000000140" / name).read_bytes()
     assert load_policy(run).trained["step"] == 140
@@ -71,17 +74,29 @@ def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
     assert success_curve(run).exists()
 
 
-def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, scripted):
+def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, tmp_path, scripted):
     _, asked = scripted
     (run / CHOICE).unlink(missing_ok=True)
     first = choosing.choose(scene, run, CONFIG)
     count = len(asked)
-    assert choosing.choose(scene, run, CONFIG) == first and len(asked) == count
+    for config in (CONFIG, replace(CONFIG, steps=80)):  # fewer steps than were trained change nothing
+        train(scene, run, config)
+        assert choosing.choose(scene, run, config) == first and len(asked) == count
     assert json.loads((run / CHOICE).read_text()) == first
-    longer = replace(CONFIG, steps=200)
-    train(scene, run, longer)
-    assert choosing.choose(scene, run, longer)["steps"] == 200
-    assert [one["step"] for one in choosing.choose(scene, run, longer)["candidates"]][-1] == 200
+    longer, copy = replace(CONFIG, steps=200), shutil.copytree(run, tmp_path / "run")
+    train(scene, copy, longer)
+    assert not (copy / CHOICE).exists()
+    again = choosing.choose(scene, copy, longer)
+    assert again["steps"] == 200 and again["candidates"][-1]["step"] == 200
+
+
+def test_a_training_that_begins_anew_keeps_nothing_of_the_one_before(scene, run, tmp_path, scripted):
+    copy = shutil.copytree(run, tmp_path / "run")
+    choosing.choose(scene, copy, CONFIG)
+    shutil.rmtree(copy / "state")
+    train(scene, copy, replace(CONFIG, steps=80))
+    assert not (copy / CHOICE).exists()
+    assert max(int(path.name) for path in (copy / "checkpoints").iterdir()) == 80
 
 
 def test_candidates_are_few_and_the_last_is_one(tmp_path):

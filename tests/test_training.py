@@ -27,6 +27,7 @@ from twin import progress, train
 from twin.env.randomisation import Ranges
 from twin.errors import InputError
 from twin.learn.architecture import Architecture, levelled, prepared
+from twin.learn.choosing import FRESH
 from twin.learn.policy import load_policy, save_policy
 from twin.learn.replay import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
@@ -142,6 +143,21 @@ def test_critics_are_told_the_state_and_the_encoder_learns_to_tell_it():
     assert error() < 0.25 < before
     assert model.replay_buffer.states[:300].shape == (300, 2, 1)
     assert 0.15 < np.isnan(model.replay_buffer.states[:300]).mean() < 0.25  # the first of five, in these episodes
+
+
+def test_critics_use_what_they_are_told():
+    """Of pictures that are all alike, what is worth something can only be known from the state."""
+    model = spot_model(privileged=True)
+    model.learn(120)
+    pictures = torch.zeros((64, 6, 9, 16), dtype=torch.uint8)
+    features = model.actor.features_extractor(pictures).detach()
+    states, actions = torch.linspace(-1, 1, 64)[:, None], torch.zeros((64, 1))
+    values = torch.cat([q(torch.cat([features, states, actions], 1)) for q in model.critic.q_networks], 1)
+    assert values.std(0).min() > 1e-4
+    told = [q[0].weight[:, TINY.features].clone() for q in model.critic.q_networks]
+    model.learn(60, reset_num_timesteps=False)
+    for before, q in zip(told, model.critic.q_networks, strict=True):
+        assert not torch.equal(before, q[0].weight[:, TINY.features])  # it has a gradient: the input is not nought
 
 
 def test_the_encoder_learns_from_the_critics_alone():
@@ -290,6 +306,8 @@ def test_the_verb(scene, capsys):
     assert train.main([*common, "--run", "one", "--steps", "4", "--observe", "simulator"]) == 0
     assert (scene / "runs/one/success.png").exists()
     assert load_policy(scene / "runs/one").trained["observe"] == "simulator"
+    choice = json.loads((scene / "runs/one/choice.json").read_text())
+    assert choice["steps"] == 4 and choice["chosen"]["trials"] == FRESH
     assert train.main([*common, "--run", "one", "--steps", "4", "--lighting", "day"]) == 2
     assert "error: " in capsys.readouterr().err
     assert train.main([*common, "--run", "two", "--lighting", "dusk"]) == 2

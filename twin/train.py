@@ -9,6 +9,7 @@ The same command goes on with a run that was stopped or killed. The policy is in
 
 import argparse
 import dataclasses
+import signal
 import sys
 from pathlib import Path
 
@@ -49,7 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
 
             twin = load_scene(given.scene)
             training.train(twin, folder, config, watch)
-        chosen = choose(twin, folder, config)["chosen"]
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            chosen = choose(twin, folder, config)["chosen"]
+        finally:
+            signal.signal(signal.SIGTERM, before)
         picture = success_curve(folder)
     except (InputError, OSError) as error:
         return refuse(error)
@@ -79,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--worlds", type=int, help="how many are driven at once")
     parser.add_argument("--updates", type=float, help="of the networks per step")
     parser.add_argument("--steering", type=float, help="share of a step's worth that full steering costs")
-    parser.add_argument("--entropy", type=float, help="of an action [nat]")
+    parser.add_argument("--entropy", type=float, help="of each number of an action [nat]; more explores more")
     parser.add_argument("--colours", type=float, help="strength of random weather in updates; 1 where lighting varies")
     parser.add_argument("--seed", type=int, help="of everything drawn")
     parser.add_argument(

@@ -67,7 +67,7 @@ class Run:
         asked = read_json(path / "config.json")["steps"]
         if asked != steps:  # the learning rate falls by the steps asked for: a longer run is another training
             raise SystemExit(f"{path} is a run of {asked} steps, not of {steps}; move it away")
-        return (path / CHOICE).exists()
+        return (path / CHOICE).exists() and read_json(path / CHOICE)["steps"] >= steps
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:

@@ -70,15 +70,17 @@ def _together(parts: list[dict[str, Any]]) -> str:
 def _training(folder: Path) -> dict[str, Any]:
     with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
-    success = read_episodes(folder)[1]
+    choice = read_json(folder / CHOICE) if (folder / CHOICE).exists() else None
+    ended, success = read_episodes(folder)
+    before = success[ended <= choice["chosen"]["step"]] if choice else success
     return {
         "steps": int(last["step"]),
         "updates": int(last["updates"]),
         "wall_s": float(last["wall_s"]),
         "memory_mb": float(last["memory_mb"]),
         "whole_episodes": len(success),
-        "exploring": _rate((success[-RECENT:] == 1).tolist()),
-        "train": read_json(folder / CHOICE)["chosen"] if (folder / CHOICE).exists() else _rate([]),
+        "exploring": _rate((before[-RECENT:] == 1).tolist()),
+        "train": choice["chosen"] if choice else _rate([]),
     }
 
 

@@ -119,7 +119,10 @@ class Worlds:
         return np.stack([self.state(i) for i in range(len(self))])
 
     def state(self, i: int) -> NDArray[np.float32]:
-        """What a driver of world i that knows the map would know, see `Drive.get_observation`; shape (k,)."""
+        """What a driver of world i that knows the map would know, see `Drive.get_observation`; shape (k,).
+
+        It is of now, which the newest picture is not where the camera has a latency.
+        """
         return np.concatenate(list(self._steps[i].observation.values()))  # type: ignore[union-attr]
 
     def info(self, i: int) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from twin.env.batch import Worlds
 from twin.env.suite import Stage
 from twin.learn.judging import Driven, episodes
 from twin.learn.policy import copy_policy, load_policy
+from twin.learn.state import saved_steps
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
 from twin.report.training import CHOICE
@@ -37,12 +38,13 @@ def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
         config: Of the run; `trials` is the number of episodes each candidate drives.
 
     Returns:
-        What `choice.json` holds: steps of the training; for every candidate its step, trials, successes and mean
+        What `choice.json` holds: steps that were trained; for every candidate its step, trials, successes and mean
         reward; step, trials and successes of the chosen one, of fresh episodes.
     """
-    if (folder / CHOICE).exists() and read_json(folder / CHOICE)["steps"] == config.steps:
+    trained = saved_steps(folder / "state")
+    if (folder / CHOICE).exists() and read_json(folder / CHOICE)["steps"] == trained:
         return read_json(folder / CHOICE)
-    candidates = _candidates(folder / "checkpoints", config.steps)
+    candidates = _candidates(folder / "checkpoints", trained)
     drawn = np.random.SeedSequence([config.seed, _STREAM]).generate_state(config.trials + FRESH)
     seeds = tuple(int(seed) for seed in drawn)
     shared, fresh = seeds[: config.trials], seeds[config.trials :]
@@ -60,7 +62,7 @@ def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
         last = told(candidates[best], fresh)
     worlds.close()
     copy_policy(candidates[best], folder)
-    out = {"steps": config.steps, "candidates": tried, "chosen": last}
+    out = {"steps": trained, "candidates": tried, "chosen": last}
     write_json(folder / CHOICE, out)
     return out
 

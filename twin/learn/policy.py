@@ -32,7 +32,7 @@ from twin.env.drivers import find_callable
 from twin.env.options import STEERING, TWIST
 from twin.errors import InputError
 from twin.learn.architecture import Architecture, Floats, onnx_bytes
-from twin.scene import digest_file, write_json
+from twin.scene import digest_file, write_json, write_text
 
 Pictures = NDArray[np.uint8]
 Act = Callable[[Pictures], Floats]
@@ -149,8 +149,9 @@ def save_policy(
 def copy_policy(source: Path, folder: Path) -> None:
     """Puts a policy folder's files in the place of another's; policy.json comes last, as in `save_policy`."""
     (folder / JSON).unlink(missing_ok=True)
-    for name in (WEIGHTS, ONNX, JSON):
+    for name in (WEIGHTS, ONNX):
         shutil.copyfile(source / name, folder / name)
+    write_text(folder / JSON, (source / JSON).read_text(encoding="utf-8"))
 
 
 def find_policy(root: Path, source: str) -> str:

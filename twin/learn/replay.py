@@ -85,7 +85,7 @@ class FrameReplayBuffer(ReplayBuffer):
         self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
         self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
         self.states = np.zeros((*size, states), np.float32)
-        """Where the robot really was when a transition began; NaN in the first of a training, of which none is told."""
+        """Where the robot really was when a transition began; NaN in a world's first of a process."""
         self.states_after = np.zeros((*size, states), np.float32)
         self._state = np.full((n_envs, states), np.nan, np.float32)
         self.length = self.buffer_size + self.buffer_size // _SHORT + -(-2 * slack // n_envs) + self.stack + 2

@@ -49,6 +49,11 @@ def has_state(folder: Path) -> bool:
     return (folder / _JSON).exists()
 
 
+def saved_steps(folder: Path) -> int:
+    """Of the state that is there."""
+    return int(read_json(folder / _JSON)["steps"])
+
+
 def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
     """Brings a new model to the saved state; returns `more`.
 

@@ -41,7 +41,7 @@ class TrainConfig:
     steering: float = 0.5
     """Share of what a step is worth that is lost by steering as hard as can be."""
     entropy: float = -0.5
-    """Of an action, that is aimed at [nat]; -0.5 is a spread of 0.15 of the largest, -1 of 0.09."""
+    """Of each number of an action, that is aimed at [nat]; -0.5 is a spread of 0.15 of the largest, -1 of 0.09."""
     start_along: float = 0.9
     """Every second episode starts on the way, beside the route and askew, up to this share of the stretch: else a
     policy that has learnt to stay in the middle never sees again how to get back there."""

@@ -2,7 +2,8 @@
 
     runs/<name>/
       config.json                what was asked for
-      policy.json .safetensors .onnx     the newest policy (see `policy.py`)
+      policy.json .safetensors .onnx     the newest policy (see `policy.py`); in the end the chosen one
+      choice.json                which that is (see `choosing.py`)
       checkpoints/<steps>/       policies along the way, of varied quality
       episodes.csv               every episode driven in training
       log.csv                    speed, memory and losses at every save
@@ -15,6 +16,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -42,6 +44,7 @@ from twin.learn.state import has_state, load_state, save_state
 from twin.learn.train_config import TrainConfig
 from twin.learn.vectors import DriveVecEnv
 from twin.loading import Twin
+from twin.report.training import CHOICE
 from twin.report.trials import RECENT, csv_text
 from twin.scene import read_json, write_json, write_text
 
@@ -109,6 +112,7 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
         folder.mkdir(parents=True, exist_ok=True)
         for stale in ("episodes.csv", "log.csv", "state/pictures.bin"):
             (folder / stale).unlink(missing_ok=True)
+        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
         (folder / "state").mkdir(exist_ok=True)
     if go_on and not (folder / "state" / "pictures.bin").exists():
         raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
@@ -129,8 +133,11 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
     try:
         left = config.steps - model.num_timesteps
         if left > 0:
+            (folder / CHOICE).unlink(missing_ok=True)  # what it says will not be so
             model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
             keeper.end()
+            if keeper.stopped:
+                raise KeyboardInterrupt
     finally:
         for one, handler in before_us.items():
             signal.signal(one, handler)
@@ -151,7 +158,7 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
         train_freq=1,
         gradient_steps=0,  # see `meanwhile`
         ent_coef="auto_0.1",
-        target_entropy=config.entropy,
+        target_entropy=config.entropy * config.control.actions,
         replay_buffer_class=FrameReplayBuffer,
         replay_buffer_kwargs={
             "file": pictures,
@@ -219,11 +226,11 @@ class _Keeper(BaseCallback):
         self._folder, self._config, self._scene, self._watch = folder, config, twin.scene.root.resolve().name, watch
         self._said = said
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
-        self._stop = False
+        self.stopped = False
 
     def stop(self, *_: Any) -> None:
         """A signal handler: before the next step, all is saved, and KeyboardInterrupt raised."""
-        self._stop = True
+        self.stopped = True
 
     @property
     def wall(self) -> float:
@@ -240,9 +247,9 @@ class _Keeper(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # Here, and not in _on_step, all that was collected is in the buffer.
-        if self._stop or self.model.num_timesteps - self._saved >= self._config.save_every:
+        if self.stopped or self.model.num_timesteps - self._saved >= self._config.save_every:
             self.save()
-        if self._stop:
+        if self.stopped:
             raise KeyboardInterrupt
         self._checkpoint()
 

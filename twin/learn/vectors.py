@@ -15,7 +15,10 @@ from twin.loading import Twin
 
 
 class DriveVecEnv(VecEnv):
-    """n worlds; one that ends begins anew in the same step, its last observation in `terminal_observation`."""
+    """n worlds; one that ends begins anew in the same step, its last observation in `terminal_observation`.
+
+    Every `info` holds `state`, see `Worlds.state`, and where an episode ended `first_state`, of the one that begins.
+    """
 
     def __init__(
         self,

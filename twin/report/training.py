@@ -97,7 +97,7 @@ def _draw_choice(axes: Axes, choice: dict[str, Any]) -> None:
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])
     label = f"the chosen one, {chosen['trials']} more"
-    bars = [[rate - low], [high - rate]]
+    bars = [[max(0.0, rate - low)], [max(0.0, high - rate)]]  # rounding may put an end on the wrong side
     axes.errorbar(chosen["step"], rate, bars, fmt="o", color="#d95f02", capsize=3, label=label)
 
 
