@@ -111,8 +111,8 @@ def _stages(forecast: Forecast) -> Html:
     lead = element(
         "p",
         "Train: success over the last episodes before it was saved, exploring. Validate: success in the twin, in the "
-        "lightings that are compared with the road’s. Real: success on the road. A policy that falls from the first to the second "
-        "has learnt its training by heart; what falls from the second to the third is the twin’s error, or chance.",
+        "lightings that are compared with the road’s. Real: success on the road. A policy that falls from the first "
+        "to the second has learnt its training by heart; what falls from the second to the third is the twin’s error, or chance.",
         class_="done",
     )
     policies = dict.fromkeys(c.policy for c in forecast.candidates)
