@@ -21,7 +21,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
     "varied": (),
 }
 """Name → options of `twin.train`."""
-STEPS = {"straight": 12_000, "right": 12_000}
+STEPS = {"straight": 12_000, "right": 16_000}
 SHARES = (0.25, 0.5)
 """Of a run's steps, at which checkpoints are taken for the forecast."""
 EPISODES = 32
