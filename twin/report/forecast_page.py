@@ -112,7 +112,8 @@ def _stages(forecast: Forecast) -> Html:
         "p",
         "Train: success over the last episodes before it was saved, exploring. Validate: success in the twin, in the "
         "lightings that are compared with the road’s. Real: success on the road. A policy that falls from the first "
-        "to the second has learnt its training by heart; what falls from the second to the third is the twin’s error, or chance.",
+        "to the second has learnt its training by heart; what falls from the second to the third is the twin’s error, "
+        "or chance.",
         class_="done",
     )
     policies = dict.fromkeys(c.policy for c in forecast.candidates)
