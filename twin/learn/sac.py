@@ -1,7 +1,7 @@
 """SAC from pixels (Haarnoja et al. 2018) on stable-baselines3, with one encoder for actor and critics.
 
-The *encoder* turns stacks into features. It learns from the critics' loss alone, and the actor takes its features as
-they are (Yarats et al. 2019; Kostrikov et al. 2020); next states are encoded by it, too, and not by a slowly following
+The *encoder* turns stacks into features. It learns nothing from the actor's loss; the actor takes its features as they
+are (Yarats et al. 2019; Kostrikov et al. 2020); next states are encoded by it, too, and not by a slowly following
 copy (Yarats et al. 2021, DrQ-v2). So an update runs it forward twice and backward once, where stable-baselines3's own
 update, in which actor and critics have encoders of their own, has five passes forward and three backward.
 
