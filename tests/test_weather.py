@@ -8,7 +8,7 @@ import twin
 from twin import progress
 from twin.env.haze import Haze
 from twin.env.randomisation import Ranges
-from twin.env.shade import Shade
+from twin.env.shade import Shade, _solids
 from twin.env.tasks import Drive
 from twin.geometry.cameras import pixel_grid, unproject
 
@@ -92,3 +92,18 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
     assert any(differ)
     rng = np.random.default_rng(0)
     assert {Ranges(bystanders=(0, 3)).draw(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
+
+
+def test_solid_shadows_have_straight_edges_and_no_seam():
+    patterns = np.stack([_solids(np.random.default_rng(seed)) for seed in range(40)])
+    assert patterns.min() == 0.0 and patterns.max() == 1.0
+    covers = patterns.mean((1, 2))
+    assert 0.02 < covers.min() and covers.max() < 0.9 and covers.std() > 0.05
+    assert ((patterns > 0.0) & (patterns < 1.0)).mean() < 0.05  # sharp
+    for axis in (1, 2):
+        steps = np.abs(np.diff(patterns, axis=axis)).mean()
+        seam = np.abs(np.take(patterns, 0, axis) - np.take(patterns, -1, axis)).mean()
+        assert 0.3 * steps < seam < 3.0 * steps
+    # Posts lie along the sun's direction, which a row of the pattern is: what is dark goes on along it.
+    along, across = (np.abs(np.diff(patterns, axis=axis)).mean() for axis in (2, 1))
+    assert across > 1.1 * along

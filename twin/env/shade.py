@@ -1,8 +1,10 @@
 """Shadows that the film did not have, such as another sun throws: dark patches that lie in the place and stay there.
 
 What throws them is not there. A *pattern* of light and dark, drawn for an episode, fills the plane z = 0 and is carried
-through space along the rays of a sun, drawn too, so that ground, kerbs and walls are crossed by it as by a shadow. The
-lower the sun, the longer the patches; some are broken up, as those of leaves are.
+through space along the rays of a sun, drawn too, so that ground, kerbs and walls are crossed by it as by a shadow. It
+is made of *patches*, some of them broken up as those of leaves are, of *solids* with straight edges as houses and posts
+throw them, which look like kerbs and lines to who has never seen any, or of both. The lower the sun, the longer they
+are.
 """
 
 import cv2
@@ -17,7 +19,10 @@ _TEXEL = 0.1  # [m] across the sun's direction
 _BLOBS = (0.4, 2.0)  # [m] smallest and largest radius of patches
 _LEAVES = 0.15  # [m] of the holes in broken ones
 _SUN = (10.0, 55.0)  # [°] elevation
-_COVER = (0.2, 0.6)  # share of the plane in the dark
+_COVER = (0.2, 0.6)  # share of the plane in the dark of patches
+_HOUSES, _HOUSE = (1, 4), (3.0, 12.0)  # how many, below the second; [m] their sides, before the sun stretches them
+_POSTS, _POST, _POST_LENGTH = (0, 8), (0.1, 0.5), (2.0, 10.0)  # how many; [m] width and length
+_FINER = 4  # times, what solids are drawn at so that their edges are smooth
 _REACH = 40.0  # [m] of depth up to which patches are seen
 _SKY = np.array([1.0, 0.95, 0.85], np.float32)  # what is left in a shadow is the sky's light, which is bluer
 
@@ -37,10 +42,15 @@ class Shade:
         long = max(1.0, 1.0 / np.tan(elevation))
         self._to_texel = np.stack([along / long, [-along[1], along[0]]]) / _TEXEL
         self._loss: Floats = np.float32(strength) * _SKY
-        radius = np.exp(rng.uniform(*np.log(_BLOBS)))
-        self._pattern = _patches(rng, radius / _TEXEL, rng.uniform(*_COVER))
-        if rng.random() < 0.5:
-            self._pattern = self._pattern * _patches(rng, _LEAVES / _TEXEL, 0.6)
+        kind = rng.integers(3)  # patches, solids, both
+        self._pattern = np.zeros((_SIDE, _SIDE), np.float32)
+        if kind != 1:
+            radius = np.exp(rng.uniform(*np.log(_BLOBS)))
+            self._pattern = _patches(rng, radius / _TEXEL, rng.uniform(*_COVER))
+            if rng.random() < 0.5:
+                self._pattern = self._pattern * _patches(rng, _LEAVES / _TEXEL, 0.6)
+        if kind != 0:
+            self._pattern = np.maximum(self._pattern, _solids(rng))
 
     def over(self, rgb: Floats, depth: Floats, rays: Array, pose: Array) -> Floats:
         """A picture with the shadows in it.
@@ -57,6 +67,22 @@ class Shade:
         dark = cv2.remap(self._pattern, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32)
         dark[depth >= _REACH] = 0.0
         return rgb * (np.float32(1.0) - dark[..., None] * self._loss)
+
+
+def _solids(rng: np.random.Generator) -> Floats:
+    """A pattern, 1 in the dark, of houses turned anyhow and of posts along the sun's direction; shape (side, side)."""
+    side = _SIDE * _FINER
+    canvas = np.zeros((side, side), np.uint8)
+    houses = [(rng.uniform(*_HOUSE, 2), rng.uniform(0.0, np.pi)) for _ in range(rng.integers(*_HOUSES))]
+    posts = [((rng.uniform(*_POST_LENGTH), rng.uniform(*_POST)), 0.0) for _ in range(rng.integers(*_POSTS))]
+    for size, turn in houses + posts:
+        middle = rng.uniform(0.0, side, 2)
+        for x in (-side, 0, side):  # it repeats itself without a seam
+            for y in (-side, 0, side):
+                wide, high = (extent / _TEXEL * _FINER for extent in size)
+                box = ((middle[0] + x, middle[1] + y), (wide, high), np.rad2deg(turn))
+                cv2.fillConvexPoly(canvas, cv2.boxPoints(box).round().astype(np.int32), 255)
+    return cv2.resize(canvas, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(255.0)
 
 
 def _patches(rng: np.random.Generator, radius: float, cover: float) -> Floats:
