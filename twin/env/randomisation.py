@@ -22,6 +22,9 @@ from twin.errors import InputError
 Array = NDArray[np.float64]
 Range = tuple[float, float]
 
+VERSION = 2
+"""Of what comes out of a draw. Raised where haze, shadows or bystanders of the same draw become others."""
+
 _PAYLOAD_SIDE = 0.3  # [m] of the cube that the payload's inertia is of
 _TYRE = "_tyre"
 _FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
