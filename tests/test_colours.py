@@ -36,3 +36,18 @@ def test_drawn_around_what_was_there_and_by_the_seed():
     assert abs(means.mean() - before.mean()) < 0.15 * before.mean()
     assert 10.0 < means.mean(1).std() < 60.0  # brightness differs
     assert (means[:, 0] - means[:, 2]).std() > 3.0  # and so does tint
+
+
+def test_rectangles_of_one_colour_cover_some():
+    """In noise no colour comes twice, so what does is covered."""
+    picture = np.random.default_rng(3).integers(60, 190, (3, 45, 80), np.uint8)
+    before = np.repeat(np.tile(picture, (4, 1, 1))[None], 200, 0)
+    shares = []
+    for stack in recoloured(before, 1.0, np.random.default_rng(4)):
+        pixels = stack[:3].reshape(3, -1).T
+        pixels = pixels[((pixels > 0) & (pixels < 255)).all(1)]  # not what is merely too dark or too bright
+        _, counts = np.unique(pixels, axis=0, return_counts=True)
+        shares.append(counts.max() / (45 * 80))
+    covered = np.array(shares) > 0.01
+    assert 0.6 < covered.mean() < 0.9  # three of four
+    assert 0.02 < np.mean(shares) < 0.2 and max(shares) < 0.3

@@ -8,6 +8,7 @@ alike for all pictures of a stack, so that motion stays what it is:
     tone     v → v^gamma, and its contrast about the middle
     tint     a gain for each colour
     shade    a smooth pattern of light and dark over the picture
+    covers   rectangles of one colour, so that no one thing in the background is what is steered by
 
 All is drawn around no change at all, and scaled by one *strength*; 1 is what the constants below say.
 """
@@ -17,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations, of logarithms
-_SHADE = 0.25  # the same, at the knots
+_SHADE = 0.4  # the same, at the knots
+_COVERS, _COVER = 4, (0.1, 0.5)  # fewer than so many; their sides as shares of the picture's
 _KNOTS = (3, 5)  # of the pattern, down and across
 _LEVELS = np.arange(256) / 255.0
 
@@ -39,6 +41,11 @@ def recoloured(stacks: NDArray[np.uint8], strength: float, rng: np.random.Genera
         for channel in range(channels):
             toned = cv2.LUT(stacks[i, channel], curves[i, channel % 3])
             cv2.multiply(toned, shade, out[i, channel], dtype=cv2.CV_8U)
+        for _ in range(rng.integers(_COVERS) if strength else 0):
+            sides = (rng.uniform(*_COVER, 2) * (height, width)).astype(int) + 1
+            top, left = (rng.uniform(size=2) * ((height, width) - sides)).astype(int)
+            colour = np.tile(rng.integers(0, 256, 3, np.uint8), channels // 3)
+            out[i, :, top : top + sides[0], left : left + sides[1]] = colour[:, None, None]
     return out
 
 
