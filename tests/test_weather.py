@@ -9,6 +9,7 @@ from twin import progress
 from twin.env.haze import Haze
 from twin.env.randomisation import Ranges
 from twin.env.shade import Shade, _solids
+from twin.env.sides import Sides
 from twin.env.tasks import Drive
 from twin.geometry.cameras import pixel_grid, unproject
 
@@ -46,27 +47,30 @@ def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
 
     def seen(shade: Shade, x: float) -> tuple[np.ndarray, np.ndarray]:
         """A camera that looks straight down on z = 0 from 2 m: how light it is, and where."""
-        pose = np.diag([1.0, -1.0, -1.0, 1.0])
-        pose[:3, 3] = x, 0.0, 2.0
-        depth = np.full((24, 32), 2.0, np.float32)
-        return shade.over(rgb, depth, rays, pose), (rays * 2.0)[..., 0] + x
+        points = rays * [2.0, -2.0, -2.0] + [x, 0.0, 2.0]
+        return shade.over(rgb, np.full((24, 32), 2.0, np.float32), points), points[..., 0]
 
     covers = []
     for seed in range(30):
-        shade = Shade(0.5, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        elevation, azimuth = np.deg2rad(rng.uniform(10.0, 55.0)), rng.uniform(0.0, 2.0 * np.pi)
+        level = np.cos(elevation)
+        sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        shade = Shade(0.5, sun, rng)
         light, x = seen(shade, 0.0)
         assert light.min() >= 0.5 and light.max() <= 1.0
         moved, there = seen(shade, 0.5)  # five pixels further
         np.testing.assert_allclose(there[:, :-5], x[:, 5:], atol=1e-9)
         np.testing.assert_allclose(moved[:, :-5], light[:, 5:], atol=1e-4)
         covers.append(float((light[..., 0] < 0.75).mean()))
-        np.testing.assert_array_equal(shade.over(rgb, 0 * x + 1e3, rays, np.eye(4)), rgb)  # the sky
+        np.testing.assert_array_equal(shade.over(rgb, 0 * x + 1e3, 40.0 * rays), rgb)  # the sky
     assert 0.1 < np.mean(covers) < 0.6 and np.std(covers) > 0.1
 
 
 def test_randomised_episodes_have_weather_and_bystanders(scene):
     still = dict.fromkeys(("friction", "wheel_radius", "airlight"), (1.0, 1.0))
-    still |= dict.fromkeys(("payload", "latency", "camera_shift", "camera_turn", "shade", "bystanders"), (0.0, 0.0))
+    robot = ("payload", "latency", "camera_shift", "camera_turn")
+    still |= dict.fromkeys((*robot, "sunlight", "shade", "bystanders"), (0.0, 0.0))
 
     def first(seed: int = 3, **ranges) -> tuple[np.ndarray, Drive]:
         environment = twin.load(scene, "ahead", seed, lighting="day", **SMALL, randomise=Ranges(**(still | ranges)))
@@ -107,3 +111,39 @@ def test_solid_shadows_have_straight_edges_and_no_seam():
     # Posts lie along the sun's direction, which a row of the pattern is: what is dark goes on along it.
     along, across = (np.abs(np.diff(patterns, axis=axis)).mean() for axis in (2, 1))
     assert across > 1.1 * along
+
+
+def _walls() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Of a camera 1 m above the ground at the end of a street along x, looking along x: depth, points, and masks."""
+    rays = unproject(pixel_grid(96, 54), np.array([50.0, 50.0, 48.0, 27.0]))
+    forward, left, up = rays[..., 2], -rays[..., 0], -rays[..., 1]
+    with np.errstate(divide="ignore"):
+        ground = np.where(up < 0.0, -1.0 / up, np.inf)
+        sides = 4.0 / np.abs(left)
+    sides = np.where(sides * np.abs(up) < 6.0, sides, np.inf)  # walls end 6 m above the camera
+    depth = np.minimum(np.minimum(ground, sides), 1e3)
+    points = np.stack([forward, left, up], -1) * np.minimum(depth, 40.0)[..., None]
+    near = depth < 30.0
+    masks = {"ground": near & (ground < 0.9 * sides), "sky": depth > 999.0}
+    masks |= {"left": near & (sides < 0.9 * ground) & (left > 0), "right": near & (sides < 0.9 * ground) & (left < 0)}
+    return depth.astype(np.float32), points.astype(np.float32), masks
+
+
+def test_another_sun_lights_what_faces_it_and_leaves_the_ground():
+    depth, points, masks = _walls()
+    rgb = np.full((*depth.shape, 3), 0.5, np.float32)
+    low = np.deg2rad(15.0)
+    sun = np.array([0.0, np.cos(low), np.sin(low)])  # it stands to the left: the right wall faces it
+    lit = Sides(0.7, sun, np.random.default_rng(0)).over(rgb, depth, points)
+    light = {name: np.median(lit[mask][:, 1]) / 0.5 for name, mask in masks.items()}
+    assert light["ground"] == pytest.approx(1.0, abs=0.01)
+    assert light["right"] == pytest.approx(np.exp(0.7 * (np.cos(low) - np.sin(low))), rel=0.01)
+    assert light["left"] == pytest.approx(np.exp(0.7 * (-np.cos(low) - np.sin(low))), rel=0.01)
+    warm = np.median(lit[masks["right"]], 0)
+    assert warm[0] > warm[1] > warm[2]
+    assert lit[masks["sky"]].std(0).max() > 0.001  # lighter towards the sun
+    np.testing.assert_array_equal(Sides(0.0, sun, np.random.default_rng(0)).over(rgb, depth, points), rgb)
+    skies = [
+        np.median(Sides(0.7, sun, np.random.default_rng(k)).over(rgb, depth, points)[masks["sky"]]) for k in range(20)
+    ]
+    assert np.std(np.log(skies)) > 0.2

@@ -24,7 +24,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
 STEPS = {"straight": 12_000, "right": 16_000}
 SHARES = (0.25, 0.5)
 """Of a run's steps, at which checkpoints are taken for the forecast."""
-EPISODES = 32
+EPISODES = 50
 """In the twin, per policy and lighting."""
 LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMISED), "checkpoint": (HELD_OUT + RANDOMISED,)}
 """Of the twin. The latter is what reality is compared with; the former, for finished policies, is the paper's."""

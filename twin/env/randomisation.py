@@ -1,8 +1,8 @@
-"""What differs from episode to episode: the robot, the air, shadows, and things beside the corridor.
+"""What differs from episode to episode: the robot, the air, the light, shadows, and things beside the corridor.
 
 Of the robot tyre friction, payload, latency, camera pose and wheel radius differ; the air is hazy (see `haze.py`);
-shadows lie where the film had none (see `shade.py`); and *bystanders*, things where nothing is driven, stand as if they
-had been moved there.
+another sun lights what stands (see `sides.py`) and throws shadows that the film had not (see `shade.py`); and
+*bystanders*, things where nothing is driven, stand as if they had been moved there.
 
 *Ranges* say how far each may be from what was built and filmed; a *draw* is what one episode got, every value uniform
 in its range and independent of the others. What is the robot's is applied to the episode's own copy of the model.
@@ -22,8 +22,8 @@ from twin.errors import InputError
 Array = NDArray[np.float64]
 Range = tuple[float, float]
 
-VERSION = 2
-"""Of what comes out of a draw. Raised where haze, shadows or bystanders of the same draw become others."""
+VERSION = 3
+"""Of what comes out of a draw. Raised where haze, light, shadows or bystanders of the same draw become others."""
 
 _PAYLOAD_SIDE = 0.3  # [m] of the cube that the payload's inertia is of
 _TYRE = "_tyre"
@@ -50,6 +50,8 @@ class Ranges:
     """Of the air [1/m], added to the film's; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
     """How bright the haze is, as a share of the sky at the horizon."""
+    sunlight: Range = (0.0, 0.7)
+    """How much another sun brightens what faces it and darkens what turns away, at most [natural logarithm]."""
     shade: Range = (0.0, 0.75)
     """Share of a colour that is lost where shadows lie that the film did not have."""
     bystanders: Range = (0, 4)
@@ -62,7 +64,7 @@ class Ranges:
         for name in ("friction", "wheel_radius"):
             if not getattr(self, name)[0] > 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected more than 0")
-        for name in ("payload", "latency", "extinction", "airlight", "shade", "bystanders"):
+        for name in ("payload", "latency", "extinction", "airlight", "sunlight", "shade", "bystanders"):
             if not getattr(self, name)[0] >= 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
 
@@ -77,6 +79,7 @@ class Ranges:
             wheel_radius=float(rng.uniform(*self.wheel_radius)),
             extinction=float(rng.uniform(*self.extinction)),
             airlight=float(rng.uniform(*self.airlight)),
+            sunlight=float(rng.uniform(*self.sunlight)),
             shade=float(rng.uniform(*self.shade)),
             bystanders=int(rng.integers(round(self.bystanders[0]), round(self.bystanders[1]) + 1)),
         )
@@ -94,6 +97,7 @@ class Draw:
     wheel_radius: float = 1.0
     extinction: float = 0.0
     airlight: float = 1.0
+    sunlight: float = 0.0
     shade: float = 0.0
     bystanders: int = 0
 

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.env.sides import REACH
+
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
@@ -18,28 +20,27 @@ _SIDE = 256  # texels of a pattern, which repeats itself
 _TEXEL = 0.1  # [m] across the sun's direction
 _BLOBS = (0.4, 2.0)  # [m] smallest and largest radius of patches
 _LEAVES = 0.15  # [m] of the holes in broken ones
-_SUN = (10.0, 55.0)  # [°] elevation
 _COVER = (0.2, 0.6)  # share of the plane in the dark of patches
 _HOUSES, _HOUSE = (1, 4), (3.0, 12.0)  # how many, below the second; [m] their sides, before the sun stretches them
 _POSTS, _POST, _POST_LENGTH = (0, 8), (0.1, 0.5), (2.0, 10.0)  # how many; [m] width and length
 _FINER = 4  # times, what solids are drawn at so that their edges are smooth
-_REACH = 40.0  # [m] of depth up to which patches are seen
 _SKY = np.array([1.0, 0.95, 0.85], np.float32)  # what is left in a shadow is the sky's light, which is bluer
 
 
 class Shade:
     """The shadows of one episode."""
 
-    def __init__(self, strength: float, rng: np.random.Generator) -> None:
+    def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
         """
         Args:
             strength: Share of a colour that is lost in full shadow.
+            sun: Direction towards it, a unit vector, shape (3,).
             rng: Of the episode.
         """
-        elevation, azimuth = np.deg2rad(rng.uniform(*_SUN)), rng.uniform(0.0, 2.0 * np.pi)
-        along = np.array([np.cos(azimuth), np.sin(azimuth)])
-        self._slant = along / np.tan(elevation)
-        long = max(1.0, 1.0 / np.tan(elevation))
+        flat = np.linalg.norm(sun[:2])
+        along = sun[:2] / flat
+        self._slant = sun[:2] / sun[2]
+        long = max(1.0, flat / sun[2])
         self._to_texel = np.stack([along / long, [-along[1], along[0]]]) / _TEXEL
         self._loss: Floats = np.float32(strength) * _SKY
         kind = rng.integers(3)  # patches, solids, both
@@ -52,20 +53,18 @@ class Shade:
         if kind != 0:
             self._pattern = np.maximum(self._pattern, _solids(rng))
 
-    def over(self, rgb: Floats, depth: Floats, rays: Array, pose: Array) -> Floats:
+    def over(self, rgb: Floats, depth: Floats, points: Array) -> Floats:
         """A picture with the shadows in it.
 
         Args:
             rgb: Shape (height, width, 3).
             depth: z-depth [m], shape (height, width).
-            rays: Of the pixels, in the camera, with z = 1, shape (height, width, 3).
-            pose: camera_to_world, OpenCV axes, shape (4, 4).
+            points: What is seen, in the world [m], no farther than REACH in depth; shape (height, width, 3).
         """
-        points = (rays * np.minimum(depth, _REACH)[..., None]) @ pose[:3, :3].T + pose[:3, 3]
         flat = points[..., :2] - points[..., 2:] * self._slant
         across, down = np.moveaxis(flat @ self._to_texel.T % _SIDE, -1, 0).astype(np.float32)
         dark = cv2.remap(self._pattern, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32)
-        dark[depth >= _REACH] = 0.0
+        dark[depth >= REACH] = 0.0
         return rgb * (np.float32(1.0) - dark[..., None] * self._loss)
 
 

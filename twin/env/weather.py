@@ -1,4 +1,5 @@
-"""What the weather of an episode lays over its pictures: shadows (`shade.py`), and then the air (`haze.py`)."""
+"""What the weather of an episode lays over its pictures: another sun's light on what stands (`sides.py`), that sun's
+shadows (`shade.py`), and then the air (`haze.py`)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,8 +7,11 @@ from numpy.typing import NDArray
 from twin.env.haze import Haze
 from twin.env.randomisation import Draw
 from twin.env.shade import Shade
+from twin.env.sides import REACH, Sides
 
 Floats = NDArray[np.float32]
+
+_ELEVATION = (10.0, 55.0)  # [°] of the sun
 
 
 class Weather:
@@ -17,13 +21,27 @@ class Weather:
         """
         Args:
             draw: Of the episode.
-            rng: Of its shadows.
+            rng: Of its sun, light and shadows.
         """
-        self._shade = Shade(draw.shade, rng) if draw.shade else None
+        elevation, azimuth = np.deg2rad(rng.uniform(*_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
+        level = np.cos(elevation)
+        sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        self._sides = Sides(draw.sunlight, sun, rng) if draw.sunlight else None
+        self._shade = Shade(draw.shade, sun, rng) if draw.shade else None
         self._haze = Haze(draw.extinction, draw.airlight) if draw.extinction else None
 
     def over(self, rgb: Floats, depth: Floats, rays: NDArray, pose: NDArray) -> Floats:
-        """A picture in this weather; shapes and units as in `Shade.over`."""
+        """A picture in this weather.
+
+        Args:
+            rgb: Shape (height, width, 3).
+            depth: z-depth [m], shape (height, width).
+            rays: Of the pixels, in the camera, with z = 1, shape (height, width, 3).
+            pose: camera_to_world, OpenCV axes, shape (4, 4).
+        """
+        around = (rays * np.minimum(depth, REACH)[..., None]) @ pose[:3, :3].T
+        if self._sides:
+            rgb = self._sides.over(rgb, depth, around.astype(np.float32))
         if self._shade:
-            rgb = self._shade.over(rgb, depth, rays, pose)
+            rgb = self._shade.over(rgb, depth, around + pose[:3, 3])
         return self._haze.over(rgb, depth, np.linalg.norm(rays, axis=-1).astype(np.float32)) if self._haze else rgb

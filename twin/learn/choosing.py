@@ -6,6 +6,7 @@ one that arrives most often is the run's policy; of those alike, the one that ea
 was lucky, too, it drives *fresh* episodes at the end, and its rate in training is told of these alone.
 """
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +50,9 @@ def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
     seeds = tuple(int(seed) for seed in drawn)
     shared, fresh = seeds[: config.trials], seeds[config.trials :]
     stage = Stage.open(twin, config.task, {**config.options(), "start_along": 0.0})
-    worlds = Worlds(stage, [None] * config.worlds)
     tried = []
-    with progress.bar("choose", len(candidates) * len(shared) + len(fresh), "episode") as bar:
+    bar = progress.bar("choose", len(candidates) * len(shared) + len(fresh), "episode")
+    with closing(Worlds(stage, [None] * config.worlds)) as worlds, bar:
 
         def told(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
             return {"step": int(path.name)} | _summed(episodes(load_policy(path), worlds, which, bar.update))
@@ -60,7 +61,6 @@ def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
             tried.append(told(path, shared))
         best = max(range(len(tried)), key=lambda i: (tried[i]["successes"], tried[i]["reward"]))
         last = told(candidates[best], fresh)
-    worlds.close()
     copy_policy(candidates[best], folder)
     out = {"steps": trained, "candidates": tried, "chosen": last}
     write_json(folder / CHOICE, out)

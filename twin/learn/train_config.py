@@ -17,6 +17,9 @@ from twin.learn.policy import Control
 _STATES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
 """Speed [m/s], yaw rate [rad/s], cross-track [m], heading error and turns 1, 2 and 4 m ahead [rad]."""
 
+_CLEAR = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
+"""The place as filmed; only the robot differs."""
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -119,7 +122,7 @@ class TrainConfig:
         # And where only leaving the road costs, it drives anywhere on it: beside the kerb one surprise is enough.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
-        ranges = Ranges() if self.varies else Ranges(extinction=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
+        ranges = Ranges() if self.varies else _CLEAR
         lit = {"lighting": self.lighting, "observe": self.observe, "randomise": ranges if self.randomise else None}
         return {**dataclasses.asdict(self.control), **lit, "rewards": rewards, "start_along": self.start_along}
 

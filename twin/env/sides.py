@@ -1,0 +1,64 @@
+"""What another sun does to a place that was filmed under its own: what faces it brightens, what turns away darkens.
+
+The ground is what all else is compared with, and keeps its light. A surface of normal n under a sun in direction s
+gets a gain of exp(strength · (n · s − s_z)), more of it in red than in blue: the light of a low sun is warm. Normals
+come from the picture's own depth. What is far, and the sky itself, get one light of another brightness and colour,
+more of it towards the sun.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+REACH = 40.0  # [m] of depth beyond which no normals are told
+_WARM = (0.0, 0.5)  # share of the gain by which red has more, and blue less, than green
+_SKY, _TINT = 0.6, 0.15  # standard deviations of the sky's brightness and colour, as shares of the strength
+_STANDS = (-0.4, 0.0)  # [m] above the camera: where that begins which stands. Below, a field's ground is too rough
+_SMOOTH = 3  # [px] a side, over which points are averaged before normals are taken
+
+
+class Sides:
+    """The light on what stands, in one episode."""
+
+    def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
+        """
+        Args:
+            strength: Largest change, as a natural logarithm: 0.7 is twice the light or half of it.
+            sun: Direction towards it, a unit vector, shape (3,).
+            rng: Of the episode.
+        """
+        red_to_blue = np.array([1.0, 0.0, -1.0])
+        self._sun = sun.astype(np.float32)
+        self._gain = (strength * (1.0 + rng.uniform(*_WARM) * red_to_blue)).astype(np.float32)
+        sky = rng.normal(0.0, _SKY) + rng.normal(0.0, _TINT) * red_to_blue
+        self._sky = (strength * sky).astype(np.float32)
+
+    def over(self, rgb: Floats, depth: Floats, points: Floats) -> Floats:
+        """A picture under this sun.
+
+        Args:
+            rgb: Shape (height, width, 3).
+            depth: z-depth [m], shape (height, width).
+            points: What is seen, relative to the camera in world axes [m], no farther than REACH in depth; shape
+                (height, width, 3).
+        """
+        low, high = _STANDS
+        stands = np.clip((points[..., 2] - low) / (high - low), 0.0, 1.0)
+        facing = stands * (_normals(points) @ self._sun - self._sun[2])
+        light = facing[..., None] * self._gain
+        far = depth >= REACH
+        ahead = points[far] / np.linalg.norm(points[far], axis=-1, keepdims=True)
+        light[far] = self._sky + (ahead @ self._sun)[:, None] * (0.5 * self._gain)
+        return rgb * np.exp(light)
+
+
+def _normals(points: Floats) -> Floats:
+    """Unit normals of the surface through points around the camera, towards it, shape (height, width, 3)."""
+    smooth = cv2.blur(points, (_SMOOTH, _SMOOTH), borderType=cv2.BORDER_REPLICATE)
+    down, across = np.gradient(smooth, axis=(0, 1))
+    normal = np.cross(down, across)
+    normal *= -np.sign(np.sum(normal * smooth, axis=-1, keepdims=True))
+    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)).astype(np.float32)
