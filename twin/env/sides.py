@@ -50,8 +50,8 @@ class Sides:
         facing = stands * (_normals(points) @ self._sun - self._sun[2])
         light = facing[..., None] * self._gain
         far = depth >= REACH
-        ahead = points[far] / np.linalg.norm(points[far], axis=-1, keepdims=True)
-        light[far] = self._sky + (ahead @ self._sun)[:, None] * (0.5 * self._gain)
+        ahead = points[far] @ self._sun / np.sqrt(np.einsum("...i,...i", points[far], points[far]))
+        light[far] = self._sky + ahead[:, None] * (0.5 * self._gain)
         return rgb * np.exp(light)
 
 
@@ -60,5 +60,5 @@ def _normals(points: Floats) -> Floats:
     smooth = cv2.blur(points, (_SMOOTH, _SMOOTH), borderType=cv2.BORDER_REPLICATE)
     down, across = np.gradient(smooth, axis=(0, 1))
     normal = np.cross(down, across)
-    normal *= -np.sign(np.sum(normal * smooth, axis=-1, keepdims=True))
-    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)).astype(np.float32)
+    squares, towards = (np.einsum("...i,...i", normal, other) for other in (normal, smooth))
+    return normal * (-np.sign(towards) / np.sqrt(np.maximum(squares, 1e-18)))[..., None]
