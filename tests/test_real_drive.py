@@ -10,6 +10,7 @@ import pytest
 from dm_control.rl import control
 
 from twin.alignment.logs import read_log
+from twin.alone import alone
 from twin.config import MjcfConfig
 from twin.env.drivers import RouteDriver
 from twin.env.options import parse_options
@@ -207,6 +208,8 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
         assert (cell.trials, cell.successes) == (len(mine), sum(t.success for t in mine))
         assert cell.twin_key == (cell.policy, "straight", "held-out+randomised")
     before = out.with_name("results_trials.csv").read_text()
+    with alone(out.with_name(".results.lock"), "x"), pytest.raises(InputError, match="is being written"):
+        drive.run([left], "straight", ["rain"], 3, out)
     third = max(t.seed for t in trials if t.lighting == "rain") + 1
     drive.run([left], "straight", ["rain"], 3, out, "sun", films=tmp_path / "films")
     assert {cell.twin_lighting for cell in read_results(out, twin)} == {"held-out+randomised"}  # as it was before

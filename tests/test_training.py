@@ -19,6 +19,7 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import progress, train
+from twin.alone import alone
 from twin.env.randomisation import Ranges
 from twin.errors import InputError
 from twin.learn.choosing import FRESH
@@ -121,6 +122,13 @@ def test_the_verb(scene, capsys):
     assert "error: " in capsys.readouterr().err
     assert train.main([*common, "--run", "two", "--lighting", "dusk"]) == 2
     assert "dusk" in capsys.readouterr().err
+
+
+def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
+    with alone(scene / "runs/locked/.lock", "x"):
+        assert train.main([str(scene), "--task", "ahead", "--run", "locked", "--quiet", "--steps", "4"]) == 2
+    assert "locked is being trained by process" in capsys.readouterr().err
+    assert [path.name for path in (scene / "runs/locked").iterdir()] == [".lock"]
 
 
 def test_a_finished_run_is_left_as_it_is(scene, tmp_path):

@@ -12,6 +12,7 @@ from tiny_runs import SMALL, tiny_runs
 from tiny_twin import tiny_twin
 
 from twin import load_scene, progress, validate
+from twin.alone import alone
 from twin.env.randomisation import Ranges, asked
 from twin.env.suite import Stage, fingerprint
 from twin.errors import InputError
@@ -152,6 +153,12 @@ def test_another_policy_of_the_same_name_is_refused(fresh, tmp_path):
         run(fresh, str(tmp_path / "ahead"))
     with pytest.raises(InputError, match="two policies"):
         run(fresh, "ahead", str(tmp_path / "ahead"))
+
+
+def test_two_validations_do_not_mix(fresh):
+    with alone(fresh / "validation" / ".lock", "x"), pytest.raises(InputError, match="validation by process"):
+        run(fresh, "ahead")
+    assert not (fresh / "validation" / "episodes.csv").exists()
 
 
 def test_what_is_named_twice_is_driven_once(fresh):

@@ -6,20 +6,18 @@ A stage runs in `build/<folder>.partial`, which is renamed when it is complete. 
 """
 
 import argparse
-import contextlib
 import dataclasses
 import errno
-import fcntl
 import importlib
 import os
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from twin import progress
+from twin.alone import alone
 from twin.config import SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError, refuse
@@ -77,7 +75,7 @@ def build(
     config = load_config(scene.config_file, overrides)
     inputs = input_digests(scene, config)
     scene.build.mkdir(exist_ok=True)
-    with _lock(scene):
+    with alone(scene.build / ".lock", f"{scene.root} is being built"):
         recover(scene)
         stamps: dict[str, Stamp] = {}
         skipped: dict[str, bool] = {}
@@ -188,24 +186,6 @@ def _publish(scene: SceneDir, report: dict[str, Any]) -> None:
 
         replace_file(scene.stage("review") / "review.mp4", scene.review_mp4)
         write_page(scene, report)
-
-
-@contextlib.contextmanager
-def _lock(scene: SceneDir) -> Iterator[None]:
-    """One build of a scene at a time; the lock goes with the process, however it ends."""
-    path = scene.build / ".lock"
-    with path.open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            raise InputError(
-                f"{scene.root} is being built by process {file.read().strip() or '?'}; wait for it or stop it"
-            ) from None
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        yield
 
 
 def _select_device(device: str | None) -> None:

@@ -12,10 +12,17 @@ import dataclasses
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from twin import progress
+from twin.alone import alone
 from twin.errors import InputError, refuse
-from twin.loading import load_scene
+from twin.loading import Twin, load_scene
+from twin.report.statistics import wilson
+from twin.report.training import success_curve
+
+if TYPE_CHECKING:
+    from twin.learn.train_config import TrainConfig
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -23,38 +30,14 @@ def main(arguments: list[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     progress.set_quiet(given.quiet)
     try:
-        try:
-            from twin.learn import training
-            from twin.learn.choosing import choose
-            from twin.learn.train_config import PRESETS, TrainConfig
-        except ImportError as error:
-            raise InputError(f"training needs more: pip install .[learn] ({error})") from None
-        from twin.report.statistics import wilson
-        from twin.report.training import success_curve
+        from twin.learn.train_config import PRESETS, TrainConfig
 
         names = {field.name for field in dataclasses.fields(TrainConfig)}
         asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
         config = TrainConfig(**{**PRESETS[given.preset], **asked})
-        folder = given.scene / "runs" / given.run
-        with progress.bar("train", config.steps, "step") as bar:
-
-            def watch(now: training.Progress) -> None:
-                if not bar.n:  # what was trained before was not trained in this time
-                    bar.initial = bar.n = bar.last_print_n = now.steps
-                bar.update(now.steps - bar.n)
-                if now.recent:
-                    low, high = wilson(sum(now.recent), len(now.recent))
-                    bar.set_postfix_str(
-                        f"success {sum(now.recent)}/{len(now.recent)} ({low:.2f} to {high:.2f})", refresh=False
-                    )
-
-            twin = load_scene(given.scene)
-            training.train(twin, folder, config, watch)
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-        try:
-            chosen = choose(twin, folder, config)["chosen"]
-        finally:
-            signal.signal(signal.SIGTERM, before)
+        twin, folder = load_scene(given.scene), given.scene / "runs" / given.run
+        with alone(folder / ".lock", f"{folder} is being trained"):
+            chosen = _trained(twin, folder, config)
         picture = success_curve(folder)
     except (InputError, OSError) as error:
         return refuse(error)
@@ -69,6 +52,34 @@ def main(arguments: list[str] | None = None) -> int:
             f"episodes like those of the training ({low:.2f} to {high:.2f}); success along it: {picture}"
         )
     return 0
+
+
+def _trained(twin: Twin, folder: Path, config: "TrainConfig") -> dict[str, Any]:
+    """Trains under a bar; returns what the best of the late policies did."""
+    try:
+        from twin.learn import training
+        from twin.learn.choosing import choose
+    except ImportError as error:
+        raise InputError(f"training needs more: pip install .[learn] ({error})") from None
+
+    with progress.bar("train", config.steps, "step") as bar:
+
+        def watch(now: training.Progress) -> None:
+            if not bar.n:  # what was trained before was not trained in this time
+                bar.initial = bar.n = bar.last_print_n = now.steps
+            bar.update(now.steps - bar.n)
+            if now.recent:
+                low, high = wilson(sum(now.recent), len(now.recent))
+                bar.set_postfix_str(
+                    f"success {sum(now.recent)}/{len(now.recent)} ({low:.2f} to {high:.2f})", refresh=False
+                )
+
+        training.train(twin, folder, config, watch)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return choose(twin, folder, config)["chosen"]
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from twin import progress
+from twin.alone import alone
 from twin.config import HELD_OUT, RANDOMISED
 from twin.env.randomisation import asked
 from twin.env.suite import fingerprint
@@ -126,28 +127,30 @@ def validate(
 
     Raises:
         InputError: a policy, the scene, the task or a lighting is not to be had; or names of other policies or another
-            build are in the table; or an episode of the table ends otherwise when it is driven again to be filmed.
+            build are in the table; or an episode of the table ends otherwise when it is driven again to be filmed;
+            or another process is at it.
     """
     twin = load_scene(root)
     folder = twin.scene.validation
     policies = _policies(root, sources, trust)
     lightings = tuple(dict.fromkeys(lightings))
-    _mend(folder / "episodes.csv")
-    _mend(folder / "worst.csv")
-    _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
-    todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
-    seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
-    driven = todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
-    if worst:
-        searched = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
-        for name in policies:
-            _search(searched, name, episodes)
-    said = _write(twin)
-    if films:
-        for name, (source, _) in policies.items():
-            _film(root, folder, source, trust, [t for t in driven if t.policy == name])
+    with alone(folder / ".lock", f"policies are being driven for {folder}"):
+        _mend(folder / "episodes.csv")
+        _mend(folder / "worst.csv")
+        _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
+        todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
+        seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
+        driven = todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
+        if worst:
+            searched = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
+            for name in policies:
+                _search(searched, name, episodes)
         said = _write(twin)
-    return said
+        if films:
+            for name, (source, _) in policies.items():
+                _film(root, folder, source, trust, [t for t in driven if t.policy == name])
+            said = _write(twin)
+        return said
 
 
 def _write(twin: Twin) -> dict:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.alone import alone
 from twin.config import HELD_OUT, RANDOMISED
 from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
@@ -137,7 +138,8 @@ def run(
         Every trial of the table, those of earlier calls too.
 
     Raises:
-        InputError: unknown names, unusable policy files, or another file than before under a policy's name.
+        InputError: unknown names, unusable policy files, another file than before under a policy's name, or another
+            process that drives for the same table.
     """
     for name in lightings:
         if name not in WEATHER:
@@ -146,27 +148,34 @@ def run(
         raise InputError(f"trials = {trials}; expected 1 to {_PER_WEATHER}")
     table = out.with_name(f"{out.stem}_trials.csv")
     loaded = [policy_file(path) for path in policies]
-    _remember(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
-    done = read_trials(table) if table.exists() else []
-    known = {(*_key(one), one.seed) for one in done}
-    for policy in {one.name: one for one in loaded}.values():
-        test = Test(policy, task)
-        for lighting in dict.fromkeys(lightings):
-            # Of each weather its own, or ten starts in five weathers would pass for fifty.
-            first = _FIRST_SEED + _PER_WEATHER * list(WEATHER).index(lighting)
-            seeds = [first + k for k in range(trials)]
-            missing = [seed for seed in seeds if (policy.name, task, lighting, seed) not in known]
-            with bar(f"{policy.name}, {task}, {lighting}", len(missing), "trial") as progress:
-                for seed in missing:
-                    frames: list[Picture] = []
-                    done.append(test.trial(lighting, seed, frames.append if films else None))
-                    if films:
-                        _film(frames, films / f"{policy.name.replace('/', '_')}_{task}_{lighting}_{seed}.mp4")
-                    _write(done, table, out, twin_lighting)
-                    progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
-                    progress.update()
-    _write(done, table, out, twin_lighting)
+    with alone(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
+        _remember(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
+        done = read_trials(table) if table.exists() else []
+        known = {(*_key(one), one.seed) for one in done}
+        for policy in {one.name: one for one in loaded}.values():
+            test = Test(policy, task)
+            for lighting in dict.fromkeys(lightings):
+                # Of each weather its own, or ten starts in five weathers would pass for fifty.
+                first = _FIRST_SEED + _PER_WEATHER * list(WEATHER).index(lighting)
+                seeds = [first + k for k in range(trials)]
+                missing = [seed for seed in seeds if (policy.name, task, lighting, seed) not in known]
+                with bar(f"{policy.name}, {task}, {lighting}", len(missing), "trial") as progress:
+                    for seed in missing:
+                        done.append(_trial(test, lighting, seed, films))
+                        _write(done, table, out, twin_lighting)
+                        progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
+                        progress.update()
+        _write(done, table, out, twin_lighting)
     return done
+
+
+def _trial(test: Test, lighting: str, seed: int, films: Path | None) -> Trial:
+    """A trial, filmed where it is asked for."""
+    frames: list[Picture] = []
+    trial = test.trial(lighting, seed, frames.append if films else None)
+    if films:
+        _film(frames, films / f"{trial.policy.replace('/', '_')}_{trial.task}_{lighting}_{seed}.mp4")
+    return trial
 
 
 def _film(frames: Sequence[Picture], path: Path) -> None:
