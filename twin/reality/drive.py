@@ -79,6 +79,15 @@ class Test:
             self.road.physics, self.road.drive, control_timestep=policy.control.control_timestep
         )
 
+    def begin(self, lighting: str, seed: int) -> Eye:
+        """Puts the robot to the start; returns its camera. Arguments: see `trial`."""
+        self.road.drive.seed(seed)
+        self._environment.reset()
+        size = self.policy.size
+        intrinsics = self.road.intrinsics(size)
+        raster = _raster(lighting, tuple(intrinsics.tolist()), size)
+        return Eye(raster, WEATHER[lighting], self._robot, intrinsics, size, self.road.drive.rng(CAMERA))
+
     def trial(self, lighting: str, seed: int, watch: Callable[[Picture], None] | None = None) -> Trial:
         """Drives once.
 
@@ -88,17 +97,7 @@ class Test:
             watch: Is shown every picture (h, w, 3).
         """
         policy, drive, physics = self.policy, self.road.drive, self.road.physics
-        drive.seed(seed)
-        self._environment.reset()
-        intrinsics = self.road.intrinsics(policy.size)
-        eye = Eye(
-            _raster(lighting, tuple(intrinsics.tolist()), policy.size),
-            WEATHER[lighting],
-            self._robot,
-            intrinsics,
-            policy.size,
-            drive.rng(CAMERA),
-        )
+        eye = self.begin(lighting, seed)
         width, height = policy.size
         stack, steps, ended = np.zeros((policy.stack, 3, height, width), np.uint8), 0, False
         while not ended:

@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 
 CHOICE = "choice.json"
 """Of a run: what its last policies did without exploring, and which is the run's; see `learn/choosing.py`."""
-_BINS = 25
+_BINS, _LEAST = 25, 5  # of a curve, and episodes in one
 
 
 def trainings(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -72,10 +72,10 @@ def binned(steps: np.ndarray, success: np.ndarray, bins: int = _BINS) -> list[tu
     Args:
         steps: At which episodes ended, ascending, shape (n,).
         success: 0 or 1, shape (n,).
-        bins: Most; every bin has 10 episodes at least, where there are so many.
+        bins: Most; every bin has `_LEAST` episodes at least, where there are so many.
     """
     out = []
-    parts = max(1, min(bins, len(steps) // 10))
+    parts = max(1, min(bins, len(steps) // _LEAST))
     for at, won in zip(np.array_split(steps, parts), np.array_split(success, parts), strict=True):
         low, high = wilson(won.sum(), len(won))
         out.append((float(at.mean()), int(won.sum()), len(won), float(low), float(high)))
@@ -105,14 +105,14 @@ def success_curve(folder: Path) -> Path:
     """Draws `success.png` of a run: success over steps, with intervals of 90 %, and the choice at its end."""
     steps, success = read_episodes(folder)
     path = folder / "success.png"
-    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
     if len(steps):
         draw_curve(axes, steps, success, "#1f77b4")
     if (folder / CHOICE).exists():
         _draw_choice(axes, read_json(folder / CHOICE))
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper left", frameon=False, fontsize=8)
-    axes.set(xlabel="steps of all worlds", ylabel="success in training", ylim=(-0.02, 1.02), xlim=(0, None))
+        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    axes.set(xlabel="steps of all worlds", ylabel="success in training", ylim=(-0.04, 1.04), xlim=(0, None))
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -1,0 +1,104 @@
+"""The README's picture of the experiment.
+
+    python benchmarks/table1/picture.py SCENE docs/forecast.jpg
+
+The road as randomised episodes of the twin show it, the road of the real test in its weather, success on the road over
+success in the twin for every policy that drove, and success along a training. SCENE holds what `benchmarks/table1`
+left there.
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from numpy.typing import NDArray
+
+import twin
+from twin.learn.policy import load_policy
+from twin.reality.drive import Test
+from twin.reality.weather import WEATHER
+from twin.report.forecast import Forecast
+from twin.report.forecast_figures import twin_against_road
+from twin.report.training import success_curve
+
+Picture = NDArray[np.uint8]
+
+_WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
+_SEEDS = range(1, 1 + len(WEATHER))  # of the twin's pictures
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--run", default="right_varied_0", help="whose training is shown")
+    given = parser.parse_args()
+    run = given.scene / "runs" / given.run
+    test = Test(load_policy(run), "straight")
+    road = [test.begin(name, 7_000_000).look(test.road.physics.camera_to_world, 0.0) for name in WEATHER]
+    drawn = twin_against_road(Forecast.load(given.scene / "forecast"))
+    curve = cv2.imread(str(success_curve(run)))[..., ::-1]
+    parts = [
+        _caption("The road as the twin shows it in randomised episodes: lights, suns, shadows and haze are drawn anew"),
+        _row([_first(given.scene, seed) for seed in _SEEDS]),
+        _caption("The road of the real test: weather that nobody filmed, things that were moved"),
+        _row(road, list(WEATHER)),
+        _side_by_side(_drawn(drawn), curve),
+    ]
+    whole = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
+    cv2.imwrite(str(given.out), whole[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86])
+
+
+def _first(scene: Path, seed: int) -> Picture:
+    """The first picture of an episode."""
+    step = twin.load(scene, "straight", seed, randomise=True).reset()
+    return step.observation["pixels"][-1]
+
+
+def _drawn(figure: object) -> Picture:
+    canvas = FigureCanvasAgg(figure)  # type: ignore[arg-type]
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _caption(text: str) -> Picture:
+    out = np.full((_LINE, _WIDTH, 3), 255, np.uint8)
+    return _written(out, text, (_GAP, _LINE - 11), 0.62, (20, 20, 20))
+
+
+def _row(pictures: list[Picture], names: list[str] | None = None) -> Picture:
+    """Pictures of one size beside each other, over the whole width."""
+    width = (_WIDTH - _GAP) // len(pictures) - _GAP
+    height = round(width * pictures[0].shape[0] / pictures[0].shape[1])
+    out = np.full((height + _GAP, _WIDTH, 3), 255, np.uint8)
+    for i, picture in enumerate(pictures):
+        left = _GAP + i * (width + _GAP)
+        large = cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
+        if names:
+            _written(large, names[i], (8, 24), 0.62, (0, 0, 0), 4)
+            _written(large, names[i], (8, 24), 0.62, (255, 255, 255))
+        out[:height, left : left + width] = large
+    return out
+
+
+def _side_by_side(*drawings: Picture) -> Picture:
+    height = min(round(d.shape[0] * (_WIDTH / len(drawings)) / d.shape[1]) for d in drawings)
+    scaled = [
+        cv2.resize(d, (height * d.shape[1] // d.shape[0], height), interpolation=cv2.INTER_AREA) for d in drawings
+    ]
+    out = np.full((height, _WIDTH, 3), 255, np.uint8)
+    for i, drawing in enumerate(scaled):
+        middle = (2 * i + 1) * _WIDTH // (2 * len(scaled))
+        left = middle - drawing.shape[1] // 2
+        out[:, left : left + drawing.shape[1]] = drawing
+    return out
+
+
+def _written(out: Picture, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int], thick: int = 1):
+    return cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
+
+
+if __name__ == "__main__":
+    main()
