@@ -156,7 +156,7 @@ def test_another_policy_of_the_same_name_is_refused(fresh, tmp_path):
 
 
 def test_two_validations_do_not_mix(fresh):
-    with alone(fresh / "validation" / ".lock", "x"), pytest.raises(InputError, match="validation by process"):
+    with alone(fresh / ".validation.lock", "x"), pytest.raises(InputError, match="validation by process"):
         run(fresh, "ahead")
     assert not (fresh / "validation" / "episodes.csv").exists()
 

@@ -14,7 +14,7 @@ from tiny_twin import tiny_twin
 
 from twin import film, progress, validate
 from twin.errors import InputError
-from twin.report.training import RECENT, trainings
+from twin.report.training import RECENT, binned, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.report.validation import rate, share, summary, typical_episode, worst_episode
 from twin.report.validation_page import Curve, validation_page
@@ -281,3 +281,12 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
     capsys.readouterr()
     assert film.main([*common, "--policy", "nobody", "--quiet"]) == 2
     assert capsys.readouterr().err.startswith("error: no policy nobody")
+
+
+@pytest.mark.parametrize("count", [1, 4, 24, 1000])
+def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count):
+    won = np.arange(count) % 3 == 0
+    points = binned(np.arange(count), won)
+    assert sum(n for _, _, n, _, _ in points) == count and sum(k for _, k, _, _, _ in points) == won.sum()
+    assert all(n >= min(5, count) and low - 1e-9 <= k / n <= high + 1e-9 for _, k, n, low, high in points)
+    assert len(points) == min(25, max(1, count // 5))

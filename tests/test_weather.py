@@ -7,10 +7,11 @@ from tiny_twin import tiny_twin
 import twin
 from twin import progress
 from twin.env.haze import Haze
-from twin.env.randomisation import Ranges
-from twin.env.shade import Shade, _solids
+from twin.env.randomisation import Draw, Ranges
+from twin.env.shade import _solids
 from twin.env.sides import Sides
 from twin.env.tasks import Drive
+from twin.env.weather import Weather
 from twin.geometry.cameras import pixel_grid, unproject
 
 SMALL = {"size": (32, 18)}
@@ -40,30 +41,28 @@ def test_haze_hides_by_distance_and_spares_what_is_near():
     np.testing.assert_allclose(Haze(1e3).over(rgb, near, lengths)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
 
 
+def _pose(x: float, turned: float) -> np.ndarray:
+    """camera_to_world of a camera 2 m above z = 0 that looks straight down, turned about the vertical [rad]."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(turned), np.sin(turned), 0], [np.sin(turned), -np.cos(turned), 0], [0, 0, -1]]
+    pose[:3, 3] = x, 0.0, 2.0
+    return pose
+
+
 def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
-    intrinsics = np.array([20.0, 20.0, 16.0, 12.0])
-    rays = unproject(pixel_grid(32, 24), intrinsics)
-    rgb = np.ones((24, 32, 3), np.float32)
-
-    def seen(shade: Shade, x: float) -> tuple[np.ndarray, np.ndarray]:
-        """A camera that looks straight down on z = 0 from 2 m: how light it is, and where."""
-        points = rays * [2.0, -2.0, -2.0] + [x, 0.0, 2.0]
-        return shade.over(rgb, np.full((24, 32), 2.0, np.float32), points), points[..., 0]
-
+    rays = unproject(pixel_grid(32, 32), np.array([20.0, 20.0, 16.0, 16.0]))
+    rgb, depth = np.ones((32, 32, 3), np.float32), np.full((32, 32), 2.0, np.float32)
     covers = []
     for seed in range(30):
-        rng = np.random.default_rng(seed)
-        elevation, azimuth = np.deg2rad(rng.uniform(10.0, 55.0)), rng.uniform(0.0, 2.0 * np.pi)
-        level = np.cos(elevation)
-        sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-        shade = Shade(0.5, sun, rng)
-        light, x = seen(shade, 0.0)
+        weather = Weather(Draw(shade=0.5), np.random.default_rng(seed))
+        light = weather.over(rgb, depth, rays, _pose(0.0, 0.0))
         assert light.min() >= 0.5 and light.max() <= 1.0
-        moved, there = seen(shade, 0.5)  # five pixels further
-        np.testing.assert_allclose(there[:, :-5], x[:, 5:], atol=1e-9)
+        moved = weather.over(rgb, depth, rays, _pose(0.5, 0.0))  # five pixels further
         np.testing.assert_allclose(moved[:, :-5], light[:, 5:], atol=1e-4)
+        turned = weather.over(rgb, depth, rays, _pose(0.0, np.pi / 2))
+        np.testing.assert_allclose(np.rot90(turned), light, atol=1e-4)
         covers.append(float((light[..., 0] < 0.75).mean()))
-        np.testing.assert_array_equal(shade.over(rgb, 0 * x + 1e3, 40.0 * rays), rgb)  # the sky
+        np.testing.assert_array_equal(weather.over(rgb, 500.0 * depth, rays, np.eye(4)), rgb)  # the sky
     assert 0.1 < np.mean(covers) < 0.6 and np.std(covers) > 0.1
 
 
@@ -86,6 +85,7 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
     wide = twin.load(scene, "ahead", 0, pixels=False, half_width=3.0, randomise=Ranges(bystanders=(4, 4)))
     wide.reset()
     assert len(wide.task.obstacles) == 4 and all(abs(one.lateral) > 3.6 for one in wide.task.obstacles)
+    assert not np.array_equal(first(extinction=(0.0, 0.0), sunlight=(0.7, 0.7))[0], clear)
     shaded, _ = first(extinction=(0.0, 0.0), shade=(0.6, 0.6))
     assert (shaded <= clear).all() and (shaded < clear).any()
     differ = []
@@ -113,37 +113,81 @@ def test_solid_shadows_have_straight_edges_and_no_seam():
     assert across > 1.1 * along
 
 
-def _walls() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Of a camera 1 m above the ground at the end of a street along x, looking along x: depth, points, and masks."""
-    rays = unproject(pixel_grid(96, 54), np.array([50.0, 50.0, 48.0, 27.0]))
-    forward, left, up = rays[..., 2], -rays[..., 0], -rays[..., 1]
+RAYS = unproject(pixel_grid(96, 54), np.array([50.0, 50.0, 48.0, 27.0]))
+LOW = np.deg2rad(15.0)
+LEFT = np.array([0.0, np.cos(LOW), np.sin(LOW)])
+"""A sun to the left of who looks along x: the right side of a street faces it."""
+
+
+def street(ground: float, height: float = 6.0) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Of a camera at the end of a street along x, looking along x: depth, points, and masks of what is seen.
+
+    The ground is so far below the camera, and walls end so far above it [m].
+    """
+    left, up = -RAYS[..., 0], -RAYS[..., 1]
     with np.errstate(divide="ignore"):
-        ground = np.where(up < 0.0, -1.0 / up, np.inf)
-        sides = 4.0 / np.abs(left)
-    sides = np.where(sides * np.abs(up) < 6.0, sides, np.inf)  # walls end 6 m above the camera
-    depth = np.minimum(np.minimum(ground, sides), 1e3)
-    points = np.stack([forward, left, up], -1) * np.minimum(depth, 40.0)[..., None]
-    near = depth < 30.0
-    masks = {"ground": near & (ground < 0.9 * sides), "sky": depth > 999.0}
-    masks |= {"left": near & (sides < 0.9 * ground) & (left > 0), "right": near & (sides < 0.9 * ground) & (left < 0)}
+        floor, sides = np.where(up < 0.0, -ground / up, np.inf), 4.0 / np.abs(left)
+    sides = np.where(sides * up < height, sides, np.inf)
+    depth = np.minimum(np.minimum(floor, sides), 1e3)
+    points = np.stack([RAYS[..., 2], left, up], -1) * np.minimum(depth, 40.0)[..., None]
+    near, wall = depth < 25.0, sides < 0.9 * floor
+    masks = {"ground": near & (floor < 0.9 * sides), "sky": depth > 999.0}
+    masks |= {"left": near & wall & (left > 0), "right": near & wall & (left < 0)}
+    masks |= {name: masks[name] & (points[..., 2] > 0.2) for name in ("left", "right")}
     return depth.astype(np.float32), points.astype(np.float32), masks
 
 
-def test_another_sun_lights_what_faces_it_and_leaves_the_ground():
-    depth, points, masks = _walls()
+@pytest.mark.parametrize("ground", [1.0, 0.15])  # the latter is high enough to be lit
+def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
+    depth, points, masks = street(ground)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
-    low = np.deg2rad(15.0)
-    sun = np.array([0.0, np.cos(low), np.sin(low)])  # it stands to the left: the right wall faces it
-    lit = Sides(0.7, sun, np.random.default_rng(0)).over(rgb, depth, points)
+    lit = Sides(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)
     light = {name: np.median(lit[mask][:, 1]) / 0.5 for name, mask in masks.items()}
     assert light["ground"] == pytest.approx(1.0, abs=0.01)
-    assert light["right"] == pytest.approx(np.exp(0.7 * (np.cos(low) - np.sin(low))), rel=0.01)
-    assert light["left"] == pytest.approx(np.exp(0.7 * (-np.cos(low) - np.sin(low))), rel=0.01)
+    assert light["right"] == pytest.approx(np.exp(0.7 * (np.cos(LOW) - np.sin(LOW))), rel=0.01)
+    assert light["left"] == pytest.approx(np.exp(0.7 * (-np.cos(LOW) - np.sin(LOW))), rel=0.01)
     warm = np.median(lit[masks["right"]], 0)
     assert warm[0] > warm[1] > warm[2]
-    assert lit[masks["sky"]].std(0).max() > 0.001  # lighter towards the sun
-    np.testing.assert_array_equal(Sides(0.0, sun, np.random.default_rng(0)).over(rgb, depth, points), rgb)
+    towards, away = (lit[masks["sky"] & side][:, 1].mean() for side in (RAYS[..., 0] < 0.0, RAYS[..., 0] > 0.0))
+    assert towards > 1.05 * away
+    np.testing.assert_array_equal(Sides(0.0, LEFT, np.random.default_rng(0)).over(rgb, depth, points), rgb)
+
+
+def test_what_is_low_keeps_its_light_and_skies_differ():
+    depth, points, masks = street(1.0)
+    rgb = np.full((*depth.shape, 3), 0.5, np.float32)
+    lit = Sides(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)[..., 1] / 0.5
+    high, right = points[..., 2], points[..., 1] < -3.9
+    middle = np.median(lit[right & (abs(high + 0.2) < 0.05) & (depth < 15.0)])
+    assert np.log(middle) == pytest.approx(0.5 * 0.7 * (np.cos(LOW) - np.sin(LOW)), rel=0.15)
+    assert np.median(lit[right & (high < -0.5) & (high > -0.9) & (depth < 15.0)]) == pytest.approx(1.0, abs=0.01)
     skies = [
-        np.median(Sides(0.7, sun, np.random.default_rng(k)).over(rgb, depth, points)[masks["sky"]]) for k in range(20)
+        np.median(Sides(0.7, LEFT, np.random.default_rng(k)).over(rgb, depth, points)[masks["sky"]]) for k in range(20)
     ]
     assert np.std(np.log(skies)) > 0.2
+
+
+def test_the_sun_stays_where_it_is_when_the_robot_turns_and_its_shadows_are_its_own():
+    """A wall is lit alike from wherever it is seen; posts' shadows lie along the light."""
+    rgb = np.full((54, 96, 3), 0.5, np.float32)
+    up = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera axes to x ahead, y left, z up
+    ratios = []
+    for seed in range(12):
+        weather = Weather(Draw(sunlight=0.7), np.random.default_rng(seed))
+        seen = []
+        for turned in (-0.15, 0.15):
+            pose = np.eye(4)
+            c, s = np.cos(turned), np.sin(turned)
+            pose[:3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ up
+            pose[:3, 3] = 100.0, -50.0, 0.5
+            ahead = (RAYS @ pose[:3, :3].T)[..., 0]
+            depth = (10.0 / ahead).astype(np.float32)  # a wall across x, 10 m ahead
+            lit = weather.over(rgb, depth, RAYS, pose)
+            seen.append(np.median(lit[:20, 20:-20, 1]) / 0.5)
+        assert seen[0] == pytest.approx(seen[1], rel=0.01)
+        ratios.append(seen[0])
+    assert max(ratios) > 1.3 and min(ratios) < 0.6
+    sides = weather._sides
+    both = Weather(Draw(sunlight=0.7, shade=0.5), np.random.default_rng(11))
+    np.testing.assert_allclose(both._sides._sun, sides._sun)
+    np.testing.assert_allclose(both._shade._slant, sides._sun[:2] / sides._sun[2], rtol=1e-5)

@@ -36,7 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
         asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
         config = TrainConfig(**{**PRESETS[given.preset], **asked})
         twin, folder = load_scene(given.scene), given.scene / "runs" / given.run
-        with alone(folder / ".lock", f"{folder} is being trained"):
+        with alone(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
             chosen = _trained(twin, folder, config)
         picture = success_curve(folder)
     except (InputError, OSError) as error:

@@ -134,7 +134,7 @@ def validate(
     folder = twin.scene.validation
     policies = _policies(root, sources, trust)
     lightings = tuple(dict.fromkeys(lightings))
-    with alone(folder / ".lock", f"policies are being driven for {folder}"):
+    with alone(folder.with_name(".validation.lock"), f"policies are being driven for {folder}"):
         _mend(folder / "episodes.csv")
         _mend(folder / "worst.csv")
         _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
@@ -261,8 +261,8 @@ def _check_same(
         road, digest = _road(task, lighting), fingerprint(twin, task, lighting)
         if road in driven and noted["roads"].get(road) != digest:
             raise InputError(
-                f"{folder} has episodes of {task} under {lighting} from before the scene was built anew, or its task, "
-                "obstacles or photo changed; move it away to validate anew"
+                f"{folder} has episodes of {task} under {lighting} from before the scene was built anew, its task, "
+                "obstacles or photo changed, or twin draws episodes otherwise; move it away to validate anew"
             )
         noted["roads"][road] = digest
     for name, (source, _) in policies.items():

@@ -27,17 +27,18 @@ Picture = NDArray[np.uint8]
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
 _SEEDS = range(1, 1 + len(WEATHER))  # of the twin's pictures
+_TRIAL = 7_000_000  # seed of a real trial
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--run", default="right_varied_0", help="whose training is shown")
+    parser.add_argument("--run", default="straight_varied_0", help="whose training is shown")
     given = parser.parse_args()
     run = given.scene / "runs" / given.run
     test = Test(load_policy(run), "straight")
-    road = [test.begin(name, 7_000_000).look(test.road.physics.camera_to_world, 0.0) for name in WEATHER]
+    road = [test.begin(name, _TRIAL).look(test.road.physics.camera_to_world, 0.0) for name in WEATHER]
     drawn = twin_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(success_curve(run)))[..., ::-1]
     parts = [
@@ -48,7 +49,8 @@ def main() -> None:
         _side_by_side(_drawn(drawn), curve),
     ]
     whole = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
-    cv2.imwrite(str(given.out), whole[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86])
+    if not cv2.imwrite(str(given.out), whole[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86]):
+        parser.error(f"{given.out} cannot be written")
 
 
 def _first(scene: Path, seed: int) -> Picture:

@@ -16,7 +16,7 @@ from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.options import SIMULATOR, Options
 from twin.env.overlay import Overlay
 from twin.env.simulator_view import SimulatorView
-from twin.env.tasks import CAMERA, LIGHT, SHADE, Drive
+from twin.env.tasks import CAMERA, LIGHT, WEATHER, Drive
 from twin.env.trust import Trust
 from twin.env.weather import Weather
 from twin.nerf.baked import BakedField
@@ -66,7 +66,7 @@ class Pixels:
                 self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
             if o.camera:
                 self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
-            self._weather[i] = Weather(task.draw, task.rng(SHADE)) if o.randomise else None
+            self._weather[i] = Weather(task.draw, task.rng(WEATHER)) if o.randomise else None
         if len(which):
             self.stacks[list(which)] = self._look(which)[:, None]
 

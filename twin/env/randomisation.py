@@ -51,7 +51,7 @@ class Ranges:
     airlight: Range = (0.85, 1.15)
     """How bright the haze is, as a share of the sky at the horizon."""
     sunlight: Range = (0.0, 0.7)
-    """How much another sun brightens what faces it and darkens what turns away, at most [natural logarithm]."""
+    """How much lighter what faces another sun is than what turns away; the `strength` of `Sides`."""
     shade: Range = (0.0, 0.75)
     """Share of a colour that is lost where shadows lie that the film did not have."""
     bystanders: Range = (0, 4)

@@ -1,7 +1,7 @@
 """Shadows that the film did not have, such as another sun throws: dark patches that lie in the place and stay there.
 
 What throws them is not there. A *pattern* of light and dark, drawn for an episode, fills the plane z = 0 and is carried
-through space along the rays of a sun, drawn too, so that ground, kerbs and walls are crossed by it as by a shadow. It
+through space along the rays of the episode's sun, so that ground, kerbs and walls are crossed by it as by a shadow. It
 is made of *patches*, some of them broken up as those of leaves are, of *solids* with straight edges as houses and posts
 throw them, which look like kerbs and lines to who has never seen any, or of both. The lower the sun, the longer they
 are.

@@ -29,7 +29,7 @@ from twin.mjcf.world import World, heading_at, heading_error, nearest, point_at
 
 Array = NDArray[np.float64]
 
-START, ROBOT, LIGHT, OBSTACLES, CAMERA, SHADE = range(6)
+START, ROBOT, LIGHT, OBSTACLES, CAMERA, WEATHER = range(6)
 """Streams of an episode's randomness: `numpy.random.default_rng([seed, stream])`."""
 
 _BUMPER = 0.5  # [m] ahead of the base

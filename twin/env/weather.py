@@ -39,9 +39,10 @@ class Weather:
             rays: Of the pixels, in the camera, with z = 1, shape (height, width, 3).
             pose: camera_to_world, OpenCV axes, shape (4, 4).
         """
-        around = (rays * np.minimum(depth, REACH)[..., None]) @ pose[:3, :3].T
-        if self._sides:
-            rgb = self._sides.over(rgb, depth, around.astype(np.float32))
-        if self._shade:
-            rgb = self._shade.over(rgb, depth, around + pose[:3, 3])
+        if self._sides or self._shade:
+            around = (rays * np.minimum(depth, REACH)[..., None]) @ pose[:3, :3].T
+            if self._sides:
+                rgb = self._sides.over(rgb, depth, around.astype(np.float32))
+            if self._shade:
+                rgb = self._shade.over(rgb, depth, around + pose[:3, 3])
         return self._haze.over(rgb, depth, np.linalg.norm(rays, axis=-1).astype(np.float32)) if self._haze else rgb

@@ -49,7 +49,7 @@ class TrainConfig:
     """Every second episode starts on the way, beside the route and askew, up to this share of the stretch: else a
     policy that has learnt to stay in the middle never sees again how to get back there."""
     randomise: bool = True
-    """Another robot in every episode; and where the lighting varies, hazy air and bystanders, too."""
+    """Another robot in every episode; and where the lighting varies, weather and bystanders, too."""
     privileged: bool = True
     """The critics take where the robot is, too, and the encoder learns to tell it; see `sac.py`. Never the policy."""
     pool: int = 2

@@ -197,8 +197,8 @@ def _check_same(folder: Path, said: dict[str, Any]) -> None:
         raise InputError(f"{folder} was trained by an earlier version, which had no {new[0]}; give another --run")
     if there["road"] != said["road"]:
         raise InputError(
-            f"{folder} was trained before the scene was built anew, or its task or obstacles changed; "
-            "give another --run"
+            f"{folder} was trained before the scene was built anew, its task or obstacles changed, or twin draws "
+            "episodes otherwise; give another --run"
         )
     for name in said:
         if name != "steps" and there.get(name) != said[name]:

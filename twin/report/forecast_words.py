@@ -172,8 +172,8 @@ def unknowns(forecast: Forecast) -> list[Caution]:
             out.append(Caution(what, "drive all of them under the same ones; the rates mix policy with light."))
     out.append(
         Caution(
-            "What the twin does not have: other traffic, wet ground, weather but for haze and shadows, and whatever "
-            "else changed since the films.",
+            "What the twin does not have: other traffic, wet ground, weather but for haze, sun and shadows, and "
+            "whatever else changed since the films.",
             "only real trials tell; spread them over days.",
         )
     )

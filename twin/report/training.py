@@ -20,7 +20,8 @@ from matplotlib.axes import Axes
 
 CHOICE = "choice.json"
 """Of a run: what its last policies did without exploring, and which is the run's; see `learn/choosing.py`."""
-_BINS, _LEAST = 25, 5  # of a curve, and episodes in one
+_BINS = 25  # points of a curve, at most
+_LEAST = 5  # episodes behind each point
 
 
 def trainings(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -72,7 +73,7 @@ def binned(steps: np.ndarray, success: np.ndarray, bins: int = _BINS) -> list[tu
     Args:
         steps: At which episodes ended, ascending, shape (n,).
         success: 0 or 1, shape (n,).
-        bins: Most; every bin has `_LEAST` episodes at least, where there are so many.
+        bins: At most; every one has 5 episodes at least, where there are so many.
     """
     out = []
     parts = max(1, min(bins, len(steps) // _LEAST))

@@ -47,7 +47,9 @@ def light_words(lighting: str) -> str:
     """What a lighting of the tables is."""
     if lighting.endswith(RANDOMISED):
         plain = light_words(lighting.removesuffix(RANDOMISED))
-        return f"{plain}; and for every episode another robot, hazy air, shadows, and things beside the corridor"
+        return (
+            f"{plain}; and for every episode another robot, another sun, haze, shadows, and things beside the corridor"
+        )
     if lighting.startswith("drawn_"):
         return f"light number {lighting[6:]} of those drawn in the search"
     if lighting.count(":") == 2:
