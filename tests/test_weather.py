@@ -179,7 +179,7 @@ def test_the_sun_stays_where_it_is_when_the_robot_turns_and_its_shadows_are_its_
             pose = np.eye(4)
             c, s = np.cos(turned), np.sin(turned)
             pose[:3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ up
-            pose[:3, 3] = 100.0, -50.0, 0.5
+            pose[:3, 3] = -100.0, -50.0, 0.5
             ahead = (RAYS @ pose[:3, :3].T)[..., 0]
             depth = (10.0 / ahead).astype(np.float32)  # a wall across x, 10 m ahead
             lit = weather.over(rgb, depth, RAYS, pose)
