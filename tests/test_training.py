@@ -148,7 +148,7 @@ def test_nothing_is_noted_of_a_run_that_could_not_begin(scene, capsys):
     common = [str(scene), "--run", "typo", "--quiet", "--worlds", "2", "--steps", "4"]
     assert train.main([*common, "--task", "strait"]) == 2
     assert train.main([*common, "--task", "ahead", "--lighting", "dusk"]) == 2
-    assert not (scene / "runs/typo").exists()
+    assert not (scene / "runs/typo/config.json").exists()
     assert train.main([*common, "--task", "ahead"]) == 0
     assert capsys.readouterr().err.count("error: ") == 2
 
