@@ -8,17 +8,20 @@ left there.
 """
 
 import argparse
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import is_color_like, to_hex
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import twin
 from twin.learn.policy import load_policy
 from twin.reality.drive import Test
 from twin.reality.weather import WEATHER
+from twin.report.figures import CARD, INK, LINE, MUTED, SERIES
 from twin.report.forecast import Forecast
 from twin.report.forecast_figures import twin_against_road
 from twin.report.training import success_curve
@@ -27,6 +30,14 @@ Picture = NDArray[np.uint8]
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
 _SEEDS = range(1, 1 + len(WEATHER))  # of the twin's pictures
+_PAPER = {
+    INK: "#16202a",
+    MUTED: "#5b6670",
+    LINE: "#d5dade",
+    CARD: "#ffffff",
+    SERIES[0]: "#2b6cd9",
+    SERIES[1]: "#d97a06",
+}
 _TRIAL = 7_000_000  # seed of a real trial
 
 
@@ -59,10 +70,18 @@ def _first(scene: Path, seed: int) -> Picture:
     return step.observation["pixels"][-1]
 
 
-def _drawn(figure: object) -> Picture:
-    canvas = FigureCanvasAgg(figure)  # type: ignore[arg-type]
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+def _drawn(figure: Figure) -> Picture:
+    """A figure of a page, whose colours stand for the page's, in those of paper."""
+    for artist in figure.findobj():
+        artist.set_path_effects([])  # which have a card's colour, too
+        for part in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
+            told = getattr(artist, f"get_{part}", lambda: None)()
+            one = np.asarray(told)[0] if np.ndim(told) == 2 and len(told) else told
+            if is_color_like(one) and to_hex(one) in _PAPER:
+                getattr(artist, f"set_{part}")(_PAPER[to_hex(one)])
+    file = BytesIO()
+    figure.savefig(file, format="png", dpi=160, facecolor="white")
+    return cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_COLOR_RGB)
 
 
 def _caption(text: str) -> Picture:
