@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from matplotlib.colors import is_color_like, to_hex
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 import twin
@@ -73,7 +74,8 @@ def _first(scene: Path, seed: int) -> Picture:
 def _drawn(figure: Figure) -> Picture:
     """A figure of a page, whose colours stand for the page's, in those of paper."""
     for artist in figure.findobj():
-        artist.set_path_effects([])  # which have a card's colour, too
+        if isinstance(artist, Text) and artist.get_bbox_patch():
+            artist.set_bbox({"facecolor": _PAPER[CARD], "edgecolor": "none", "alpha": 0.7, "pad": 1.0})
         for part in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
             told = getattr(artist, f"get_{part}", lambda: None)()
             one = np.asarray(told)[0] if np.ndim(told) == 2 and len(told) else told
