@@ -119,15 +119,15 @@ LEFT = np.array([0.0, np.cos(LOW), np.sin(LOW)])
 """A sun to the left of who looks along x: the right side of a street faces it."""
 
 
-def street(ground: float, height: float = 6.0) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Of a camera at the end of a street along x, looking along x: depth, points, and masks of what is seen.
 
-    The ground is so far below the camera, and walls end so far above it [m].
+    The ground is so far below the camera [m]; walls end 6 m above it.
     """
     left, up = -RAYS[..., 0], -RAYS[..., 1]
     with np.errstate(divide="ignore"):
         floor, sides = np.where(up < 0.0, -ground / up, np.inf), 4.0 / np.abs(left)
-    sides = np.where(sides * up < height, sides, np.inf)
+    sides = np.where(sides * up < 6.0, sides, np.inf)
     depth = np.minimum(np.minimum(floor, sides), 1e3)
     points = np.stack([RAYS[..., 2], left, up], -1) * np.minimum(depth, 40.0)[..., None]
     near, wall = depth < 25.0, sides < 0.9 * floor
@@ -168,7 +168,7 @@ def test_what_is_low_keeps_its_light_and_skies_differ():
 
 
 def test_the_sun_stays_where_it_is_when_the_robot_turns_and_its_shadows_are_its_own():
-    """A wall is lit alike from wherever it is seen; posts' shadows lie along the light."""
+    """A wall is lit alike from wherever it is seen, and shadows are carried along the same sun's rays."""
     rgb = np.full((54, 96, 3), 0.5, np.float32)
     up = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera axes to x ahead, y left, z up
     ratios = []

@@ -19,7 +19,6 @@ from twin.alone import alone
 from twin.errors import InputError, refuse
 from twin.loading import Twin, load_scene
 from twin.report.statistics import wilson
-from twin.report.training import success_curve
 
 if TYPE_CHECKING:
     from twin.learn.train_config import TrainConfig
@@ -31,6 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     progress.set_quiet(given.quiet)
     try:
         from twin.learn.train_config import PRESETS, TrainConfig
+        from twin.report.training import success_curve
 
         names = {field.name for field in dataclasses.fields(TrainConfig)}
         asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
