@@ -4,7 +4,8 @@ The ground is what all else is compared with, and keeps its light. A surface of 
 a gain of exp(strength · (n · s − s_z)), more of it in red than in blue, as the light of a low sun is warm. Normals come
 from the picture's own depth; beside an outline, within three pixels, they are the outline's. What is lower than 0.4 m
 below the lens keeps its light, kerbs too, as a field's ground is rough; what is higher than the lens gets all of it.
-What is far, and the sky itself, get one light of another brightness and colour, more of it towards the sun.
+What is far, and the sky itself, get one light of another brightness and colour, more of it towards the sun; between 25
+and 40 m the one passes into the other.
 """
 
 import cv2
@@ -15,6 +16,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 REACH = 40.0  # [m] of depth beyond which no normals are told
+_NEAR = 25.0  # [m] of depth up to which nothing is far
 _WARM = (0.0, 0.5)  # share of the gain by which red has more, and blue less, than green
 _SKY, _TINT = 0.6, 0.15  # standard deviations of the sky's brightness and colour, as shares of the strength
 _STANDS = (-0.4, 0.0)  # [m] above the lens: up to the first nothing is lit otherwise, from the second on all of it
@@ -50,9 +52,10 @@ class Sides:
         stands = np.clip((points[..., 2] - low) / (high - low), 0.0, 1.0)
         facing = stands * (_normals(points) @ self._sun - self._sun[2])
         light = facing[..., None] * self._gain
-        far = depth >= REACH
+        far = depth > _NEAR
+        share = np.minimum((depth[far] - _NEAR) / (REACH - _NEAR), 1.0)[:, None]
         ahead = points[far] @ self._sun / np.sqrt(np.einsum("...i,...i", points[far], points[far]))
-        light[far] = self._sky + ahead[:, None] * (0.5 * self._gain)
+        light[far] += share * (self._sky + ahead[:, None] * (0.5 * self._gain) - light[far])
         return rgb * np.exp(light)
 
 
