@@ -249,7 +249,7 @@ def test_a_run_of_an_earlier_version_is_told_to_be_one(tmp_path):
 def test_setups_vary_what_they_say():
     varied, day = TrainConfig().options(), TrainConfig(lighting="day").options()
     assert varied["randomise"] == Ranges() and TrainConfig(randomise=False).options()["randomise"] is None
-    nought = dict.fromkeys(("extinction", "sunlight", "shade", "grain"), (0.0, 0.0))
+    nought = dict.fromkeys(("extinction", "sunlight", "shade"), (0.0, 0.0))
     assert day["randomise"] == Ranges(**nought, bystanders=(0, 0))
     assert TrainConfig(observe="simulator").options()["randomise"] == day["randomise"]
     assert varied["rewards"].cross_track == -varied["rewards"].step and varied["start_along"] > 0.0

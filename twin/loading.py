@@ -33,15 +33,15 @@ class Twin:
 
         return Cameras.load(self._folder("metric"))
 
-    def field(self) -> BakedField:
+    def field(self, device: str = "cpu") -> BakedField:
         """The place to look at, under every lighting it was filmed in and those added by `python -m twin.relight`.
 
-        Needs no torch.
+        Needs no torch. `device` is cpu or cuda.
         """
         from twin.nerf.added import added_lightings
         from twin.nerf.baked import BakedField
 
-        field = BakedField.load(self._folder("field"))
+        field = BakedField.load(self._folder("field"), device)
         field.add_lightings(*added_lightings(self.scene))
         return field
 

@@ -5,13 +5,14 @@ episode: every world is the dm_control environment that `twin.load` gives, stepp
 through exactly what it would alone.
 
 `mujoco.batch.Batch` would step faster by what Python does between the looks at the contacts; it has no contacts to look
-at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock.
+at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock. On a
+GPU `mujoco_warp` steps them all at once, see `device_steps.py`; everything else stays as it is.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import dm_env
 import numpy as np
@@ -19,7 +20,13 @@ from numpy.typing import NDArray
 
 from twin.cores import cores
 from twin.env.dm import control
+from twin.env.dm_physics import DrivePhysics
+from twin.env.options import CPU
 from twin.env.suite import Stage
+from twin.env.tasks import Drive
+
+if TYPE_CHECKING:
+    from twin.env.device_steps import DeviceSteps
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -43,11 +50,12 @@ class Outcome:
 class Worlds:
     """n worlds of one scene and task."""
 
-    def __init__(self, stage: Stage, seeds: Sequence[int | None]) -> None:
+    def __init__(self, stage: Stage, seeds: Sequence[int | None], device: str | None = None) -> None:
         """
         Args:
             stage: Scene, task and options.
             seeds: One per world, of its sequence of episodes; None: unpredictable.
+            device: Warp's name of the device on which `mujoco_warp` steps the worlds; None: what the options say.
         """
         parts = [stage.drive(seed) for seed in seeds]
         self.physics, self.tasks = [p for p, _ in parts], [t for _, t in parts]
@@ -58,6 +66,13 @@ class Worlds:
         self._steps: list[dm_env.TimeStep | None] = [None] * len(parts)
         threads = min(cores(), len(parts))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        if device is None and stage.options.device != CPU:
+            device = stage.options.device
+        self._device: DeviceSteps | None = None
+        if device:
+            from twin.env.device_steps import DeviceSteps  # slow to import
+
+            self._device = DeviceSteps(self.physics, step, device)
         spec = self._environments[0].action_spec()
         self._low, self._high = spec.minimum, spec.maximum
 
@@ -85,6 +100,8 @@ class Worlds:
             self._steps[i] = self._environments[i].reset()
 
         self._each(reset, which)
+        if self._device:
+            self._device.begin(which)
         if self.pixels:
             self.pixels.begin(which)
 
@@ -102,7 +119,16 @@ class Worlds:
         def advance(k: int) -> dm_env.TimeStep:
             return self._environments[which[k]].step(wanted[k])
 
-        steps = self._each(advance, range(len(which)))
+        def judge(k: int) -> dm_env.TimeStep:
+            return _judged(self.tasks[which[k]], self.physics[which[k]])
+
+        if self._device:
+            for i, action in zip(which, wanted, strict=True):
+                self.tasks[i].before_step(action, self.physics[i])
+            self._device.step(which)
+            steps = self._each(judge, range(len(which)))
+        else:
+            steps = self._each(advance, range(len(which)))
         for i, step in zip(which, steps, strict=True):
             self._steps[i] = step
         if self.pixels:
@@ -135,3 +161,14 @@ class Worlds:
 
     def _each(self, function: Callable[[int], T], which: Iterable[int]) -> list[T]:
         return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]
+
+
+def _judged(task: Drive, physics: DrivePhysics) -> dm_env.TimeStep:
+    """What `control.Environment.step` makes of a world once its small steps are done."""
+    task.after_step(physics)
+    reward, observation, discount = (
+        ask(physics) for ask in (task.get_reward, task.get_observation, task.get_termination)
+    )
+    if discount is None:
+        return dm_env.TimeStep(dm_env.StepType.MID, reward, 1.0, observation)
+    return dm_env.TimeStep(dm_env.StepType.LAST, reward, discount, observation)

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import warp as wp
+
 from twin.config import TRAINING, ObstacleConfig
 from twin.env.camera_effects import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
@@ -17,6 +19,7 @@ CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
 
 TWIST, STEERING = "twist", "steering"
 NERF, SIMULATOR = "nerf", "simulator"
+CPU, CUDA = "cpu", "cuda"
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,8 @@ class Options:
     randomise: Ranges | None = None
     """How far robot, weather and bystanders differ from episode to episode; None: they do not. `True` stands for the
     default ranges."""
+    device: str = CPU
+    """cpu; or cuda: fields are marched on the GPU, and many worlds step there, too."""
 
 
 def parse_options(given: dict[str, Any]) -> Options:
@@ -107,6 +112,10 @@ def parse_options(given: dict[str, Any]) -> Options:
         raise InputError(f"action = {options.action!r}; expected {TWIST!r} or {STEERING!r}")
     if options.observe not in (NERF, SIMULATOR):
         raise InputError(f"observe = {options.observe!r}; expected {NERF!r} or {SIMULATOR!r}")
+    if options.device not in (CPU, CUDA):
+        raise InputError(f"device = {options.device!r}; expected {CPU!r} or {CUDA!r}")
+    if options.device == CUDA and not wp.is_cuda_available():
+        raise InputError(f"device = {CUDA!r}: no CUDA device is visible to warp; use device={CPU!r}")
     for name, low in (("control_timestep", 0.01), ("speed", 0.01), ("yaw_rate", 0.01), ("stack", 1)):
         if not getattr(options, name) >= low:
             raise InputError(f"{name} = {getattr(options, name)}; expected at least {low:g}")

@@ -95,16 +95,16 @@ class Overlay:
         def paint(number: int) -> None:
             for k in range(number, len(datas), len(self._painters)):
                 self._paint(self._painters[number], datas[k], poses[k], lightings[k], out, k)
+                if weather and (sky := weather[k]):
+                    out.rgb[k] = sky.over(out.rgb[k], out.depth[k], self._rays, poses[k])
+                if effects:
+                    now = poses[k], datas[k].time, self._rays, self.intrinsics
+                    out.rgb[k] = effects[k].exposed(out.rgb[k], out.depth[k], *now)
 
         if self._pool is None:
             paint(0)
         else:
             list(self._pool.map(paint, range(len(self._painters))))
-        for k, sky in enumerate(weather):
-            if sky:
-                out.rgb[k] = sky.over(out.rgb[k], out.depth[k], self._rays, poses[k])
-        for k, effect in enumerate(effects or ()):
-            out.rgb[k] = effect.exposed(out.rgb[k], out.depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return out
 
     def _paint(

@@ -58,16 +58,16 @@ class HuskyPhysics:
         self.data = mujoco.MjData(model) if data is None else data
         self._body = model.body("base_link").id
         self._camera = model.camera("front").id
-        self._actuators = np.array([model.actuator(side).id for side in SIDES])
+        self.actuators = np.array([model.actuator(side).id for side in SIDES])
         wheels = [model.joint(f"{name}_wheel") for name in WHEELS]
         self._wheel_angles = np.array([wheel.qposadr[0] for wheel in wheels])
         self._wheel_dofs = np.array([wheel.dofadr[0] for wheel in wheels])
-        self._robot = model.body_rootid[model.geom_bodyid] == self._body
+        self.is_robot = model.body_rootid[model.geom_bodyid] == self._body
         self._ground = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground")
-        self._counts = ~self._robot & (np.arange(model.ngeom) != self._ground)
+        self.counts = ~self.is_robot & (np.arange(model.ngeom) != self._ground)
         self._spawn = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "spawn")
         self._period_steps = round(CONTROL_PERIOD / model.opt.timestep)
-        self._look_steps = max(1, round(_LOOK_PERIOD / model.opt.timestep))
+        self.look_steps = max(1, round(_LOOK_PERIOD / model.opt.timestep))
         self._seen = mujoco.MjData(model) if self.params.camera_latency else self.data
         if data is None:
             self.reset()
@@ -120,22 +120,50 @@ class HuskyPhysics:
     def step(self, period: float = CONTROL_PERIOD) -> None:
         """Lets `period` [s] pass, the time between two commands."""
         touched: set[int] = set()
-        left = round(period / self.model.opt.timestep)
-        while left:
-            if not self._until_update:
-                self.data.ctrl[self._actuators] = self.controller.update(self.time)
-                self._until_update = self._period_steps
-            some = min(left, self._look_steps, self._until_update)
+        for some, speeds in self.course(period):
+            self.data.ctrl[self.actuators] = speeds
             if self.surroundings:
                 self.surroundings(self.time + some * self.model.opt.timestep)
             mujoco.mj_step(self.model, self.data, some)
-            left, self._until_update = left - some, self._until_update - some
             touched |= self._touching()
             if self.params.camera_latency:
                 self._instants.append(self._instant())
         # Poses and contacts of the instant that is now read, rather than of the last small step's start.
         mujoco.mj_forward(self.model, self.data)
-        self._touched = touched | self._touching()
+        self._arrive(touched | self._touching())
+
+    def course(self, period: float) -> list[tuple[int, Array]]:
+        """What the controller makes of `period` [s] from now: small steps until the next look, and for how long the
+        left and the right wheels are asked for which speed [rad/s], shape (2,). It has run when this returns."""
+        out, time = [], self.time
+        left = round(period / self.model.opt.timestep)
+        speeds = self.data.ctrl[self.actuators].copy()
+        while left:
+            if not self._until_update:
+                speeds = self.controller.update(time)
+                self._until_update = self._period_steps
+            some = min(left, self.look_steps, self._until_update)
+            out.append((some, speeds))
+            time += some * self.model.opt.timestep
+            left, self._until_update = left - some, self._until_update - some
+        return out
+
+    def take_over(self, touched: set[int], looks: list[tuple[float, Array, Array, Array]]) -> None:
+        """Goes on from where another engine's small steps have led: `data` holds positions, velocities and time.
+
+        Args:
+            touched: Geoms that were in contact at a look.
+            looks: Time [s], `qpos`, `mocap_pos` and `mocap_quat` of each.
+        """
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        if self.params.camera_latency:
+            self._instants += [_Instant(*look) for look in looks]
+        self._arrive(touched)
+
+    def _arrive(self, touched: set[int]) -> None:
+        self._touched = touched
         oldest = self.time - self.params.camera_latency - 2 * _LOOK_PERIOD
         self._instants = [one for one in self._instants if one.time > oldest]
 
@@ -146,7 +174,7 @@ class HuskyPhysics:
     def _touching(self) -> set[int]:
         pairs = self.data.contact.geom
         # Of a pair that counts one geom is the robot's and the other neither robot nor ground.
-        hit = self._robot[pairs[:, ::-1]] & self._counts[pairs]
+        hit = self.is_robot[pairs[:, ::-1]] & self.counts[pairs]
         return set(pairs[hit].tolist()) if hit.any() else set()
 
     @property
@@ -233,7 +261,7 @@ class HuskyPhysics:
     @property
     def motor_torque(self) -> Array:
         """Of the left and of the right side, at the wheels [N m], shape (2,)."""
-        return self.data.actuator_force[self._actuators].copy()
+        return self.data.actuator_force[self.actuators].copy()
 
     @property
     def motor_current(self) -> Array:

@@ -23,7 +23,7 @@ from twin.env.obstacles import add_obstacles
 from twin.env.options import NERF, Options, parse_options
 from twin.env.overlay import Overlay
 from twin.env.pixels import Pixels
-from twin.env.randomisation import VERSION, Ranges
+from twin.env.randomisation import ANOTHER_DAY, VERSION
 from twin.env.scene_model import episode_spec
 from twin.env.simulator_view import SimulatorView
 from twin.env.stretches import Stretch, find_task
@@ -66,7 +66,7 @@ class Stage:
         spec = episode_spec(world, stretch.start, stretch.end, half_width)
         add_obstacles(spec, obstacles.pool, world)
         trust = Trust(twin.cameras()) if parsed.pixels else None
-        field = twin.field() if parsed.pixels and parsed.observe == NERF else None
+        field = twin.field(parsed.device) if parsed.pixels and parsed.observe == NERF else None
         return Stage(world, stretch, parsed, obstacles, spec.compile(), field, trust)
 
     def drive(self, seed: int | None) -> tuple[DrivePhysics, Drive]:
@@ -97,7 +97,7 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
         InputError: as `Stage.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
-    drawn = {"version": VERSION, **dataclasses.asdict(Ranges())} if lighting.endswith(RANDOMISED) else {}
+    drawn = {"version": VERSION, **dataclasses.asdict(ANOTHER_DAY)} if lighting.endswith(RANDOMISED) else {}
     photos = [twin.scene.lightings / f"{name}.json" for name in lighting.removesuffix(RANDOMISED).split(":")]
     return digest_json(
         {

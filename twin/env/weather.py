@@ -1,10 +1,9 @@
-"""What an episode lays over its pictures: the detail that fields leave out (`grain.py`), another sun's light on what
-stands (`sides.py`), that sun's shadows (`shade.py`), and then the air (`haze.py`)."""
+"""What the weather of an episode lays over its pictures: another sun's light on what stands (`sides.py`), that sun's
+shadows (`shade.py`), and then the air (`haze.py`)."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.grain import Grain
 from twin.env.haze import Haze
 from twin.env.randomisation import Draw
 from twin.env.shade import Shade
@@ -22,16 +21,15 @@ class Weather:
         """
         Args:
             draw: Of the episode.
-            rng: Of its sun, light, shadows and grain.
+            rng: Of its sun, light and shadows.
         """
         elevation, azimuth = np.deg2rad(rng.uniform(*_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
         level = np.cos(elevation)
         sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-        # Each draws from a sequence of its own, so that none changes with what else there is.
-        sides, shade, grain = rng.spawn(3)
+        # Each draws from a sequence of its own, so that neither changes with whether there is the other.
+        sides, shade = rng.spawn(2)
         self._sides = Sides(draw.sunlight, sun, sides) if draw.sunlight else None
         self._shade = Shade(draw.shade, sun, shade) if draw.shade else None
-        self._grain = Grain(draw.grain, grain) if draw.grain else None
         self._haze = Haze(draw.extinction, draw.airlight) if draw.extinction else None
 
     def over(self, rgb: Floats, depth: Floats, rays: NDArray, pose: NDArray) -> Floats:
@@ -43,13 +41,10 @@ class Weather:
             rays: Of the pixels, in the camera, with z = 1, shape (height, width, 3).
             pose: camera_to_world, OpenCV axes, shape (4, 4).
         """
-        if self._grain or self._sides or self._shade:
+        if self._sides or self._shade:
             around = (rays * np.minimum(depth, REACH)[..., None]) @ pose[:3, :3].T
-            there = around + pose[:3, 3]
-            if self._grain:
-                rgb = self._grain.over(rgb, depth, there.astype(np.float32))
             if self._sides:
                 rgb = self._sides.over(rgb, depth, around.astype(np.float32))
             if self._shade:
-                rgb = self._shade.over(rgb, depth, there)
+                rgb = self._shade.over(rgb, depth, around + pose[:3, 3])
         return self._haze.over(rgb, depth, np.linalg.norm(rays, axis=-1).astype(np.float32)) if self._haze else rgb

@@ -17,7 +17,7 @@ from twin.learn.policy import Control
 _STATES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
 """Speed [m/s], yaw rate [rad/s], cross-track [m], heading error and turns 1, 2 and 4 m ahead [rad]."""
 
-_CLEAR = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), grain=(0.0, 0.0), bystanders=(0, 0))
+_CLEAR = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
 """The place as filmed; only the robot differs."""
 
 

@@ -1,0 +1,73 @@
+"""Many worlds stepped by mujoco_warp go through what MuJoCo makes them go through. Here on the CPU, as a GPU is rare."""
+
+import numpy as np
+import pytest
+import warp as wp
+from tiny_twin import tiny_twin
+
+import twin
+from twin import progress
+from twin.config import ObstacleConfig
+from twin.env.batch import Worlds
+from twin.env.randomisation import Ranges
+from twin.env.suite import Stage
+from twin.errors import InputError
+
+WALKER = ObstacleConfig("walker", "pedestrian", station=6.0, lateral=-1.5, to=(6.0, 1.5), speed=1.0)
+RANGES = Ranges(friction=(0.7, 1.3), payload=(0.0, 40.0), latency=(0.0, 0.1), bystanders=(0, 0))
+OPTIONS = {"pixels": False, "randomise": RANGES, "obstacles": (WALKER,)}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
+
+
+def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
+    """Robots of different make under different commands, one world after the other and all at once."""
+    stage = Stage.open(scene, "bend", OPTIONS)
+    plain, device = Worlds(stage, [1, 2, 3]), Worlds(stage, [1, 2, 3], device="cpu")
+    for worlds in (plain, device):
+        worlds.begin(range(3))
+    rng = np.random.default_rng(0)
+    actions = np.array([[1.0, 0.0], [0.6, 0.5], [0.2, -0.4]])
+    for k in range(12):
+        which = [0, 1, 2] if k != 6 else [1]
+        given = np.clip(actions + 0.2 * rng.normal(size=actions.shape), -1.0, 1.0)[which]
+        a, b = plain.step(given, which), device.step(given, which)
+        np.testing.assert_array_equal(a.over, b.over)
+        np.testing.assert_allclose(a.reward, b.reward, atol=0.02)
+    for one, other in zip(plain.physics, device.physics, strict=True):
+        assert one.time() == pytest.approx(other.time())
+        np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=0.02)
+        np.testing.assert_allclose(one.robot.wheel_velocity, other.robot.wheel_velocity, atol=0.1)
+        np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=0.02)
+        np.testing.assert_allclose(one.data.mocap_pos, other.data.mocap_pos, atol=1e-9)
+        assert one.speed > 0.1
+    plain.close(), device.close()
+
+
+def test_what_is_touched_on_a_device_ends_the_episode(scene):
+    wall = ObstacleConfig("in_the_way", "box", station=2.0, lateral=0.0)
+    stage = Stage.open(scene, "bend", {"pixels": False, "obstacles": (wall,)})
+    worlds = Worlds(stage, [4, 5], device="cpu")
+    worlds.begin(range(2))
+    for _ in range(30):
+        out = worlds.step(np.array([[1.0, 0.0], [-1.0, 0.0]]))
+        if out.over.any():
+            break
+    assert out.terminated.tolist() == [True, False]
+    assert worlds.tasks[0].cause == "collision" and any("in_the_way" in name for name in worlds.physics[0].touched)
+    assert worlds.physics[1].touched == ()
+    worlds.begin([0])
+    assert worlds.physics[0].time() == 0.0 and not worlds.step(np.zeros((1, 2)), [0]).over.any()
+    worlds.close()
+
+
+def test_no_gpu_is_one_clear_line(scene):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(InputError, match="device = 'cuda': no CUDA device"):
+        patch.setattr(wp, "is_cuda_available", lambda: False)
+        twin.load(scene, "bend", device="cuda")
+    with pytest.raises(InputError, match=r"device = 'tpu'; expected"):
+        twin.load(scene, "bend", device="tpu")
