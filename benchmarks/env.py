@@ -29,6 +29,7 @@ TARGETS: dict[str, tuple[str, float]] = {
     "overlay.obstacle_psnr.overcast": ("≥", 18.0),
     "overlay.obstacle_psnr.night": ("≥", 18.0),
     "overlay.mask_iou": ("≥", 0.9),
+    "gpu.steps_per_s": ("≥", 10_000.0),
 }
 """What is wanted of a figure."""
 

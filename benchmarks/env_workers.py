@@ -179,6 +179,28 @@ def soak(scene: Path, steps: int) -> dict[str, Any]:
     }
 
 
+def gpu(scene: Path, count: int) -> dict[str, Any]:
+    """The same as `batch` on a GPU, nothing but the field in view."""
+    import torch
+
+    worlds = _worlds(scene, count, device="cuda", obstacles=())
+    worlds.begin(range(count))
+    begin, steps = 0.0, 30
+    for k in range(steps + 3):
+        if k == 3:  # compiled, and captured
+            torch.cuda.synchronize()
+            begin = time.perf_counter()
+        worlds.step(_onward(worlds))
+        worlds.pixels.tensor()
+    torch.cuda.synchronize()
+    rate = count * steps / (time.perf_counter() - begin)
+    return {
+        "gpu.worlds": count,
+        "gpu.steps_per_s": rate,
+        "gpu.bytes": torch.cuda.mem_get_info()[1] - torch.cuda.mem_get_info()[0],
+    }
+
+
 def trust(scene: Path) -> dict[str, Any]:
     """See `twin.env.trust`: depth error against the known truth at poses on and off the filmed path, by trust."""
     from env_trust import trust_against_truth
@@ -186,11 +208,12 @@ def trust(scene: Path) -> dict[str, Any]:
     return trust_against_truth(scene)
 
 
-def _worlds(scene: Path, count: int) -> Any:
+def _worlds(scene: Path, count: int, **options: Any) -> Any:
     from twin.env.batch import Worlds
     from twin.env.suite import Stage
 
-    return Worlds(Stage.open(scene, standard_tasks(scene)[-1], one_obstacle(scene)), list(range(count)))
+    stage = Stage.open(scene, standard_tasks(scene)[-1], one_obstacle(scene) | options)
+    return Worlds(stage, list(range(count)))
 
 
 def _onward(worlds: Any) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""Many worlds stepped by mujoco_warp go through what MuJoCo makes them go through. Here on the CPU, as a GPU is rare."""
+"""Many worlds stepped by mujoco_warp go through what MuJoCo makes them go through. Here on the CPU: GPUs are rare."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,12 +11,16 @@ import twin
 from twin import progress
 from twin.config import ObstacleConfig
 from twin.env.batch import Worlds
+from twin.env.camera_effects import CameraOptions
+from twin.env.device_pixels import DevicePixels
+from twin.env.pixels import Pixels
 from twin.env.randomisation import Ranges
 from twin.env.suite import Stage
 from twin.errors import InputError
 
 WALKER = ObstacleConfig("walker", "pedestrian", station=6.0, lateral=-1.5, to=(6.0, 1.5), speed=1.0)
 RANGES = Ranges(friction=(0.7, 1.3), payload=(0.0, 40.0), latency=(0.0, 0.1), bystanders=(0, 0))
+SMALL = {"size": (32, 18)}
 OPTIONS = {"pixels": False, "randomise": RANGES, "obstacles": (WALKER,)}
 
 
@@ -63,6 +69,42 @@ def test_what_is_touched_on_a_device_ends_the_episode(scene):
     worlds.begin([0])
     assert worlds.physics[0].time() == 0.0 and not worlds.step(np.zeros((1, 2)), [0]).over.any()
     worlds.close()
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.1])
+def test_pictures_on_a_device_are_those_on_the_host(scene, latency):
+    """Through the ends of episodes, some worlds at a time, and as a tensor that shares the memory."""
+    stage = Stage.open(scene, "bend", {"obstacles": (), "lighting": ("day", "night"), "lighting_drift": True, **SMALL})
+    robot = replace(stage.world.robot, camera_latency=latency)
+    stage = replace(stage, world=replace(stage.world, robot=robot))
+    parts = [stage.drive(seed) for seed in range(3)]
+    host, device = stage.pixels(parts), DevicePixels(stage.field, stage.trust, stage.options, parts)
+    for physics, task in parts:
+        task.initialize_episode(physics)
+    before = None
+    for k in range(6):
+        which = [0, 1, 2] if k % 3 == 0 else [0, 2] if k % 3 == 1 else [1]
+        for i in which:
+            parts[i][1].before_step([1.0, 0.3 * i], parts[i][0])
+            parts[i][0].step(50)
+        for pixels in (host, device):
+            (pixels.begin if k in (0, 3) else pixels.look)(which)
+        np.testing.assert_array_equal(device.stacks, host.stacks)
+        np.testing.assert_allclose(device.trust, host.trust, atol=1e-5)
+        assert device.info(0)["lighting"] == host.info(0)["lighting"]
+        np.testing.assert_array_equal(device.tensor().numpy(), host.stacks.reshape(3, -1, 18, 32))
+        assert before is None or not np.array_equal(before, host.stacks)
+        before = device.stacks
+
+
+def test_only_bare_pictures_stay_on_the_device(scene):
+    def kind(**options) -> type:
+        stage = Stage.open(scene, "bend", {"obstacles": (), **SMALL, **options})
+        stage = replace(stage, options=replace(stage.options, device="cuda"))  # the field stays on the CPU
+        return type(stage.pixels([stage.drive(0)]))
+
+    assert kind() is DevicePixels
+    assert kind(randomise=True) is kind(obstacles=1) is kind(camera=CameraOptions(vibration=0.1)) is Pixels
 
 
 def test_no_gpu_is_one_clear_line(scene):

@@ -13,10 +13,12 @@ _ARCH = 90  # sm_90: Hopper
 _SLOW = {"stereo"}
 """Unrolled windows make it 20 s of compiling to machine code; to PTX, which a driver takes on, it is half of that."""
 _MADE = {
+    "many worlds' steps": lambda: import_module("twin.env.device_steps"),
+    "many worlds' pictures": lambda: import_module("twin.env.device_pixels"),
     "march of one lane": lambda: march.march(march.LANES["cuda"]).module,
     "shade of one lane": lambda: shade.shade(shade.LANES["cuda"], 64, 32)[0].module,
 }
-"""Kernels that are made for a number of lanes are in modules of their own."""
+"""Those elsewhere; and kernels that are made for a number of lanes, which are in modules of their own."""
 _NO_KERNEL = {"lookup", "shade", "vectorised"}
 
 

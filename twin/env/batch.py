@@ -68,11 +68,7 @@ class Worlds:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         if device is None and stage.options.device != CPU:
             device = stage.options.device
-        self._device: DeviceSteps | None = None
-        if device:
-            from twin.env.device_steps import DeviceSteps  # slow to import
-
-            self._device = DeviceSteps(self.physics, step, device)
+        self._device = _device_steps(self.physics, step, device) if device else None
         spec = self._environments[0].action_spec()
         self._low, self._high = spec.minimum, spec.maximum
 
@@ -161,6 +157,12 @@ class Worlds:
 
     def _each(self, function: Callable[[int], T], which: Iterable[int]) -> list[T]:
         return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]
+
+
+def _device_steps(physics: Sequence[DrivePhysics], step: float, device: str) -> "DeviceSteps":
+    from twin.env.device_steps import DeviceSteps  # slow to import
+
+    return DeviceSteps(physics, step, device)
 
 
 def _judged(task: Drive, physics: DrivePhysics) -> dm_env.TimeStep:

@@ -1,23 +1,24 @@
 """The physics of many worlds in one go on a GPU, by `mujoco_warp`.
 
 Episodes begin, are judged and end on the host, in the same code as everywhere: its `MjData` says where a world is. A
-control step takes the *state* of all worlds (positions, velocities, the solver's last accelerations) to the device, lets
-the small steps pass there under the courses of their controllers, and brings the states back with the geoms that were
-touched. A *slot* is a piece of a course: some small steps under one command, at whose end contacts are looked at; worlds
-whose controllers run at other times have other slots. Numbers are of single precision there, and of another solver:
-episodes are those of MuJoCo in kind, not bit for bit.
+control step takes the *state* of all worlds (positions, velocities, the solver's last accelerations) to the device,
+lets the small steps pass there under the courses of their controllers, and brings the states back with the geoms that
+were touched. A *slot* is a piece of a course: some small steps under one command, at whose end contacts are looked at;
+worlds whose controllers run at other times have other slots. Numbers are of single precision there, and of another
+solver: episodes are those of MuJoCo in kind, not bit for bit.
 
 The device is a GPU, or for tests the CPU, where this is slower than MuJoCo itself.
 """
 
+# mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
+# (inside kernels, Warp's own types hold, which mypy does not know)
+
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from twin.env.dm_physics import DrivePhysics
 
@@ -137,16 +138,17 @@ class DeviceSteps:
             RuntimeError: more contacts than there is room for.
         """
         self._send(which)
-        if self._where == "cpu":
-            self._advance()
-        else:
-            if self._graph is None:
-                self._advance()  # compiles, which a capture must not
-                with wp.ScopedCapture(self._where) as capture:
-                    self._advance()
-                self._graph = capture.graph
-                self._send_states()
-            wp.capture_launch(self._graph)
+        with wp.ScopedDevice(self._where):
+            if self._where == "cpu":
+                self._advance()
+            else:
+                if self._graph is None:
+                    self._advance()  # compiles, which a capture must not
+                    with wp.ScopedCapture() as capture:
+                        self._advance()
+                    self._graph = capture.graph
+                    self._send_states()
+                wp.capture_launch(self._graph)
         self._fetch(which)
 
     def _send(self, which: Sequence[int]) -> None:
@@ -182,25 +184,14 @@ class DeviceSteps:
         self._data.overflow.zero_()
 
     def _advance(self) -> None:
-        d, n, here = self._data, len(self._worlds), {"device": self._where}
-        contact = d.contact
+        d = self._data
+        contact, commands = d.contact, [self._slot, self._speeds, self._positions, self._turns]
         for k in range(self._steps):
-            wp.launch(
-                _before,
-                n,
-                [k, self._slot, self._speeds, self._positions, self._turns],
-                [d.ctrl, d.mocap_pos, d.mocap_quat],
-                **here,
-            )
+            wp.launch(_before, d.nworld, [k, *commands], [d.ctrl, d.mocap_pos, d.mocap_quat])
             mjw.step(self._model, d)
-            wp.launch(_keep, d.qpos.shape, [k, self._slot, d.qpos], [self._history], **here)
-            wp.launch(
-                _touch,
-                d.naconmax,
-                [k, self._looks, d.nacon, contact.geom, contact.worldid, self._is_robot, self._counts],
-                [self._touched],
-                **here,
-            )
+            wp.launch(_keep, d.qpos.shape, [k, self._slot, d.qpos], [self._history])
+            pairs = [d.nacon, contact.geom, contact.worldid, self._is_robot, self._counts]
+            wp.launch(_touch, d.naconmax, [k, self._looks, *pairs], [self._touched])
 
     def _fetch(self, which: Sequence[int]) -> None:
         d = self._data

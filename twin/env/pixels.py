@@ -68,19 +68,23 @@ class Pixels:
                 self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
             self._weather[i] = Weather(task.draw, task.rng(WEATHER)) if o.randomise else None
         if len(which):
-            self.stacks[list(which)] = self._look(which)[:, None]
+            self._show(which, fills=True)
 
     def look(self, which: Sequence[int]) -> None:
         """Adds a new picture to the stacks of some worlds."""
         if len(which):
-            index = list(which)
-            self.stacks[index] = np.concatenate([self.stacks[index][:, 1:], self._look(which)[:, None]], 1)
+            self._show(which, fills=False)
 
     def info(self, i: int) -> dict[str, Any]:
         """What is to be told of world i's picture: `lighting`, as tables name it, and `trust`."""
         light = self.lights[i]
         name = light.name + (RANDOMISED if self.options.randomise else "") if light else ""
         return {"lighting": name, "trust": float(self.trust[i])}
+
+    def _show(self, which: Sequence[int], fills: bool) -> None:
+        """Adds new pictures to the stacks of some worlds, or fills these with them."""
+        index, new = list(which), self._look(which)[:, None]
+        self.stacks[index] = new if fills else np.concatenate([self.stacks[index][:, 1:], new], 1)
 
     def _look(self, which: Sequence[int]) -> Picture:
         physics = [self.worlds[i][0] for i in which]

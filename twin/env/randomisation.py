@@ -107,8 +107,8 @@ class Draw:
 
 
 ANOTHER_DAY = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75))
-"""What policies are judged in: a day that is surely not the film's. Training draws from nothing to as much, to be
-learnt from; counted in a forecast, its mild days would promise more than a road keeps, whose sun is never the film's."""
+"""What policies are judged in: a day that is surely not the film's. Training draws from nothing to as much, so as to be
+learnt from; in a forecast, its mild days would promise more than a road keeps, whose sun is never the film's."""
 
 
 def asked(lighting: str) -> dict[str, Any]:

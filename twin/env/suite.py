@@ -16,11 +16,13 @@ from dm_env import specs
 
 from twin.config import RANDOMISED
 from twin.config_file import load_config
+from twin.env.device_pixels import DevicePixels
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles
+from twin.env.obstacle_view import ObstacleView, camera_pose
 from twin.env.obstacles import add_obstacles
-from twin.env.options import NERF, Options, parse_options
+from twin.env.options import CPU, NERF, Options, parse_options
 from twin.env.overlay import Overlay
 from twin.env.pixels import Pixels
 from twin.env.randomisation import ANOTHER_DAY, VERSION
@@ -74,10 +76,22 @@ class Stage:
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
         return physics, Drive(self.world, self.stretch, self.options, self.obstacles, self.model, seed)
 
+    @property
+    def _bare(self) -> bool:
+        """Whether nothing is put into pictures of the field, not even the robot itself."""
+        if self.options.randomise or self.options.camera or self.obstacles.pool:
+            return False
+        data, camera = mujoco.MjData(self.model), self.model.camera("front").id
+        mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("spawn").id)
+        mujoco.mj_forward(self.model, data)
+        return ObstacleView(self.model, camera, self.options.size).in_view(data, camera_pose(data, camera)) is None
+
     def pixels(self, worlds: list[tuple[DrivePhysics, Drive]]) -> Pixels | None:
         if self.trust is None:
             return None
         size, count = self.options.size, len(worlds)
+        if self.field is not None and self.options.device != CPU and self._bare:
+            return DevicePixels(self.field, self.trust, self.options, worlds)
         if self.field is not None:
             overlay = Overlay(self.model, self.field, size, count)
             return Pixels(overlay, self.field, self.trust, self.options, worlds)

@@ -18,9 +18,11 @@ from twin.nerf.rendering import Rendering
 
 Array = NDArray[np.float64]
 
+SKY = 0.5
+"""Opacity below which a pixel shows the sky."""
+
 _PER_TURN = 10.0  # [m]: a right angle counts as 10 m, as in `geometry.cameras.nearest_frame`
 _NEAR, _FAR = 1.0, 5.0  # [m]
-_SKY = 0.5  # opacity below which a pixel shows the sky
 _SKY_WEIGHT = 5.0
 _CANDIDATES = 32  # filmed frames looked at, nearest first
 
@@ -47,8 +49,10 @@ class Trust:
 
     def of(self, camera_to_world: Array, rendering: Rendering) -> Array:
         """Trust of pictures from OpenCV poses (n, 4, 4), in [0, 1], shape (n,)."""
-        filmed = np.clip((_FAR - self.offset(camera_to_world)) / (_FAR - _NEAR), 0.0, 1.0)
         lower = rendering.opacity[:, rendering.opacity.shape[1] // 2 :]
-        opaque = lower.mean((1, 2))
-        sky = np.clip(1.0 - _SKY_WEIGHT * (lower < _SKY).mean((1, 2)), 0.0, 1.0)
-        return np.minimum(np.minimum(filmed, opaque), sky)
+        return self.judged(camera_to_world, lower.mean((1, 2)), (lower < SKY).mean((1, 2)))
+
+    def judged(self, camera_to_world: Array, opaque: Array, sky: Array) -> Array:
+        """The same from the lower half's mean opacity, and the share of it that shows the sky, each shape (n,)."""
+        filmed = np.clip((_FAR - self.offset(camera_to_world)) / (_FAR - _NEAR), 0.0, 1.0)
+        return np.minimum(np.minimum(filmed, opaque), np.clip(1.0 - _SKY_WEIGHT * sky, 0.0, 1.0))

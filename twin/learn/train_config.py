@@ -124,7 +124,8 @@ class TrainConfig:
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.varies else _CLEAR
         lit = {"lighting": self.lighting, "observe": self.observe, "randomise": ranges if self.randomise else None}
-        return {**dataclasses.asdict(self.control), **lit, "rewards": rewards, "start_along": self.start_along}
+        rest = {"rewards": rewards, "start_along": self.start_along, "device": self.device}
+        return dataclasses.asdict(self.control) | lit | rest
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -7,7 +7,7 @@ baked field shows its place under every lighting.
 
 import itertools
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
@@ -167,17 +167,44 @@ class BakedField:
         Raises:
             InputError: unknown lighting, or cameras of several sizes and none given.
         """
+        with self._lock:  # the arrays are shared by all who call
+            return self._developed(cameras, lighting, size, stop).rendering()
+
+    def show(
+        self,
+        cameras: Posed,
+        lighting: str | NDArray | Sequence[str | NDArray],
+        take: Callable[[Any, Any], None],
+    ) -> None:
+        """Shows `take` what n cameras see without bringing it to the host.
+
+        Args:
+            cameras: As for `render`.
+            lighting: As for `render`.
+            take: Is given colours, Warp (n, height · width) of vec3, and opacities, (n, height · width), on the
+                field's device; they are rendered into again once it returns.
+        """
+        with self._lock:
+            picture = self._developed(cameras, lighting, None, None)
+            take(picture.rgb, picture.opacity)
+
+    def _developed(
+        self,
+        cameras: Posed,
+        lighting: str | NDArray | Sequence[str | NDArray],
+        size: tuple[int, int] | None,
+        stop: NDArray | None,
+    ) -> "_Picture":
         intrinsics, (width, height) = resized(cameras, size)
         pose = np.asarray(cameras.camera_to_world, np.float64)
-        with self._lock:  # the arrays are shared by all who call
-            picture = self._picture(len(pose), width, height, stop is not None)
-            picture.aim(pose, intrinsics, self._biases(lighting, len(pose)), stop)
-            if self._pool is None:
-                for piece in picture.pieces:
-                    picture.develop(piece)
-            else:
-                list(self._pool.map(picture.develop, picture.pieces))
-            return picture.rendering()
+        picture = self._picture(len(pose), width, height, stop is not None)
+        picture.aim(pose, intrinsics, self._biases(lighting, len(pose)), stop)
+        if self._pool is None:
+            for piece in picture.pieces:
+                picture.develop(piece)
+        else:
+            list(self._pool.map(picture.develop, picture.pieces))
+        return picture
 
     def _biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Floats:
         """The head's first bias with the appearance in it, shape (n, hidden)."""
