@@ -30,6 +30,7 @@ from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
 from twin.report.video import describe
+from twin.robot import TRACK
 
 SMALL = {"size": (32, 18)}
 
@@ -167,6 +168,7 @@ def test_smaller_wheels_drive_slower_and_latency_later(scene):
     def after_two_seconds(**ranges) -> float:
         fixed = {name: (value, value) for name, value in ranges.items()}
         still = {"friction": (1.0, 1.0), "payload": (0.0, 0.0), "latency": (0.0, 0.0), "wheel_radius": (1.0, 1.0)}
+        still["wheel_difference"] = (0.0, 0.0)
         environment = twin.load(
             scene, "bend", 0, pixels=False, start_heading=0.0, randomise=Ranges(**(still | fixed)), time_limit=9.0
         )
@@ -180,6 +182,27 @@ def test_smaller_wheels_drive_slower_and_latency_later(scene):
     assert after_two_seconds(wheel_radius=0.9) == pytest.approx(0.9 * plain, rel=0.01)
     assert plain - after_two_seconds(latency=0.1) == pytest.approx(0.1, rel=0.15)
     assert after_two_seconds(payload=40.0) == pytest.approx(plain, rel=0.02)
+
+
+def test_larger_wheels_on_the_right_turn_it_to_the_left(scene):
+    """As much as a larger speed of them would: v times the difference over the effective track."""
+    still = {"friction": (1.0, 1.0), "payload": (0.0, 0.0), "latency": (0.0, 0.0), "wheel_radius": (1.0, 1.0)}
+
+    def turned(difference: float) -> float:
+        ranges = Ranges(**still, wheel_difference=(difference, difference))
+        environment = twin.load(
+            scene, "bend", 0, pixels=False, start_heading=0.0, half_width=9.0, randomise=ranges, time_limit=9.0
+        )
+        environment.reset()
+        before = environment.physics.planar_pose[2]
+        for _ in range(30):
+            environment.step([1.0, 0.0])
+        return float(environment.physics.planar_pose[2] - before)
+
+    straight, left, right = turned(0.0), turned(0.02), turned(-0.02)
+    assert left - straight == pytest.approx(straight - right, rel=0.2)
+    way = 2.5  # [m], from rest
+    assert 0.02 * way / (2.5 * TRACK) < left - straight < 0.02 * way / TRACK
 
 
 def test_ranges_that_make_no_sense_are_refused():

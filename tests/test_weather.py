@@ -68,7 +68,7 @@ def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
 
 def test_randomised_episodes_have_weather_and_bystanders(scene):
     still = dict.fromkeys(("friction", "wheel_radius", "airlight"), (1.0, 1.0))
-    robot = ("payload", "latency", "camera_shift", "camera_turn")
+    robot = ("payload", "latency", "wheel_difference", "camera_shift", "camera_turn")
     still |= dict.fromkeys((*robot, "sunlight", "shade", "bystanders"), (0.0, 0.0))
 
     def first(seed: int = 3, **ranges) -> tuple[np.ndarray, Drive]:

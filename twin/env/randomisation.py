@@ -1,6 +1,6 @@
 """What differs from episode to episode: the robot, the air, the light, shadows, and things beside the corridor.
 
-Of the robot tyre friction, payload, latency, camera pose and wheel radius differ; the air is hazy (see `haze.py`);
+Of the robot tyre friction, payload, latency, camera pose and wheels differ; the air is hazy (see `haze.py`);
 another sun lights what stands (see `sides.py`) and throws shadows that the film had not (see `shade.py`); and
 *bystanders*, things where nothing is driven, stand as if they had been moved there.
 
@@ -46,6 +46,8 @@ class Ranges:
     """Of the front camera about each of its axes [°]."""
     wheel_radius: Range = (0.98, 1.02)
     """As a share of the robot's own; its controller does not know."""
+    wheel_difference: Range = (-0.006, 0.006)
+    """By which the right wheels are larger than the left ones, as a share: who does not look drifts to a side."""
     extinction: Range = (0.0, 0.05)
     """Of the air [1/m], added to the film's; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
@@ -77,6 +79,7 @@ class Ranges:
             camera_shift=tuple(rng.uniform(*self.camera_shift, 3).tolist()),
             camera_turn=tuple(rng.uniform(*self.camera_turn, 3).tolist()),
             wheel_radius=float(rng.uniform(*self.wheel_radius)),
+            wheel_difference=float(rng.uniform(*self.wheel_difference)),
             extinction=float(rng.uniform(*self.extinction)),
             airlight=float(rng.uniform(*self.airlight)),
             sunlight=float(rng.uniform(*self.sunlight)),
@@ -95,6 +98,7 @@ class Draw:
     camera_shift: tuple[float, ...] = (0.0, 0.0, 0.0)
     camera_turn: tuple[float, ...] = (0.0, 0.0, 0.0)
     wheel_radius: float = 1.0
+    wheel_difference: float = 0.0
     extinction: float = 0.0
     airlight: float = 1.0
     sunlight: float = 0.0
@@ -126,6 +130,7 @@ class Nominal:
             model: Of `episode_spec`, as compiled.
         """
         self._tyres = np.array([i for i in range(model.ngeom) if model.geom(i).name.endswith(_TYRE)])
+        self._right = np.array([model.geom(i).name.split("_")[1] == "right" for i in self._tyres])
         self._payload = model.body(PAYLOAD).id
         self._camera = model.camera("front").id
         self._fields = {name: np.array(getattr(model, name)) for name in _FIELDS}
@@ -138,9 +143,10 @@ class Nominal:
         """Makes a copy of the model that of an episode."""
         tyres, camera, was = self._tyres, self._camera, self._fields
         model.geom_friction[tyres, 0] = was["geom_friction"][tyres, 0] * draw.friction
-        model.geom_size[tyres] = was["geom_size"][tyres] * [draw.wheel_radius, 1.0, draw.wheel_radius]
+        radius = draw.wheel_radius * (1.0 + np.where(self._right, 0.5, -0.5) * draw.wheel_difference)
+        model.geom_size[tyres] = was["geom_size"][tyres] * np.stack([radius, np.ones_like(radius), radius], 1)
         # What MuJoCo bounds a geom by may be too large, but never too small.
-        grown = max(1.0, draw.wheel_radius)
+        grown = max(1.0, float(radius.max()))
         model.geom_rbound[tyres] = was["geom_rbound"][tyres] * grown
         model.geom_aabb[tyres] = was["geom_aabb"][tyres] * grown
         model.bvh_aabb[self._boxes] = was["bvh_aabb"][self._boxes] * [1.0, 1.0, 1.0, grown, grown, grown]
