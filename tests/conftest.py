@@ -8,7 +8,16 @@ from drive_logs import SOFT, columns
 
 from twin import progress
 
+_LONGEST = ("test_real_places.py", "test_end_to_end.py", "test_alignment.py", "test_env.py")
+"""Files that take minutes, and so are begun with."""
+
 _DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take long come first, or the second core would wait for them in the end."""
+    order = {name: k for k, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 @pytest.fixture(autouse=True)
