@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
@@ -13,6 +14,7 @@ from twin.config import ObstacleConfig
 from twin.env.batch import Worlds
 from twin.env.camera_effects import CameraOptions
 from twin.env.device_pixels import DevicePixels
+from twin.env.dm import control
 from twin.env.pixels import Pixels
 from twin.env.randomisation import Ranges
 from twin.env.suite import Stage
@@ -33,6 +35,7 @@ def scene(tmp_path_factory):
 def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
     """Robots of different make under different commands, one world after the other and all at once."""
     stage = Stage.open(scene, "bend", OPTIONS)
+    stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
     plain, device = Worlds(stage, [1, 2, 3]), Worlds(stage, [1, 2, 3], device="cpu")
     for worlds in (plain, device):
         worlds.begin(range(3))
@@ -46,12 +49,31 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
         np.testing.assert_allclose(a.reward, b.reward, atol=0.02)
     for one, other in zip(plain.physics, device.physics, strict=True):
         assert one.time() == pytest.approx(other.time())
-        np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=0.02)
-        np.testing.assert_allclose(one.robot.wheel_velocity, other.robot.wheel_velocity, atol=0.1)
-        np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=0.02)
+        np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=3e-3)
+        np.testing.assert_allclose(one.robot.wheel_velocity, other.robot.wheel_velocity, atol=0.05)
+        np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=4e-3)
+        assert one.seen.time == pytest.approx(one.time() - 0.07) and other.seen.time == pytest.approx(one.seen.time)
         np.testing.assert_allclose(one.data.mocap_pos, other.data.mocap_pos, atol=1e-9)
         assert one.speed > 0.1
     plain.close(), device.close()
+
+
+def test_what_goes_wrong_on_a_device_is_said(scene):
+    worlds = Worlds(Stage.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], device="cpu")
+    worlds.begin([0])  # the other world lies where the model has it, and is nobody's concern
+    device = worlds._device
+    device._advance = lambda: None
+    device._data.overflow.assign([0, int(mjw.OverflowType.NEFC)])
+    device._send_states = lambda: None
+    worlds.step(np.zeros((1, 2)), [0])
+    device._data.overflow.assign([int(mjw.OverflowType.NEFC), 0])
+    with pytest.raises(RuntimeError, match=r"worlds \[0\]: more than .* no room; use device='cpu'"):
+        worlds.step(np.zeros((1, 2)), [0])
+    device._data.overflow.zero_()
+    device._data.qvel.assign(np.full(device._data.qvel.shape, np.nan, np.float32))
+    with pytest.raises(control.PhysicsError, match=r"worlds \[0\]"):
+        worlds.step(np.zeros((1, 2)), [0])
+    worlds.close()
 
 
 def test_what_is_touched_on_a_device_ends_the_episode(scene):

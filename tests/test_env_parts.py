@@ -206,7 +206,13 @@ def test_larger_wheels_on_the_right_turn_it_to_the_left(scene):
 
 
 def test_ranges_that_make_no_sense_are_refused():
-    wrong = [{"friction": (0.0, 1.0)}, {"payload": (-1.0, 0.0)}, {"latency": (0.2, 0.1)}, {"extinction": (-0.1, 0.0)}]
+    wrong = [
+        {"wheel_difference": (-0.1, 3.0)},
+        {"friction": (0.0, 1.0)},
+        {"payload": (-1.0, 0.0)},
+        {"latency": (0.2, 0.1)},
+        {"extinction": (-0.1, 0.0)},
+    ]
     for ranges in (*wrong, {"bystanders": (-1, 2)}):
         with pytest.raises(InputError):
             Ranges(**ranges)

@@ -2,7 +2,7 @@
 
 A *world* is one robot in a model of its own, with its own sequence of episodes. Nothing here decides what happens in an
 episode: every world is the dm_control environment that `twin.load` gives, stepped by the same code, so one of many goes
-through exactly what it would alone.
+through exactly what it would alone, on a CPU.
 
 `mujoco.batch.Batch` would step faster by what Python does between the looks at the contacts; it has no contacts to look
 at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock. On a
@@ -115,14 +115,11 @@ class Worlds:
         def advance(k: int) -> dm_env.TimeStep:
             return self._environments[which[k]].step(wanted[k])
 
-        def judge(k: int) -> dm_env.TimeStep:
-            return _judged(self.tasks[which[k]], self.physics[which[k]])
-
         if self._device:
             for i, action in zip(which, wanted, strict=True):
                 self.tasks[i].before_step(action, self.physics[i])
             self._device.step(which)
-            steps = self._each(judge, range(len(which)))
+            steps = [_judged(self.tasks[i], self.physics[i]) for i in which]
         else:
             steps = self._each(advance, range(len(which)))
         for i, step in zip(which, steps, strict=True):
@@ -136,8 +133,8 @@ class Worlds:
     def observation(self) -> NDArray:
         """Pictures uint8 (n, 3 · stack, height, width), the newest last; or the states, float32 (n, k)."""
         if self.pixels:
-            n, stack, three, height, width = self.pixels.stacks.shape
-            return self.pixels.stacks.reshape(n, stack * three, height, width).copy()
+            stacks = self.pixels.stacks
+            return stacks.reshape(len(self), -1, *stacks.shape[3:]).copy()
         return np.stack([self.state(i) for i in range(len(self))])
 
     def state(self, i: int) -> NDArray[np.float32]:

@@ -29,8 +29,8 @@ def spaces_of(worlds: Worlds) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Bo
     """Observation and action space of one world."""
     action = gymnasium.spaces.Box(-1.0, 1.0, (worlds.actions,), np.float32)
     if worlds.pixels:
-        _, stack, three, height, width = worlds.pixels.stacks.shape
-        return gymnasium.spaces.Box(0, 255, (stack * three, height, width), np.uint8), action
+        width, height = worlds.options.size
+        return gymnasium.spaces.Box(0, 255, (3 * worlds.options.stack, height, width), np.uint8), action
     return gymnasium.spaces.Box(-np.inf, np.inf, (worlds.states,), np.float32), action
 
 

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from twin.cores import cores
@@ -56,8 +57,12 @@ class Overlay:
         self.size, self.worlds, self._field = size, worlds, field
         self._camera = model.camera(_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
+        # Painters draw on the CPU in threads of their own, and Warp's default device, which they set meanwhile, is the
+        # process's. With a field on a GPU its stream is, too, so that one paints alone.
+        wp.set_device("cpu")
+        painters = min(worlds, cores()) if field.where == "cpu" else 1
         # One after the other, as Warp compiles kernels when they are first used.
-        self._painters = [_Painter(model, field, self._camera, size) for _ in range(min(worlds, cores()))]
+        self._painters = [_Painter(model, field, self._camera, size) for _ in range(painters)]
         self._pool = ThreadPoolExecutor(len(self._painters)) if len(self._painters) > 1 else None
         self._shadows = Shadows(model, self._painters[0].view.geoms)
         self._route, self._shaded, self._lock = route_of(model), shaded, threading.Lock()

@@ -66,6 +66,8 @@ class Ranges:
         for name in ("friction", "wheel_radius"):
             if not getattr(self, name)[0] > 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected more than 0")
+        if max(map(abs, self.wheel_difference)) > 0.5:
+            raise InputError(f"randomise: wheel_difference = {self.wheel_difference}; expected at most ±0.5")
         for name in ("payload", "latency", "extinction", "airlight", "sunlight", "shade", "bystanders"):
             if not getattr(self, name)[0] >= 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
@@ -130,7 +132,7 @@ class Nominal:
             model: Of `episode_spec`, as compiled.
         """
         self._tyres = np.array([i for i in range(model.ngeom) if model.geom(i).name.endswith(_TYRE)])
-        self._right = np.array([model.geom(i).name.split("_")[1] == "right" for i in self._tyres])
+        self._right = np.array(["right" in model.geom(i).name for i in self._tyres])
         self._payload = model.body(PAYLOAD).id
         self._camera = model.camera("front").id
         self._fields = {name: np.array(getattr(model, name)) for name in _FIELDS}

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from twin.mjcf.husky import add_dry
 from twin.mjcf.world import World, point_at
 
 Array = NDArray[np.float64]
@@ -59,6 +60,7 @@ def episode_spec(world: World, start: float, end: float, half_width: float, look
     payload = base.add_body(name=PAYLOAD, pos=world.robot.payload_position)
     payload.explicitinertial = True
     payload.mass, payload.ipos, payload.inertia = 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    add_dry(payload, PAYLOAD)
     return spec
 
 

@@ -25,7 +25,7 @@ from twin.env.obstacles import add_obstacles
 from twin.env.options import CPU, NERF, Options, parse_options
 from twin.env.overlay import Overlay
 from twin.env.pixels import Pixels
-from twin.env.randomisation import ANOTHER_DAY, VERSION
+from twin.env.randomisation import ANOTHER_DAY, VERSION, Ranges
 from twin.env.scene_model import episode_spec
 from twin.env.simulator_view import SimulatorView
 from twin.env.stretches import Stretch, find_task
@@ -111,7 +111,8 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
         InputError: as `Stage.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
-    drawn = {"version": VERSION, **dataclasses.asdict(ANOTHER_DAY)} if lighting.endswith(RANDOMISED) else {}
+    ranges = [dataclasses.asdict(one) for one in (Ranges(), ANOTHER_DAY)]  # of training and of judging
+    drawn = {"version": VERSION, "ranges": ranges} if lighting.endswith(RANDOMISED) else {}
     photos = [twin.scene.lightings / f"{name}.json" for name in lighting.removesuffix(RANDOMISED).split(":")]
     return digest_json(
         {

@@ -112,17 +112,7 @@ def add_husky(
             group=ROBOT_GROUP,
             rgba=(0.2, 0.2, 0.8, 0.4),
         )
-    # What tyres wade through drags the tyres alone. MuJoCo's fluid acts on every body, unless one of its geoms is said
-    # to be an ellipsoid in it: then on that geom only. So the chassis gets one too small to be felt.
-    base.add_geom(
-        name="chassis_dry",
-        size=(1e-3, 1e-3, 1e-3),
-        mass=0,
-        contype=0,
-        conaffinity=0,
-        fluid_ellipsoid=True,
-        group=ROBOT_GROUP,
-    )
+    add_dry(base, "chassis")
     wheels = {name: _add_wheel(base, name, i, params) for i, name in enumerate(WHEELS)}
     for side in SIDES:
         _add_drive(spec, side, params)
@@ -162,6 +152,23 @@ def _chassis_inertia(params: HuskyParams) -> tuple[float, Array, Array]:
     for m, d in zip(masses, centers - center, strict=True):
         tensor = tensor + m * (d @ d * np.eye(3) - np.outer(d, d))
     return float(mass), center, tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+
+
+def add_dry(body: mujoco.MjsBody, name: str) -> None:
+    """Keeps what tyres wade through (`ground_viscosity`) from dragging a body.
+
+    MuJoCo's fluid acts on every body, unless one of its geoms is said to be an ellipsoid in it: then on that geom only.
+    So the body gets one too small to be felt.
+    """
+    body.add_geom(
+        name=f"{name}_dry",
+        size=(1e-3, 1e-3, 1e-3),
+        mass=0,
+        contype=0,
+        conaffinity=0,
+        fluid_ellipsoid=True,
+        group=ROBOT_GROUP,
+    )
 
 
 def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams) -> mujoco.MjsBody:
