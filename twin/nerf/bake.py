@@ -31,6 +31,7 @@ _SAMPLES = 24
 _SEEN = 0.004  # weight from which a place counts as matter
 _FINEST = 0.03  # [m] side of the near cells at best
 _COARSENING = 1.15
+_COARSE, _MORE = 0.15, 1.39  # [m] side of near cells from which there may be so many times the bricks: 7 % of speed
 _FAR_COARSER = 4.0  # cells of the far grid over those of the near one
 _NOTHING = -8.0  # raw density where no brick is
 _RAW_RANGE = (-6.0, 12.0)  # of raw density, that bytes cover
@@ -50,7 +51,8 @@ def bake(
         pixels: The frames it was trained on.
         seed: Of the fine-tuning's batches.
         steps: Of fine-tuning, at least 1.
-        most_bricks: Cells grow until there are no more bricks than this; 9,000 are 105 MB.
+        most_bricks: Cells grow until there are no more bricks than this, 9,000 being 105 MB; no more than 1.39 times
+            as many where cells would come out larger than 15 cm, as those of a long road do.
 
     Raises:
         InputError: no camera sees anything in the field.
@@ -63,6 +65,8 @@ def bake(
             "lower nerf.near_plane or set nerf.near_half_extent = 0 where these were changed"
         )
     layout, slots = _layout(field, near, far, most_bricks)
+    if layout.near_side.max() / kernels.CELLS > _COARSE:
+        layout, slots = _layout(field, near, far, round(_MORE * most_bricks))
     values = _sample(field, layout, slots)
     tuner = _Tuner(field, pixels, layout, slots, values, steps, seed)
     error = tuner.run()
