@@ -28,9 +28,9 @@ from twin.nerf.plausible import Probes
 
 Array = NDArray[np.float64]
 
-GROUND_ALBEDO = 0.38
-"""What the ground along the route is taken to reflect, in film colours: worn asphalt reflects about 12 %, which the
-tone curve of a film (exponent 1 / 2.2) shows as 0.38."""
+GROUND_ALBEDO = 0.37
+"""What the ground along the route is taken to reflect, in film colours: worn asphalt reflects about 11 %, which the
+tone curve of a film (exponent 1 / 2.2) shows as 0.37."""
 
 SIDES = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 """Directions that light comes from besides above and everywhere, shape (4, 3)."""
