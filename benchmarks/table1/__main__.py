@@ -96,7 +96,8 @@ def main() -> None:
             list(pool.map(lambda run: real(given.scene, run), done))
     if "forecast" in given.steps:
         forecast(given.scene)
-    seeds = sorted({int(path.name.rsplit("_", 1)[1]) for path in (given.scene / "runs").glob("*_*_[0-9]*")})
+    folders = [path for path in (given.scene / "runs").glob("*_*_[0-9]*") if path.is_dir()]
+    seeds = sorted({int(path.name.rsplit("_", 1)[1]) for path in folders})
     results = collect(given.scene, runs(seeds, list(TASKS), list(SETUPS)))
     out = Path(__file__).with_name("results.json")
     out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

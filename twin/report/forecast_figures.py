@@ -14,6 +14,7 @@ LIMITS = (-0.04, 1.04)
 TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 _NAMED = 3  # points furthest off, which are named
+_NAME = (0.5, 0.06)  # width and height of a name, in units of the axes
 _LONGEST = 26  # characters of a name
 _ROW = 0.34  # [in]
 _SQUARE = 4.6  # [in]
@@ -115,7 +116,12 @@ def _ends(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _name_furthest(axes: Axes, points: list[tuple[str, float, float]]) -> None:
-    for name, x, y in sorted(points, key=lambda p: -abs(p[2] - p[1]))[:_NAMED]:
+    """Names the points that are furthest off, but none over the name of another."""
+    named: list[tuple[float, float]] = []
+    for name, x, y in sorted(points, key=lambda p: -abs(p[2] - p[1])):
+        if len(named) == _NAMED or any(abs(x - a) < _NAME[0] and abs(y - b) < _NAME[1] for a, b in named):
+            continue
+        named.append((x, y))
         offset, side = ((-7, -10), "right") if x > 0.5 else ((7, -10), "left")
         box = {"facecolor": CARD, "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
         text = axes.annotate(short(name), (x, y), offset, textcoords="offset points", ha=side, bbox=box, zorder=3)
