@@ -44,13 +44,15 @@ def test_a_score_is_not_met_where_its_budget_was_exceeded(scripts, monkeypatch):
     assert field.judge("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
 
 
-def test_nothing_is_wanted_that_no_section_measures(scripts, tmp_path):
+def test_nothing_is_wanted_of_a_gpu_that_is_not_measured(scripts, monkeypatch, tmp_path):
     import env
+    import warp
     from env_sections import gpu
 
+    monkeypatch.setattr(warp, "is_cuda_available", lambda: False)
     found = gpu(tmp_path, True)
-    assert list(found) == ["gpu.none"] and "CPU only" in found["gpu.none"]
-    assert not any(name.startswith("gpu.") for name in env.TARGETS)
+    assert list(found) == ["gpu.none"] and "no CUDA device" in found["gpu.none"]
+    assert [name for name in env.TARGETS if name.startswith("gpu.")] == ["gpu.steps_per_s"]
 
 
 def test_seen_and_touched_is_driven_by_the_scene_s_own_robot(scripts, monkeypatch, tmp_path):

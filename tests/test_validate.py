@@ -13,7 +13,7 @@ from tiny_twin import tiny_twin
 
 from twin import load_scene, progress, validate
 from twin.alone import alone
-from twin.env.randomisation import Ranges, asked
+from twin.env.randomisation import ANOTHER_DAY, asked
 from twin.env.suite import Stage, fingerprint
 from twin.errors import InputError
 from twin.learn import judging
@@ -96,7 +96,7 @@ def test_randomised_episodes_are_others_and_repeat(scene):
     assert fingerprint(load_scene(scene), "ahead", "day") != fingerprint(load_scene(scene), "ahead", "day+randomised")
     assert drive(chunk(scene, seeds)) == plain
     stage = Stage.open(scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")})
-    assert stage.options.lighting == "day" and stage.options.randomise == Ranges()
+    assert stage.options.lighting == "day" and stage.options.randomise == ANOTHER_DAY
     with pytest.raises(InputError, match="randomized"):
         drive(chunk(scene, [0], "day+randomized"))
 

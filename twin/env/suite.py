@@ -16,7 +16,6 @@ from dm_env import specs
 
 from twin.config import RANDOMISED
 from twin.config_file import load_config
-from twin.env.device_pixels import DevicePixels
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles
@@ -91,6 +90,8 @@ class Stage:
             return None
         size, count = self.options.size, len(worlds)
         if self.field is not None and self.options.device != CPU and self._bare:
+            from twin.env.device_pixels import DevicePixels  # its kernels are for that alone
+
             return DevicePixels(self.field, self.trust, self.options, worlds)
         if self.field is not None:
             overlay = Overlay(self.model, self.field, size, count)
