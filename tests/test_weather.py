@@ -153,6 +153,16 @@ def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
     np.testing.assert_array_equal(Sides(0.0, LEFT, np.random.default_rng(0)).over(rgb, depth, points), rgb)
 
 
+def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
+    ahead = np.linspace(20.0, 45.0, 251, dtype=np.float32)[None]
+    points = np.stack([np.minimum(ahead, 40.0), 0.0 * ahead, 0.0 * ahead - 1.0], -1)  # the ground, 1 m below
+    rgb = np.full((*ahead.shape, 3), 0.5, np.float32)
+    lit = np.log(Sides(0.7, LEFT, np.random.default_rng(3)).over(rgb, ahead, points)[0, :, 1] / 0.5)
+    assert abs(lit[0]) < 1e-3 and np.ptp(lit[-40:]) < 1e-3 and abs(lit[-1]) > 0.05
+    steps = np.diff(lit)
+    assert np.abs(steps).max() < 0.02 * abs(lit[-1]) and (np.sign(lit[-1]) * steps > -1e-3).all()
+
+
 def test_what_is_low_keeps_its_light_and_skies_differ():
     depth, points, masks = street(1.0)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
