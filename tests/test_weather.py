@@ -154,7 +154,7 @@ def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
 
 
 def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
-    ahead = np.linspace(20.0, 45.0, 251, dtype=np.float32)[None]
+    ahead = np.tile(np.linspace(20.0, 45.0, 251, dtype=np.float32), (3, 1))
     points = np.stack([np.minimum(ahead, 40.0), 0.0 * ahead, 0.0 * ahead - 1.0], -1)  # the ground, 1 m below
     rgb = np.full((*ahead.shape, 3), 0.5, np.float32)
     lit = np.log(Sides(0.7, LEFT, np.random.default_rng(3)).over(rgb, ahead, points)[0, :, 1] / 0.5)
