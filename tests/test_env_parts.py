@@ -18,7 +18,7 @@ from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
 from twin.env.lightings import Light, LightSets, draw_light
 from twin.env.physics import HuskyPhysics
-from twin.env.randomisation import Draw, Nominal, Ranges
+from twin.env.randomisation import ANOTHER_DAY, Draw, Nominal, Ranges
 from twin.env.scene_model import episode_spec
 from twin.env.stretches import find_task, tasks
 from twin.env.suite import Stage
@@ -30,7 +30,7 @@ from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
 from twin.report.video import describe
-from twin.robot import TRACK
+from twin.robot import TRACK, HuskyParams
 
 SMALL = {"size": (32, 18)}
 
@@ -216,6 +216,18 @@ def test_ranges_that_make_no_sense_are_refused():
     for ranges in (*wrong, {"bystanders": (-1, 2)}):
         with pytest.raises(InputError):
             Ranges(**ranges)
+
+
+def test_what_is_known_of_the_robot_is_held_where_policies_are_judged():
+    robot = HuskyParams(friction=0.6, wheel_radius=(0.162, 0.163), center_of_mass=(-0.05, 0.0, 0.06))
+    draws = [ANOTHER_DAY.for_robot(robot).draw(np.random.default_rng(k)) for k in range(9)]
+    assert {(d.friction, d.wheel_radius, d.wheel_difference, d.payload) for d in draws} == {(1.0, 1.0, 0.0, 0.0)}
+    others = [ANOTHER_DAY.draw(np.random.default_rng(k)) for k in range(9)]
+    for name in ("latency", "camera_shift", "camera_turn", "sunlight", "shade", "extinction", "bystanders"):
+        assert [getattr(d, name) for d in draws] == [getattr(d, name) for d in others]
+    assert len({d.latency for d in draws}) == 9
+    assert ANOTHER_DAY.for_robot(HuskyParams()) == ANOTHER_DAY  # nothing is known of it
+    assert Ranges().for_robot(robot) == Ranges()  # training goes on drawing it
 
 
 # ---- the model of an episode

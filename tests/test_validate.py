@@ -1,6 +1,7 @@
 """Validation: episodes do not depend on who drives beside whom, a killed validation ends with the same table, and the
 summary says what the table holds."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -19,8 +20,10 @@ from twin.errors import InputError
 from twin.learn import judging
 from twin.learn.judging import Chunk, campaign, drawn_light, drive
 from twin.learn.policy import Control, load_policy, save_policy
+from twin.loading import Twin
 from twin.report.trials import Trial, read_trials
 from twin.report.validation import lines, pairs, rate, summary
+from twin.robot import HuskyParams
 
 FIRST = 1_000_000
 
@@ -87,7 +90,7 @@ def run(scene: Path, *policies: str, lightings=("day", "night"), episodes=5) -> 
     return (scene / "validation" / "episodes.csv").read_text()
 
 
-def test_randomised_episodes_are_others_and_repeat(scene):
+def test_randomised_episodes_are_others_and_repeat(scene, monkeypatch):
     seeds = range(6)
     plain, drawn = drive(chunk(scene, seeds)), drive(chunk(scene, seeds, "day+randomised"))
     assert [one.seed for one in drawn] == list(seeds)
@@ -97,6 +100,11 @@ def test_randomised_episodes_are_others_and_repeat(scene):
     assert drive(chunk(scene, seeds)) == plain
     stage = Stage.open(scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")})
     assert stage.options.lighting == "day" and stage.options.randomise == ANOTHER_DAY
+    fitted = dataclasses.replace(load_scene(scene).world(), robot=HuskyParams(friction=0.6))
+    monkeypatch.setattr(Twin, "world", lambda self: fitted)
+    options = load_policy(scene / "runs" / "ahead").options()
+    stages = [Stage.open(scene, "ahead", {**options, **asked(f"day{what}")}) for what in ("+randomised", "")]
+    assert stages[0].options.randomise.friction == (1.0, 1.0) and stages[1].options.randomise is None
     with pytest.raises(InputError, match="randomized"):
         drive(chunk(scene, [0], "day+randomized"))
 

@@ -2,9 +2,9 @@
 
     python benchmarks/table1 SCENE [--seeds 0] [--jobs 2] [--steps train validate real forecast]
 
-films reality and builds its twin in SCENE (unless that is done), trains the three setups on both tasks, validates
-every policy in the twin under held-out lightings, as filmed and with all else drawn anew, drives them in reality under
-weather that neither has seen, and forecasts. Every step is a command of `twin`, goes on where it was cut off, and adds
+films reality, aligns the robot to a drive log of reality's Husky and builds the twin in SCENE (unless that is done),
+trains the three setups on both tasks, validates every policy in the twin under held-out lightings, as filmed and with
+all else drawn anew, drives them in reality under weather that neither has seen, and forecasts. Every step is a command of `twin`, goes on where it was cut off, and adds
 to what is there: the same call with more seeds keeps all runs. `results.json` beside this file holds every run. Setups,
 sizes, checkpoints: `plan.py`.
 """
@@ -34,8 +34,10 @@ def verb(*arguments: str | Path) -> None:
 def build(scene: Path) -> None:
     if not (scene / "scene.toml").exists():
         verb("twin.reality", "film", "--out", scene)
-    if not (scene / "build" / "report.html").exists():
-        verb("twin.build", scene)
+    if not (scene / "robot.toml").exists():
+        verb("twin.reality", "log", "--out", scene / "drive.csv")
+        verb("twin.align", scene, scene / "drive.csv")
+    verb("twin.build", scene)  # what is up to date it leaves alone
 
 
 def train(scene: Path, run: Run) -> None:

@@ -8,7 +8,7 @@ another sun lights what stands (see `sides.py`) and throws shadows that the film
 in its range and independent of the others. What is the robot's is applied to the episode's own copy of the model.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import mujoco
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from twin.config import RANDOMISED
 from twin.env.scene_model import PAYLOAD
 from twin.errors import InputError
+from twin.robot import HuskyParams
 
 Array = NDArray[np.float64]
 Range = tuple[float, float]
@@ -27,6 +28,14 @@ VERSION = 4
 
 _PAYLOAD_SIDE = 0.3  # [m] of the cube that the payload's inertia is of
 _TYRE = "_tyre"
+_HELD_BY = {
+    "friction": ("friction",),
+    "center_of_mass": ("payload",),
+    "payload_mass": ("payload",),
+    "command_latency": ("latency",),
+    "wheel_radius": ("wheel_radius", "wheel_difference"),
+}
+"""Of `HuskyParams`: what need not be drawn where it is known. No drive log tells how the camera sits."""
 _FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
 
 
@@ -58,9 +67,11 @@ class Ranges:
     """Share of a colour that is lost where shadows lie that the film did not have."""
     bystanders: Range = (0, 4)
     """Things beside the corridor: cones, boxes, bollards in any colour."""
+    hold_known: bool = False
+    """Whether only that of the robot is drawn which the scene does not know, see `for_robot`."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in asdict(self).items():
+        for name, (low, high) in self.each().items():
             if not low <= high:
                 raise InputError(f"randomise: {name} = ({low}, {high}); expected (lowest, highest)")
         for name in ("friction", "wheel_radius"):
@@ -71,6 +82,24 @@ class Ranges:
         for name in ("payload", "latency", "extinction", "airlight", "sunlight", "shade", "bystanders"):
             if not getattr(self, name)[0] >= 0.0:
                 raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
+
+    def each(self) -> dict[str, Range]:
+        """Every range by its name."""
+        return {name: value for name, value in asdict(self).items() if name != "hold_known"}
+
+    def for_robot(self, robot: HuskyParams) -> "Ranges":
+        """These ranges for a scene's robot: where it is known better than as published, it is held if that is wanted.
+
+        Known is what `robot.toml` or `[robot]` made another than the published robot's. A road is driven by one robot:
+        rates over many would tell how robust a policy is, and not what that one will do.
+        """
+        if not self.hold_known:
+            return self
+        published, as_built = HuskyParams(), Draw()
+        known = [name for name in _HELD_BY if getattr(robot, name) != getattr(published, name)]
+        drawn = [each for name in known for each in _HELD_BY[name]]
+        held: dict[str, Any] = {name: (getattr(as_built, name),) * 2 for name in drawn}
+        return replace(self, **held)
 
     def draw(self, rng: np.random.Generator) -> "Draw":
         """One episode's values."""
@@ -112,9 +141,10 @@ class Draw:
         return asdict(self)
 
 
-ANOTHER_DAY = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75))
-"""What policies are judged in: a day that is surely not the film's. Training draws from nothing to as much, so as to be
-learnt from; in a forecast, its mild days would promise more than a road keeps, whose sun is never the film's."""
+ANOTHER_DAY = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75), hold_known=True)
+"""What policies are judged in: a day that is surely not the film's, and the robot at hand as far as it is known.
+Training draws from nothing to as much, so as to be learnt from; in a forecast, its mild days would promise more than a
+road keeps, whose sun is never the film's."""
 
 
 def asked(lighting: str) -> dict[str, Any]:

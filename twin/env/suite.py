@@ -58,6 +58,8 @@ class Stage:
         if not twin.scene.has_route:
             raise InputError(f"{twin.scene.root}: nothing to drive, as its build has no route (mjcf.route)")
         world = twin.world()
+        if parsed.randomise:
+            parsed = dataclasses.replace(parsed, randomise=parsed.randomise.for_robot(world.robot))
         config = load_config(twin.scene.config_file)
         stretch = find_task(task, world, config.task)
         wanted = config.obstacle if isinstance(parsed.obstacles, str) else parsed.obstacles
