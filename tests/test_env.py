@@ -214,11 +214,11 @@ def test_steering_and_being_off_the_route_cost_what_is_said(scene, action, act):
     for sign in (1.0, -1.0):
         asked = np.array(act) * ([1.0] * (len(act) - 1) + [sign])
         reward = environment.step(asked).reward
-        off = abs(float(environment.task.cross_track)) / environment.task.half_width
+        off = abs(environment.task.cross_track) / environment.task.half_width
         assert off > 0.01
         assert reward == pytest.approx(1.0 - 0.5 * 0.5**2 - 0.2 * off)
     straight = environment.step(np.array([*act[:-1], 0.0])).reward
-    off = abs(float(environment.task.cross_track)) / environment.task.half_width
+    off = abs(environment.task.cross_track) / environment.task.half_width
     assert straight == pytest.approx(1.0 - 0.2 * off)
 
 

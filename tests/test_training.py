@@ -273,6 +273,6 @@ def test_states_are_what_the_world_tells(scene):
     assert done.all()
     for i, info in enumerate(infos):
         assert info["state"][2] == pytest.approx(info["cross_track"], abs=1e-6)
-        assert info["first_state"][2] == pytest.approx(float(env.worlds.tasks[i].cross_track), abs=1e-6)
+        assert info["first_state"][2] == pytest.approx(env.worlds.tasks[i].cross_track, abs=1e-6)
         assert info["first_state"][0] == pytest.approx(0.0, abs=1e-3) and info["state"][0] > 0.1
     env.close()

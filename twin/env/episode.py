@@ -101,7 +101,7 @@ def record(
         rows.append(
             (
                 *(physics.time(), physics.base_to_world, position, step.reward or 0.0, physics.speed),
-                *(float(task.cross_track), task.progress, info["trust"]),
+                *(task.cross_track, task.progress, info["trust"]),
             )
         )
         if step.last() or len(actions) == most:

@@ -21,23 +21,19 @@ from twin.config import ObstacleConfig
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles, Surroundings
+from twin.env.judge import CAUSES, STATE, Judge, Motion
 from twin.env.options import STEERING, Options
 from twin.env.randomisation import Draw, Nominal
 from twin.env.stretches import Stretch
 from twin.errors import InputError
-from twin.mjcf.world import World, heading_at, heading_error, nearest, point_at
+from twin.mjcf.world import World, heading_at, point_at
 
 Array = NDArray[np.float64]
 
 START, ROBOT, LIGHT, OBSTACLES, CAMERA, WEATHER = range(6)
 """Streams of an episode's randomness: `numpy.random.default_rng([seed, stream])`."""
 
-_BUMPER = 0.5  # [m] ahead of the base
-_SEARCH = (1.0, 3.0)  # [m] behind and ahead of the last foot point
-_ROLLED = 0.5  # cosine of the tilt beyond which the robot has rolled over
-_STUCK_TIME, _STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: less way than this in that time
 _START_TRIES = 50
-_AHEAD = (1.0, 2.0, 4.0)  # [m] along the route, of which the state tells the curvature
 
 
 class Drive(control.Task):
@@ -51,6 +47,7 @@ class Drive(control.Task):
         obstacles: EpisodeObstacles,
         model: mujoco.MjModel,
         seed: int | None = None,
+        judge: tuple[Judge, int] | None = None,
     ) -> None:
         """
         Args:
@@ -60,11 +57,12 @@ class Drive(control.Task):
             obstacles: What stands or moves in the way; the model holds its pool.
             model: As compiled; the one that is driven in may be a copy.
             seed: Of the sequence of episodes; None: unpredictable.
+            judge: Of many drives, and which of them this is; by default one of its own.
         """
         self.world, self.stretch, self.options = world, stretch, options
-        self.half_width = options.half_width or world.half_width
-        self.time_limit = options.time_limit or 2.0 * stretch.length / options.speed
-        self._route, self._obstacles = world.route[:, :2], obstacles
+        self._judge, self._number = judge or (Judge(world, stretch, options), 0)
+        self.half_width, self.time_limit = self._judge.half_width, self._judge.time_limit
+        self._obstacles = obstacles
         self._nominal = Nominal(model) if options.randomise else None
         self.seed(seed)
         self.episode_seed = 0
@@ -73,8 +71,6 @@ class Drive(control.Task):
         """The robot of the episode under way."""
         self.obstacles: tuple[ObstacleConfig, ...] = ()
         """Of the episode under way."""
-        self.cause = ""
-        """Why the episode ended; empty while it goes on."""
         self._began = stretch.start
 
     def seed(self, seed: int | None) -> None:
@@ -106,61 +102,31 @@ class Drive(control.Task):
                 f"task {self.stretch.name!r}: the robot touches {', '.join(physics.touched)} wherever it starts; "
                 "move the obstacle or the start"
             )
-        self.cause, self._stood, self._steering = "", 0.0, 0.0
-        foot, self.cross_track = nearest(self._route, physics.planar_pose[:2], self._around(self._began))
-        self._foot = self._before = float(foot)
-        self._last_moved = physics.planar_pose[:2]
+        self._judge.begin(self._me, np.array([self._began]), physics.planar_pose[None, :2])
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
-        action = np.clip(np.asarray(action, float), *self._bounds())
-        self._steering = float(action[-1]) / self.options.yaw_rate
-        if self.options.action == STEERING:
-            physics.robot.command(self.options.speed, float(action[0]))
-        else:
-            physics.robot.command(float(action[0]), float(action[1]))
+        commands = self.commands(np.asarray(action, float)[None])
+        self._judge.act(self._me, commands[:, 1])
+        physics.robot.command(*commands[0].tolist())
 
     def after_step(self, physics: DrivePhysics) -> None:
-        position = physics.planar_pose[:2]
-        foot, self.cross_track = nearest(self._route, position, self._around(self._foot))
-        self._before, self._foot = self._foot, float(foot)
-        if np.linalg.norm(position - self._last_moved) > _STUCK_DISTANCE:
-            self._last_moved, self._stood = position, physics.time()
-        self.cause = self._cause(physics)
+        self._judge.judge(self._me, _motion(physics))
 
     def get_reward(self, physics: DrivePhysics) -> float:
-        terms = self.options.rewards
-        reward = getattr(terms, self.cause) if self.cause else 0.0
-        if self.cause in ("", "goal"):
-            reward += terms.step
-        off = min(1.0, abs(float(self.cross_track)) / self.half_width)
-        reward += terms.progress * (self._foot - self._before) + terms.cross_track * off
-        return float(reward + terms.steering * self._steering**2)
+        return float(self._judge.reward(self._me)[0])
 
     def get_termination(self, physics: DrivePhysics) -> float | None:
-        if not self.cause:
-            return None
-        return 1.0 if self.cause == "timeout" else 0.0
+        failed_or_arrived, timeout = self._judge.ended(self._me)
+        return 0.0 if failed_or_arrived[0] else 1.0 if timeout[0] else None
 
     def get_observation(self, physics: DrivePhysics) -> "OrderedDict[str, Array]":
-        """What a driver that knows the map would know.
-
-        `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] left positive, `heading_error` [rad] of the robot against
-        the route, `turns` [rad]: how far the route's heading has turned 1, 2 and 4 m ahead, shape (3,).
-        """
-        pose = physics.planar_pose
-        heading = heading_at(self._route, self._foot)
-        ahead = heading_at(self._route, self._foot + np.array(_AHEAD))
-        return OrderedDict(
-            speed=np.array([physics.speed], np.float32),
-            yaw_rate=np.array([physics.yaw_rate], np.float32),
-            cross_track=np.array([self.cross_track], np.float32),
-            heading_error=np.array([heading_error(pose[2], heading)], np.float32),
-            turns=heading_error(ahead, heading).astype(np.float32),
-        )
+        """What a driver that knows the map would know, see `Judge.state`."""
+        state = self._judge.state(self._me, _motion(physics))[0]
+        ends = np.cumsum(list(STATE.values()))
+        return OrderedDict(zip(STATE, np.split(state, ends[:-1]), strict=True))
 
     def observation_spec(self, physics: DrivePhysics) -> "OrderedDict[str, specs.Array]":
-        shapes = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": len(_AHEAD)}
-        return OrderedDict((name, specs.Array((n,), np.float32, name)) for name, n in shapes.items())
+        return OrderedDict((name, specs.Array((n,), np.float32, name)) for name, n in STATE.items())
 
     def action_spec(self, physics: DrivePhysics) -> specs.BoundedArray:
         low, high = self._bounds()
@@ -173,9 +139,26 @@ class Drive(control.Task):
         return ("yaw_rate",) if self.options.action == STEERING else ("speed", "yaw_rate")
 
     @property
+    def cause(self) -> str:
+        """Why the episode ended; empty while it goes on."""
+        return CAUSES[self._judge.cause[self._number]]
+
+    @property
+    def cross_track(self) -> float:
+        """Distance from the route [m], left positive."""
+        return float(self._judge.cross_track[self._number])
+
+    @property
     def progress(self) -> float:
         """Way along the stretch [m]; may be slightly negative."""
-        return self._foot - self.stretch.start
+        return float(self._judge.foot[self._number]) - self.stretch.start
+
+    def commands(self, actions: Array) -> Array:
+        """What actions, shape (k, 1 or 2), ask of the robot: v [m/s] and ω [rad/s], shape (k, 2)."""
+        actions = np.clip(actions, *self._bounds())
+        if self.options.action == STEERING:
+            return np.column_stack([np.full(len(actions), self.options.speed), actions])
+        return actions
 
     def info(self, physics: DrivePhysics) -> dict[str, Any]:
         """The episode so far, JSON-able."""
@@ -184,7 +167,7 @@ class Drive(control.Task):
             "is_success": self.cause == "goal",
             "start": self._began - self.stretch.start,
             "progress": self.progress,
-            "cross_track": float(self.cross_track),
+            "cross_track": self.cross_track,
             "speed": physics.speed,
             "touched": list(physics.touched),
             "episode_seed": self.episode_seed,
@@ -204,22 +187,16 @@ class Drive(control.Task):
         turn = np.deg2rad(rng.uniform(-o.start_heading, o.start_heading))
         on_the_way = max(0.0, rng.uniform(-1.0, 1.0)) if o.start_along else 0.0
         s = self._began = self.stretch.start + on_the_way * o.start_along * self.stretch.length
-        heading = float(heading_at(self._route, s))
-        x, y = point_at(self._route, s) + offset * np.array([-np.sin(heading), np.cos(heading)])
+        heading = float(heading_at(self.world.route[:, :2], s))
+        x, y = point_at(self.world.route[:, :2], s) + offset * np.array([-np.sin(heading), np.cos(heading)])
         return float(x), float(y), heading + float(turn)
 
-    def _around(self, s: float) -> tuple[float, float]:
-        return s - _SEARCH[0], s + _SEARCH[1]
+    @property
+    def _me(self) -> list[int]:
+        return [self._number]
 
-    def _cause(self, physics: DrivePhysics) -> str:
-        if physics.uprightness < _ROLLED:
-            return "rollover"
-        if physics.touched:
-            return "collision"
-        if abs(float(self.cross_track)) > self.half_width:
-            return "out_of_bounds"
-        if self._foot >= self.stretch.end - _BUMPER:
-            return "goal"
-        if physics.time() > self.time_limit - 1e-6:
-            return "timeout"
-        return "stuck" if physics.time() - self._stood >= _STUCK_TIME else ""
+
+def _motion(physics: DrivePhysics) -> Motion:
+    """Of one robot."""
+    values = physics.speed, physics.yaw_rate, physics.uprightness, bool(physics.touched), physics.time()
+    return Motion(physics.planar_pose[None], *(np.array([value]) for value in values))

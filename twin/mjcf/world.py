@@ -118,31 +118,35 @@ def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
     return np.arctan2(chord[..., 1], chord[..., 0])
 
 
-def nearest(route: Array, xy: Array, around: tuple[float, float] | None = None) -> tuple[Array, Array]:
+def nearest(route: Array, xy: Array, around: tuple[Array | float, Array | float] | None = None) -> tuple[Array, Array]:
     """Foot of the perpendicular on the route.
 
     Args:
         route: Shape (m, ≥2).
         xy: Points, shape (..., 2).
-        around: Arc lengths between which to look [m], for a route that meets itself; everywhere by default.
+        around: Arc lengths between which to look [m], for a route that meets itself, for all points or of shape (...);
+            everywhere by default.
 
     Returns:
         Arc length of the foot [m] and cross-track error [m], both of shape (...).
     """
-    knots = arc_lengths(route)
-    start, step = route[:-1, :2], np.diff(route[:, :2], axis=0)
-    if around is not None:
-        inside = (knots[1:] >= around[0]) & (knots[:-1] <= around[1])
-        start, step, knots = start[inside], step[inside], knots[:-1][inside]
-    offset = np.asarray(xy)[..., None, :] - start
+    knots, xy = arc_lengths(route), np.asarray(xy)
+    low, high = (knots[0], knots[-1]) if around is None else around
+    # Of every point, the segments that reach into its range: a run of them, as long as the longest of all points.
+    first = np.broadcast_to(np.searchsorted(knots[1:], low), xy.shape[:-1])
+    last = np.broadcast_to(np.searchsorted(knots[:-1], high, "right"), xy.shape[:-1])
+    run = first[..., None] + np.arange(np.max(last - first, initial=1))
+    inside, run = run < last[..., None], np.minimum(run, len(route) - 2)
+    start, step = route[run, :2], np.diff(route[:, :2], axis=0)[run]
+    offset = xy[..., None, :] - start
     length_2 = np.maximum((step**2).sum(-1), 1e-18)
     share = np.clip((offset * step).sum(-1) / length_2, 0.0, 1.0)
     miss = offset - share[..., None] * step
-    best = np.argmin((miss**2).sum(-1), -1)[..., None]
+    best = np.argmin(np.where(inside, (miss**2).sum(-1), np.inf), -1)[..., None]
     cross = step[..., 0] * offset[..., 1] - step[..., 1] * offset[..., 0]
     distance = np.take_along_axis(np.linalg.norm(miss, axis=-1), best, -1)[..., 0]
     side = np.sign(np.take_along_axis(cross, best, -1)[..., 0])
-    s = np.take_along_axis(knots[: len(start)] + share * np.sqrt(length_2), best, -1)[..., 0]
+    s = np.take_along_axis(knots[run] + share * np.sqrt(length_2), best, -1)[..., 0]
     return s, np.where(side < 0, -distance, distance)
 
 
