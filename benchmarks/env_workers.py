@@ -147,11 +147,11 @@ def memory(scene: Path, count: int) -> dict[str, Any]:
 def soak(scene: Path, steps: int) -> dict[str, Any]:
     import psutil
 
-    from twin.env.batch import Worlds
+    from twin.env.batch import worlds_of
     from twin.env.suite import Stage
 
     count = 8
-    worlds = Worlds(
+    worlds = worlds_of(
         Stage.open(scene, standard_tasks(scene)[-1], {"randomise": True, "obstacles": 3}), list(range(count))
     )
     worlds.begin(range(count))
@@ -204,11 +204,11 @@ def trust(scene: Path) -> dict[str, Any]:
 
 
 def _worlds(scene: Path, count: int, **options: Any) -> Any:
-    from twin.env.batch import Worlds
+    from twin.env.batch import worlds_of
     from twin.env.suite import Stage
 
     stage = Stage.open(scene, standard_tasks(scene)[-1], one_obstacle(scene) | options)
-    return Worlds(stage, list(range(count)))
+    return worlds_of(stage, list(range(count)))
 
 
 def _onward(worlds: Any) -> np.ndarray:

@@ -14,6 +14,7 @@ from twin.config import ObstacleConfig
 from twin.env.batch import Worlds
 from twin.env.camera_effects import CameraOptions
 from twin.env.device_pixels import DevicePixels
+from twin.env.device_worlds import DeviceWorlds
 from twin.env.dm import control
 from twin.env.pixels import Pixels
 from twin.env.randomisation import Ranges
@@ -36,7 +37,7 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
     """Robots of different make under different commands, one world after the other and all at once."""
     stage = Stage.open(scene, "bend", OPTIONS)
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
-    plain, device = Worlds(stage, [1, 2, 3]), Worlds(stage, [1, 2, 3], device="cpu")
+    plain, device = Worlds(stage, [1, 2, 3]), DeviceWorlds(stage, [1, 2, 3], "cpu")
     for worlds in (plain, device):
         worlds.begin(range(3))
     rng = np.random.default_rng(0)
@@ -47,6 +48,17 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
         a, b = plain.step(given, which), device.step(given, which)
         np.testing.assert_array_equal(a.over, b.over)
         np.testing.assert_allclose(a.reward, b.reward, atol=0.02)
+        # What is known of all worlds at once is what each of them says.
+        poses, times = device._device.eyes(np.arange(3))
+        motion = device._device.motion(np.arange(3))
+        for i, (physics, task) in enumerate(zip(device.physics, device.tasks, strict=True)):
+            np.testing.assert_allclose(poses[i], physics.camera_to_world, atol=1e-7)
+            assert times[i] == pytest.approx(physics.seen.time, abs=1e-9) and motion.time[i] == physics.time()
+            np.testing.assert_allclose(motion.pose[i], physics.planar_pose, atol=1e-9)
+            said = motion.speed[i], motion.yaw_rate[i], motion.uprightness[i]
+            np.testing.assert_allclose(said, (physics.speed, physics.yaw_rate, physics.uprightness), atol=1e-9)
+            np.testing.assert_allclose(device.state(i), np.concatenate(list(task.get_observation(physics).values())))
+            assert device.info(i)["progress"] == task.progress != 0.0
     for one, other in zip(plain.physics, device.physics, strict=True):
         assert one.time() == pytest.approx(other.time())
         np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=3e-3)
@@ -59,12 +71,12 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
 
 
 def test_what_goes_wrong_on_a_device_is_said(scene):
-    worlds = Worlds(Stage.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], device="cpu")
+    worlds = DeviceWorlds(Stage.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
     worlds.begin([0])  # the other world lies where the model has it, and is nobody's concern
     device = worlds._device
     device._advance = lambda: None
     device._data.overflow.assign([0, int(mjw.OverflowType.NEFC)])
-    device._send_states = lambda: None
+    device._send = lambda: None
     worlds.step(np.zeros((1, 2)), [0])
     device._data.overflow.assign([int(mjw.OverflowType.NEFC), 0])
     with pytest.raises(RuntimeError, match=r"worlds \[0\]: more than .* no room; use device='cpu'"):
@@ -79,7 +91,7 @@ def test_what_goes_wrong_on_a_device_is_said(scene):
 def test_what_is_touched_on_a_device_ends_the_episode(scene):
     wall = ObstacleConfig("in_the_way", "box", station=1.5, lateral=0.0)
     stage = Stage.open(scene, "bend", {"pixels": False, "obstacles": (wall,)})
-    worlds = Worlds(stage, [4, 5], device="cpu")
+    worlds = DeviceWorlds(stage, [4, 5], "cpu")
     worlds.begin(range(2))
     for _ in range(30):
         out = worlds.step(np.array([[1.0, 0.0], [-1.0, 0.0]]))

@@ -6,13 +6,13 @@ through exactly what it would alone, on a CPU.
 
 `mujoco.batch.Batch` would step faster by what Python does between the looks at the contacts; it has no contacts to look
 at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock. On a
-GPU `mujoco_warp` steps them all at once, see `device_steps.py`; everything else stays as it is.
+GPU `mujoco_warp` steps them all at once, and all are judged at once, see `device_worlds.py`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import dm_env
 import numpy as np
@@ -24,9 +24,6 @@ from twin.env.dm_physics import DrivePhysics
 from twin.env.options import CPU
 from twin.env.suite import Stage
 from twin.env.tasks import Drive
-
-if TYPE_CHECKING:
-    from twin.env.device_steps import DeviceSteps
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -50,27 +47,31 @@ class Outcome:
 class Worlds:
     """n worlds of one scene and task."""
 
-    def __init__(self, stage: Stage, seeds: Sequence[int | None], device: str | None = None) -> None:
+    def __init__(self, stage: Stage, seeds: Sequence[int | None]) -> None:
         """
         Args:
             stage: Scene, task and options.
             seeds: One per world, of its sequence of episodes; None: unpredictable.
-            device: Warp's name of the device on which `mujoco_warp` steps the worlds; None: what the options say.
         """
-        parts = [stage.drive(seed) for seed in seeds]
-        self.physics, self.tasks = [p for p, _ in parts], [t for _, t in parts]
+        parts = self._parts(stage, seeds)
+        self._physics, self.tasks = [p for p, _ in parts], [t for _, t in parts]
         self.pixels = stage.pixels(parts)
         self.options = stage.options
         step = stage.options.control_timestep
         self._environments = [control.Environment(p, t, control_timestep=step) for p, t in parts]
-        self._steps: list[dm_env.TimeStep | None] = [None] * len(parts)
         threads = min(cores(), len(parts))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
-        if device is None and stage.options.device != CPU:
-            device = stage.options.device
-        self._device = _device_steps(self.physics, step, device) if device else None
         spec = self._environments[0].action_spec()
         self._low, self._high = spec.minimum, spec.maximum
+        self._states = np.zeros((len(parts), self.states), np.float32)
+
+    def _parts(self, stage: Stage, seeds: Sequence[int | None]) -> list[tuple[DrivePhysics, Drive]]:
+        return [stage.drive(seed) for seed in seeds]
+
+    @property
+    def physics(self) -> list[DrivePhysics]:
+        """Of every world, as it is now."""
+        return self._physics
 
     def __len__(self) -> int:
         return len(self._environments)
@@ -91,13 +92,8 @@ class Worlds:
 
     def begin(self, which: Sequence[int]) -> None:
         """Starts new episodes in some worlds."""
-
-        def reset(i: int) -> None:
-            self._steps[i] = self._environments[i].reset()
-
-        self._each(reset, which)
-        if self._device:
-            self._device.begin(which)
+        for i, step in zip(which, self._each(lambda i: self._environments[i].reset(), which), strict=True):
+            self._states[i] = _state(step)
         if self.pixels:
             self.pixels.begin(which)
 
@@ -111,21 +107,16 @@ class Worlds:
         which = range(len(self)) if which is None else which
         # In float64, as a driver of one environment does it.
         wanted = self._low + (np.clip(np.asarray(actions, float), -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
-
-        def advance(k: int) -> dm_env.TimeStep:
-            return self._environments[which[k]].step(wanted[k])
-
-        if self._device:
-            for i, action in zip(which, wanted, strict=True):
-                self.tasks[i].before_step(action, self.physics[i])
-            self._device.step(which)
-            steps = [_judged(self.tasks[i], self.physics[i]) for i in which]
-        else:
-            steps = self._each(advance, range(len(which)))
-        for i, step in zip(which, steps, strict=True):
-            self._steps[i] = step
+        out = self._advance(wanted, which)
         if self.pixels:
             self.pixels.look(which)
+        return out
+
+    def _advance(self, wanted: Array, which: Sequence[int]) -> Outcome:
+        """The same with actions in metres and radians, and but for the pictures."""
+        steps = self._each(lambda k: self._environments[which[k]].step(wanted[k]), range(len(which)))
+        for i, step in zip(which, steps, strict=True):
+            self._states[i] = _state(step)
         last = np.array([step.last() for step in steps])
         goes_on = np.array([step.discount for step in steps]) > 0.0
         return Outcome(np.array([step.reward for step in steps]), last & ~goes_on, last & goes_on)
@@ -135,18 +126,18 @@ class Worlds:
         if self.pixels:
             stacks = self.pixels.stacks
             return stacks.reshape(len(self), -1, *stacks.shape[3:]).copy()
-        return np.stack([self.state(i) for i in range(len(self))])
+        return self._states.copy()
 
     def state(self, i: int) -> NDArray[np.float32]:
         """What a driver of world i that knows the map would know, see `Drive.get_observation`; shape (k,).
 
         It is of now, which the newest picture is not where the camera has a latency.
         """
-        return np.concatenate(list(self._steps[i].observation.values()))  # type: ignore[union-attr]
+        return self._states[i].copy()
 
     def info(self, i: int) -> dict[str, Any]:
         """Of world i's episode so far, JSON-able."""
-        return self.tasks[i].info(self.physics[i]) | (self.pixels.info(i) if self.pixels else {})
+        return self.tasks[i].info(self._physics[i]) | (self.pixels.info(i) if self.pixels else {})
 
     def close(self) -> None:
         if self._pool:
@@ -156,18 +147,14 @@ class Worlds:
         return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]
 
 
-def _device_steps(physics: Sequence[DrivePhysics], step: float, device: str) -> "DeviceSteps":
-    from twin.env.device_steps import DeviceSteps  # slow to import
+def worlds_of(stage: Stage, seeds: Sequence[int | None]) -> Worlds:
+    """n worlds on the device that the stage's options say; see `Worlds`."""
+    if stage.options.device == CPU:
+        return Worlds(stage, seeds)
+    from twin.env.device_worlds import DeviceWorlds  # slow to import
 
-    return DeviceSteps(physics, step, device)
+    return DeviceWorlds(stage, seeds, stage.options.device)
 
 
-def _judged(task: Drive, physics: DrivePhysics) -> dm_env.TimeStep:
-    """What `control.Environment.step` makes of a world once its small steps are done."""
-    task.after_step(physics)
-    reward, observation, discount = (
-        ask(physics) for ask in (task.get_reward, task.get_observation, task.get_termination)
-    )
-    if discount is None:
-        return dm_env.TimeStep(dm_env.StepType.MID, reward, 1.0, observation)
-    return dm_env.TimeStep(dm_env.StepType.LAST, reward, discount, observation)
+def _state(step: dm_env.TimeStep) -> NDArray[np.float32]:
+    return np.concatenate(list(step.observation.values()))

@@ -18,15 +18,15 @@ Array = NDArray[np.float64]
 CONTROL_PERIOD = 0.1  # [s]
 COMMAND_TIMEOUT = 0.25  # [s] without a command, then the robot stops
 
-_TICK = 1e-9  # [s] instants nearer than this are the same
+TICK = 1e-9  # [s] instants nearer than this are the same
 
 
 def limited_command(command: Array, previous: Array, params: HuskyParams, period: float = CONTROL_PERIOD) -> Array:
     """A command after the limits of speed and acceleration: v [m/s], ω [rad/s].
 
     Args:
-        command: Wanted v, ω, shape (2,).
-        previous: What was carried out one `period` [s] ago, shape (2,).
+        command: Wanted v, ω, shape (..., 2).
+        previous: What was carried out one `period` [s] ago, shape (..., 2).
         params: `max_speed`, `max_yaw_rate` and their accelerations.
     """
     limit = np.array([params.max_speed, params.max_yaw_rate])
@@ -35,11 +35,11 @@ def limited_command(command: Array, previous: Array, params: HuskyParams, period
 
 
 def wheel_speeds(command: Array, params: HuskyParams) -> Array:
-    """Speeds of the left and of the right wheels [rad/s], shape (2,), for v [m/s] and ω [rad/s], shape (2,)."""
-    v, yaw_rate = command
-    half = yaw_rate * params.separation_multiplier * TRACK / 2
-    sides = np.array([v - half, v + half])
-    return sides / max(1.0, np.abs(sides).max() / params.max_wheel_speed) / WHEEL_RADIUS
+    """Speeds of the left and of the right wheels [rad/s] for v [m/s] and ω [rad/s], each shape (..., 2)."""
+    half = command[..., 1:] * params.separation_multiplier * TRACK / 2
+    sides = command[..., :1] + half * np.array([-1.0, 1.0])
+    beyond = np.abs(sides).max(-1, keepdims=True) / params.max_wheel_speed
+    return sides / np.maximum(1.0, beyond) / WHEEL_RADIUS
 
 
 def commanded_motion(speeds: Array, params: HuskyParams) -> Array:
@@ -65,7 +65,7 @@ class Controller:
     def phase(self) -> float:
         """When the controller first runs [s]; then every 0.1 s. A command given at 0 reaches it just then."""
         phase = self.params.command_latency % CONTROL_PERIOD
-        return 0.0 if phase > CONTROL_PERIOD - _TICK else phase
+        return 0.0 if phase > CONTROL_PERIOD - TICK else phase
 
     @property
     def carried_out(self) -> Array:
@@ -78,10 +78,10 @@ class Controller:
 
     def update(self, time: float) -> Array:
         """Runs once: speeds of the left and of the right wheels [rad/s], shape (2,)."""
-        while self._under_way and self._under_way[0][0] <= time + _TICK:
+        while self._under_way and self._under_way[0][0] <= time + TICK:
             self._latest = self._under_way.popleft()
         wanted = np.zeros(2)
-        if self._latest is not None and time - self._latest[0] <= COMMAND_TIMEOUT - _TICK:
+        if self._latest is not None and time - self._latest[0] <= COMMAND_TIMEOUT - TICK:
             wanted = self._latest[1]
         self._carried_out = limited_command(wanted, self._carried_out, self.params)
         return wheel_speeds(self._carried_out, self.params)

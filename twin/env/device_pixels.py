@@ -7,11 +7,12 @@ whose pictures come back to the host for what is put into them.
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
 # (inside kernels, Warp's own types hold, which mypy does not know)
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from twin.env.dm_physics import DrivePhysics
 from twin.env.lightings import Light, LightSets
@@ -25,6 +26,9 @@ from twin.nerf.baked import BakedField
 
 if TYPE_CHECKING:
     import torch
+
+Array = NDArray[np.float64]
+Eyes = Callable[[NDArray[np.int64]], tuple[Array, Array]]
 
 
 @wp.kernel
@@ -77,6 +81,8 @@ class DevicePixels(Pixels):
         self.lights: list[Light | None] = [None] * n
         self.trust = np.zeros(n)
         self._effects, self._weather = [None] * n, [None] * n
+        self.eyes: Eyes = self._eyes
+        """Where cameras of some worlds were when their newest pictures were taken, OpenCV poses (k, 4, 4), and when."""
 
     @property
     def stacks(self) -> Picture:  # type: ignore[override]
@@ -92,10 +98,14 @@ class DevicePixels(Pixels):
         width, height = self.options.size
         return wp.to_torch(self._stacks).reshape(len(self.worlds), -1, height, width)
 
+    def _eyes(self, which: NDArray[np.int64]) -> tuple[Array, Array]:
+        physics = [self.worlds[i][0] for i in which]
+        return np.array([one.camera_to_world for one in physics]), np.array([one.seen.time for one in physics])
+
     def _show(self, which: Sequence[int], fills: bool) -> None:
         width, height = self.options.size
-        poses = np.array([self.worlds[i][0].camera_to_world for i in which])
-        lights = [self.lights[i].at(self.worlds[i][0].seen.time) for i in which]  # type: ignore[union-attr]
+        poses, times = self.eyes(np.array(which))
+        lights = [self.lights[i].at(time) for i, time in zip(which, times.tolist(), strict=True)]  # type: ignore[union-attr]
         views = Viewpoints.of(poses, self._intrinsics, self.options.size)
         lower, device = height // 2 * width, self._field.where
         below, index = (

@@ -1,12 +1,11 @@
 """The physics of many worlds in one go on a GPU, by `mujoco_warp`.
 
-Episodes begin, are judged and end on the host, in the same code as everywhere: its `MjData` says where a world is. A
-control step takes the *state* of all worlds (positions, velocities, the solver's last accelerations) to the device,
-lets the small steps pass there under the courses of their controllers, and brings the states back with the geoms that
-were touched. A *slot* is a piece of a course: some small steps under one command, at whose end contacts are looked at;
-worlds whose controllers run at other times have other slots. Numbers are of single precision there, and of another
-solver: episodes are those of MuJoCo in kind, not bit for bit. On a GPU contacts are found in any order, so there they
-are not the same twice, either.
+Episodes begin on the host, in the same code as everywhere. From then on their *state* (positions, velocities, the
+solver's last accelerations) is kept here in arrays over all worlds: a control step takes it to the device, lets the
+small steps pass there under the courses of the robots' controllers (`courses.py`), and brings it back with the geoms
+that were touched. The worlds' own `MjData` are brought up to it when they are asked for (`sync`), as that takes far
+longer. Numbers are of single precision on the device, and of another solver: episodes are those of MuJoCo in kind, not
+bit for bit. On a GPU contacts are found in any order, so there they are not the same twice, either.
 
 The device is a GPU, or for tests the CPU, where this is slower than MuJoCo itself.
 """
@@ -21,10 +20,14 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from twin.env.controller import CONTROL_PERIOD
+from twin.env.courses import Controllers, Courses
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
+from twin.env.episode_obstacles import Surroundings
+from twin.env.judge import Motion
+from twin.geometry.cameras import opencv_to_mujoco
 
 _DRAWN = (
     *("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "cam_pos", "cam_quat", "body_mass", "body_inertia"),
@@ -33,11 +36,11 @@ _DRAWN = (
 """What `Nominal.apply` makes different from world to world, with what MuJoCo derives from it."""
 
 Array = NDArray[np.float64]
-Looks = list[tuple[float, Array, Array]]
-"""Of one world in one control step: time [s], `mocap_pos` and `mocap_quat` of each look."""
-
+Which = NDArray[np.int64]
 _SENT = ("qpos", "qvel", "qacc_warmstart")
-_FETCHED = (*_SENT, "sensordata", "actuator_force")
+_STATE = (*_SENT, "ctrl", "sensordata", "actuator_force")
+
+_SAME_TIME = 1e-6  # [s] apart are rounding errors of the clock
 
 _CONTACTS, _ROWS = 96, 384  # room per world for contacts and for the solver's rows; the demo needs a third
 _OVERFLOWS = mjw.OverflowType.NEFC | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD
@@ -46,7 +49,7 @@ _OVERFLOWS = mjw.OverflowType.NEFC | mjw.OverflowType.BROADPHASE | mjw.OverflowT
 @wp.kernel
 def _before(
     k: int,
-    slot: wp.array2d(dtype=int),
+    piece: wp.array2d(dtype=int),
     speeds: wp.array3d(dtype=float),
     positions: wp.array3d(dtype=wp.vec3),
     turns: wp.array3d(dtype=wp.quat),
@@ -56,7 +59,7 @@ def _before(
 ):
     """Commands of small step k, and where what moves by itself is in it."""
     world = wp.tid()
-    mine = slot[k, world]
+    mine = piece[k, world]
     for i in range(ctrl.shape[1]):
         ctrl[world, i] = speeds[mine, world, i]
     for i in range(mocap_pos.shape[1]):
@@ -67,13 +70,13 @@ def _before(
 @wp.kernel
 def _keep(
     k: int,
-    slot: wp.array2d(dtype=int),
+    piece: wp.array2d(dtype=int),
     qpos: wp.array2d(dtype=float),
     history: wp.array3d(dtype=float),
 ):
-    """Where worlds are at the ends of their slots: the last small step of a slot writes last."""
+    """Where worlds are at the ends of their pieces: the last small step of a piece writes last."""
     world, i = wp.tid()
-    history[slot[k, world], world, i] = qpos[world, i]
+    history[piece[k, world], world, i] = qpos[world, i]
 
 
 @wp.kernel
@@ -109,34 +112,41 @@ class DeviceSteps:
             period: Between two commands [s].
             where: Warp's name of the device.
         """
-        self._worlds, self._period, self._where = list(worlds), period, where
+        self._worlds, self._where = list(worlds), where
         robot, n = worlds[0].robot, len(worlds)
-        model = robot.model
+        model, self._params = robot.model, robot.params
         self._steps = round(period / model.opt.timestep)
-        # A piece ends with a look; every run of the controller, and the control step's end, may cut one short.
-        slots = self._steps // robot.look_steps + round(period / CONTROL_PERIOD) + 3
-        data = [world.robot.data for world in worlds]
-        self._sent = {
-            "slot": np.zeros((self._steps, n), np.int32),
-            "looks": np.zeros((self._steps, n), np.int32),
-            "speeds": np.zeros((slots, n, model.nu), np.float32),
-            "positions": np.tile(np.float32([d.mocap_pos for d in data]), (slots, 1, 1, 1)),
-            "turns": np.tile(np.float32([d.mocap_quat for d in data]), (slots, 1, 1, 1)),
-        }
+        self._controllers = Controllers(self._params, n, period, model.opt.timestep, robot.look_steps)
+        pieces = self._controllers.pieces
+        self._state = {name: np.stack([getattr(world.robot.data, name) for world in worlds]) for name in _STATE}
+        self._time, self._stale = np.zeros(n), np.zeros(n, bool)
+        self._touched = np.zeros((n, model.ngeom), bool)
+        self._moving = np.zeros(n, bool)  # whether anything moves by itself
+        mocap = [
+            np.stack([getattr(world.robot.data, name) for world in worlds]) for name in ("mocap_pos", "mocap_quat")
+        ]
+        self._mocap = [np.tile(values, (pieces, 1, 1, 1)) for values in mocap]  # of each piece
+        # Of the last looks, the newest last, and in the same order: what `HuskyPhysics.seen` goes by.
+        kept = pieces * (int(np.ceil(self._params.camera_latency / period)) + 2) if self._params.camera_latency else 0
+        self._look_times = np.full((kept, n), np.inf)
+        self._looks = [np.zeros((kept, *values.shape)) for values in (self._state["qpos"], *mocap)]
         self._drawn = {name: np.stack([getattr(world.robot.model, name) for world in worlds]) for name in _DRAWN}
+        self._camera, self._actuators = model.camera("front").id, robot.actuators
         with wp.ScopedDevice(where):
             self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(_DRAWN, n))
             self._model.opt.warn_overflow = 0  # what it prints from kernels; `_fetch` says it once
             if where != "cpu":
                 self._model.opt.graph_conditional = wp.is_conditional_graph_supported()
             self._data = mjw.make_data(model, nworld=n, nconmax=_CONTACTS, njmax=_ROWS)
-            kinds = {"slot": int, "looks": int, "speeds": float, "positions": wp.vec3, "turns": wp.quat}
-            self._there = {name: wp.array(self._sent[name], dtype=kind) for name, kind in kinds.items()}
-            self._history = wp.zeros((slots, n, model.nq), dtype=float)
-            self._touched = wp.zeros((n, model.ngeom), dtype=int)
+            self._piece, self._look = (wp.zeros((self._steps, n), dtype=int) for _ in range(2))
+            self._speeds = wp.zeros((pieces, n, model.nu), dtype=float)
+            kinds = zip(self._mocap, (wp.vec3, wp.quat), strict=True)
+            self._mocap_there = [wp.array(values.astype(np.float32), dtype=kind) for values, kind in kinds]
+            self._history = wp.zeros((pieces, n, model.nq), dtype=float)
+            self._touched_there = wp.zeros((n, model.ngeom), dtype=int)
             masks = (robot.is_robot, robot.counts)
             self._is_robot, self._counts = (wp.array(mask.astype(np.int32), dtype=int) for mask in masks)
-            self._send_states()
+            self._send()
             self._graph: Any = None
             if where != "cpu":
                 # Now, as nothing else may use the GPU while a graph is captured; once before, as that compiles.
@@ -145,89 +155,165 @@ class DeviceSteps:
                     self._advance()
                 self._graph = capture.graph
 
-    def begin(self, which: Sequence[int]) -> None:
-        """Takes over the models of worlds whose episodes have just begun."""
+    def begin(self, which: Which) -> None:
+        """Takes over the models and states of worlds whose episodes have just begun."""
         if not len(which):
             return
+        robots = [self._worlds[i].robot for i in which]
         for name, values in self._drawn.items():
-            for i in which:
-                values[i] = getattr(self._worlds[i].robot.model, name)
+            values[which] = [getattr(robot.model, name) for robot in robots]
             array = getattr(self._model, name)
             # Vectors and quaternions are one element each there.
             array.assign(values.reshape(array.shape + getattr(array.dtype, "_shape_", ())))
+        for name, values in self._state.items():
+            values[which] = [getattr(robot.data, name) for robot in robots]
+        mocap = [np.stack([getattr(robot.data, name) for robot in robots]) for name in ("mocap_pos", "mocap_quat")]
+        for values, there, new in zip(self._mocap, self._mocap_there, mocap, strict=True):
+            values[:, which] = new
+            there.assign(values.astype(np.float32))
+        self._look_times[:, which] = np.inf
+        if len(self._look_times):
+            self._look_times[-1, which] = 0.0
+            for values, new in zip(self._looks, (self._state["qpos"][which], *mocap), strict=True):
+                values[-1, which] = new
+        self._time[which], self._stale[which] = 0.0, False
+        self._touched[which] = [np.isin(np.arange(len(robot.is_robot)), list(robot.touching)) for robot in robots]
+        self._moving[which] = [isinstance(r.surroundings, Surroundings) and r.surroundings.moving for r in robots]
+        latency = np.array([robot.params.command_latency for robot in robots])
+        self._controllers.begin(which, latency, np.array([robot.until_update for robot in robots]))
 
-    def step(self, which: Sequence[int]) -> None:
-        """Lets a control step pass in some worlds, whose robots have been commanded.
+    def step(self, which: Which, commands: Array) -> None:
+        """Lets a control step pass in some worlds under commands, v [m/s] and ω [rad/s], shape (k, 2).
 
         Raises:
             RuntimeError: more contacts than there is room for.
             PhysicsError: dm_control's; a world came apart.
         """
-        looks = self._send(which)
+        courses = self._controllers.courses(which, commands)
+        self._surround(which, courses)
+        speeds = np.zeros(self._speeds.shape, np.float32)
+        speeds[:, :, self._actuators] = courses.speeds
+        for there, values in ((self._piece, courses.piece), (self._look, courses.looks), (self._speeds, speeds)):
+            there.assign(values)
+        self._send()
         with wp.ScopedDevice(self._where):
             if self._graph is None:
                 self._advance()
             else:
                 wp.capture_launch(self._graph)
-        self._fetch(which, looks)
+        self._fetch(which, courses)
 
-    def _send(self, which: Sequence[int]) -> list[Looks]:
-        """Sends courses and states."""
-        sent, ends = self._sent, list[Looks]()
-        sent["looks"][:] = 0
-        for i in which:
-            robot, k = self._worlds[i].robot, 0
-            data, time = robot.data, robot.time
-            ends.append([])
-            for number, (some, command) in enumerate(robot.course(self._period)):
-                time += some * robot.model.opt.timestep
-                if robot.surroundings:
-                    robot.surroundings(time)
-                data.ctrl[robot.actuators] = command
-                sent["speeds"][number, i] = data.ctrl
-                sent["positions"][number, i], sent["turns"][number, i] = data.mocap_pos, data.mocap_quat
-                sent["slot"][k : k + some, i], sent["looks"][k + some - 1, i] = number, 1
-                ends[-1].append((time, data.mocap_pos.copy(), data.mocap_quat.copy()))
-                k += some
-        for name, values in sent.items():
-            self._there[name].assign(values)
-        self._send_states()
-        return ends
+    def motion(self, which: Which) -> Motion:
+        """Of the robots of some worlds."""
+        qpos, qvel = self._state["qpos"][which], self._state["qvel"][which]
+        matrix = _matrices(qpos[:, 3:7])
+        pose = np.column_stack([qpos[:, :2], np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0])])
+        speed = (qvel[:, :3] * matrix[:, :, 0]).sum(-1)
+        touched = self._touched[which].any(1)
+        return Motion(pose, speed, qvel[:, 5], matrix[:, 2, 2], touched, self._time[which].copy())
 
-    def _send_states(self) -> None:
+    def eyes(self, which: Which) -> tuple[Array, Array]:
+        """OpenCV poses of the front cameras when their newest pictures were taken, shape (k, 4, 4), and when that was
+        [s], shape (k,)."""
+        qpos, time = self._state["qpos"][which, :7], self._time[which]
+        if len(self._look_times):
+            qpos, time = self._before(which)
+        matrix, pose = _matrices(qpos[:, 3:]), np.tile(np.eye(4), (len(which), 1, 1))
+        pose[:, :3, :3] = matrix @ _matrices(self._drawn["cam_quat"][which, self._camera])
+        pose[:, :3, 3] = qpos[:, :3] + (matrix @ self._drawn["cam_pos"][which, self._camera, :, None])[..., 0]
+        return opencv_to_mujoco(pose), time
+
+    def sync(self, which: Which) -> None:
+        """Brings the `MjData` of some worlds to where they are."""
+        for i in which[self._stale[which]].tolist():
+            robot = self._worlds[i].robot
+            for name, values in self._state.items():
+                getattr(robot.data, name)[:] = values[i]
+            robot.data.mocap_pos[:], robot.data.mocap_quat[:] = (values[-1, i] for values in self._mocap)
+            robot.data.time = self._time[i]
+            looks = [
+                (float(time), *(values[k, i] for values in self._looks))
+                for k, time in enumerate(self._look_times[:, i])
+                if np.isfinite(time)
+            ]
+            robot.take_over(set(np.flatnonzero(self._touched[i]).tolist()), looks)
+        self._stale[which] = False
+
+    def _before(self, which: Which) -> tuple[Array, Array]:
+        """Positions, shape (k, 7), and times [s] of the bases when the newest pictures were taken, as `seen` says."""
+        looks, qpos = self._look_times[:, which], self._looks[0][:, which, :7]
+        time = self._time[which] - self._params.camera_latency
+        row = np.arange(len(which))
+        past = looks <= time + _SAME_TIME
+        past[np.argmin(looks, 0), row] = True  # nothing is older than the beginning
+        first = np.argmax(np.where(past, looks, -np.inf), 0)
+        coming = np.where(past, np.inf, looks)
+        last = np.argmin(coming, 0)
+        start, end = looks[first, row], coming[last, row]
+        a, b = qpos[first, row], qpos[last, row]
+        between = (start + _SAME_TIME < time) & np.isfinite(end)
+        share = np.zeros(len(which))
+        share[between] = ((time - start) / (end - start))[between]
+        # Between two looks, 10 ms apart, the straight line between two attitudes is as good as the arc.
+        b[:, 3:] *= np.sign((a[:, 3:] * b[:, 3:]).sum(-1, keepdims=True))
+        return a + share[:, None] * (b - a), np.where(between, time, start)
+
+    def _surround(self, which: Which, courses: Courses) -> None:
+        """Moves what moves by itself to where it is at the end of each piece."""
+        moving = which[self._moving[which]]
+        for i in moving.tolist():
+            robot = self._worlds[i].robot
+            times = courses.times[:, i]
+            for p, time in enumerate(times[np.isfinite(times)].tolist()):
+                assert robot.surroundings
+                robot.surroundings(time)
+                self._mocap[0][p:, i], self._mocap[1][p:, i] = robot.data.mocap_pos, robot.data.mocap_quat
+        if len(moving):
+            for values, there in zip(self._mocap, self._mocap_there, strict=True):
+                there.assign(values.astype(np.float32))
+
+    def _send(self) -> None:
         for name in _SENT:
-            values = np.stack([getattr(world.robot.data, name) for world in self._worlds])
-            getattr(self._data, name).assign(values.astype(np.float32))
-        self._touched.zero_()
+            getattr(self._data, name).assign(self._state[name].astype(np.float32))
+        self._touched_there.zero_()
         self._data.overflow.zero_()
 
     def _advance(self) -> None:
-        d, there = self._data, self._there
-        contact, commands = d.contact, [there["slot"], there["speeds"], there["positions"], there["turns"]]
+        d, contact = self._data, self._data.contact
+        commands = [self._piece, self._speeds, *self._mocap_there]
         for k in range(self._steps):
             wp.launch(_before, d.nworld, [k, *commands], [d.ctrl, d.mocap_pos, d.mocap_quat])
             mjw.step(self._model, d)
-            wp.launch(_keep, d.qpos.shape, [k, there["slot"], d.qpos], [self._history])
+            wp.launch(_keep, d.qpos.shape, [k, self._piece, d.qpos], [self._history])
             pairs = [d.nacon, contact.geom, contact.worldid, self._is_robot, self._counts]
-            wp.launch(_touch, d.naconmax, [k, there["looks"], *pairs], [self._touched])
+            wp.launch(_touch, d.naconmax, [k, self._look, *pairs], [self._touched_there])
 
-    def _fetch(self, which: Sequence[int], looks: list[Looks]) -> None:
-        over = self._data.overflow.numpy()
-        full = [i for i in which if over[i] & int(_OVERFLOWS)]
-        if full:
+    def _fetch(self, which: Which, courses: Courses) -> None:
+        over = self._data.overflow.numpy()[which] & int(_OVERFLOWS)
+        if over.any():
             raise RuntimeError(
-                f"worlds {full}: more than {_CONTACTS} contacts or {_ROWS} rows of constraints, for which mujoco_warp "
-                "has no room; use device='cpu'"
+                f"worlds {which[over != 0].tolist()}: more than {_CONTACTS} contacts or {_ROWS} rows of constraints, "
+                "for which mujoco_warp has no room; use device='cpu'"
             )
-        states = {name: getattr(self._data, name).numpy() for name in _FETCHED}
-        wrong = [i for i in which if not np.isfinite(np.append(states["qpos"][i], states["qvel"][i])).all()]
-        if wrong:
-            raise control.PhysicsError(f"worlds {wrong}: positions or velocities are no longer numbers")
-        touched, history = self._touched.numpy(), self._history.numpy().astype(float)
-        for i, ends in zip(which, looks, strict=True):
-            robot = self._worlds[i].robot
-            for name, values in states.items():
-                getattr(robot.data, name)[:] = values[i]
-            robot.data.time = ends[-1][0]
-            seen = [(time, history[k, i], *mocap) for k, (time, *mocap) in enumerate(ends)]
-            robot.take_over(set(np.flatnonzero(touched[i]).tolist()), seen)
+        new = {name: getattr(self._data, name).numpy()[which] for name in _STATE}
+        finite = np.isfinite(new["qpos"]).all(1) & np.isfinite(new["qvel"]).all(1)
+        if not finite.all():
+            raise control.PhysicsError(
+                f"worlds {which[~finite].tolist()}: positions or velocities are no longer numbers"
+            )
+        for name, values in self._state.items():
+            values[which] = new[name]
+        self._touched[which] = self._touched_there.numpy()[which] > 0
+        times = courses.times[:, which]
+        self._time[which] = np.where(np.isfinite(times), times, -np.inf).max(0)
+        self._stale[which] = True
+        if len(self._look_times):
+            newest = (times, self._history.numpy()[:, which], *(values[:, which] for values in self._mocap))
+            for kept, some in zip((self._look_times, *self._looks), newest, strict=True):
+                kept[: -len(some), which] = kept[len(some) :, which]
+                kept[-len(some) :, which] = some
+
+
+def _matrices(quaternions: Array) -> Array:
+    """Rotation matrices (k, 3, 3) of quaternions w, x, y, z, shape (k, 4), of any length."""
+    return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()

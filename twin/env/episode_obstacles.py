@@ -75,9 +75,10 @@ class Surroundings:
 
     def __init__(self, obstacles: Sequence[ObstacleConfig], data: mujoco.MjData) -> None:
         self.obstacles, self._data = tuple(obstacles), data
-        self._moving = moves(self.obstacles)
+        self.moving = moves(self.obstacles)
+        """Whether any of them does."""
 
     def __call__(self, time: float) -> None:
         """Moves what moves to where it is at a time [s]; at 0 everything."""
-        if self._moving or time == 0.0:
+        if self.moving or time == 0.0:
             place(self.obstacles, self._data, time)

@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from twin.env.batch import Worlds
+from twin.env.batch import Worlds, worlds_of
 from twin.env.suite import Stage
 from twin.loading import Twin
 
@@ -48,7 +48,7 @@ class DriveEnv(gymnasium.Env):
     ) -> None:
         """See `twin.load`; `render_mode` is None or rgb_array."""
         self.render_mode = render_mode
-        self.worlds = Worlds(Stage.open(scene, task, options), [None])
+        self.worlds = worlds_of(Stage.open(scene, task, options), [None])
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.worlds.options.control_timestep)}
         self.observation_space, self.action_space = spaces_of(self.worlds)
 
@@ -92,7 +92,7 @@ class DriveVectorEnv(VectorEnv):
     ) -> None:
         """See `twin.load`."""
         self.num_envs, self.render_mode = num_envs, render_mode
-        self.worlds = Worlds(Stage.open(scene, task, options), [None] * num_envs)
+        self.worlds = worlds_of(Stage.open(scene, task, options), [None] * num_envs)
         self.single_observation_space, self.single_action_space = spaces_of(self.worlds)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

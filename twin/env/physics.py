@@ -99,7 +99,7 @@ class HuskyPhysics:
         """Takes the state as it is for the beginning: nothing commanded yet, and touched only what it touches now."""
         self.controller = Controller(self.params)
         # Small steps until the controller runs next.
-        self._until_update = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6)) % self._period_steps
+        self.until_update = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6)) % self._period_steps
         self._touched = self._touching()
         self._instants = [self._instant()]
 
@@ -139,27 +139,27 @@ class HuskyPhysics:
         left = round(period / self.model.opt.timestep)
         speeds = self.data.ctrl[self.actuators].copy()
         while left:
-            if not self._until_update:
+            if not self.until_update:
                 speeds = self.controller.update(time)
-                self._until_update = self._period_steps
-            some = min(left, self.look_steps, self._until_update)
+                self.until_update = self._period_steps
+            some = min(left, self.look_steps, self.until_update)
             out.append((some, speeds))
             time += some * self.model.opt.timestep
-            left, self._until_update = left - some, self._until_update - some
+            left, self.until_update = left - some, self.until_update - some
         return out
 
     def take_over(self, touched: set[int], looks: list[tuple[float, Array, Array, Array]]) -> None:
         """Goes on from where another engine's small steps have led: `data` holds positions, velocities and time.
 
         Args:
-            touched: Geoms that were in contact at a look.
-            looks: Time [s], `qpos`, `mocap_pos` and `mocap_quat` of each.
+            touched: Geoms that were in contact at a look of the last control step.
+            looks: Time [s], `qpos`, `mocap_pos` and `mocap_quat` of the last ones, if the camera has a latency.
         """
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         if self.params.camera_latency:
-            self._instants += [_Instant(*look) for look in looks]
+            self._instants = [_Instant(*look) for look in looks]
         self._arrive(touched)
 
     def _arrive(self, touched: set[int]) -> None:
@@ -181,6 +181,11 @@ class HuskyPhysics:
     def touched(self) -> tuple[str, ...]:
         """Names of the geoms touched during the last control step, sorted."""
         return tuple(sorted(self.model.geom(i).name for i in self._touched))
+
+    @property
+    def touching(self) -> frozenset[int]:
+        """The same, as numbers of geoms."""
+        return frozenset(self._touched)
 
     @property
     def time(self) -> float:

@@ -19,6 +19,7 @@ from twin.config_file import load_config
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles
+from twin.env.judge import Judge
 from twin.env.obstacle_view import ObstacleView, camera_pose
 from twin.env.obstacles import add_obstacles
 from twin.env.options import CPU, NERF, Options, parse_options
@@ -72,10 +73,10 @@ class Stage:
         field = twin.field(parsed.device) if parsed.pixels and parsed.observe == NERF else None
         return Stage(world, stretch, parsed, obstacles, spec.compile(), field, trust)
 
-    def drive(self, seed: int | None) -> tuple[DrivePhysics, Drive]:
-        """One more world, with a model of its own."""
+    def drive(self, seed: int | None, judge: tuple[Judge, int] | None = None) -> tuple[DrivePhysics, Drive]:
+        """One more world, with a model of its own; see `Drive`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
-        return physics, Drive(self.world, self.stretch, self.options, self.obstacles, self.model, seed)
+        return physics, Drive(self.world, self.stretch, self.options, self.obstacles, self.model, seed, judge)
 
     @property
     def _bare(self) -> bool:

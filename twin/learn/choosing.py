@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from twin import progress
-from twin.env.batch import Worlds
+from twin.env.batch import worlds_of
 from twin.env.suite import Stage
 from twin.learn.judging import Driven, episodes
 from twin.learn.policy import copy_policy, load_policy
@@ -52,7 +52,7 @@ def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
     stage = Stage.open(twin, config.task, {**config.options(), "start_along": 0.0})
     tried = []
     bar = progress.bar("choose", len(candidates) * len(shared) + len(fresh), "episode")
-    with closing(Worlds(stage, [None] * config.worlds)) as worlds, bar:
+    with closing(worlds_of(stage, [None] * config.worlds)) as worlds, bar:
 
         def told(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
             return {"step": int(path.name)} | _summed(episodes(load_policy(path), worlds, which, bar.update))

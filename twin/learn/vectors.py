@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from twin.env.batch import Worlds
+from twin.env.batch import worlds_of
 from twin.env.gym import spaces_of
 from twin.env.suite import Stage
 from twin.loading import Twin
@@ -36,7 +36,7 @@ class DriveVecEnv(VecEnv):
             seed: World i has the episodes of seed + i; None: unpredictable.
             options: See `twin.env.options.Options`.
         """
-        self.worlds = Worlds(Stage.open(scene, task, options), [None] * n_envs)
+        self.worlds = worlds_of(Stage.open(scene, task, options), [None] * n_envs)
         super().__init__(n_envs, *spaces_of(self.worlds))
         self._returns, self._lengths = np.zeros(n_envs), np.zeros(n_envs, int)
         self.seed(seed)

@@ -1,0 +1,58 @@
+"""The controllers of many robots make of commands what each robot's own makes of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_follower import on_a_plane
+
+from twin.env.controller import Controller
+from twin.env.courses import Controllers
+from twin.env.physics import HuskyPhysics
+from twin.robot import HuskyParams
+
+PARAMS = HuskyParams(max_acceleration=1.0, max_wheel_speed=0.8)
+
+
+@pytest.mark.parametrize("period", [0.1, 0.06, 0.24])
+def test_many_controllers_do_what_each_does_alone(period):
+    rng = np.random.default_rng(0)
+    model = on_a_plane().model
+    latencies = np.array([0.0, 0.013, 0.1, 0.237, 0.05, 0.4])
+    n, steps = len(latencies), round(period / model.opt.timestep)
+
+    def husky(i: int) -> HuskyPhysics:
+        return HuskyPhysics(model, replace(PARAMS, command_latency=latencies[i]))
+
+    robots = [husky(i) for i in range(n)]
+    many = Controllers(PARAMS, n, period, model.opt.timestep, robots[0].look_steps)
+
+    def begin(which: np.ndarray) -> None:
+        for i in which:
+            robots[i] = husky(i)
+        until = np.array([robots[i].until_update for i in which])
+        many.begin(which, latencies[which], until)
+
+    begin(np.arange(n))
+    for k in range(30):
+        if k == 11:
+            latencies[2] = 0.71  # more commands under way than there were before
+            begin(np.array([0, 2]))
+        which = np.arange(n) if k % 4 else np.array([1, 2, 5])  # the others' time stands still
+        commands = rng.uniform([-1.0, -2.0], [1.0, 2.0], (len(which), 2))
+        told = many.courses(which, commands)
+        for i, command in zip(which, commands, strict=True):
+            robot = robots[i]
+            robot.command(*command)
+            course, done = robot.course(period), 0
+            for p, (some, speeds) in enumerate(course):
+                np.testing.assert_array_equal(told.speeds[p, i], speeds)
+                assert (told.piece[done : done + some, i] == p).all()
+                assert told.looks[done : done + some, i].tolist() == [0] * (some - 1) + [1]
+                done += some
+                robot.data.time += some * model.opt.timestep
+                assert told.times[p, i] == robot.data.time
+            robot.data.ctrl[robot.actuators] = course[-1][1]
+            assert done == steps and np.isinf(told.times[len(course) :, i]).all()
+    moving = [Controller(replace(PARAMS, command_latency=latency)).phase for latency in latencies]
+    assert len(set(np.round(moving, 6))) > 3  # or pieces would all have been alike
