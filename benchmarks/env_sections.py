@@ -137,6 +137,11 @@ def gpu(scene: Path, quick: bool) -> dict[str, Any]:
     return worker("gpu", scene, 8 if quick else 1024, cores=len(os.sched_getaffinity(0)))
 
 
+def host(scene: Path, quick: bool) -> dict[str, Any]:
+    """What the host costs of 1024 worlds on a GPU, and what that leaves possible; needs no GPU."""
+    return worker("host", scene, 8 if quick else 1024, cores=len(os.sched_getaffinity(0)))
+
+
 SECTIONS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {
     "speed": speed,
     "memory": memory,
@@ -146,5 +151,6 @@ SECTIONS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {
     "trust": trust,
     "overlay": overlay,
     "seen_touched": seen_touched,
+    "host": host,
     "gpu": gpu,
 }

@@ -196,6 +196,46 @@ def gpu(scene: Path, count: int) -> dict[str, Any]:
     return {"gpu.worlds": count, "gpu.steps_per_s": count * steps / (time.perf_counter() - begin)}
 
 
+def host(scene: Path, count: int) -> dict[str, Any]:
+    """What the host does for worlds on a GPU in a step, whatever the GPU: small steps and pictures are left out.
+
+    It holds Python's lock throughout, so `host.steps_per_s` is the most that any GPU comes to.
+    """
+    import dataclasses
+
+    import warp
+
+    from twin.env.device_steps import DeviceSteps
+    from twin.env.device_worlds import DeviceWorlds
+    from twin.env.suite import Stage
+    from twin.nerf.baked import BakedField
+
+    blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
+
+    def show(field: BakedField, cameras: Any, lighting: Any, take: Any) -> None:
+        field._biases(lighting, len(cameras.camera_to_world))  # as `show` does, on the host
+        take(*blank)
+
+    DeviceSteps._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]
+    stage = Stage.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
+    options = dataclasses.replace(stage.options, device="cuda")  # pictures that stay; the field itself is on the CPU
+    worlds = DeviceWorlds(dataclasses.replace(stage, options=options), list(range(count)), "cpu")
+    begin = time.perf_counter()
+    worlds.begin(range(count))
+    begun, times = time.perf_counter() - begin, []
+    for _ in range(23):
+        times.append(time.perf_counter())
+        worlds.step(_onward(worlds))
+        worlds.pixels.tensor()
+    step = float(np.median(np.diff(times)[2:]))
+    return {
+        "host.worlds": count,
+        "host.us_per_step": 1e6 * step / count,
+        "host.steps_per_s": count / step,
+        "host.begin_ms": 1e3 * begun / count,
+    }
+
+
 def trust(scene: Path) -> dict[str, Any]:
     """See `twin.env.trust`: depth error against the known truth at poses on and off the filmed path, by trust."""
     from env_trust import trust_against_truth

@@ -149,7 +149,7 @@ def test_it_is_driven_by_what_it_sees(built, tmp_path):
 def test_the_benchmark_of_the_environment_runs(built, tmp_path):
     root, _ = built
     script, file = Path(__file__).parents[1] / "benchmarks/env.py", tmp_path / "figures.json"
-    sections = ["speed", "memory", "driver", "audit", "soak", "trust", "gpu"]
+    sections = ["speed", "memory", "driver", "audit", "soak", "trust", "host", "gpu"]
     command = [sys.executable, str(script), "--quick", "--scene", str(root), "--json", str(file), "--only", *sections]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -158,4 +158,5 @@ def test_the_benchmark_of_the_environment_runs(built, tmp_path):
     assert figures["driver.success"] == 1.0 and figures["driver.blind.route"] <= 1.0  # a dozen nearly straight metres
     assert figures["soak.not_finite"] == 0 and figures["audit.false_successes"] == 0
     assert figures["trust.pictures"] > 10
+    assert figures["host.steps_per_s"] > 1
     assert figures["gpu.steps_per_s"] > 1 if wp.is_cuda_available() else "no CUDA device" in figures["gpu.none"]

@@ -212,6 +212,11 @@ class DeviceSteps:
         touched = self._touched[which].any(1)
         return Motion(pose, speed, qvel[:, 5], matrix[:, 2, 2], touched, self._time[which].copy())
 
+    def touched(self, i: int) -> tuple[str, ...]:
+        """Names of the geoms touched in world i during the last control step, sorted."""
+        model = self._worlds[i].robot.model
+        return tuple(sorted(model.geom(k).name for k in np.flatnonzero(self._touched[i])))
+
     def eyes(self, which: Which) -> tuple[Array, Array]:
         """OpenCV poses of the front cameras when their newest pictures were taken, shape (k, 4, 4), and when that was
         [s], shape (k,)."""

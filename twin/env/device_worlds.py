@@ -15,7 +15,7 @@ from twin.env.batch import Outcome, Worlds
 from twin.env.device_pixels import DevicePixels
 from twin.env.device_steps import DeviceSteps
 from twin.env.dm_physics import DrivePhysics
-from twin.env.judge import Judge
+from twin.env.judge import Judge, Motion
 from twin.env.suite import Stage
 from twin.env.tasks import Drive
 
@@ -33,6 +33,7 @@ class DeviceWorlds(Worlds):
             device: Warp's name of the device.
         """
         self._judge = Judge(stage.world, stage.stretch, stage.options, len(seeds))
+        self._speed = np.zeros(len(seeds))
         super().__init__(stage, seeds)
         self._device = DeviceSteps(self._physics, stage.options.control_timestep, device)
         if isinstance(self.pixels, DevicePixels):
@@ -51,13 +52,13 @@ class DeviceWorlds(Worlds):
         self._each(lambda i: self._environments[i].reset(), which)
         some = np.array(which, int)
         self._device.begin(some)
-        self._states[some] = self._judge.state(some, self._device.motion(some))
+        self._remember(some, self._device.motion(some))
         if self.pixels:
             self.pixels.begin(which)
 
     def info(self, i: int) -> dict[str, Any]:
-        self._device.sync(np.array([i]))
-        return super().info(i)
+        told = self.tasks[i].told(float(self._speed[i]), self._device.touched(i))
+        return told | (self.pixels.info(i) if self.pixels else {})
 
     def _advance(self, wanted: Array, which: Sequence[int]) -> Outcome:
         some = np.array(which, int)
@@ -66,7 +67,10 @@ class DeviceWorlds(Worlds):
         self._device.step(some, commands)
         motion = self._device.motion(some)
         self._judge.judge(some, motion)
-        self._states[some] = self._judge.state(some, motion)
+        self._remember(some, motion)
         if self.pixels and not isinstance(self.pixels, DevicePixels):
             self._device.sync(some)  # the host draws what is in view
         return Outcome(self._judge.reward(some), *self._judge.ended(some))
+
+    def _remember(self, which: NDArray[np.int64], motion: Motion) -> None:
+        self._states[which], self._speed[which] = self._judge.state(which, motion), motion.speed

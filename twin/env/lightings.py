@@ -110,9 +110,11 @@ class LightSets:
         """
         own = np.flatnonzero(self.anchors.held_out == (which == HELD_OUT))
         anchor = int(rng.choice(own))
+        judge = self._filmed.judge
         # Where lights are rarely drawn, such as at the edge of what was filmed, the anchor itself will do.
-        for light in chain((self._filmed.sample(rng) for _ in range(_TRIES)), [self.anchors.embeddings[anchor]]):
-            if self._place_of(light) == (which, anchor):
+        for light in chain((judge.propose(rng) for _ in range(_TRIES)), [self.anchors.embeddings[anchor]]):
+            # Few are near the anchor, and most could have been filmed: so the former is asked first.
+            if self._place_of(light) == (which, anchor) and not judge.faults(light):
                 return light
         raise InputError(
             f"lighting {which!r}: none among those drawn; this place was filmed in too few lightings: film another, "

@@ -9,6 +9,7 @@ changing one of them leaves the others as they were, and two policies can be com
 """
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -69,6 +70,7 @@ class Drive(control.Task):
         """Of the episode under way."""
         self.draw = Draw()
         """The robot of the episode under way."""
+        self._record = self.draw.record()
         self.obstacles: tuple[ObstacleConfig, ...] = ()
         """Of the episode under way."""
         self._began = stretch.start
@@ -86,6 +88,7 @@ class Drive(control.Task):
     def initialize_episode(self, physics: DrivePhysics) -> None:
         self.episode_seed = int(self._rng.integers(2**63))
         self.draw = self.options.randomise.draw(self.rng(ROBOT)) if self.options.randomise else Draw()
+        self._record = self.draw.record()
         if self._nominal:
             self._nominal.apply(self.draw, physics.model.ptr)
         params = self.world.robot
@@ -162,16 +165,20 @@ class Drive(control.Task):
 
     def info(self, physics: DrivePhysics) -> dict[str, Any]:
         """The episode so far, JSON-able."""
+        return self.told(physics.speed, physics.touched)
+
+    def told(self, speed: float, touched: Sequence[str]) -> dict[str, Any]:
+        """The same, where the robot's speed [m/s] and what it touched are known."""
         return {
             "cause": self.cause,
             "is_success": self.cause == "goal",
             "start": self._began - self.stretch.start,
             "progress": self.progress,
             "cross_track": self.cross_track,
-            "speed": physics.speed,
-            "touched": list(physics.touched),
+            "speed": speed,
+            "touched": list(touched),
             "episode_seed": self.episode_seed,
-            "randomisation": self.draw.record(),
+            "randomisation": self._record.copy(),
         }
 
     def _bounds(self) -> tuple[Array, Array]:

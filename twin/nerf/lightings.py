@@ -69,7 +69,7 @@ class Lightings:
         Raises:
             InputError: there are no probes, or none of the lightings drawn was plausible.
         """
-        return plausible.sample(rng, self.judge, self.vectors, self.frame_vectors)
+        return plausible.sample(rng, self.judge)
 
     @cached_property
     def judge(self) -> plausible.Judge:

@@ -75,6 +75,19 @@ class Judge:
         low, high = filmed.min(0), filmed.max(0)
         margin = _WIDEN[0] + _WIDEN[1] * (high - low)
         self._low, self._high = low - margin, high + margin
+        self._vectors, self._residuals = vectors, residuals(vectors, frame_vectors)
+
+    def propose(self, rng: np.random.Generator) -> Floats:
+        """An embedding (dim,) from the distribution of the learned ones, not judged yet.
+
+        A random mixture of the lightings, and on it a normal deviate with the frames' covariance about their lightings.
+        """
+        embedding = rng.dirichlet(np.full(len(self._vectors), _CONCENTRATION)) @ self._vectors
+        count = len(self._residuals)
+        if count:
+            # Normal weights on the residuals themselves give their covariance, however many dimensions they span.
+            embedding = embedding + _SPREAD * rng.normal(size=count) @ self._residuals / np.sqrt(count)
+        return embedding.astype(np.float32)
 
     def off(self, picture: NDArray) -> NDArray[np.float64]:
         """How far each probe's colour is from the nearest sum of the filmed lights, shape (k,), rms over channels."""
@@ -110,23 +123,14 @@ def numbers(picture: NDArray) -> NDArray[np.float64]:
     return np.array([grey.mean(), grey.std(), saturation, red - green, blue - green, black, burnt], np.float64)
 
 
-def propose(rng: np.random.Generator, vectors: Floats, frame_vectors: Floats) -> Floats:
-    """An embedding (dim,) from the distribution of the learned ones, not judged yet.
-
-    A random mixture of the lightings, and on it a normal deviate with the frames' covariance about their lightings.
-    """
-    shares = rng.dirichlet(np.full(len(vectors), _CONCENTRATION))
-    embedding = shares @ vectors
-    if len(frame_vectors):
-        # A frame's lighting is the one next to it: residuals are kept small in training.
-        nearest = np.linalg.norm(frame_vectors[:, None] - vectors, axis=-1).argmin(1)
-        residuals = frame_vectors - vectors[nearest]
-        # Normal weights on the residuals themselves give their covariance, however many dimensions they span.
-        embedding = embedding + _SPREAD * rng.normal(size=len(residuals)) @ residuals / np.sqrt(len(residuals))
-    return embedding.astype(np.float32)
+def residuals(vectors: Floats, frame_vectors: Floats) -> Floats:
+    """Of the frames' embeddings (frames, dim) from those of their lightings (lightings, dim); shape (frames, dim)."""
+    # A frame's lighting is the one next to it: residuals are kept small in training.
+    nearest = np.linalg.norm(frame_vectors[:, None] - vectors, axis=-1).argmin(1)
+    return frame_vectors - vectors[nearest]
 
 
-def sample(rng: np.random.Generator, judge: Judge, vectors: Floats, frame_vectors: Floats) -> Floats:
+def sample(rng: np.random.Generator, judge: Judge) -> Floats:
     """A plausible embedding (dim,): proposals until the judge finds no fault.
 
     Raises:
@@ -134,7 +138,7 @@ def sample(rng: np.random.Generator, judge: Judge, vectors: Floats, frame_vector
     """
     faults: list[str] = []
     for _ in range(_TRIES):
-        embedding = propose(rng, vectors, frame_vectors)
+        embedding = judge.propose(rng)
         faults = judge.faults(embedding)
         if not faults:
             return embedding
