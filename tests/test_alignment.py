@@ -9,7 +9,7 @@ import pytest
 from drive_logs import SOFT, columns
 
 from twin.align import main, summary
-from twin.alignment import commands, currents, ground, kinematics, logs, slope
+from twin.alignment import commands, currents, ground, kinematics, logs, simulate, slope
 from twin.alignment.aligned import Alignment, align, robot_toml
 from twin.alignment.identify import Fit, Parameter, bend, fit
 from twin.alignment.kinematics import Icr
@@ -122,7 +122,7 @@ def test_averaging_slopes_turns_them_into_one_frame():
 
 def test_a_slope_pulls_downhill():
     """On one and the same slope the robot creeps down it while it scrubs, whatever way it started to face."""
-    told = np.full((2, 210, 2), [-3.0, 3.0])
+    told = np.full((2, 225, 2), [-3.0, 3.0])
     level = np.zeros((2, 2))
     steep = np.array([[0.0, -1.0], [0.0, 1.0]])
     start = told[:, 0]
@@ -131,6 +131,19 @@ def test_a_slope_pulls_downhill():
     shift = (moved - still)[:, -1, 1]
     assert shift[0] < -0.05
     assert shift[1] > 0.05
+
+
+@pytest.mark.parametrize("late", [0.2, 0.07, 0.0, -0.15])
+def test_late_poses_are_those_of_before(late):
+    """A robot that speeds up along a straight line, and one that goes on around a circle."""
+    time = (np.arange(simulate.BEFORE + logs.SAMPLES + commands.AHEAD) - simulate.BEFORE) * logs.PERIOD
+    line = np.stack([(time + 1.0) ** 2, 0 * time, 0 * time], -1)
+    circle = np.stack([np.sin(time), 1 - np.cos(time), time], -1)
+    told = simulate.retimed(np.stack([line, circle]), late)
+    t = np.arange(told.shape[1]) * logs.PERIOD
+    assert told.shape[1] >= logs.SAMPLES + 2
+    np.testing.assert_allclose(told[0, :, 0], (t - late + 1) ** 2 - (1 - late) ** 2, atol=1e-3)
+    np.testing.assert_allclose(told[1], np.stack([np.sin(t), 1 - np.cos(t), t], -1), atol=1e-3)
 
 
 def test_tyres_in_grass_are_dragged_and_the_chassis_is_not():
@@ -253,7 +266,7 @@ def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) 
     prediction = Prediction("made up", windows, kinematics.predict(kinematics.NOMINAL, windows), wheels + 0.1)
     fits = [
         Fit({}, drive_errors or {}, {}, 0.0),
-        Fit({"pose_x": 0.0, "pose_y": 0.0}, ground_errors or {}, {}, 0.0),
+        Fit({"pose_x": 0.0, "pose_y": 0.0, "pose_late": 0.0}, ground_errors or {}, {}, 0.0),
     ]
     return Alignment(windows, kinematics.NOMINAL, drive, *fits, params, *[prediction] * 4)
 

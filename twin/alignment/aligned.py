@@ -132,6 +132,7 @@ class Alignment:
                 "half_gain": round(self.drive.half_gain, 4),
                 "pose_x_m": round(self.ground_fit.values["pose_x"], 4),
                 "pose_y_m": round(self.ground_fit.values["pose_y"], 4),
+                "pose_late_s": round(self.ground_fit.values["pose_late"], 4),
             },
             "refused": self.refused,
         }

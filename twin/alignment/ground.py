@@ -23,7 +23,8 @@ stand. None acts on the body, and all are off by default.
 Rolling resistance is not among them: servos hold the wheels' speed against it, so that only torques would show it, and
 what poses seem to say of it is what the model gets wrong elsewhere. So it is with the mass's height on level ground.
 
-Poses may be those of a sensor: the offset of their origin from the base is fitted along, as the log's own.
+Poses may be those of a sensor with a clock of its own: the offset of their origin from the base, and how late they are
+against the wheel speeds, are fitted along, as the log's own.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,7 @@ from twin.alignment.commands import Drive, targets
 from twin.alignment.identify import Fit, Parameter, fit
 from twin.alignment.kinematics import residuals
 from twin.alignment.logs import Windows
-from twin.alignment.simulate import COARSE, Drives, drive
+from twin.alignment.simulate import COARSE, Drives, drive, retimed
 from twin.robot import WHEEL_RADIUS, HuskyParams
 
 Array = NDArray[np.float64]
@@ -55,12 +56,13 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "ground_viscosity": (5.0, 5.0, 0.0, 80.0, "Pa s", "turns while driving at several speeds"),
     "center_of_mass_x": (-0.05, 0.05, -0.2, 0.2, "m", "turns forward and backward at speed"),
     "center_of_mass_y": (0.0, 0.03, -0.1, 0.1, "m", "turns to both sides"),
-    "center_of_mass_z": (0.062, 0.1, -0.1, 0.6, "m", _BRAKING),
+    "center_of_mass_z": (0.062, 0.1, -0.1, 0.45, "m", _BRAKING),
     "radius_left": (WHEEL_RADIUS, 0.008, 0.1, 0.25, "m", "long straight drives"),
     "radius_right": (WHEEL_RADIUS, 0.008, 0.1, 0.25, "m", "long straight drives"),
     "log10_servo_gain": (np.log10(800.0), 0.3, 1.0, 4.0, "", _TORQUE),
     "pose_x": (0.0, 0.2, -1.0, 1.0, "m", "turns on the spot"),
     "pose_y": (0.0, 0.1, -1.0, 1.0, "m", "turns on the spot"),
+    "pose_late": (0.0, 0.1, -0.15, 0.2, "s", "turns that begin and end"),
 }
 
 
@@ -101,6 +103,7 @@ def usual(params: HuskyParams) -> dict[str, float]:
         "log10_servo_gain": float(np.log10(params.servo_gain)),
         "pose_x": 0.0,
         "pose_y": 0.0,
+        "pose_late": 0.0,
     }
 
 
@@ -116,7 +119,12 @@ def simulated(
     told, _ = targets(drive_, windows)
     fitted = robot(replace(params, servo_lag=drive_.lag, max_wheel_speed=5.0), values)
     out = drive(fitted, told, windows.wheels[:, 0], slope, timestep)
-    return replace(out, poses=moved_origin(out.poses, values["pose_x"], values["pose_y"]))
+    return replace(out, poses=told_poses(out, values))
+
+
+def told_poses(drives: Drives, values: dict[str, float]) -> Array:
+    """Poses of drives as the log tells them: of its own origin, and with its own clock. Shape (n, ≥ k + 2, 3)."""
+    return moved_origin(retimed(drives.poses, values["pose_late"]), values["pose_x"], values["pose_y"])
 
 
 def moved_origin(poses: Array, x: float, y: float) -> Array:
@@ -147,6 +155,9 @@ def fit_ground(
     if not slope.any():
         height = kept["center_of_mass_z"]
         hidden["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
+    fitting = np.flatnonzero(windows.fitting)
+    if len(fitting) < _MANY:  # where it is next to nothing, others would go astray for it
+        hidden["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
     table = [
         Parameter(name, start, span, low, high, kept[name], unit, cure)
         for name, (start, span, low, high, unit, cure) in _TABLE.items()
@@ -162,13 +173,12 @@ def fit_ground(
 
         def error(values: dict[str, float]) -> Array:
             out = drive(robot(base, values), told[which], some.wheels[:, 0], slope[which], timestep)
-            return residuals(moved_origin(out.poses, values["pose_x"], values["pose_y"]), some)
+            return residuals(told_poses(out, kept | values), some)
 
         begin = [replace(p, start=starts.get(p.name, p.start)) for p in table]
         found = fit(begin, error, some.groups, evaluations, progress)
         return replace(found, values=kept | found.values, refused=hidden | found.refused)
 
-    fitting = np.flatnonzero(windows.fitting)
     if len(fitting) < _MANY:
         return fit_to(fitting, {}, COARSE)
     # A third of the windows at a coarse time step finds the neighbourhood in a tenth of the time; what they cannot

@@ -15,7 +15,7 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from twin.alignment.commands import AHEAD, STEP
-from twin.alignment.logs import PERIOD, SAMPLES
+from twin.alignment.logs import PERIOD, SAMPLES, relative
 from twin.alignment.slope import GRAVITY
 from twin.cores import cores
 from twin.mjcf.husky import add_husky, set_options
@@ -25,6 +25,7 @@ from twin.robot import WHEELS, HuskyParams
 Array = NDArray[np.float64]
 
 LEAD = 0.4  # [s]
+BEFORE = 4  # samples of the lead that are told, too
 COARSE = 0.005  # [s] time step to begin a fit with; poses after 2 s are up to 1 cm and 0.8° off those of a fine one
 
 _SETTLE = 1.0  # [s]
@@ -36,11 +37,28 @@ class Drives:
     """What the robots did."""
 
     poses: Array
-    """x, y [m], yaw [rad] of the base relative to the start, `PERIOD` [s] apart, shape (n, k + AHEAD, 3)."""
+    """x, y [m], yaw [rad] of the base relative to the first, `PERIOD` [s] apart; time starts with number `BEFORE`.
+    Shape (n, BEFORE + k + AHEAD, 3)."""
     wheels: Array
     """Of the left and of the right side [rad/s], shape (n, k + AHEAD, 2)."""
     torques: Array
     """Of the left and the right motor, at the wheels [N m], means over each `PERIOD`, shape (n, k + AHEAD − 1, 2)."""
+
+
+def retimed(poses: Array, late: float) -> Array:
+    """Poses as a log tells them whose poses lag its wheel speeds by `late` [s]; less than nothing: they are ahead.
+
+    Args:
+        poses: Of `Drives`.
+        late: At most `BEFORE` samples, at least minus three.
+
+    Returns:
+        Relative to the one that the log has first, shape (n, k + AHEAD − 3, 3).
+    """
+    position = BEFORE - late / PERIOD + np.arange(SAMPLES + AHEAD - 3)
+    whole = np.clip(position.astype(int), 0, poses.shape[1] - 2)
+    share = (position - whole)[:, None]
+    return relative(poses[:, whole] * (1 - share) + poses[:, whole + 1] * share)
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:
@@ -82,12 +100,12 @@ def drive(params: HuskyParams, told: Array, start: Array, slope: Array, timestep
     torque = [model.sensor(f"{side}_torque").adr[0] for side in ("left", "right")]
     torques = sensors[:, lead:, torque]
     # A rollout's first state is that after one step; the one before time starts is the last of the lead.
-    seen = states[:, lead - 1 :: per_sample]
+    seen = states[:, lead - 1 - BEFORE * per_sample :: per_sample]
     position, velocity = seen[..., 1 : 1 + model.nq], seen[..., 1 + model.nq : 1 + model.nq + model.nv]
     n, k = told.shape[0], SAMPLES + AHEAD
     return Drives(
-        _planar(position[:, :k, :7]),
-        np.stack([velocity[:, :k, joints[[i, i + 2]]].mean(-1) for i in (0, 1)], -1),
+        _planar(position[:, : BEFORE + k, :7]),
+        np.stack([velocity[:, BEFORE : BEFORE + k, joints[[i, i + 2]]].mean(-1) for i in (0, 1)], -1),
         torques[:, : (k - 1) * per_sample].reshape(n, k - 1, per_sample, 2).mean(2),
     )
 
