@@ -199,7 +199,8 @@ def gpu(scene: Path, count: int) -> dict[str, Any]:
 def host(scene: Path, count: int) -> dict[str, Any]:
     """What the host does for worlds on a GPU in a step, whatever the GPU: small steps and pictures are left out.
 
-    It holds Python's lock throughout, so `host.steps_per_s` is the most that any GPU comes to.
+    It holds Python's lock throughout, so `host.steps_per_s` is the most that `Worlds.step` comes to with any GPU;
+    `host.info_us` is what asking a world for its `info` and `state` costs besides, as stable-baselines3 does.
     """
     import dataclasses
 
@@ -210,7 +211,8 @@ def host(scene: Path, count: int) -> dict[str, Any]:
     from twin.env.suite import Stage
     from twin.nerf.baked import BakedField
 
-    blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
+    with warp.ScopedDevice("cpu"):
+        blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
 
     def show(field: BakedField, cameras: Any, lighting: Any, take: Any) -> None:
         field._biases(lighting, len(cameras.camera_to_world))  # as `show` does, on the host
@@ -228,10 +230,15 @@ def host(scene: Path, count: int) -> dict[str, Any]:
         worlds.step(_onward(worlds))
         worlds.pixels.tensor()
     step = float(np.median(np.diff(times)[2:]))
+    asked = time.perf_counter()
+    for i in range(count):
+        worlds.info(i), worlds.state(i)
+    asked = time.perf_counter() - asked
     return {
         "host.worlds": count,
         "host.us_per_step": 1e6 * step / count,
         "host.steps_per_s": count / step,
+        "host.info_us": 1e6 * asked / count,
         "host.begin_ms": 1e3 * begun / count,
     }
 

@@ -20,6 +20,7 @@ from twin.env.pixels import Pixels
 from twin.env.randomisation import Ranges
 from twin.env.suite import Stage
 from twin.errors import InputError
+from twin.robot import HuskyParams
 
 WALKER = ObstacleConfig("walker", "pedestrian", station=6.0, lateral=-1.5, to=(6.0, 1.5), speed=1.0)
 RANGES = Ranges(friction=(0.7, 1.3), payload=(0.0, 40.0), latency=(0.0, 0.1), bystanders=(0, 0))
@@ -30,7 +31,8 @@ OPTIONS = {"pixels": False, "randomise": RANGES, "obstacles": (WALKER,)}
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     progress.set_quiet(True)
-    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
+    # Lagging servos: they have a state of their own.
+    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin"), robot=HuskyParams(servo_lag=0.05)))
 
 
 def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
@@ -62,13 +64,49 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
             assert device.info(i) | {"speed": 0} == task.info(physics) | {"speed": 0}
     for one, other in zip(plain.physics, device.physics, strict=True):
         assert one.time() == pytest.approx(other.time())
-        np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=3e-3)
-        np.testing.assert_allclose(one.robot.wheel_velocity, other.robot.wheel_velocity, atol=0.05)
+        np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=6e-3)
+        # Where a motor is at its limit, a wheel slips a little sooner or later.
+        np.testing.assert_allclose(one.robot.wheel_velocity, other.robot.wheel_velocity, atol=0.3)
+        np.testing.assert_allclose(one.data.act, other.data.act, atol=1e-4)
         np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=4e-3)
         assert one.seen.time == pytest.approx(one.time() - 0.07) and other.seen.time == pytest.approx(one.seen.time)
         np.testing.assert_allclose(one.data.mocap_pos, other.data.mocap_pos, atol=1e-9)
         assert one.speed > 0.1
     assert all(task.progress > 0.1 for task in device.tasks)
+    # One begins anew while it moves, and stands.
+    for worlds in (plain, device):
+        worlds.begin([0])
+        worlds.begin([])
+        for _ in range(2):
+            worlds.step(np.array([[-1.0, 0.0], [1.0, 0.2]]), [0, 2])
+    for i in (0, 2):
+        one, other = plain.physics[i], device.physics[i]
+        np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=6e-3)
+        np.testing.assert_allclose(one.data.act, other.data.act, atol=1e-4)
+    assert abs(device.physics[0].speed) < 0.01 and plain.physics[0].data.act.shape == (2,)
+    plain.close(), device.close()
+
+
+@pytest.mark.parametrize("obstacles", [(), (WALKER,)])
+def test_what_worlds_on_a_device_see(scene, obstacles):
+    """Bare pictures that stay there, and such that the host puts something into; nobody asks for the worlds between."""
+    stage = Stage.open(scene, "bend", {"obstacles": obstacles, "lighting": "day", **SMALL})
+    stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
+    plain = Worlds(stage, [1, 2])
+    stage = replace(stage, options=replace(stage.options, device="cuda"))  # the field stays on the CPU
+    device = DeviceWorlds(stage, [1, 2], "cpu")
+    assert type(device.pixels) is (Pixels if obstacles else DevicePixels)
+    before = None
+    for worlds in (plain, device):
+        worlds.begin([0, 1])
+    for k in range(3):
+        for worlds in (plain, device):
+            worlds.step(np.array([[1.0, 0.4], [1.0, -0.4]])[: 2 - k % 2], [0, 1][: 2 - k % 2])
+        off = np.abs(plain.observation().astype(int) - device.observation())
+        assert off.mean() < 1.0 and np.quantile(off, 0.99) < 20
+        assert before is None or np.abs(before.astype(int) - device.observation()).mean() > 2 * off.mean()
+        before = device.observation()
+    np.testing.assert_allclose(plain.pixels.trust, device.pixels.trust, atol=0.02)
     plain.close(), device.close()
 
 

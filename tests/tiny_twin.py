@@ -1,6 +1,7 @@
 """A small built scene that every stage of an environment can be loaded from: `tiny_world`'s, with a field made up by
 formula and two lightings."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from twin.mjcf.export import run
 from twin.nerf.baked import BakedField
 from twin.nerf.layout import BrickLayout, leaps
 from twin.nerf.lightings import Lightings
+from twin.robot import HuskyParams
 from twin.scene import write_json
 
 LAYOUT = BrickLayout((4.5, -2.5, 1.0), (8.0, 6.0, 2.0), 0.1, 0.5, (12, 9, 5), (8, 8, 4))
@@ -32,12 +34,14 @@ length = 10.0
 """
 
 
-def tiny_twin(root: Path, boxes=((3.0, 2.2, 0.8), (4.0, -3.0, 0.8)), more: str = "") -> Path:
+def tiny_twin(
+    root: Path, boxes=((3.0, 2.2, 0.8), (4.0, -3.0, 0.8)), more: str = "", robot: HuskyParams | None = None
+) -> Path:
     """Writes the scene folder; `more` goes to the end of its scene.toml."""
     scene = tiny_scene(root, boxes)
     (root / "scene.toml").write_text(SCENE_TOML + more)
     scene.stage("mjcf").mkdir()
-    run(scene, tiny_config(), scene.stage("mjcf"))
+    run(scene, replace(tiny_config(), robot=robot or HuskyParams()), scene.stage("mjcf"))
     scene.stage("field").mkdir()
     tiny_field(boxes).save(scene.stage("field"))
     for stage in ("metric", "mesh", "mjcf", "field"):

@@ -115,7 +115,7 @@ def simulated(
     slope: Array,
     timestep: float | None = None,
 ) -> Drives:
-    """What the robot with these values does with a log's commands; its poses are those of the log's origin."""
+    """What the robot with these values does with a log's commands; its poses are `told_poses`."""
     told, _ = targets(drive_, windows)
     fitted = robot(replace(params, servo_lag=drive_.lag, max_wheel_speed=5.0), values)
     out = drive(fitted, told, windows.wheels[:, 0], slope, timestep)

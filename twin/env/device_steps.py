@@ -37,7 +37,7 @@ _DRAWN = (
 
 Array = NDArray[np.float64]
 Which = NDArray[np.int64]
-_SENT = ("qpos", "qvel", "qacc_warmstart")
+_SENT = ("qpos", "qvel", "act", "qacc_warmstart")
 _STATE = (*_SENT, "ctrl", "sensordata", "actuator_force")
 
 _SAME_TIME = 1e-6  # [s] apart are rounding errors of the clock
@@ -237,7 +237,7 @@ class DeviceSteps:
             robot.data.mocap_pos[:], robot.data.mocap_quat[:] = (values[-1, i] for values in self._mocap)
             robot.data.time = self._time[i]
             looks = [
-                (float(time), *(values[k, i] for values in self._looks))
+                (float(time), *(values[k, i].copy() for values in self._looks))
                 for k, time in enumerate(self._look_times[:, i])
                 if np.isfinite(time)
             ]

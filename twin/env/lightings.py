@@ -33,11 +33,14 @@ from twin.nerf.baked import BakedField
 
 Floats = NDArray[np.float32]
 
+VERSION = 2
+"""Of what a generator draws from a set. Raised where the same one draws other lights."""
+
 _SEED = 20_240_315  # of the anchors; a constant, so that every run on a build has the same sets
 _DRAWN = 200  # lights that anchors are chosen among
 _FURTHER = 8  # anchors besides the filmed lightings
 _MARGIN = 1.25  # the other set's nearest anchor must be this much further than the own one
-_TRIES = 30  # draws for an anchor
+_TRIES = 60  # proposals for an anchor, of which about every tenth is near it
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,8 @@ class HuskyPhysics:
         return out
 
     def take_over(self, touched: set[int], looks: list[tuple[float, Array, Array, Array]]) -> None:
-        """Goes on from where another engine's small steps have led: `data` holds positions, velocities and time.
+        """Takes over where another engine's small steps have led: `data` holds positions, velocities and time. What the
+        controller has been commanded it is not told.
 
         Args:
             touched: Geoms that were in contact at a look of the last control step.

@@ -14,8 +14,9 @@ import mujoco
 import numpy as np
 from dm_env import specs
 
-from twin.config import RANDOMISED
+from twin.config import RANDOMISED, RESERVED_LIGHTINGS
 from twin.config_file import load_config
+from twin.env import lightings
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.episode_obstacles import EpisodeObstacles
@@ -117,13 +118,15 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
     world, config = twin.world(), load_config(twin.scene.config_file)
     ranges = [dataclasses.asdict(one) for one in (Ranges(), ANOTHER_DAY)]  # of training and of judging
     drawn = {"version": VERSION, "ranges": ranges} if lighting.endswith(RANDOMISED) else {}
-    photos = [twin.scene.lightings / f"{name}.json" for name in lighting.removesuffix(RANDOMISED).split(":")]
+    plain = lighting.removesuffix(RANDOMISED)
+    photos = [twin.scene.lightings / f"{name}.json" for name in plain.split(":")]
     return digest_json(
         {
             "stages": [read_json(twin.scene.stamp(stage))["result"] for stage in ("field", "mjcf")],
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
             **({"randomise": drawn} if drawn else {}),
+            **({"lights": lightings.VERSION} if plain in RESERVED_LIGHTINGS else {}),
             "photos": [digest_file(path) for path in photos if path.exists()],
         }
     )
