@@ -150,6 +150,7 @@ def test_more_policies_and_episodes_are_added(fresh):
         ("ahead", 2),
     ]
     said = json.loads((fresh / "validation" / "summary.json").read_text())
+    assert said["robot_known"] == []  # as published
     assert [c["trials"] for c in said["cells"]] == [3, 3]
     assert (fresh / "validation" / "failures_ahead.png").stat().st_size > 5_000
 

@@ -290,3 +290,14 @@ def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count)
     assert sum(n for _, _, n, _, _ in points) == count and sum(k for _, k, _, _, _ in points) == won.sum()
     assert all(n >= min(5, count) and low - 1e-9 <= k / n <= high + 1e-9 for _, k, n, low, high in points)
     assert len(points) == min(25, max(1, count // 5))
+
+
+def test_whose_robot_is_judged_is_said():
+    """Where episodes are drawn anew and nothing is known of the robot, it says what would tell."""
+
+    def cautions(light: str, **more) -> str:
+        return " ".join(c.what for c in unknowns(told([trial(light=light)], **more)))
+
+    assert "another one drives every episode" in cautions("held-out+randomised", robot_known=[])
+    assert "another one" not in cautions("held-out+randomised", robot_known=["friction"])
+    assert "another one" not in cautions("held-out", robot_known=[])

@@ -17,7 +17,7 @@ from typing import Any
 from twin import progress
 from twin.alone import alone
 from twin.config import HELD_OUT, RANDOMISED
-from twin.env.randomisation import asked
+from twin.env.randomisation import asked, known_of
 from twin.env.suite import fingerprint
 from twin.errors import InputError, refuse
 from twin.learn.judging import CHUNK, Chunk, Driven, campaign
@@ -160,6 +160,7 @@ def _write(twin: Twin) -> dict:
     said = summary(trials)
     said["training"] = trainings(twin.scene.root, dict.fromkeys(t.policy for t in trials))
     said["worst"] = _worst_lights(folder / "worst.csv")
+    said["robot_known"] = known_of(twin.world().robot)
     films = folder / "films" / "films.json"
     said["films"] = read_json(films) if films.exists() else []
     write_json(folder / "summary.json", said)

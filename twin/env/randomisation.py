@@ -95,9 +95,8 @@ class Ranges:
         """
         if not self.hold_known:
             return self
-        published, as_built = HuskyParams(), Draw()
-        known = [name for name in _HELD_BY if getattr(robot, name) != getattr(published, name)]
-        drawn = [each for name in known for each in _HELD_BY[name]]
+        as_built = Draw()
+        drawn = [each for name in known_of(robot) for each in _HELD_BY[name]]
         held: dict[str, Any] = {name: (getattr(as_built, name),) * 2 for name in drawn}
         return replace(self, **held)
 
@@ -145,6 +144,12 @@ ANOTHER_DAY = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75), hold_known=True)
 """What policies are judged in: a day that is surely not the film's, and the robot at hand as far as it is known.
 Training draws from nothing to as much, so as to be learnt from; in a forecast, its mild days would promise more than a
 road keeps, whose sun is never the film's."""
+
+
+def known_of(robot: HuskyParams) -> list[str]:
+    """What need not be drawn of a robot, as it is another than the published robot's: names of `HuskyParams`."""
+    published = HuskyParams()
+    return [name for name in _HELD_BY if getattr(robot, name) != getattr(published, name)]
 
 
 def asked(lighting: str) -> dict[str, Any]:

@@ -48,7 +48,8 @@ def light_words(lighting: str) -> str:
     if lighting.endswith(RANDOMISED):
         plain = light_words(lighting.removesuffix(RANDOMISED))
         return (
-            f"{plain}; and for every episode another robot, another sun, haze, shadows, and things beside the corridor"
+            f"{plain}; and for every episode another sun, haze, shadows, things beside the corridor, and another robot "
+            "but for what is known of yours"
         )
     if lighting.startswith("drawn_"):
         return f"light number {lighting[6:]} of those drawn in the search"
@@ -133,6 +134,15 @@ def unknowns(said: dict[str, Any]) -> list[Caution]:
                 f"{len(few)} of {len(said['cells'])} rates come from fewer than {FEW} episodes (the least: "
                 f"{smallest}), so their intervals are wide.",
                 "run the same command with more --episodes; what was driven is kept.",
+            )
+        )
+    drawn = dict.fromkeys(c["lighting"] for c in said["cells"] if c["lighting"].endswith(RANDOMISED))
+    if drawn and not said.get("robot_known"):
+        out.append(
+            Caution(
+                f"What your robot does: under {listing(drawn)} another one drives every episode, for nothing is known "
+                "of yours.",
+                "log five minutes of driving, run python -m twin.align, build again and validate anew.",
             )
         )
     searched = {(w["policy"], w["task"]) for w in said.get("worst", [])}
