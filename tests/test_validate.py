@@ -14,6 +14,7 @@ from tiny_twin import tiny_twin
 
 from twin import load_scene, progress, validate
 from twin.alone import alone
+from twin.env import lightings
 from twin.env.randomisation import ANOTHER_DAY, asked
 from twin.env.suite import Stage, fingerprint
 from twin.errors import InputError
@@ -97,6 +98,11 @@ def test_randomised_episodes_are_others_and_repeat(scene, monkeypatch):
     assert [one.progress for one in plain] != [one.progress for one in drawn]
     assert drive(chunk(scene, [2], "day+randomised")) == [drawn[2]]
     assert fingerprint(load_scene(scene), "ahead", "day") != fingerprint(load_scene(scene), "ahead", "day+randomised")
+    said = [fingerprint(load_scene(scene), "ahead", name) for name in ("day", "any", "held-out", "training+randomised")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lightings, "VERSION", -1)
+        other = [fingerprint(load_scene(scene), "ahead", n) for n in ("day", "any", "held-out", "training+randomised")]
+    assert [a == b for a, b in zip(said, other, strict=True)] == [True, True, False, False]
     assert drive(chunk(scene, seeds)) == plain
     stage = Stage.open(scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")})
     assert stage.options.lighting == "day" and stage.options.randomise == ANOTHER_DAY

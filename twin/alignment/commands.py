@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 STEP = 0.01  # [s] of the arithmetic
 HISTORY = 20  # samples of the window before that late commands are taken from
-AHEAD = 5  # samples beyond a window's end: of poses that are stamped late, and of clocks that differ
+AHEAD = 5  # samples beyond a window's end, for poses that were measured later than the log says
 
 _PER_SAMPLE = round(PERIOD / STEP)
 _CURES = {

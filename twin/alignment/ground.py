@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 from twin.alignment.commands import Drive, targets
 from twin.alignment.identify import Fit, Parameter, fit
 from twin.alignment.kinematics import residuals
-from twin.alignment.logs import Windows
-from twin.alignment.simulate import COARSE, Drives, drive, retimed
+from twin.alignment.logs import PERIOD, Windows
+from twin.alignment.simulate import BEFORE, COARSE, EARLY, Drives, drive, retimed
 from twin.robot import WHEEL_RADIUS, HuskyParams
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "log10_servo_gain": (np.log10(800.0), 0.3, 1.0, 4.0, "", _TORQUE),
     "pose_x": (0.0, 0.2, -1.0, 1.0, "m", "turns on the spot"),
     "pose_y": (0.0, 0.1, -1.0, 1.0, "m", "turns on the spot"),
-    "pose_late": (0.0, 0.1, -0.15, 0.2, "s", "turns that begin and end"),
+    "pose_late": (0.0, 0.1, -EARLY * PERIOD, BEFORE * PERIOD, "s", "turns that begin and end"),
 }
 
 

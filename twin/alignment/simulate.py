@@ -25,7 +25,7 @@ from twin.robot import WHEELS, HuskyParams
 Array = NDArray[np.float64]
 
 LEAD = 0.4  # [s]
-BEFORE = 4  # samples of the lead that are told, too
+BEFORE, EARLY = 4, 3  # samples by which poses may be late against the wheel speeds, and ahead of them
 COARSE = 0.005  # [s] time step to begin a fit with; poses after 2 s are up to 1 cm and 0.8° off those of a fine one
 
 _SETTLE = 1.0  # [s]
@@ -50,12 +50,12 @@ def retimed(poses: Array, late: float) -> Array:
 
     Args:
         poses: Of `Drives`.
-        late: At most `BEFORE` samples, at least minus three.
+        late: At most `BEFORE` samples, at least −`EARLY`.
 
     Returns:
-        Relative to the one that the log has first, shape (n, k + AHEAD − 3, 3).
+        Relative to the one that the log has first, shape (n, k + AHEAD − EARLY, 3).
     """
-    position = BEFORE - late / PERIOD + np.arange(SAMPLES + AHEAD - 3)
+    position = BEFORE - late / PERIOD + np.arange(SAMPLES + AHEAD - EARLY)
     whole = np.clip(position.astype(int), 0, poses.shape[1] - 2)
     share = (position - whole)[:, None]
     return relative(poses[:, whole] * (1 - share) + poses[:, whole + 1] * share)

@@ -43,12 +43,14 @@ class Controllers:
             timestep: Of physics [s].
             look_steps: Small steps between two looks.
         """
-        self._params, self._timestep, self._look_steps = params, timestep, look_steps
+        self._params, self.timestep, self._look_steps = params, timestep, look_steps
         self._steps, self._period = round(period / timestep), period
         self._between = round(CONTROL_PERIOD / timestep)  # small steps between two runs of the controller
         # A piece ends with a look; every run of the controller, and the control step's end, may cut one short.
         self.pieces = self._steps // look_steps + round(period / CONTROL_PERIOD) + 3
-        self._latency, self._until, self._time = np.zeros(count), np.zeros(count, int), np.zeros(count)
+        self._latency, self._until = np.zeros(count), np.zeros(count, int)
+        self.time = np.zeros(count)
+        """Of each robot [s], since its episode began, shape (n,)."""
         self._arrivals, self._given = np.full((2, count), -np.inf), np.zeros((2, count, 2))  # the newest last
         self._carried_out, self._speeds = np.zeros((count, 2)), np.zeros((count, 2))
 
@@ -60,7 +62,7 @@ class Controllers:
             latency: Their `command_latency` [s], shape (k,).
             until: Small steps until their controllers run first, shape (k,).
         """
-        self._latency[which], self._until[which], self._time[which] = latency, until, 0.0
+        self._latency[which], self._until[which], self.time[which] = latency, until, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._given)
         if missing > 0:  # so many commands may be under way
             n = len(self._latency)
@@ -71,10 +73,10 @@ class Controllers:
     def courses(self, which: NDArray[np.int64], commands: Array) -> Courses:
         """Gives some robots commands, v [m/s] and ω [rad/s], shape (k, 2), and runs their controllers for a control
         step. For the others no time passes, and what is said of them means nothing."""
-        for ring, new in ((self._arrivals, self._time[which] + self._latency[which]), (self._given, commands)):
+        for ring, new in ((self._arrivals, self.time[which] + self._latency[which]), (self._given, commands)):
             ring[:-1, which] = ring[1:, which]
             ring[-1, which] = new
-        n = len(self._time)
+        n = len(self.time)
         speeds, times = np.zeros((self.pieces, n, 2)), np.full((self.pieces, n), np.inf)
         looks = np.zeros((self._steps + 1, n), np.int32)  # shifted by one, so that the pieces' numbers are its sums
         left = np.zeros(n, int)
@@ -87,18 +89,18 @@ class Controllers:
                 self._until[due] = self._between
             some = np.minimum(np.minimum(left, self._look_steps), self._until)
             going = left > 0
-            left, self._time, self._until = left - some, self._time + some * self._timestep, self._until - some
+            left, self.time, self._until = left - some, self.time + some * self.timestep, self._until - some
             speeds[p] = self._speeds
-            times[p, going] = self._time[going]
+            times[p, going] = self.time[going]
             looks[self._steps - left[going], everyone[going]] = 1
         return Courses(speeds, times, np.cumsum(looks[:-1], 0, dtype=np.int32), looks[1:])
 
     def _run(self, which: NDArray[np.int64]) -> Array:
         """Runs controllers once: speeds of the left and of the right wheels [rad/s], shape (k, 2)."""
-        time, arrivals = self._time[which], self._arrivals[:, which]
+        time, arrivals = self.time[which], self._arrivals[:, which]
         newest = len(arrivals) - 1 - np.argmax((arrivals <= time + TICK)[::-1], axis=0)
         arrived = np.take_along_axis(arrivals, newest[None], 0)[0]
-        lives = (arrived <= time + TICK) & (time - arrived <= COMMAND_TIMEOUT - TICK)
+        lives = time - arrived <= COMMAND_TIMEOUT - TICK
         wanted = np.where(lives[:, None], self._given[newest, which], 0.0)
         self._carried_out[which] = limited_command(wanted, self._carried_out[which], self._params)
         return wheel_speeds(self._carried_out[which], self._params)

@@ -119,7 +119,7 @@ class DeviceSteps:
         self._controllers = Controllers(self._params, n, period, model.opt.timestep, robot.look_steps)
         pieces = self._controllers.pieces
         self._state = {name: np.stack([getattr(world.robot.data, name) for world in worlds]) for name in _STATE}
-        self._time, self._stale = np.zeros(n), np.zeros(n, bool)
+        self._stale = np.zeros(n, bool)
         self._touched = np.zeros((n, model.ngeom), bool)
         self._moving = np.zeros(n, bool)  # whether anything moves by itself
         mocap = [
@@ -176,7 +176,7 @@ class DeviceSteps:
             self._look_times[-1, which] = 0.0
             for values, new in zip(self._looks, (self._state["qpos"][which], *mocap), strict=True):
                 values[-1, which] = new
-        self._time[which], self._stale[which] = 0.0, False
+        self._stale[which] = False
         self._touched[which] = [np.isin(np.arange(len(robot.is_robot)), list(robot.touching)) for robot in robots]
         self._moving[which] = [isinstance(r.surroundings, Surroundings) and r.surroundings.moving for r in robots]
         latency = np.array([robot.params.command_latency for robot in robots])
@@ -210,7 +210,7 @@ class DeviceSteps:
         pose = np.column_stack([qpos[:, :2], np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0])])
         speed = (qvel[:, :3] * matrix[:, :, 0]).sum(-1)
         touched = self._touched[which].any(1)
-        return Motion(pose, speed, qvel[:, 5], matrix[:, 2, 2], touched, self._time[which].copy())
+        return Motion(pose, speed, qvel[:, 5], matrix[:, 2, 2], touched, self._controllers.time[which].copy())
 
     def touched(self, i: int) -> tuple[str, ...]:
         """Names of the geoms touched in world i during the last control step, sorted."""
@@ -220,7 +220,7 @@ class DeviceSteps:
     def eyes(self, which: Which) -> tuple[Array, Array]:
         """OpenCV poses of the front cameras when their newest pictures were taken, shape (k, 4, 4), and when that was
         [s], shape (k,)."""
-        qpos, time = self._state["qpos"][which, :7], self._time[which]
+        qpos, time = self._state["qpos"][which, :7], self._controllers.time[which]
         if len(self._look_times):
             qpos, time = self._before(which)
         matrix, pose = _matrices(qpos[:, 3:]), np.tile(np.eye(4), (len(which), 1, 1))
@@ -235,7 +235,7 @@ class DeviceSteps:
             for name, values in self._state.items():
                 getattr(robot.data, name)[:] = values[i]
             robot.data.mocap_pos[:], robot.data.mocap_quat[:] = (values[-1, i] for values in self._mocap)
-            robot.data.time = self._time[i]
+            robot.data.time = self._controllers.time[i]
             looks = [
                 (float(time), *(values[k, i].copy() for values in self._looks))
                 for k, time in enumerate(self._look_times[:, i])
@@ -247,7 +247,7 @@ class DeviceSteps:
     def _before(self, which: Which) -> tuple[Array, Array]:
         """Positions, shape (k, 7), and times [s] of the bases when the newest pictures were taken, as `seen` says."""
         looks, qpos = self._look_times[:, which], self._looks[0][:, which, :7]
-        time = self._time[which] - self._params.camera_latency
+        time = self._controllers.time[which] - self._params.camera_latency
         row = np.arange(len(which))
         past = looks <= time + _SAME_TIME
         past[np.argmin(looks, 0), row] = True  # nothing is older than the beginning
@@ -309,11 +309,13 @@ class DeviceSteps:
         for name, values in self._state.items():
             values[which] = new[name]
         self._touched[which] = self._touched_there.numpy()[which] > 0
-        times = courses.times[:, which]
-        self._time[which] = np.where(np.isfinite(times), times, -np.inf).max(0)
         self._stale[which] = True
         if len(self._look_times):
-            newest = (times, self._history.numpy()[:, which], *(values[:, which] for values in self._mocap))
+            newest = (
+                courses.times[:, which],
+                self._history.numpy()[:, which],
+                *(values[:, which] for values in self._mocap),
+            )
             for kept, some in zip((self._look_times, *self._looks), newest, strict=True):
                 kept[: -len(some), which] = kept[len(some) :, which]
                 kept[-len(some) :, which] = some

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from dm_env import specs
 
-from twin.config import RANDOMISED, RESERVED_LIGHTINGS
+from twin.config import HELD_OUT, RANDOMISED, TRAINING
 from twin.config_file import load_config
 from twin.env import lightings
 from twin.env.dm import control
@@ -110,7 +110,7 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
     """What decides an episode besides its seed and who drives, as a digest.
 
     That is the field, the MJCF scene with its robot, the task's stretch, the obstacles of `scene.toml`, lightings from
-    photos that `lighting` names, and what is drawn where it ends in `+randomised`.
+    photos that `lighting` names, how lights of a set are drawn, and what is drawn where it ends in `+randomised`.
 
     Raises:
         InputError: as `Stage.open`.
@@ -126,7 +126,7 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
             **({"randomise": drawn} if drawn else {}),
-            **({"lights": lightings.VERSION} if plain in RESERVED_LIGHTINGS else {}),
+            **({"lights": lightings.VERSION} if plain in (TRAINING, HELD_OUT) else {}),
             "photos": [digest_file(path) for path in photos if path.exists()],
         }
     )
