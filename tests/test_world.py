@@ -368,3 +368,17 @@ def test_tiny_world_is_drivable_model(tmp_path):
     data = mujoco.MjData(world.model())
     mujoco.mj_resetDataKeyframe(world.model(), data, 0)
     np.testing.assert_allclose(data.qpos[:3], world.spawn[:3], atol=1e-4)
+
+
+def test_many_points_are_projected_as_each_alone():
+    """On a route that meets itself, of uneven segments, each point within a range of its own."""
+    rng = np.random.default_rng(0)
+    angle = np.sort(rng.uniform(0.0, 4.0 * np.pi, 160))
+    route = np.stack([3.0 * np.sin(angle), 2.0 * np.sin(2.0 * angle)], -1)  # an eight, twice around
+    middle = rng.uniform(0.0, arc_lengths(route)[-1], 50)
+    low, high = middle - rng.uniform(0.0, 1.0, 50), middle + rng.uniform(0.0, 3.0, 50)
+    points = point_at(route, middle) + rng.normal(scale=0.5, size=(50, 2))
+    together = np.stack(nearest(route, points, (low, high)), -1)
+    alone = [nearest(route, points[i], (low[i], high[i])) for i in range(50)]
+    np.testing.assert_array_equal(together, alone)
+    assert (np.abs(together[:, 0] - nearest(route, points)[0]) > 1.0).any()  # elsewhere it is nearer still

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.controller import COMMAND_TIMEOUT, CONTROL_PERIOD, TICK, limited_command, wheel_speeds
+from twin.env.controller import CONTROL_PERIOD, TICK, limited_command, wheel_speeds
 from twin.robot import HuskyParams
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ class Controllers:
         time, arrivals = self.time[which], self._arrivals[:, which]
         newest = len(arrivals) - 1 - np.argmax((arrivals <= time + TICK)[::-1], axis=0)
         arrived = np.take_along_axis(arrivals, newest[None], 0)[0]
-        lives = time - arrived <= COMMAND_TIMEOUT - TICK
-        wanted = np.where(lives[:, None], self._given[newest, which], 0.0)
+        # None lapses: a command comes with every control step, which is no longer than COMMAND_TIMEOUT.
+        wanted = np.where(np.isfinite(arrived)[:, None], self._given[newest, which], 0.0)
         self._carried_out[which] = limited_command(wanted, self._carried_out[which], self._params)
         return wheel_speeds(self._carried_out[which], self._params)
