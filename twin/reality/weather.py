@@ -1,10 +1,70 @@
 """The lightings of the real test. None of them is ever filmed, and nothing but a trial may know them.
 
-The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Stated here
-and drawn once: what a trial adds of its own is only the camera's drift of exposure.
+The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Five are stated
+here, five more are *days* drawn once, with a fixed seed, as a calendar would: sun, clouds and air are whatever they are.
+What a trial adds of its own is only the camera's drift of exposure.
 """
 
-from twin.reality.lighting import Lighting
+import numpy as np
+
+from twin.reality.lighting import Colour, Lighting
+from twin.reality.things import SEED
+
+_DAYS = 5
+_WHITE, _RED = np.array([1.0, 0.94, 0.83]), np.array([1.0, 0.60, 0.34])  # of a high sun, and of one at the horizon
+_REDDENED = 14.0  # [°] over which a rising sun loses all but 1/e of its red
+_GREY = 0.3  # of this the mean of pictures is to be, as automatic exposure would have it
+
+
+def _day(number: int) -> Lighting:
+    """A day: its sun, its clouds and its air are uniform in the ranges below, its colours follow from these."""
+    rng = np.random.default_rng([SEED, 51, number])
+    elevation, azimuth = rng.uniform(6.0, 60.0), rng.uniform(0.0, 2.0 * np.pi)
+    clouds, veil = rng.uniform(0.1, 1.0), rng.uniform(0.0, 1.0)
+    hazy, wet = rng.uniform() < 0.4, rng.uniform() < 0.4
+    visibility, wetness = float(np.exp(rng.uniform(np.log(60.0), np.log(400.0)))), float(rng.uniform(0.15, 0.4))
+    tint, brightness = rng.uniform(-0.03, 0.03), float(np.exp(rng.uniform(-0.15, 0.15)))
+
+    up, low = np.sin(np.deg2rad(elevation)), float(np.exp(-elevation / _REDDENED))
+    overcast = clouds > 0.8
+    through = 0.0 if overcast else (1.0 - clouds) ** 0.3 * (1.0 - 0.4 * veil)  # of the sun's own light
+    sun = through * (0.55 + 0.45 * up) * 1.2 * (low * _RED + (1.0 - low) * _WHITE)
+    grey = 0.30 + 0.32 * np.sqrt(up) * (0.7 + 0.3 * clouds)  # what comes from everywhere
+    ambient = grey * np.array([0.96 - 0.04 * through, 1.0, 1.08 + 0.04 * through])
+    level = np.cos(np.deg2rad(elevation))
+    ray = (float(-level * np.cos(azimuth)), float(-level * np.sin(azimuth)), float(-up))
+    clear, dull = np.array([0.24, 0.45, 0.80]), np.array([0.62, 0.65, 0.70])
+    bright = 0.55 + 0.45 * np.sqrt(up)
+    zenith = bright * ((1.0 - clouds) * clear + clouds * dull)
+    horizon = bright * (low * np.array([1.05, 0.80, 0.62]) + (1.0 - low) * np.array([0.80, 0.85, 0.90]))
+    cloud = bright * (low * np.array([0.95, 0.72, 0.66]) + (1.0 - low) * np.array([0.93, 0.94, 0.95]))
+    cloud *= 0.78 if overcast else 1.0
+    return Lighting(
+        f"day_{number}",
+        ambient=_colour(ambient),
+        suns=(
+            ((0.1, 0.2, -1.0), _colour(np.full(3, 0.3 * grey)), False) if overcast else (ray, _colour(sun), True),
+            ((-ray[0], -ray[1], -0.7), _colour(0.18 * ambient), False),
+        ),
+        zenith=_colour(zenith),
+        horizon=_colour(horizon),
+        clouds=float(clouds),
+        cloud=_colour(cloud),
+        skyline=_colour(horizon * np.array([0.42, 0.47, 0.44])),
+        occlusion=float(0.4 + 0.6 * (1.0 - through)),
+        exposure=float(brightness * _GREY / (0.36 * (ambient.mean() + 0.5 * up * sun.mean()))),
+        noise=0.003 + 0.004 * low,
+        gain=(1.0 + tint, 1.0, 1.0 - tint),
+        glow_sun=_colour(0.45 * through * np.array([1.0, 0.8, 0.55])),
+        wet=wetness if wet else 0.0,
+        visibility=visibility if hazy else float("inf"),
+    )
+
+
+def _colour(rgb: np.ndarray) -> Colour:
+    red, green, blue = np.clip(rgb, 0.0, 1.05).tolist()
+    return red, green, blue
+
 
 WEATHER: dict[str, Lighting] = {
     lighting.name: lighting
@@ -86,6 +146,7 @@ WEATHER: dict[str, Lighting] = {
             noise=0.007,
             gain=(0.97, 1.0, 1.04),
         ),
+        *(_day(number) for number in range(1, 1 + _DAYS)),
     )
 }
 """By name."""
