@@ -1,8 +1,8 @@
 """The lightings of the real test. None of them is ever filmed, and nothing but a trial may know them.
 
-The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Five are stated
-here, five more are *days* drawn once, with a fixed seed, as a calendar would: sun, clouds and air are whatever they are.
-What a trial adds of its own is only the camera's drift of exposure.
+The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Five are
+stated here, five more are *days*, drawn once with a fixed seed as a calendar would: sun, clouds and air are whatever
+they are. What a trial adds of its own is only the camera's drift of exposure.
 """
 
 import numpy as np
