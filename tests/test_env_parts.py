@@ -226,6 +226,9 @@ def test_what_is_known_of_the_robot_is_held_where_policies_are_judged():
     for name in ("latency", "camera_shift", "camera_turn", "sunlight", "shade", "extinction", "bystanders"):
         assert [getattr(d, name) for d in draws] == [getattr(d, name) for d in others]
     assert len({d.latency for d in draws}) == 9
+    seen = [ANOTHER_DAY.for_robot(HuskyParams(camera_height=0.59, camera_yaw=0.4)).draw(np.random.default_rng(1))]
+    seen.append(ANOTHER_DAY.for_robot(HuskyParams(camera_height=0.59)).draw(np.random.default_rng(1)))
+    assert [any(d.camera_shift) for d in seen] == [False, False] and [any(d.camera_turn) for d in seen] == [False, True]
     assert ANOTHER_DAY.for_robot(HuskyParams()) == ANOTHER_DAY  # nothing is known of it
     assert Ranges().for_robot(robot) == Ranges()  # training goes on drawing it
 

@@ -1,23 +1,30 @@
-"""Verb: fit the Husky to a log of a real one driving.
+"""Verb: fit the Husky to a log of a real one driving, and its camera to a film that it took.
 
     python -m twin.align scenes/demo drive.csv
+    python -m twin.align scenes/demo robot.mp4
     python -m twin.align husky drive.npz --out aligned
 
-fits the controller's limits and latency, the servo's lag, tyres, ground, centre of mass and effective wheel radii to
-half of the log and scores them on the other half, beside a kinematic model fitted to the same half. Each value comes
+From a log the controller's limits and latency, the servo's lag, tyres, ground, centre of mass and effective wheel radii
+are fitted to its one half and scored on the other, beside a kinematic model fitted to the same half. Each value comes
 with a standard error; what the log does not show is left alone, and said so. Out come `robot.toml`, which the scene's
 next build uses, and `alignment/` with `align.json` and four pictures.
+
+A film by the robot's front camera, driving on the built place, tells how the camera sits (height, yaw, pitch, roll) and
+its focal length, unless `[robot] camera_intrinsics` does. They go to the same `robot.toml`; `alignment/camera.png`
+shows the film beside what the twin's robot sees.
 """
 
 import argparse
 import sys
 import tempfile
 import tomllib
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from twin import progress
-from twin.alignment.aligned import Alignment, align, robot_toml, told_error
+from twin.alignment.aligned import Alignment, align, robot_toml, told_error, toml_text
 from twin.alignment.checks import check
 from twin.alignment.logs import read_log
 from twin.config_file import ROBOT_TOML, load_config, parse, read_robot
@@ -25,6 +32,11 @@ from twin.errors import InputError, refuse
 from twin.robot import HuskyParams
 from twin.scene import SceneDir, digest_file, write_json, write_text
 
+if TYPE_CHECKING:
+    from twin.alignment.camera import CameraAlignment
+
+FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
+"""Suffixes of what is taken for a film."""
 FOLDER = "alignment"
 """Where figures and pictures go, beside `robot.toml`."""
 PUBLISHED = "husky"
@@ -64,6 +76,39 @@ def run(target: str, log: Path, out: Path | None = None, use_slope: bool = True)
     return result, folder
 
 
+def run_camera(target: str, film: Path) -> "tuple[CameraAlignment, Path]":
+    """Aligns the camera of a scene's robot to a film that it took; writes the results and returns where.
+
+    Args:
+        target: Folder of a built scene.
+        film: By the robot's front camera, driving on the place.
+
+    Raises:
+        InputError: no such scene or film, no place for the results, or a film that cannot be used.
+    """
+    from twin.alignment.camera import align_camera, pictures
+
+    if not film.is_file():
+        raise InputError(f"{film}: no such film")
+    params, kept, folder = _robot(target)
+    if folder is None or not SceneDir(folder).config_file.exists():
+        raise InputError(f"{target}: a film is found on a built place; give the scene's folder")
+    scene, shown = SceneDir(folder), folder / FOLDER
+    _writable(shown)
+    # What robot.toml has of the camera may come from an earlier film, which this one replaces.
+    by_hand = parse(HuskyParams, _own(folder), str(scene.config_file))
+    params = replace(params, camera_intrinsics=by_hand.camera_intrinsics, camera_size=by_hand.camera_size)
+    result, frames = align_camera(film, scene, params)
+    told = f"The camera was fitted to {film.name} by python -m twin.align: {result.told}."
+    text = toml_text(told, kept, result.identified)
+    robot = parse(HuskyParams, tomllib.loads(text), ROBOT_TOML)
+    pictures(shown, result, frames, scene, robot)
+    figures = {"film": str(film), "film_sha256": digest_file(film)} | result.figures()
+    write_json(shown / "camera.json", figures)
+    write_text(folder / ROBOT_TOML, text)
+    return result, folder
+
+
 def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
     """The robot to start from, what its robot.toml says, and the folder that lies in."""
     if target == PUBLISHED:
@@ -88,16 +133,20 @@ def _writable(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written to: {error}; give another folder with --out") from None
 
 
-def hidden(folder: Path, result: Alignment) -> list[str]:
+def hidden(folder: Path, identified: Iterable[str]) -> list[str]:
     """Fitted fields that `[robot]` of the `scene.toml` beside the written `robot.toml`, if there is one, overrules."""
+    return sorted(set(_own(folder)) & set(identified))
+
+
+def _own(folder: Path) -> dict[str, Any]:
+    """`[robot]` of the `scene.toml` in a folder; empty where there is none."""
     path = SceneDir(folder).config_file
     if not path.exists():
-        return []
+        return {}
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8")).get("robot", {})
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
-    return sorted(set(table.get("robot", {})) & set(result.identified))
 
 
 def summary(result: Alignment) -> str:
@@ -112,39 +161,55 @@ def summary(result: Alignment) -> str:
             f"{s.yaw_deg_p90:6.1f}°  {wheels}"
         )
     rows.append("fitted:" if result.identified else "fitted: nothing, for the log shows nothing of the robot")
-    for name, (value, error) in result.identified.items():
-        told = ", ".join(f"{v:.4g}" for v in value) if isinstance(value, tuple) else f"{value:.4g}"
-        rows.append(f"  {name} = {told} ± {told_error(error)}")
+    rows += _fitted(result.identified)
     if result.refused:
         rows.append("left alone, for this log does not show them:")
         rows += [f"  {line}" for line in result.refused]
     return "\n".join(rows)
 
 
+def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
+    """A line per field: its value and standard error."""
+    rows = []
+    for name, (value, error) in identified.items():
+        told = ", ".join(f"{v:.4g}" for v in value) if isinstance(value, tuple) else f"{value:.4g}"
+        rows.append(f"  {name} = {told}" + ("" if error is None else f" ± {told_error(error)}"))
+    return rows
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
     parser = argparse.ArgumentParser(
         prog="python -m twin.align",
-        description="Fit the Husky's parameters to a log of a real one driving; score them on windows not fitted to.",
+        description="Fit the Husky's parameters to a log of a real one driving, scored on windows not fitted to; "
+        "or how its camera sits to a film by that camera.",
         epilog="A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
         "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
         "acceleration_x, acceleration_y [m/s²] and group. Or the folder of a ROS 2 bag with cmd_vel, joint states, a "
-        "pose and an IMU (pip install 'twin[ros]').",
+        "pose and an IMU (pip install 'twin[ros]'). A film (.mp4, ...) is of the robot's front camera, rectified, "
+        "driving some ten metres or more on the built scene's place, mostly ahead, in light such as some film's.",
     )
     parser.add_argument("robot", help=f"folder of a scene, a robot.toml, or `{PUBLISHED}` for the published one")
-    parser.add_argument("log", type=Path, help="a .csv, an .npz, or the folder of a ROS 2 bag")
+    parser.add_argument("log", type=Path, help="a .csv, an .npz, the folder of a ROS 2 bag, or a film")
     parser.add_argument("--out", type=Path, help=f"folder for robot.toml and {FOLDER}/; by default the scene's")
     parser.add_argument("--level", action="store_true", help="take the ground for level, whatever the log's IMU says")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
     options = parser.parse_args(arguments)
     progress.set_quiet(options.quiet)
     try:
-        result, folder = run(options.robot, options.log, options.out, not options.level)
-        overruled = hidden(folder, result)
+        if options.log.suffix.lower() in FILMS:
+            if options.out or options.level:
+                raise InputError(f"{options.log} is a film; --out and --level belong to a log")
+            camera, folder = run_camera(options.robot, options.log)
+            identified, lines = camera.identified, "\n".join([camera.told, "fitted:", *_fitted(camera.identified)])
+        else:
+            result, folder = run(options.robot, options.log, options.out, not options.level)
+            identified, lines = result.identified, summary(result)
+        overruled = hidden(folder, identified)
     except (InputError, OSError) as error:
         return refuse(error)
     if not options.quiet:
-        print(summary(result))
+        print(lines)
         if overruled:
             print(f"scene.toml's [robot] overrules what was fitted: {', '.join(overruled)}; remove it there to use it")
         print(f"wrote {folder / ROBOT_TOML}; look at {folder / FOLDER}")

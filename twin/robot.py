@@ -143,6 +143,10 @@ class HuskyParams:
     """Of the lens forward and left of the base origin [m]."""
     camera_pitch: float = 5.0
     """How far it looks down [°]."""
+    camera_yaw: float = 0.0
+    """How far it looks to the left [°]."""
+    camera_roll: float = 0.0
+    """How far it leans to the right [°]."""
     camera_intrinsics: tuple[float, ...] = ()
     """fx, fy, cx, cy at `camera_size` [px]; empty: in a scene those of the film, elsewhere a ZED 2's."""
     camera_size: tuple[int, int] = ZED2.size
@@ -170,6 +174,15 @@ class HuskyParams:
     def camera_position(self) -> tuple[float, float, float]:
         """Of the front camera in the base [m]."""
         return (*self.camera_offset, self.camera_height - BASE_HEIGHT)
+
+    @property
+    def camera_rotation(self) -> Array:
+        """The front camera's axes right, up and back (columns) in the base, shape (3, 3)."""
+        yaw, pitch, roll = np.deg2rad([self.camera_yaw, self.camera_pitch, self.camera_roll])
+        turned = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        axes = np.array([[0, np.sin(pitch), -np.cos(pitch)], [-1, 0, 0], [0, np.cos(pitch), np.sin(pitch)]])
+        leaning = np.array([[np.cos(roll), np.sin(roll), 0], [-np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+        return turned @ axes @ leaning
 
     def camera(self, fallback: PixelCamera = ZED2) -> PixelCamera:
         """The front camera at its native size; `fallback` where no intrinsics are given."""
@@ -207,6 +220,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "camera_height": (0.05, 3.0),
     "camera_offset": (-2.0, 2.0),
     "camera_pitch": (-90.0, 90.0),
+    "camera_yaw": (-180.0, 180.0),
+    "camera_roll": (-180.0, 180.0),
     "camera_intrinsics": (-1e5, 1e5),
     "camera_size": (1, 20_000),
     "camera_latency": (0.0, 2.0),

@@ -2,9 +2,9 @@
 
     python benchmarks/table1 SCENE [--seeds 0] [--jobs 2] [--steps train validate real forecast]
 
-films reality, aligns the robot to a drive log of reality's Husky and builds the twin in SCENE (unless that is done),
-trains the three setups on both tasks, validates every policy in the twin under held-out lightings, as filmed and with
-all else drawn anew, drives them in reality under weather that neither has seen, and forecasts. Every step is a command
+films reality and builds the twin in SCENE (unless that is done), aligns its robot to a drive log of reality's Husky and
+to a film by that one's camera, trains the three setups on both tasks, validates every policy in the twin under held-out
+lightings, as filmed and with all else drawn anew, drives them in reality under weather that neither has seen, and forecasts. Every step is a command
 of `twin`, goes on where it was cut off, and adds to what is there: the same call with more seeds keeps all runs.
 `results.json` beside this file holds every run. Setups, sizes, checkpoints: `plan.py`.
 """
@@ -34,10 +34,12 @@ def verb(*arguments: str | Path) -> None:
 def build(scene: Path) -> None:
     if not (scene / "scene.toml").exists():
         verb("twin.reality", "film", "--out", scene)
-    if not (scene / "robot.toml").exists():
-        verb("twin.reality", "log", "--out", scene / "drive.csv")
-        verb("twin.align", scene, scene / "drive.csv")
     verb("twin.build", scene)  # what is up to date it leaves alone
+    for kind, name, figures in (("log", "drive.csv", "align.json"), ("onboard", "robot.mp4", "camera.json")):
+        if not (scene / "alignment" / figures).exists():
+            verb("twin.reality", kind, "--out", scene / name)
+            verb("twin.align", scene, scene / name)
+    verb("twin.build", scene)  # with the robot at hand
 
 
 def train(scene: Path, run: Run) -> None:
@@ -56,11 +58,8 @@ def validate(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
 
 
 def real(scene: Path, run: Run) -> None:
-    final, *checkpoints = _policies(scene, run)
     out = ("--task", TASKS[run.task], "--out", scene / "real" / f"{run.name}.csv")
-    verb("twin.reality", "drive", "--policy", final, "--trials", str(TRIALS["final"]), *out)
-    if checkpoints:
-        verb("twin.reality", "drive", "--policy", *checkpoints, "--trials", str(TRIALS["checkpoint"]), *out)
+    verb("twin.reality", "drive", "--policy", *_policies(scene, run), "--trials", str(TRIALS), *out)
 
 
 def forecast(scene: Path) -> None:

@@ -188,15 +188,31 @@ def align(
 
 def robot_toml(alignment: Alignment, kept: dict[str, Any], log: str) -> str:
     """The text of a `robot.toml`: what was identified, after what stood there before and still holds."""
-    identified = alignment.identified
     scoring = int((~alignment.windows.fitting).sum())
     ours = alignment.fitted.score(~alignment.windows.fitting)
+    told = (
+        f"Fitted to {Path(log).name} by python -m twin.align; on {scoring} windows it was not fitted to the robot is "
+        f"off by {ours.position_m:.3f} m and {ours.yaw_deg:.1f}° after 2 s (median)."
+    )
+    return toml_text(told, kept, alignment.identified)
+
+
+def toml_text(told: str, kept: dict[str, Any], identified: dict[str, tuple[Any, Any]]) -> str:
+    """The text of a `robot.toml`.
+
+    Args:
+        told: How it came about, in a line.
+        kept: What stood there before.
+        identified: What goes before that: value and standard error, None where there is none.
+    """
     lines = [
-        f"# Fitted to {Path(log).name} by python -m twin.align; on {scoring} windows it was not fitted to the robot is "
-        f"off by {ours.position_m:.3f} m and {ours.yaw_deg:.1f}° after 2 s (median).",
+        f"# {told}",
         *([] if identified else ["# But nothing in it could be identified: what follows stood here before."]),
         *(f"{name} = {_toml(value)}" for name, value in kept.items() if name not in identified),
-        *(f"{name} = {_toml(value)}  # ± {told_error(error)}" for name, (value, error) in identified.items()),
+        *(
+            f"{name} = {_toml(value)}" + ("" if error is None else f"  # ± {told_error(error)}")
+            for name, (value, error) in identified.items()
+        ),
     ]
     return "\n".join(lines) + "\n"
 

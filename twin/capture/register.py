@@ -1,11 +1,14 @@
-"""Where one more photo was taken from, by the frames and sparse points of a built scene.
+"""Where one more photo, or every frame of one more film, was taken from, by the frames and sparse points of a built
+scene.
 
 A *landmark* is a feature of a frame that lies where a sparse point falls that the frame sees: so its place is known. A
 *match* pairs a feature of the photo with a landmark; *inliers* are the matches that one pose explains. The work happens
-in the worker process (`worker.py`), as all of COLMAP's does; `register` starts it and reads what it found.
+in the worker process (`worker.py`), as all of COLMAP's does; `register` and `register_film` start it and read what it
+found.
 """
 
 import tempfile
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +45,9 @@ _TOLERANCE = 0.006  # of an inlier [longer sides]
 _GUESSED_FOCAL = 1.2  # [longer sides]
 _ESTIMATED = "estimated"
 _DISTORTION_INLIERS = 100  # enough to tell distortion from noise
+_FILM_NEIGHBOURS = 12  # frames that a film's next frame is compared with
+_OUTLYING = 3.0  # [px] an inlier's error that counts as no more
+_FOCAL_ROUNDS = 4
 _CLEARLY_MORE = 1.25  # an earlier lens is kept unless a later one explains so many times more matches
 
 Image = NDArray[np.uint8]
@@ -112,7 +118,110 @@ def candidate_lenses(size: tuple[int, int], facts: PhotoFacts, scene: SceneDir) 
     return list({repr(lens): (lens, held, said) for lens, held, said in reversed(found)}.values())[::-1]
 
 
+@dataclass(frozen=True)
+class FilmRegistration:
+    """Places of a film's frames, all of one pinhole lens."""
+
+    frames: NDArray[np.int64]
+    """Indices of the frames that were found, shape (n,)."""
+    camera_to_world: Array
+    """OpenCV axes, metres, shape (n, 4, 4)."""
+    lens: Lens
+    """At the frames' size."""
+    focal_error: float
+    """Standard error of its focal length [px]; 0 where it was given."""
+    error: float
+    """Median over the frames of their inliers' mean reprojection error [px]."""
+
+
+def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, seed: int = 0) -> FilmRegistration:
+    """The poses and the focal length of a film's frames (h, w, 3), whose principal point is taken as `given` has it.
+
+    Args:
+        frames: In order, of one camera without distortion.
+        given: Its lens where that is known; else its focal length is found, and its principal point is the middle.
+        scene: Built.
+        seed: Of what is drawn at random.
+
+    Raises:
+        InputError: no frame fits the place.
+    """
+    full = frames[0].shape[1], frames[0].shape[0]
+    size = fitted_size(*full, _MAX_SIZE)
+    lens = given.scaled(*size) if given else None
+    if lens is None:
+        focal = _focal_like(size, Cameras.load(scene.stage("metric")))
+        lens = Lens("SIMPLE_PINHOLE", (focal, 0.5 * size[0], 0.5 * size[1]), *size)
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        names = [f"{i:06d}.png" for i in range(len(frames))]
+        for name, frame in zip(names, frames, strict=True):
+            write_image(work / name, cv2.cvtColor(np.asarray(resize(frame, *size), np.uint8), cv2.COLOR_RGB2GRAY))
+        job = {"task": "register_film", "metric": str(scene.stage("metric").resolve()), "work": folder, "seed": seed}
+        run_worker(job | {"photos": names, "lens": vars(lens), "held": given is not None}, work)
+        found = read_json(work / "result.json")
+    scale = full[0] / size[0]
+    return FilmRegistration(
+        np.array(found["frames"]),
+        np.array(found["camera_to_world"]),
+        lens.with_intrinsics(np.array([found["focal"], found["focal"], *lens.intrinsics[2:]])).scaled(*full)
+        if given is None
+        else given,
+        found["focal_error"] * scale,
+        found["error"] * scale,
+    )
+
+
+def _focal_like(size: tuple[int, int], cameras: Cameras) -> float:
+    """The focal length of the scene's camera whose picture has the same shape, or a guess [px]."""
+    width, height = (int(v) for v in cameras.sizes[0])
+    if same_aspect(size, (width, height)):
+        return float(np.median(cameras.intrinsics[:, 0])) * size[0] / width
+    return _GUESSED_FOCAL * max(size)
+
+
 # ---- in the worker
+
+
+class _Place:
+    """A built scene's frames and sparse points, and features of the frames that were looked at."""
+
+    def __init__(self, metric: Path) -> None:
+        self.cameras, self.points = Cameras.load(metric), SparsePoints.load(metric)
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu, options.num_threads, options.sift.max_num_features = False, 1, _FEATURES
+        self._extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        self._seen: dict[int, tuple[Array, NDArray[np.float32]]] = {}
+
+    def features(self, path: Path) -> tuple[Array, NDArray[np.float32]]:
+        """Places [px] (n, 2) and unit descriptors (n, 128) of an image file's SIFT features."""
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise InputError(f"{path}: not a readable image; delete the build folder and build again")
+        keypoints, descriptors = self._extractor.extract_from_uint8_array(np.ascontiguousarray(image))
+        places = np.array([(k.x, k.y) for k in keypoints], np.float64).reshape(-1, 2)
+        values = np.asarray(descriptors.data, np.float32).reshape(-1, 128)
+        return places, values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
+
+    def matches(self, descriptors: NDArray[np.float32], i: int) -> NDArray[np.int64]:
+        """Matches of a photo in frame i, see `frame_matches`."""
+        if i not in self._seen:
+            self._seen[i] = self.features(self.cameras.image_path(i))
+        return frame_matches(*self._seen[i], descriptors, self.cameras, self.points, i)
+
+    def first_frames(self) -> list[int]:
+        """Spread evenly over every film."""
+        return [int(i) for i in regular_choice(len(self.cameras), _FIRST_FRAMES)]
+
+    def near(self, positions: Array, count: int) -> set[int]:
+        """The frames nearest to each of some positions (n, 3)."""
+        away = np.linalg.norm(self.cameras.positions[:, None] - positions, axis=-1)
+        return {int(i) for column in away.T for i in np.argsort(column, kind="stable")[:count]}
+
+    def pairs(self, found: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:
+        """Matches of the frames that have most, each once, shape (m, 2)."""
+        most = sorted(found, key=len, reverse=True)[:_TRUSTED_FRAMES]
+        return np.unique(np.concatenate([np.zeros((0, 2), int), *most]), axis=0)
 
 
 def solve(job: dict[str, Any]) -> None:
@@ -121,16 +230,11 @@ def solve(job: dict[str, Any]) -> None:
     Raises:
         InputError: too few inliers.
     """
-    metric, work = Path(job["metric"]), Path(job["work"])
-    cameras, points = Cameras.load(metric), SparsePoints.load(metric)
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu, options.num_threads, options.sift.max_num_features = False, 1, _FEATURES
-    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    pixels, descriptors = _features(extractor, work / "photo.png")
-    matches = _matched_frames(extractor, descriptors, cameras, points)
-    pairs = np.unique(np.concatenate([np.zeros((0, 2), int), *matches]), axis=0)
-    image, place = pixels[pairs[:, 0]], points.xyz[pairs[:, 1]]
-    poses = [_posed(image, place, lens, job["seed"]) for lens in job["lenses"]]
+    place, work = _Place(Path(job["metric"])), Path(job["work"])
+    pixels, descriptors = place.features(work / "photo.png")
+    pairs = place.pairs(_matched_frames(place, descriptors))
+    image, points = pixels[pairs[:, 0]], place.points.xyz[pairs[:, 1]]
+    poses = [_posed(image, points, lens, job["seed"]) for lens in job["lenses"]]
     most = max((pose["inliers"] for pose in poses if pose), default=0)
     if most < MIN_INLIERS:
         raise InputError(
@@ -142,35 +246,147 @@ def solve(job: dict[str, Any]) -> None:
     write_json(work / "result.json", best | {"matches": len(pairs)})
 
 
-def _features(extractor: Any, path: Path) -> tuple[Array, NDArray[np.float32]]:
-    """Places [px] (n, 2) and unit descriptors (n, 128) of an image file's SIFT features."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise InputError(f"{path}: not a readable image; delete the build folder and build again")
-    keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(image))
-    places = np.array([(k.x, k.y) for k in keypoints], np.float64).reshape(-1, 2)
-    values = np.asarray(descriptors.data, np.float32).reshape(-1, 128)
-    return places, values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
+def solve_film(job: dict[str, Any]) -> None:
+    """Runs a job of `register_film` and leaves `result.json` in its work folder.
+
+    A frame is looked for near where the one before it was, else everywhere. All share one focal length: the one that
+    brings their inliers nearest.
+
+    Raises:
+        InputError: no frame was found.
+    """
+    place, work = _Place(Path(job["metric"])), Path(job["work"])
+    lens = job["lens"] | {"held": job["held"], "said": ""}
+    sights: list[_Sight] = []
+    tell(bar="frames of the film", total=len(job["photos"]))
+    for k, name in enumerate(job["photos"]):
+        pixels, descriptors = place.features(work / name)
+        wheres = [sorted(place.near(sights[-1].position[None], _FILM_NEIGHBOURS))] if sights else []
+        for where in (*wheres, place.first_frames()):
+            pairs = place.pairs(place.matches(descriptors, i) for i in where)
+            sight = _sighted(k, pixels[pairs[:, 0]], place.points.xyz[pairs[:, 1]], lens, job["seed"])
+            if sight:
+                sights.append(sight)
+                break
+        tell(step=1)
+    if not sights:
+        raise InputError(
+            f"none of the {len(job['photos'])} frames shows the place; film from the robot on the filmed path, and in "
+            "light that shows the texture some film shows: night and day share little"
+        )
+    start = float(np.median([sight.focal for sight in sights]))
+    focal, error = (start, 0.0) if job["held"] else _shared_focal(sights, lens, start)
+    poses, errors = zip(*(sight.posed(_with_focal(lens, focal)) for sight in sights), strict=True)
+    write_json(
+        work / "result.json",
+        {
+            "frames": [sight.frame for sight in sights],
+            "camera_to_world": [pose.tolist() for pose in poses],
+            "focal": focal,
+            "focal_error": error,
+            "error": float(np.median([np.sqrt((e**2).sum(1)).mean() for e in errors])),
+        },
+    )
 
 
-def _matched_frames(
-    extractor: Any, descriptors: NDArray, cameras: Cameras, points: SparsePoints
-) -> list[NDArray[np.int64]]:
-    """Matches of the photo in the frames that have most: rows of photo feature and sparse point, shapes (m, 2)."""
+@dataclass(frozen=True)
+class _Sight:
+    """A frame of a film that was found: inliers in it [px] (m, 2) and in the place [m] (m, 3)."""
+
+    frame: int
+    image: Array
+    place: Array
+    camera_from_world: Any
+    focal: float
+    """As this frame alone has it [px]."""
+
+    @property
+    def position(self) -> Array:
+        """[m], shape (3,)."""
+        return inverse_pose(np.vstack([self.camera_from_world.matrix(), [0.0, 0.0, 0.0, 1.0]]))[:3, 3]
+
+    def posed(self, lens: dict[str, Any]) -> tuple[Array, Array]:
+        """camera_to_world (4, 4) under a lens, and the inliers' errors [px] (m, 2)."""
+        camera, everything = _camera(lens), np.ones(len(self.image), bool)
+        options = pycolmap.AbsolutePoseRefinementOptions()
+        options.refine_focal_length = options.refine_extra_params = False
+        found = pycolmap.refine_absolute_pose(
+            self.camera_from_world, self.image, self.place, everything, camera, options
+        )
+        pose = found["cam_from_world"] if found else self.camera_from_world
+        errors = np.asarray(camera.img_from_cam(pose * self.place)) - self.image
+        return inverse_pose(np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])), errors
+
+
+def _sighted(frame: int, image: Array, place: Array, lens: dict[str, Any], seed: int) -> _Sight | None:
+    """A frame's place by its matches; None where too few fit."""
+    if len(image) < MIN_INLIERS:
+        return None
+    camera, estimation = _camera(lens), _estimation(lens, seed)
+    found = pycolmap.estimate_absolute_pose(image, place, camera, estimation)
+    if found is None or found["num_inliers"] < MIN_INLIERS:
+        return None
+    inlier = np.asarray(found["inlier_mask"], bool)
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.refine_focal_length, options.refine_extra_params = not lens["held"], False
+    better = pycolmap.refine_absolute_pose(found["cam_from_world"], image, place, inlier, camera, options)
+    pose = (better or found)["cam_from_world"]
+    return _Sight(frame, image[inlier], place[inlier], pose, float(camera.params[0]))
+
+
+def _shared_focal(sights: Sequence[_Sight], lens: dict[str, Any], start: float) -> tuple[float, float]:
+    """The focal length with which all inliers come nearest, and its standard error [px].
+
+    A parabola through the costs; errors beyond `_OUTLYING` count as that much, and a frame counts as one measurement of
+    two numbers, as neighbouring inliers err together.
+    """
+    focals = start * np.array([0.98, 0.99, 1.0, 1.01, 1.02])
+    for _ in range(_FOCAL_ROUNDS):
+        costs = np.zeros(len(focals))
+        for i, focal in enumerate(focals):
+            each = [sight.posed(_with_focal(lens, focal))[1] for sight in sights]
+            costs[i] = np.mean([np.minimum((e**2).sum(1), _OUTLYING**2).mean() for e in each])
+        curve = np.polyfit(focals - start, costs, 2)
+        if curve[0] <= 0.0:
+            raise InputError("the film does not show the camera's focal length; give camera_intrinsics in [robot]")
+        best = start - curve[1] / (2.0 * curve[0])
+        if abs(best - focals[2]) <= 0.5 * (focals[1] - focals[0]):
+            break
+        focals = focals + (best - focals[2])
+    return float(best), float(np.sqrt(np.polyval(curve, best - start) / (2.0 * curve[0] * len(sights))))
+
+
+def _with_focal(lens: dict[str, Any], focal: float) -> dict[str, Any]:
+    """A SIMPLE_PINHOLE with another focal length; a lens that is given stays."""
+    return lens if lens["held"] else lens | {"params": [focal, *lens["params"][1:]]}
+
+
+def _camera(lens: dict[str, Any]) -> pycolmap.Camera:
+    return Lens(lens["model"], tuple(lens["params"]), lens["width"], lens["height"]).camera
+
+
+def _estimation(lens: dict[str, Any], seed: int) -> pycolmap.AbsolutePoseEstimationOptions:
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.estimate_focal_length = lens["said"] == _ESTIMATED
+    options.ransac.max_error = _TOLERANCE * max(lens["width"], lens["height"])
+    options.ransac.min_inlier_ratio, options.ransac.random_seed = 0.02, seed
+    return options
+
+
+def _matched_frames(place: _Place, descriptors: NDArray) -> list[NDArray[np.int64]]:
+    """Matches of the photo in frames that resemble it: rows of photo feature and sparse point, shapes (m, 2)."""
     found: dict[int, NDArray[np.int64]] = {}
 
     def look(frames: list[int]) -> None:
         tell(bar="frames like the photo", total=len(frames))
         for i in frames:
-            found[i] = frame_matches(*_features(extractor, cameras.image_path(i)), descriptors, cameras, points, i)
+            found[i] = place.matches(descriptors, i)
             tell(step=1)
 
-    look([int(i) for i in regular_choice(len(cameras), _FIRST_FRAMES)])
+    look(place.first_frames())
     best = sorted(found, key=lambda i: -len(found[i]))[:_BEST_FRAMES]
-    away = np.linalg.norm(cameras.positions[:, None] - cameras.positions[best], axis=-1)
-    near = {int(i) for column in away.T for i in np.argsort(column, kind="stable")[: _NEIGHBOURS + 1]}
-    look(sorted(near - set(found)))
-    return sorted(found.values(), key=len, reverse=True)[:_TRUSTED_FRAMES]
+    look(sorted(place.near(place.cameras.positions[best], _NEIGHBOURS + 1) - set(found)))
+    return list(found.values())
 
 
 def frame_matches(
@@ -196,10 +412,12 @@ def frame_matches(
         return np.zeros((0, 2), np.int64)
     pixels, _ = project(points.xyz[seen], cameras.camera_to_world[i], cameras.intrinsics[i])
     distance, nearest = cKDTree(pixels).query(places)
-    likeness = photo @ descriptors.T
+    likeness, each = photo @ descriptors.T, np.arange(len(photo))
     best = likeness.argmax(1)
-    mutual = likeness.argmax(0)[best] == np.arange(len(photo))
-    rival, first = np.partition(likeness, -2, axis=1)[:, -2:].T
+    mutual = likeness.argmax(0)[best] == each
+    first = likeness[each, best]
+    likeness[each, best] = -1.0  # and thus nobody's best
+    rival = likeness.max(1)
     # Distances of unit vectors, squared: |a − b|² = 2 − 2 a·b.
     distinct = (1.0 - first) < _RATIO**2 * (1.0 - rival)
     good = mutual & distinct & (distance[best] < _NEAR)
@@ -210,13 +428,8 @@ def _posed(image: Array, place: Array, lens: dict[str, Any], seed: int) -> dict[
     """The pose that explains most matches under one lens; None where there is none."""
     if len(image) < MIN_INLIERS:
         return None
-    width, height, held = lens["width"], lens["height"], lens["held"]
-    camera = Lens(lens["model"], tuple(lens["params"]), width, height).camera
-    estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.estimate_focal_length = lens["said"] == _ESTIMATED
-    estimation.ransac.max_error = _TOLERANCE * max(width, height)
-    estimation.ransac.min_inlier_ratio, estimation.ransac.random_seed = 0.02, seed
-    found = pycolmap.estimate_absolute_pose(image, place, camera, estimation)
+    camera, held = _camera(lens), lens["held"]
+    found = pycolmap.estimate_absolute_pose(image, place, camera, _estimation(lens, seed))
     if found is None:
         return None
     inlier = np.asarray(found["inlier_mask"], bool)

@@ -164,7 +164,8 @@ def main(argv: list[str]) -> int:
     from twin.capture import mapping, register
 
     job = json.loads(Path(argv[0]).read_text(encoding="utf-8"))
-    solve = {"map": mapping.solve, "register": register.solve}[job["task"]]
+    tasks = {"map": mapping.solve, "register": register.solve, "register_film": register.solve_film}
+    solve = tasks[job["task"]]
     try:
         solve(job)
     except InputError as error:

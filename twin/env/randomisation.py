@@ -34,8 +34,11 @@ _HELD_BY = {
     "payload_mass": ("payload",),
     "command_latency": ("latency",),
     "wheel_radius": ("wheel_radius", "wheel_difference"),
+    "camera_height": ("camera_shift",),
+    "camera_yaw": ("camera_turn",),
 }
-"""Of `HuskyParams`: what need not be drawn where it is known. No drive log tells how the camera sits."""
+"""Of `HuskyParams`: what need not be drawn where it is known. Yaw is what only a film of the camera's own shows, and
+with it pitch and roll; where the height was measured, the offset is taken as it is told."""
 _FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
 
 

@@ -249,11 +249,8 @@ def _add_sensors(spec: mujoco.MjSpec) -> None:
 def _add_camera(base: mujoco.MjsBody, name: str, params: HuskyParams, camera: PixelCamera) -> None:
     fx, fy, cx, cy = camera.intrinsics
     width, height = camera.size
-    pitch = np.deg2rad(params.camera_pitch)
-    # Columns: right, up, backward of the camera in the base.
-    axes = np.array([[0, np.sin(pitch), -np.cos(pitch)], [-1, 0, 0], [0, np.cos(pitch), np.sin(pitch)]])
     quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    mujoco.mju_mat2Quat(quaternion, params.camera_rotation.ravel())
     base.add_camera(
         name=name,
         pos=params.camera_position,

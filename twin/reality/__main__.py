@@ -3,10 +3,11 @@
     python -m twin.reality film --out DIR
     python -m twin.reality drive --policy FILE... --task straight|right_turn --out results.csv
     python -m twin.reality log --out drive.csv
+    python -m twin.reality onboard --out robot.mp4
 
-`film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `drive` is the real test, `log` what
-`twin.align` may learn of the robot. All are random only through the seeds stated in the code, so the same command gives
-the same files.
+`film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `drive` is the real test. `log`, and
+`onboard`, a film by the robot's own camera, are what `twin.align` may learn of the robot. All are random only through
+the seeds stated in the code, so the same command gives the same files.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from pathlib import Path
 
 from twin.config import HELD_OUT, RANDOMISED
 from twin.errors import InputError, refuse
-from twin.reality import drive, log
+from twin.reality import drive, log, onboard
 from twin.reality import place as places
 from twin.reality.drive import TASKS
 from twin.reality.film import CAMERA_HEIGHT, Plan, depths, shoot
@@ -84,6 +85,8 @@ def main(given: list[str] | None = None) -> int:
     command = commands.add_parser("log", help="a drive log of the world's Husky, for twin.align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
     command.add_argument("--duration", type=float, default=300.0, help="[s] (default %(default)g)")
+    command = commands.add_parser("onboard", help="a film by the world's Husky's own camera, for twin.align")
+    command.add_argument("--out", type=Path, required=True, help="robot.mp4")
     options = parser.parse_args(given)
     try:
         if options.command == "film":
@@ -91,6 +94,8 @@ def main(given: list[str] | None = None) -> int:
             film(replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan, options.out)
         elif options.command == "log":
             log.write(options.out, log.record(options.duration))
+        elif options.command == "onboard":
+            onboard.write(options.out)
         else:
             trials = drive.run(
                 options.policy,

@@ -1,0 +1,278 @@
+"""How a robot's camera sits, by a film that it took on a known place."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from textured import K, filmed_corridor, picture
+from tiny_world import tiny_world
+
+from twin import progress
+from twin.align import main
+from twin.alignment.camera import align_camera
+from twin.alignment.seat import Seat, find_seat, heading_of, seated
+from twin.assets.ground import Ground
+from twin.capture.lens import Lens
+from twin.capture.register import register_film
+from twin.config_file import read_robot
+from twin.errors import InputError
+from twin.geometry.poses import rotation_angle
+from twin.mjcf import husky
+from twin.mjcf.export import rest_pose
+from twin.mjcf.world import World
+from twin.robot import BASE_HEIGHT, HuskyParams
+
+ASKEW = HuskyParams(camera_height=0.75, camera_yaw=1.4, camera_pitch=7.0, camera_roll=-2.0, camera_offset=(0.3, 0.05))
+GIVEN = Lens("PINHOLE", tuple(K), 320, 240)
+
+
+def hills(xy):
+    """A road that falls to its sides and rolls along its length [m]."""
+    x, y = np.asarray(xy, float).T
+    return 0.05 * np.sin(x / 3.0) - 0.02 * np.abs(y) + 0.1
+
+
+def drive(robot: HuskyParams, ground=hills, length: float = 18.0, count: int = 90, weave: float = 0.5) -> np.ndarray:
+    """Poses of a robot's camera on a weaving way; the base origin goes where it heads."""
+    x = np.linspace(0.0, length, count)
+    heading = np.arctan(weave * 2.0 * np.pi / 11.0 * np.cos(2.0 * np.pi * x / 11.0))
+    y = weave * np.sin(2.0 * np.pi * x / 11.0)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose, xy, yaw in zip(poses, np.stack([x, y], 1), heading, strict=True):
+        origin, (w, *xyz) = rest_pose(ground, xy, yaw)
+        base = Rotation.from_quat([*xyz, w]).as_matrix()
+        pose[:3, :3] = base @ robot.camera_rotation * [1.0, -1.0, -1.0]
+        pose[:3, 3] = origin + base @ robot.camera_position
+    return poses
+
+
+def shaken(poses: np.ndarray, metres: float, degrees: float) -> np.ndarray:
+    rng, out = np.random.default_rng(0), poses.copy()
+    out[:, :3, 3] += rng.normal(0.0, metres, (len(out), 3))
+    for pose in out:
+        pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(rng.normal(0.0, np.deg2rad(degrees), 3))[0]
+    return out
+
+
+def test_angles_turn_the_camera_as_they_say():
+    """In the compiled robot: a yaw looks left, a pitch down, and a roll leans to the right."""
+
+    def axes(**angles: float) -> np.ndarray:
+        spec = mujoco.MjSpec()
+        husky.add_husky(spec, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), HuskyParams(camera_pitch=0.0, **angles))
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        return data.camera("front").xmat.reshape(3, 3).T  # right, up, back
+
+    right, up, back = axes()
+    np.testing.assert_allclose([right, up, back], [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], atol=1e-12)
+    sine, cosine = np.sin(np.deg2rad(20.0)), np.cos(np.deg2rad(20.0))
+    np.testing.assert_allclose(-axes(camera_yaw=20.0)[2], [cosine, sine, 0.0], atol=1e-12)
+    np.testing.assert_allclose(axes(camera_roll=20.0)[0], [0.0, -cosine, -sine], atol=1e-12)
+    both = axes(camera_yaw=20.0, camera_roll=20.0)
+    np.testing.assert_allclose(both @ both.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(-both[2], [cosine, sine, 0.0], atol=1e-12)  # leaning does not turn where it looks
+
+
+def test_a_seated_camera_is_where_the_model_has_it(tmp_path):
+    """At rest on the ground of a scene, of the robot as compiled into it."""
+    world = tiny_world(tmp_path)
+    model = world.model()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    camera = data.camera("front")
+    origin, axes = data.body("base_link").xpos, data.body("base_link").xmat.reshape(3, 3)
+    heading = World.load(world.folder).spawn[3]
+
+    def ground_at(xy: np.ndarray) -> np.ndarray:
+        """The plane that the robot stands on."""
+        normal = axes[:, 2]
+        below = origin - BASE_HEIGHT * normal
+        return below[2] - (xy - below[:2]) @ normal[:2] / normal[2]
+
+    pose = seated(world.robot, camera.xpos[:2], heading, ground_at)
+    np.testing.assert_allclose(pose[:3, 3], camera.xpos, atol=1e-4)
+    np.testing.assert_allclose(pose[:3, :3] * [1, -1, -1], camera.xmat.reshape(3, 3), atol=1e-3)
+
+
+def test_the_seat_is_found():
+    seat, error = find_seat(drive(ASKEW), hills, ASKEW.camera_offset)
+    assert seat.height == pytest.approx(0.75, abs=0.002)
+    assert (seat.yaw, seat.pitch, seat.roll) == pytest.approx((1.4, 7.0, -2.0), abs=0.05)
+    assert max(vars(error).values()) < 0.05
+
+
+def test_errors_tell_how_far_it_may_be_off():
+    poses = shaken(drive(ASKEW), 0.01, 0.3)
+    seat, error = find_seat(poses, hills, ASKEW.camera_offset)
+    for name in ("height", "yaw", "pitch", "roll"):
+        sigma = getattr(error, name)
+        assert 0.0 < sigma < (0.01 if name == "height" else 0.3), name
+        assert abs(getattr(seat, name) - getattr(ASKEW, f"camera_{name}")) < 3.5 * sigma, name
+
+
+def test_driving_straight_or_backwards_tells_the_yaw_too():
+    for poses in (drive(ASKEW, weave=0.0), drive(ASKEW)[::-1]):
+        assert find_seat(poses, hills, ASKEW.camera_offset)[0].yaw == pytest.approx(1.4, abs=0.05)
+
+
+def test_a_short_film_is_refused():
+    poses = drive(ASKEW)
+    with pytest.raises(InputError, match=r"10 frames .* over 1\.\d m; expected at least 16 over 6 m"):
+        find_seat(poses[:10], hills, (0.3, 0.0))
+    with pytest.raises(InputError, match=r"20 frames .* over 3\.\d m"):
+        find_seat(poses[:20], hills, (0.3, 0.0))
+
+
+# ---- a film on a place
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """The textured corridor with flat ground, filmed densely."""
+    progress.set_quiet(True)
+    scene = filmed_corridor(tmp_path_factory.mktemp("corridor") / "scene", frames=16)
+    mesh = scene.stage("mesh")
+    mesh.mkdir()
+    flat = np.zeros((80, 240))
+    Ground(flat, np.array([-4.0, -4.0]), 0.1, flat == 0.0, np.zeros((*flat.shape, 3), np.uint8)).save(mesh)
+    for stage in ("metric", "mesh"):
+        (scene.stage(stage) / "stamp.json").write_text("{}")
+    return scene
+
+
+LOW = replace(ASKEW, camera_height=1.1)
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    """Frames of a robot's camera in the corridor, and where it was."""
+    poses = drive(LOW, lambda xy: np.zeros(len(xy)), length=7.0, count=28, weave=0.3)
+    return [picture(pose) for pose in poses], poses
+
+
+@pytest.fixture(scope="module")
+def registered(scene, filmed):
+    """The frames as they are found without a word of the lens."""
+    return register_film(filmed[0], None, scene)
+
+
+@pytest.fixture
+def found_once(registered, monkeypatch):
+    """Registering takes long; a lens that is given is kept."""
+    monkeypatch.setattr(
+        "twin.alignment.camera.register_film",
+        lambda frames, given, scene: replace(registered, lens=given or registered.lens),
+    )
+
+
+def test_a_film_is_found_with_its_focal_length(registered, filmed):
+    assert registered.frames.tolist() == list(range(len(filmed[0])))
+    assert registered.lens.intrinsics == pytest.approx([K[0], K[0], K[2], K[3]], rel=0.01)
+    assert 0.0 < registered.focal_error < 3.0
+    for pose, true in zip(registered.camera_to_world, filmed[1], strict=True):
+        assert np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.06
+        assert np.degrees(rotation_angle(pose[:3, :3].T @ true[:3, :3])) < 0.4
+
+
+def test_frames_of_something_else_are_left_out(scene, filmed):
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    found = register_film([noise, filmed[0][4], noise, filmed[0][6]], GIVEN, scene)
+    assert found.frames.tolist() == [1, 3] and found.lens == GIVEN and found.focal_error == 0.0
+    with pytest.raises(InputError, match="none of the 2 frames shows the place"):
+        register_film([noise, noise], GIVEN, scene)
+
+
+@pytest.fixture(scope="module")
+def film(filmed, tmp_path_factory):
+    """The frames as a file."""
+    path = tmp_path_factory.mktemp("film") / "robot.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 2.0, (320, 240))
+    for frame in filmed[0]:
+        writer.write(frame[..., ::-1])
+    writer.release()
+    return path
+
+
+def test_a_camera_is_aligned_by_its_film(scene, film):
+    known = HuskyParams(camera_intrinsics=tuple(K), camera_size=(320, 240), camera_offset=LOW.camera_offset)
+    aligned, frames = align_camera(film, scene, known)
+    assert len(frames) == aligned.frames >= 26
+    assert "camera_intrinsics" not in aligned.identified  # as it was given
+    for name, limit in {"height": 0.02, "yaw": 0.4, "pitch": 0.3, "roll": 0.3}.items():
+        value, error = aligned.identified[f"camera_{name}"]
+        assert value == pytest.approx(getattr(LOW, f"camera_{name}"), abs=limit), name
+        assert 0.0 < error < limit
+    json.dumps(aligned.figures())
+
+
+def test_the_verb_keeps_the_robot_and_says_what_overrules(scene, film, found_once, capsys, monkeypatch):
+    """What robot.toml had stays, an earlier film's focal length is found anew, and a lens by hand is believed."""
+    shown = []
+    monkeypatch.setattr("twin.alignment.camera.pictures", lambda *given: shown.append(given))
+    robot, config = scene.root / "robot.toml", scene.config_file
+    before = config.read_text()
+    robot.write_text("friction = 0.6\ncamera_intrinsics = [400.0, 400.0, 160.0, 120.0]\ncamera_size = [320, 240]\n")
+    config.write_text(before + "[metric]\ncamera_height = 1.2\n[robot]\ncamera_pitch = 5.0\n")
+    assert main([str(scene.root), str(film)]) == 0
+    out = capsys.readouterr().out
+    assert "camera_yaw = " in out and "overrules what was fitted: camera_pitch;" in out
+    table = read_robot(robot)
+    assert table["friction"] == 0.6
+    assert table["camera_intrinsics"] == pytest.approx([K[0], K[0], K[2], K[3]], rel=0.01)
+    assert table["camera_height"] == pytest.approx(1.1, abs=0.02)
+    assert shown[0][-1].camera_yaw == table["camera_yaw"]
+    by_hand = "[robot]\ncamera_intrinsics = [260.0, 260.0, 160.0, 120.0]\ncamera_size = [320, 240]\n"
+    config.write_text(before + "[metric]\ncamera_height = 1.2\n" + by_hand)
+    robot.write_text("")
+    assert main([str(scene.root), str(film)]) == 0
+    assert "camera_intrinsics" not in read_robot(robot)
+    config.write_text(before)
+    robot.unlink()
+
+
+def test_what_cannot_be_used_is_refused_in_a_line(scene, film, registered, tmp_path, capsys, monkeypatch):
+    config = scene.config_file
+    before = config.read_text()
+    config.write_text(before + "[metric]\ncamera_height = 1.2\n")
+
+    def refused(*arguments: str) -> str:
+        assert main(list(arguments)) == 2
+        return capsys.readouterr().err
+
+    assert "nothing.mp4: no such film" in refused(str(scene.root), str(tmp_path / "nothing.mp4"))
+    assert "give the scene's folder" in refused("husky", str(film))
+    assert "--out and --level belong to a log" in refused(str(scene.root), str(film), "--level")
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    (bare / "scene.toml").write_text(config.read_text())
+    assert "is not built; run python -m twin.build" in refused(str(bare), str(film))
+    assert not (bare / "robot.toml").exists()
+    bent = replace(registered, error=0.9)
+    with monkeypatch.context() as patch:
+        patch.setattr("twin.alignment.camera.register_film", lambda *_: bent)
+        assert "0.9 px off where a pinhole camera would show them, expected at most 0.8; rectify" in refused(
+            str(scene.root), str(film)
+        )
+    (tmp_path / "text.mp4").write_text("no film")
+    assert "text.mp4" in refused(str(scene.root), str(tmp_path / "text.mp4"))
+    config.write_text(before)
+
+
+def test_a_seat_that_stays_unknown_is_refused(scene, film, found_once, monkeypatch):
+    vague = Seat(0.001, 0.5, 0.1, 0.1)
+    monkeypatch.setattr("twin.alignment.camera.find_seat", lambda *_: (Seat(1.0, 0.0, 5.0, 0.0), vague))
+    known = HuskyParams(camera_intrinsics=tuple(K), camera_size=(320, 240))
+    with pytest.raises(InputError, match=r"uncertain by 0\.50, 0\.10, 0\.10° .* film a longer drive"):
+        align_camera(film, scene, known)
+
+
+def test_heading_is_the_way_the_base_looks():
+    poses = drive(ASKEW, weave=0.0, count=3)
+    np.testing.assert_allclose(heading_of(poses, np.deg2rad(1.4)), 0.0, atol=2e-3)

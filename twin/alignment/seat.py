@@ -1,0 +1,147 @@
+"""How the front camera sits on a robot, by where it was while the robot drove over known ground.
+
+The *seat* is the camera's height above flat ground and how it is turned from looking straight ahead: yaw to the left,
+pitch down, roll to the right. Height, pitch and roll are what a pose differs by from that of a base at rest on the
+ground below. Yaw shows in the direction of travel: a base that does not slide sideways goes where it heads, so what its
+steps, from frame to frame, go sideways must not add up along the way. A camera ahead of the point that the robot turns
+about swings outwards, so that the distance between the two is fitted along.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from twin.errors import InputError
+from twin.mjcf.export import rest_pose
+from twin.robot import BASE_HEIGHT, HuskyParams
+
+Array = NDArray[np.float64]
+
+_MIN_FRAMES, _MIN_WAY = 16, 6.0  # frames, [m]
+_PARTS = 8  # of the film, by whose disagreement errors are told
+_NOISE, _OUTLYING = 0.01, 0.03  # [m] that a sum of sideways steps is off, and from which on it counts less
+_PIVOT = 0.1  # [m] that the point the robot turns about may well be before or behind the base's origin
+_ROUNDS = 3
+_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Axes right, down and forward (columns) of a camera that looks straight ahead, in the base."""
+
+
+@dataclass(frozen=True)
+class Seat:
+    """Values or standard errors of a camera's seat."""
+
+    height: float
+    """[m]"""
+    yaw: float
+    """[°]"""
+    pitch: float
+    """[°]"""
+    roll: float
+    """[°]"""
+
+
+def find_seat(
+    camera_to_world: Array, ground_at: Callable[[Array], Array], offset: tuple[float, float]
+) -> tuple[Seat, Seat]:
+    """The seat, and its standard errors: a jackknife over consecutive parts of the film.
+
+    Args:
+        camera_to_world: OpenCV axes, in the order they were filmed [m], shape (n, 4, 4).
+        ground_at: Height of the ground [m] at points (n, 2), shape (n,).
+        offset: Of the lens forward and left of the base's origin [m].
+
+    Raises:
+        InputError: too few frames, or too short a way.
+    """
+    poses = np.asarray(camera_to_world, float)
+    way = float(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1).sum())
+    if len(poses) < _MIN_FRAMES or way < _MIN_WAY:
+        raise InputError(
+            f"{len(poses)} frames of the film were found on the place, over {way:.1f} m; expected at least "
+            f"{_MIN_FRAMES} over {_MIN_WAY:g} m; drive further, slowly, on the filmed path and in light such as some "
+            "film's"
+        )
+    every = np.ones(len(poses), bool)
+    headings = heading_of(poses, 0.0)
+    yaw, lens, bases = 0.0, np.array([*offset, 0.0]), poses[:, :2, 3]
+    for _ in range(_ROUNDS):  # where a base is and heads shows once it is known how the camera sits on it
+        angles, heights, bases = _stances(poses, headings - yaw, ground_at, lens)
+        lens[2], headings = heights.mean(), _headings(poses, angles[:, 1:].mean(0))
+        yaw = _yaw(bases, headings, every)
+    part = np.arange(len(poses)) * _PARTS // len(poses)
+    without = []
+    for k in range(_PARTS):
+        rest = part != k
+        without.append((heights[rest].mean(), _yaw(bases, headings, rest), *angles[rest, 1:].mean(0)))
+    spread = np.sqrt((_PARTS - 1) * np.var(without, axis=0))
+    value = Seat(float(lens[2]) + BASE_HEIGHT, float(np.degrees(yaw)), *np.degrees(angles[:, 1:].mean(0)).tolist())
+    return value, Seat(float(spread[0]), *np.degrees(spread[1:]).tolist())
+
+
+def seated(params: HuskyParams, position: Array, heading: float, ground_at: Callable[[Array], Array]) -> Array:
+    """camera_to_world (4, 4), OpenCV axes, of a robot's camera at x, y (2,) [m] whose base heads some way [rad]."""
+    base, rotation = _base(position, heading, ground_at, np.array(params.camera_position))
+    pose = np.eye(4)
+    pose[:3, :3] = rotation @ params.camera_rotation * [1.0, -1.0, -1.0]
+    pose[:3, 3] = base + rotation @ params.camera_position
+    return pose
+
+
+def heading_of(camera_to_world: Array, yaw: float) -> Array:
+    """Headings [rad] of bases whose cameras have these poses (..., 4, 4) and look left by a yaw [rad], shape (...)."""
+    return np.arctan2(camera_to_world[..., 1, 2], camera_to_world[..., 0, 2]) - yaw
+
+
+def _headings(poses: Array, lean: Array) -> Array:
+    """Headings [rad] (n,) of bases whose cameras look straight ahead but for a pitch and a roll [rad] (2,)."""
+    base = poses[:, :3, :3] @ _AHEAD.T @ Rotation.from_euler("YX", lean).as_matrix().T
+    return np.arctan2(base[:, 1, 0], base[:, 0, 0])
+
+
+def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
+    """How far the camera looks left of where the base goes [rad].
+
+    Args:
+        bases: Where the base is, x, y [m], shape (n, 2).
+        headings: Of the base if that were nothing [rad], shape (n,).
+        use: Frames, shape (n,); used are the steps between those that follow each other.
+    """
+    way, steps = np.diff(bases, axis=0), use[1:] & use[:-1]
+
+    def sideways(unknown: Array) -> Array:
+        """Sum of what the point that the robot turns about, `pivot` before the base's origin [m], went sideways [m]."""
+        yaw, pivot, start = unknown
+        heads = headings - yaw
+        off = way + np.diff(pivot * np.stack([np.cos(heads), np.sin(heads)], 1), axis=0)
+        middle = heads[:-1] + np.angle(np.exp(1j * np.diff(heads))) / 2.0
+        sums = np.cumsum((off[:, 1] * np.cos(middle) - off[:, 0] * np.sin(middle))[steps])
+        return np.append(sums - start, _NOISE * pivot / _PIVOT)
+
+    return float(least_squares(sideways, np.zeros(3), loss="soft_l1", f_scale=_OUTLYING).x[0])
+
+
+def _stances(
+    poses: Array, headings: Array, ground_at: Callable[[Array], Array], lens: Array
+) -> tuple[Array, Array, Array]:
+    """Of cameras over bases at rest below: yaw, pitch, roll [rad] (n, 3), heights above the bases' origins [m] (n,),
+    and x, y of these [m] (n, 2)."""
+    angles, heights, bases = np.zeros((len(poses), 3)), np.zeros(len(poses)), np.zeros((len(poses), 2))
+    for i, (pose, heading) in enumerate(zip(poses, headings, strict=True)):
+        base, rotation = _base(pose[:2, 3], heading, ground_at, lens)
+        angles[i] = Rotation.from_matrix(rotation.T @ pose[:3, :3] @ _AHEAD.T).as_euler("ZYX")
+        heights[i], bases[i] = (rotation.T @ (pose[:3, 3] - base))[2], base[:2]
+    return angles, heights, bases
+
+
+def _base(position: Array, heading: float, ground_at: Callable[[Array], Array], lens: Array) -> tuple[Array, Array]:
+    """Origin [m] and axes (3, 3) of a base at rest whose lens, at a place in the base (3,), is at x, y (2,)."""
+    rotation = Rotation.from_euler("Z", heading).as_matrix()
+    arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # from the ground
+    for _ in range(2):  # a base that leans carries its lens to the side
+        origin, (w, x, y, z) = rest_pose(ground_at, position - (rotation @ arm)[:2], heading)
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+    return origin, rotation

@@ -1,0 +1,67 @@
+"""A film by the camera of reality's Husky while someone drives it down the filmed road, in light that was filmed, too:
+what `twin.align` may learn of how the camera sits. No poses come with it."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.env.options import Options
+from twin.progress import track
+from twin.reality import world as worlds
+from twin.reality.eye import Eye
+from twin.reality.film import Plan, encode
+from twin.reality.lighting import LIGHTINGS
+from twin.reality.raster import Raster
+from twin.reality.road import Road, place
+from twin.reality.robot import robot
+from twin.reality.route import Route
+from twin.reality.things import SEED
+
+LIGHTING = "overcast"
+
+_STATIONS = (4.0, 30.0)  # [m] along the road
+_SPEED = 0.6  # [m/s]
+_WEAVE, _PERIOD = 0.5, 11.0  # [m] to either side, [m] along the road: so that it turns a little
+_TO_LINE, _TO_HEADING = 0.8, 1.5  # [rad/m], [1/s]
+_FPS = 4
+_CONTROL = 0.05  # [s]
+
+
+def write(path: Path) -> None:
+    """Drives and films; a few frames a second will do, as the robot is slow."""
+    husky = robot()
+    width, height = husky.params.camera_size
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frames = round((_STATIONS[1] - _STATIONS[0]) / _SPEED * _FPS)
+    plan = replace(Plan(), width=width, height=height, fps=_FPS, crf=16)
+    encode(track(_pictures(frames), "film from the robot", unit="frame", total=frames), plan, path)
+
+
+def _pictures(count: int) -> Iterator[NDArray[np.uint8]]:
+    husky, line = robot(), Route()
+    road = Road("straight", husky, Options(pixels=False))
+    size = husky.params.camera_size
+    intrinsics = road.intrinsics(size)
+    light = LIGHTINGS[LIGHTING]
+    raster = Raster(worlds.spec(light, place()).compile(), intrinsics, size)
+    eye = Eye(raster, light, husky, intrinsics, size, np.random.default_rng([SEED, 43]))
+    physics = road.physics.robot
+    start = line.at(_STATIONS[0])
+    physics.place(float(start[0]), float(start[1]), float(line.heading(_STATIONS[0])))
+    for i in range(count):
+        yield eye.look(road.physics.camera_to_world, i / _FPS)
+        for _ in range(round(1.0 / _FPS / _CONTROL)):
+            physics.command(_SPEED, _towards(line, physics.planar_pose))
+            physics.step(_CONTROL)
+
+
+def _towards(line: Route, pose: NDArray[np.float64]) -> float:
+    """Yaw rate [rad/s] that leads a base at x, y, yaw back to the weaving line."""
+    station, lateral = (float(value[0]) for value in line.project(pose[None, :2]))
+    phase = 2.0 * np.pi * station / _PERIOD
+    slope = _WEAVE * 2.0 * np.pi / _PERIOD * np.cos(phase)
+    wanted = float(line.heading(station)) + np.arctan(slope) - _TO_LINE * (lateral - _WEAVE * np.sin(phase))
+    return float(_TO_HEADING * np.angle(np.exp(1j * (wanted - pose[2]))))
