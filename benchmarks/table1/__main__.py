@@ -5,8 +5,8 @@
 films reality and builds the twin in SCENE (unless that is done), aligns its robot to a drive log of reality's Husky and
 to a film by that one's camera, trains the three setups on both tasks, validates every policy in the twin under held-out
 lightings, as filmed and with all else drawn anew, drives them in reality under weather that neither has seen, and
-forecasts. Every step is a command of `twin`, goes on where it was cut off, and adds to what is there: the same call with more seeds keeps all runs.
-`results.json` beside this file holds every run. Setups, sizes, checkpoints: `plan.py`.
+forecasts. Every step is a command of `twin`, goes on where it was cut off, and adds to what is there: the same call
+with more seeds keeps all runs. `results.json` beside this file holds every run. Setups, sizes, checkpoints: `plan.py`.
 """
 
 import argparse

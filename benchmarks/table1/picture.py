@@ -8,6 +8,7 @@ left there.
 """
 
 import argparse
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from twin.report.training import success_curve
 Picture = NDArray[np.uint8]
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
+_PER_ROW = 5  # pictures
 _SEEDS = range(1, 1 + len(WEATHER))  # of the twin's pictures
 _PAPER = {
     INK: "#16202a",
@@ -55,9 +57,9 @@ def main() -> None:
     curve = cv2.imread(str(success_curve(run)))[..., ::-1]
     parts = [
         _caption("The road as the twin shows it in randomised episodes: lights, suns, shadows and haze are drawn anew"),
-        _row([_first(given.scene, seed) for seed in _SEEDS]),
+        *_rows([_first(given.scene, seed) for seed in _SEEDS]),
         _caption("The road of the real test: weather that nobody filmed, things that were moved"),
-        _row(road, list(WEATHER)),
+        *_rows(road, list(WEATHER)),
         _side_by_side(_drawn(drawn), curve),
     ]
     whole = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
@@ -91,7 +93,13 @@ def _caption(text: str) -> Picture:
     return _written(out, text, (_GAP, _LINE - 11), 0.62, (20, 20, 20))
 
 
-def _row(pictures: list[Picture], names: list[str] | None = None) -> Picture:
+def _rows(pictures: list[Picture], names: Sequence[str] = ()) -> list[Picture]:
+    """Pictures of one size, `_PER_ROW` beside each other."""
+    starts = range(0, len(pictures), _PER_ROW)
+    return [_row(pictures[i : i + _PER_ROW], names[i : i + _PER_ROW]) for i in starts]
+
+
+def _row(pictures: list[Picture], names: Sequence[str]) -> Picture:
     """Pictures of one size beside each other, over the whole width."""
     width = (_WIDTH - _GAP) // len(pictures) - _GAP
     height = round(width * pictures[0].shape[0] / pictures[0].shape[1])

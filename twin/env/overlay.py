@@ -97,9 +97,11 @@ class Overlay:
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
         lightings: list[Lighting] = [lighting] * len(datas) if one else list(lighting)  # type: ignore[list-item]
 
-        def paint(number: int) -> None:
-            for k in range(number, len(datas), len(self._painters)):
-                self._paint(self._painters[number], datas[k], poses[k], lightings[k], out, k)
+        todo = iter(range(len(datas)))  # shared: whoever is done takes the next, as cores are not equally fast
+
+        def paint(painter: _Painter) -> None:
+            for k in todo:
+                self._paint(painter, datas[k], poses[k], lightings[k], out, k)
                 if weather and (sky := weather[k]):
                     out.rgb[k] = sky.over(out.rgb[k], out.depth[k], self._rays, poses[k])
                 if effects:
@@ -107,9 +109,9 @@ class Overlay:
                     out.rgb[k] = effects[k].exposed(out.rgb[k], out.depth[k], *now)
 
         if self._pool is None:
-            paint(0)
+            paint(self._painters[0])
         else:
-            list(self._pool.map(paint, range(len(self._painters))))
+            list(self._pool.map(paint, self._painters))
         return out
 
     def _paint(
