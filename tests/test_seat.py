@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import mujoco
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from textured import K, filmed_corridor, picture
@@ -13,17 +14,20 @@ from tiny_world import tiny_world
 
 from twin import progress
 from twin.align import main
+from twin.alignment.aligned import toml_text
 from twin.alignment.camera import align_camera
 from twin.alignment.seat import Seat, find_seat, heading_of, seated
 from twin.assets.ground import Ground
 from twin.capture.lens import Lens
-from twin.capture.register import register_film
-from twin.config_file import read_robot
+from twin.capture.register_film import _shared_focal, _Sight, register_film
+from twin.config_file import overruled, read_robot
 from twin.errors import InputError
+from twin.geometry.images import read_image
 from twin.geometry.poses import rotation_angle
 from twin.mjcf import husky
 from twin.mjcf.export import rest_pose
 from twin.mjcf.world import World
+from twin.nerf.rendering import Rendering
 from twin.robot import BASE_HEIGHT, HuskyParams
 
 ASKEW = HuskyParams(camera_height=0.75, camera_yaw=1.4, camera_pitch=7.0, camera_roll=-2.0, camera_offset=(0.3, 0.05))
@@ -50,8 +54,8 @@ def drive(robot: HuskyParams, ground=hills, length: float = 18.0, count: int = 9
     return poses
 
 
-def shaken(poses: np.ndarray, metres: float, degrees: float) -> np.ndarray:
-    rng, out = np.random.default_rng(0), poses.copy()
+def shaken(poses: np.ndarray, metres: float, degrees: float, seed: int = 0) -> np.ndarray:
+    rng, out = np.random.default_rng(seed), poses.copy()
     out[:, :3, 3] += rng.normal(0.0, metres, (len(out), 3))
     for pose in out:
         pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(rng.normal(0.0, np.deg2rad(degrees), 3))[0]
@@ -122,6 +126,31 @@ def test_driving_straight_or_backwards_tells_the_yaw_too():
         assert find_seat(poses, hills, ASKEW.camera_offset)[0].yaw == pytest.approx(1.4, abs=0.05)
 
 
+def test_gaps_and_wrong_frames_do_no_harm():
+    """Frames that were not found, and one that was found elsewhere."""
+    poses = shaken(drive(ASKEW), 0.005, 0.1)
+    astray = poses.copy()
+    astray[44, :3, 3] += [5.0, 3.0, 2.0]
+    lost = np.delete(poses, range(40, 52), 0)  # 2.4 m
+    for film in (lost, astray):
+        seat, error = find_seat(film, hills, ASKEW.camera_offset)
+        assert (seat.yaw, seat.pitch, seat.roll) == pytest.approx((1.4, 7.0, -2.0), abs=0.15)
+        assert seat.height == pytest.approx(0.75, abs=0.005)
+        assert error.yaw < 0.2
+
+
+@pytest.mark.slow
+def test_errors_are_of_the_size_that_they_say():
+    """Over many films: neither a third nor three times of what the values scatter by."""
+    off = []
+    for seed in range(24):
+        seat, error = find_seat(shaken(drive(ASKEW), 0.01, 0.3, seed), hills, ASKEW.camera_offset)
+        names = ("height", "yaw", "pitch", "roll")
+        off.append([(getattr(seat, n) - getattr(ASKEW, f"camera_{n}")) / getattr(error, n) for n in names])
+    rms = np.sqrt(np.mean(np.square(off), axis=0))
+    assert np.all(rms > 1 / 3) and np.all(rms < 1.8), rms
+
+
 def test_a_short_film_is_refused():
     poses = drive(ASKEW)
     with pytest.raises(InputError, match=r"10 frames .* over 1\.\d m; expected at least 16 over 6 m"):
@@ -142,7 +171,8 @@ def scene(tmp_path_factory):
     mesh.mkdir()
     flat = np.zeros((80, 240))
     Ground(flat, np.array([-4.0, -4.0]), 0.1, flat == 0.0, np.zeros((*flat.shape, 3), np.uint8)).save(mesh)
-    for stage in ("metric", "mesh"):
+    scene.stage("field").mkdir()
+    for stage in ("metric", "field", "mesh"):
         (scene.stage(stage) / "stamp.json").write_text("{}")
     return scene
 
@@ -212,57 +242,133 @@ def test_a_camera_is_aligned_by_its_film(scene, film):
     json.dumps(aligned.figures())
 
 
-def test_the_verb_keeps_the_robot_and_says_what_overrules(scene, film, found_once, capsys, monkeypatch):
-    """What robot.toml had stays, an earlier film's focal length is found anew, and a lens by hand is believed."""
-    shown = []
-    monkeypatch.setattr("twin.alignment.camera.pictures", lambda *given: shown.append(given))
-    robot, config = scene.root / "robot.toml", scene.config_file
-    before = config.read_text()
+class Painted:
+    """Stands for the field: the corridor itself, under two lightings of which the second is the film's."""
+
+    lightings = ("night", "day")
+
+    def field(self):
+        return self
+
+    def render(self, views, lighting):
+        (pose,), (intrinsics,), (size,) = views.camera_to_world, views.intrinsics, views.sizes
+        rgb = picture(pose, tuple(size), intrinsics) / 255.0 * (1.0 if lighting == "day" else 0.1)
+        return Rendering(rgb[None], rgb[None, ..., 0], rgb[None, ..., 0])
+
+
+@pytest.fixture
+def place(scene, monkeypatch):
+    """The scene, with a scene.toml that can be read and changed, and nothing of a robot yet."""
+    monkeypatch.setattr("twin.alignment.camera.load_scene", lambda root: Painted())
+    before = scene.config_file.read_text()
+    scene.config_file.write_text(before + "[metric]\ncamera_height = 1.2\n")
+    yield scene
+    scene.config_file.write_text(before)
+    for made in (scene.root / "robot.toml", scene.root / "alignment" / "camera.json"):
+        made.unlink(missing_ok=True)
+
+
+def by_hand(place, text: str) -> None:
+    with place.config_file.open("a") as file:
+        file.write("[robot]\n" + text)
+
+
+def test_the_verb_keeps_the_robot_and_shows_what_it_found(place, film, found_once, capsys):
+    """What robot.toml had stays, an earlier film's focal length is found anew; the pictures are of the same spots."""
+    robot = place.root / "robot.toml"
     robot.write_text("friction = 0.6\ncamera_intrinsics = [400.0, 400.0, 160.0, 120.0]\ncamera_size = [320, 240]\n")
-    config.write_text(before + "[metric]\ncamera_height = 1.2\n[robot]\ncamera_pitch = 5.0\n")
-    assert main([str(scene.root), str(film)]) == 0
-    out = capsys.readouterr().out
-    assert "camera_yaw = " in out and "overrules what was fitted: camera_pitch;" in out
+    by_hand(place, "camera_offset = [0.3, 0.05]\nmax_speed = 0.8\n")
+    assert main([str(place.config_file), str(film)]) == 0
+    assert "camera_yaw = " in capsys.readouterr().out
     table = read_robot(robot)
-    assert table["friction"] == 0.6
+    assert table["friction"] == 0.6 and "max_speed" not in table
     assert table["camera_intrinsics"] == pytest.approx([K[0], K[0], K[2], K[3]], rel=0.01)
     assert table["camera_height"] == pytest.approx(1.1, abs=0.02)
-    assert shown[0][-1].camera_yaw == table["camera_yaw"]
-    by_hand = "[robot]\ncamera_intrinsics = [260.0, 260.0, 160.0, 120.0]\ncamera_size = [320, 240]\n"
-    config.write_text(before + "[metric]\ncamera_height = 1.2\n" + by_hand)
-    robot.write_text("")
-    assert main([str(scene.root), str(film)]) == 0
-    assert "camera_intrinsics" not in read_robot(robot)
-    config.write_text(before)
-    robot.unlink()
+    figures = json.loads((place.root / "alignment" / "camera.json").read_text())
+    assert figures["robot"]["camera_yaw"]["value"] == pytest.approx(table["camera_yaw"], rel=1e-4)
+    both = read_image(place.root / "alignment" / "camera.png")
+    assert both.shape == (3 * 240, 2 * 320, 3)
+    filmed, seen = both[:, :320].astype(float), both[:, 320:].astype(float)
+    alike = np.corrcoef(filmed.ravel(), seen.ravel())[0, 1]
+    aside = np.corrcoef(filmed[:, 3:].ravel(), seen[:, :-3].ravel())[0, 1]
+    assert alike > 0.6 and alike > aside + 0.1  # a degree is 4.5 px
 
 
-def test_what_cannot_be_used_is_refused_in_a_line(scene, film, registered, tmp_path, capsys, monkeypatch):
-    config = scene.config_file
-    before = config.read_text()
-    config.write_text(before + "[metric]\ncamera_height = 1.2\n")
+def test_a_lens_by_hand_is_believed(place, film, found_once, capsys):
+    robot = place.root / "robot.toml"
+    robot.write_text("camera_intrinsics = [400.0, 400.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
+    by_hand(place, "camera_pitch = 5.0\ncamera_intrinsics = [520.0, 520.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
+    assert main([str(place.root), str(film)]) == 0
+    assert "overrules what was fitted: camera_pitch;" in capsys.readouterr().out
+    assert not {"camera_intrinsics", "camera_size"} & set(read_robot(robot))
 
+
+def test_what_cannot_be_used_is_refused_in_a_line(place, film, registered, tmp_path, capsys, monkeypatch):
     def refused(*arguments: str) -> str:
         assert main(list(arguments)) == 2
         return capsys.readouterr().err
 
-    assert "nothing.mp4: no such film" in refused(str(scene.root), str(tmp_path / "nothing.mp4"))
-    assert "give the scene's folder" in refused("husky", str(film))
-    assert "--out and --level belong to a log" in refused(str(scene.root), str(film), "--level")
+    root = str(place.root)
+    assert "nothing.mp4: no such film" in refused(root, str(tmp_path / "nothing.mp4"))
+    for other in ("husky", str(place.root / "robot.toml")):
+        assert "give the scene's folder" in refused(other, str(film))
+    for more in (("--level",), ("--out", str(tmp_path))):
+        assert "--out and --level belong to a log" in refused(root, str(film), *more)
     bare = tmp_path / "bare"
     bare.mkdir()
-    (bare / "scene.toml").write_text(config.read_text())
+    (bare / "scene.toml").write_text(place.config_file.read_text())
     assert "is not built; run python -m twin.build" in refused(str(bare), str(film))
-    assert not (bare / "robot.toml").exists()
+    assert [path.name for path in bare.iterdir()] == ["scene.toml"]
     bent = replace(registered, error=0.9)
     with monkeypatch.context() as patch:
         patch.setattr("twin.alignment.camera.register_film", lambda *_: bent)
         assert "0.9 px off where a pinhole camera would show them, expected at most 0.8; rectify" in refused(
-            str(scene.root), str(film)
+            root, str(film)
         )
     (tmp_path / "text.mp4").write_text("no film")
-    assert "text.mp4" in refused(str(scene.root), str(tmp_path / "text.mp4"))
-    config.write_text(before)
+    assert "text.mp4" in refused(root, str(tmp_path / "text.mp4"))
+    by_hand(place, "camera_intrinsics = [520.0, 520.0, 640.0, 360.0]\ncamera_size = [1280, 720]\n")
+    assert "the film is 320x240, but camera_intrinsics in [robot] are for 1280x720" in refused(root, str(film))
+    assert not (place.root / "robot.toml").exists()
+
+
+def test_a_size_without_its_intrinsics_is_refused():
+    fitted = {"camera_intrinsics": [512.0, 512.0, 320.0, 180.0], "camera_size": [640, 360], "friction": 0.6}
+    with pytest.raises(InputError, match=r"camera_size = \[1280, 720\], but robot\.toml has the camera_intrinsics"):
+        overruled(fitted, {"camera_size": [1280, 720]}, "scene.toml")
+    own = {"camera_intrinsics": [1000.0, 1000.0, 640.0, 360.0]}
+    assert overruled(fitted, own, "scene.toml") == {"friction": 0.6, **own}
+
+
+def test_a_name_that_toml_does_not_take_is_made_one(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(toml_text("fitted to b\nc\x01\udcff.mp4", {"friction": 0.5}, {}), encoding="utf-8")
+    assert read_robot(path) == {"friction": 0.5}
+
+
+def sights(nearest: float, farthest: float) -> list[_Sight]:
+    """Frames of points at such distances [m], seen with a focal length of 260 px."""
+    rng, out = np.random.default_rng(0), []
+    for _ in range(12):
+        place = np.column_stack([rng.uniform(-3, 3, (80, 2)), rng.uniform(nearest, farthest, 80)])
+        image = 260.0 * place[:, :2] / place[:, 2:] + [160.0, 120.0] + rng.normal(0.0, 0.3, (80, 2))
+        out.append(_Sight(image, place, pycolmap.Rigid3d(), 260.0))
+    return out
+
+
+def simple(focal: float) -> dict:
+    return vars(Lens("SIMPLE_PINHOLE", (focal, 160.0, 120.0), 320, 240))
+
+
+@pytest.mark.parametrize("start", [245.0, 259.0, 275.0])
+def test_the_focal_length_is_found_with_its_error(start):
+    focal, error = _shared_focal(sights(3.0, 15.0), simple(start))
+    assert 0.0 < error < 1.5 and abs(focal - 260.0) < 3.5 * error
+
+
+def test_a_wall_in_front_does_not_tell_the_focal_length():
+    with pytest.raises(InputError, match="does not show the camera's focal length; give camera_intrinsics"):
+        _shared_focal(sights(6.0, 6.01), simple(260.0))
 
 
 def test_a_seat_that_stays_unknown_is_refused(scene, film, found_once, monkeypatch):

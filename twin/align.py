@@ -27,7 +27,7 @@ from twin import progress
 from twin.alignment.aligned import Alignment, align, robot_toml, told_error, toml_text
 from twin.alignment.checks import check
 from twin.alignment.logs import read_log
-from twin.config_file import ROBOT_TOML, load_config, parse, read_robot
+from twin.config_file import ROBOT_TOML, load_config, overruled, parse, read_robot
 from twin.errors import InputError, refuse
 from twin.robot import HuskyParams
 from twin.scene import SceneDir, digest_file, write_json, write_text
@@ -39,6 +39,7 @@ FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 """Suffixes of what is taken for a film."""
 FOLDER = "alignment"
 """Where figures and pictures go, beside `robot.toml`."""
+_LENS = ("camera_intrinsics", "camera_size")
 PUBLISHED = "husky"
 """Said instead of a scene: the published robot."""
 
@@ -71,8 +72,8 @@ def run(target: str, log: Path, out: Path | None = None, use_slope: bool = True)
 
     draw(pictures, result.windows, result.fitted, result.baseline)
     figures = {"log": str(log), "log_sha256": digest_file(log) if log.is_file() else None} | result.figures()
-    write_json(pictures / "align.json", figures)
     write_text(folder / ROBOT_TOML, robot_toml(result, kept, str(log)))
+    write_json(pictures / "align.json", figures)
     return result, folder
 
 
@@ -88,25 +89,27 @@ def run_camera(target: str, film: Path) -> "tuple[CameraAlignment, Path]":
     """
     from twin.alignment.camera import align_camera, pictures
 
+    root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
+    if not SceneDir(root).config_file.exists():
+        raise InputError(f"{target}: a film is found on a built place; give the scene's folder")
     if not film.is_file():
         raise InputError(f"{film}: no such film")
-    params, kept, folder = _robot(target)
-    if folder is None or not SceneDir(folder).config_file.exists():
-        raise InputError(f"{target}: a film is found on a built place; give the scene's folder")
-    scene, shown = SceneDir(folder), folder / FOLDER
-    _writable(shown)
-    # What robot.toml has of the camera may come from an earlier film, which this one replaces.
-    by_hand = parse(HuskyParams, _own(folder), str(scene.config_file))
-    params = replace(params, camera_intrinsics=by_hand.camera_intrinsics, camera_size=by_hand.camera_size)
+    scene, by_hand = SceneDir(root), _by_hand(root)
+    params = load_config(scene.config_file).robot
+    lens = parse(HuskyParams, {name: by_hand[name] for name in _LENS if name in by_hand}, str(scene.config_file))
+    # What robot.toml has of the lens may come from an earlier film, which this one replaces.
+    params = replace(params, camera_intrinsics=lens.camera_intrinsics, camera_size=lens.camera_size)
     result, frames = align_camera(film, scene, params)
-    told = f"The camera was fitted to {film.name} by python -m twin.align: {result.told}."
-    text = toml_text(told, kept, result.identified)
-    robot = parse(HuskyParams, tomllib.loads(text), ROBOT_TOML)
-    pictures(shown, result, frames, scene, robot)
+    kept = {name: value for name, value in read_robot(root / ROBOT_TOML).items() if name not in _LENS}
+    text = toml_text(f"The camera was fitted to {film.name}: {result.in_words}.", kept, result.identified)
+    robot = overruled(tomllib.loads(text), by_hand, str(scene.config_file))
+    shown = root / FOLDER
+    _writable(shown, "make it so")
+    pictures(shown, result, frames, scene, parse(HuskyParams, robot, str(scene.config_file)))
+    write_text(root / ROBOT_TOML, text)
     figures = {"film": str(film), "film_sha256": digest_file(film)} | result.figures()
     write_json(shown / "camera.json", figures)
-    write_text(folder / ROBOT_TOML, text)
-    return result, folder
+    return result, root
 
 
 def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
@@ -123,22 +126,22 @@ def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
     return load_config(SceneDir(root).config_file).robot, read_robot(root / ROBOT_TOML), root
 
 
-def _writable(folder: Path) -> None:
+def _writable(folder: Path, cure: str = "give another folder with --out") -> None:
     """Makes a folder, and writes a file there and takes it away again."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written to: {error}; give another folder with --out") from None
+        raise InputError(f"{folder}: cannot be written to: {error}; {cure}") from None
 
 
 def hidden(folder: Path, identified: Iterable[str]) -> list[str]:
     """Fitted fields that `[robot]` of the `scene.toml` beside the written `robot.toml`, if there is one, overrules."""
-    return sorted(set(_own(folder)) & set(identified))
+    return sorted(set(_by_hand(folder)) & set(identified))
 
 
-def _own(folder: Path) -> dict[str, Any]:
+def _by_hand(folder: Path) -> dict[str, Any]:
     """`[robot]` of the `scene.toml` in a folder; empty where there is none."""
     path = SceneDir(folder).config_file
     if not path.exists():
@@ -201,7 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
             if options.out or options.level:
                 raise InputError(f"{options.log} is a film; --out and --level belong to a log")
             camera, folder = run_camera(options.robot, options.log)
-            identified, lines = camera.identified, "\n".join([camera.told, "fitted:", *_fitted(camera.identified)])
+            identified, lines = camera.identified, "\n".join([camera.in_words, "fitted:", *_fitted(camera.identified)])
         else:
             result, folder = run(options.robot, options.log, options.out, not options.level)
             identified, lines = result.identified, summary(result)

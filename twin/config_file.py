@@ -89,7 +89,7 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
     for override in overrides:
         _apply_override(table, override)
     if isinstance(table.get("robot", {}), dict):
-        table["robot"] = read_robot(path.parent / ROBOT_TOML) | table.get("robot", {})
+        table["robot"] = overruled(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), str(path))
     config = parse(SceneConfig, table, str(path))
     if not config.name:
         config = dataclasses.replace(config, name=path.resolve().parent.name)
@@ -102,6 +102,24 @@ def read_robot(path: Path) -> dict[str, Any]:
     table = _table(path) or {}
     parse(HuskyParams, table, str(path))
     return table
+
+
+def overruled(robot: dict[str, Any], by_hand: dict[str, Any], where: str) -> dict[str, Any]:
+    """What a `robot.toml` says, but for what `[robot]` in `scene.toml` says otherwise.
+
+    Intrinsics and the size that they are for go together: whichever has the intrinsics has the size.
+
+    Raises:
+        InputError: a size by hand for intrinsics that are not; `where` opens the message.
+    """
+    if "camera_intrinsics" in by_hand:
+        robot = {name: value for name, value in robot.items() if name != "camera_size"}
+    elif "camera_size" in by_hand and "camera_intrinsics" in robot:
+        raise InputError(
+            f"{where}: robot: camera_size = {by_hand['camera_size']}, but {ROBOT_TOML} has the camera_intrinsics; give "
+            "both or neither"
+        )
+    return robot | by_hand
 
 
 def _table(path: Path) -> dict[str, Any] | None:

@@ -201,12 +201,12 @@ def toml_text(told: str, kept: dict[str, Any], identified: dict[str, tuple[Any, 
     """The text of a `robot.toml`.
 
     Args:
-        told: How it came about, in a line.
+        told: How it came about; is made one line that TOML takes.
         kept: What stood there before.
         identified: What goes before that: value and standard error, None where there is none.
     """
     lines = [
-        f"# {told}",
+        "# " + "".join(c if c.isprintable() else "?" for c in told),
         *([] if identified else ["# But nothing in it could be identified: what follows stood here before."]),
         *(f"{name} = {_toml(value)}" for name, value in kept.items() if name not in identified),
         *(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from twin import progress
 from twin.alignment.seat import Seat, find_seat, heading_of, seated
 from twin.assets.ground import Ground
-from twin.capture.lens import Lens
-from twin.capture.register import FilmRegistration, register_film
+from twin.capture.lens import Lens, same_aspect
+from twin.capture.register_film import FilmRegistration, register_film
 from twin.capture.video import FilmCount, read_film
 from twin.config import CaptureConfig
 from twin.errors import InputError
@@ -44,11 +44,11 @@ class CameraAlignment:
     seat: Seat
     error: Seat
     """Standard errors."""
-    held: bool
+    focal_given: bool
     """Whether the focal length was given."""
 
     @property
-    def told(self) -> str:
+    def in_words(self) -> str:
         """The film's fit in a line."""
         found = f"{len(self.film.frames)} of {self.frames} frames found on the place"
         return f"{found}, features {self.film.error:.2f} px off (median)"
@@ -59,7 +59,7 @@ class CameraAlignment:
         out: dict[str, tuple[Any, Any]] = {
             f"camera_{name}": (value, getattr(self.error, name)) for name, value in vars(self.seat).items()
         }
-        if not self.held:
+        if not self.focal_given:
             fx, fy, cx, cy = (float(value) for value in self.film.lens.intrinsics)
             out["camera_intrinsics"] = (fx, fy, cx, cy), (self.film.focal_error, self.film.focal_error, None, None)
             out["camera_size"] = (self.film.lens.width, self.film.lens.height), None
@@ -88,9 +88,7 @@ def align_camera(film: Path, scene: SceneDir, params: HuskyParams) -> tuple[Came
     Raises:
         InputError: a scene that is not built, or a film that does not show how the camera sits.
     """
-    for stage in ("metric", "mesh"):
-        if not (scene.stage(stage) / "stamp.json").exists():
-            raise InputError(f"{scene.root} is not built; run python -m twin.build {scene.root} and align then")
+    ground = _ground(scene)
     with progress.bar("reading the film", 0, "frame") as bar:
         frames = []
         for frame in read_film(film, _CHOICE, FilmCount(), lambda *_: None):
@@ -104,7 +102,7 @@ def align_camera(film: Path, scene: SceneDir, params: HuskyParams) -> tuple[Came
             f"{film}: features lie {found.error:.1f} px off where a pinhole camera would show them, expected at most "
             f"{worst:.1f}; rectify the film (take the distortion out of it)"
         )
-    seat, error = find_seat(found.camera_to_world, Ground.load(scene.stage("mesh")).at, params.camera_offset)
+    seat, error = find_seat(found.camera_to_world, ground.at, params.camera_offset)
     if max(error.yaw, error.pitch, error.roll) > _WORST_TURN or error.height > _WORST_HEIGHT:
         raise InputError(
             f"{film}: leaves the camera's yaw, pitch, roll uncertain by {error.yaw:.2f}, {error.pitch:.2f}, "
@@ -118,7 +116,7 @@ def pictures(
     folder: Path, alignment: CameraAlignment, frames: list[Image], scene: SceneDir, robot: HuskyParams
 ) -> None:
     """Writes `camera.png`: frames of the film, left, and what the twin's robot sees from there."""
-    field, ground = load_scene(scene.root).field(), Ground.load(scene.stage("mesh"))
+    field, ground = load_scene(scene.root).field(), _ground(scene)
     some = np.linspace(0, len(alignment.film.frames) - 1, _PICTURES + 2).round().astype(int)[1:-1]
     width, height = alignment.film.lens.width, alignment.film.lens.height
     size = min(_WIDTH, width), round(height * min(1.0, _WIDTH / width))
@@ -135,8 +133,22 @@ def pictures(
     write_image(folder / "camera.png", np.vstack(rows))
 
 
+def _ground(scene: SceneDir) -> Ground:
+    """Of a scene that is built as far as is needed here."""
+    for stage in ("metric", "field", "mesh"):
+        if not (scene.stage(stage) / "stamp.json").exists():
+            raise InputError(f"{scene.root} is not built; run python -m twin.build {scene.root} and align then")
+    return Ground.load(scene.stage("mesh"))
+
+
 def _given(params: HuskyParams, size: tuple[int, int]) -> Lens | None:
     """The lens that is known of the robot, at the film's size."""
     if not params.camera_intrinsics:
         return None
+    if not same_aspect(size, params.camera().size):
+        width, height = params.camera().size
+        raise InputError(
+            f"the film is {size[0]}x{size[1]}, but camera_intrinsics in [robot] are for {width}x{height}; "
+            "film with the whole picture, or give the intrinsics of the film"
+        )
     return Lens("PINHOLE", tuple(params.camera().resized(size).intrinsics), *size)

@@ -26,13 +26,18 @@ _PARTS = 8  # of the film, by whose disagreement errors are told
 _NOISE, _OUTLYING = 0.01, 0.03  # [m] that a sum of sideways steps is off, and from which on it counts less
 _PIVOT = 0.1  # [m] that the point the robot turns about may well be before or behind the base's origin
 _ROUNDS = 3
+_FAR_OFF, _JUMP = 8.0, 3.0  # medians: from the middle, and of steps
 _AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Axes right, down and forward (columns) of a camera that looks straight ahead, in the base."""
 
 
 @dataclass(frozen=True)
 class Seat:
-    """Values or standard errors of a camera's seat."""
+    """Values or standard errors of a camera's seat.
+
+    By how far the principal point is not where it was taken to be, yaw and pitch are off, and so they should: seen in
+    pictures they are the same.
+    """
 
     height: float
     """[m]"""
@@ -65,20 +70,20 @@ def find_seat(
             f"{_MIN_FRAMES} over {_MIN_WAY:g} m; drive further, slowly, on the filmed path and in light such as some "
             "film's"
         )
-    every = np.ones(len(poses), bool)
+    yaw, lens = 0.0, np.array([*offset, 0.0])
     headings = heading_of(poses, 0.0)
-    yaw, lens, bases = 0.0, np.array([*offset, 0.0]), poses[:, :2, 3]
     for _ in range(_ROUNDS):  # where a base is and heads shows once it is known how the camera sits on it
         angles, heights, bases = _stances(poses, headings - yaw, ground_at, lens)
-        lens[2], headings = heights.mean(), _headings(poses, angles[:, 1:].mean(0))
-        yaw = _yaw(bases, headings, every)
+        sound = _sound(np.column_stack([angles[:, 1:], heights]))
+        lens[2], headings = heights[sound].mean(), _headings(poses, angles[sound, 1:].mean(0))
+        yaw = _yaw(bases, headings, sound)
     part = np.arange(len(poses)) * _PARTS // len(poses)
     without = []
     for k in range(_PARTS):
-        rest = part != k
+        rest = sound & (part != k)
         without.append((heights[rest].mean(), _yaw(bases, headings, rest), *angles[rest, 1:].mean(0)))
     spread = np.sqrt((_PARTS - 1) * np.var(without, axis=0))
-    value = Seat(float(lens[2]) + BASE_HEIGHT, float(np.degrees(yaw)), *np.degrees(angles[:, 1:].mean(0)).tolist())
+    value = Seat(float(lens[2]) + BASE_HEIGHT, float(np.degrees(yaw)), *np.degrees(angles[sound, 1:].mean(0)).tolist())
     return value, Seat(float(spread[0]), *np.degrees(spread[1:]).tolist())
 
 
@@ -102,26 +107,38 @@ def _headings(poses: Array, lean: Array) -> Array:
     return np.arctan2(base[:, 1, 0], base[:, 0, 0])
 
 
+def _sound(values: Array) -> NDArray[np.bool_]:
+    """Which frames (n, k) lie where most do, in every column."""
+    off = np.abs(values - np.median(values, axis=0))
+    return (off <= _FAR_OFF * np.maximum(np.median(off, axis=0), 1e-6)).all(1)
+
+
 def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
     """How far the camera looks left of where the base goes [rad].
 
     Args:
         bases: Where the base is, x, y [m], shape (n, 2).
         headings: Of the base if that were nothing [rad], shape (n,).
-        use: Frames, shape (n,); used are the steps between those that follow each other.
+        use: Frames, shape (n,). Steps are added up between those that follow each other; where some are left out, or
+            the robot seems to have jumped, a new sum begins.
     """
-    way, steps = np.diff(bases, axis=0), use[1:] & use[:-1]
+    way = np.diff(bases, axis=0)
+    length = np.linalg.norm(way, axis=1)
+    goes_on = use[1:] & use[:-1] & (length <= _JUMP * np.median(length))
+    pieces = [piece for piece in np.split(np.arange(len(bases)), np.flatnonzero(~goes_on) + 1) if len(piece) > 2]
 
     def sideways(unknown: Array) -> Array:
-        """Sum of what the point that the robot turns about, `pivot` before the base's origin [m], went sideways [m]."""
-        yaw, pivot, start = unknown
+        """What the point that the robot turns about, `pivot` before the base's origin [m], went sideways [m] up to each
+        frame of a piece, less the piece's mean."""
+        yaw, pivot = unknown
         heads = headings - yaw
         off = way + np.diff(pivot * np.stack([np.cos(heads), np.sin(heads)], 1), axis=0)
         middle = heads[:-1] + np.angle(np.exp(1j * np.diff(heads))) / 2.0
-        sums = np.cumsum((off[:, 1] * np.cos(middle) - off[:, 0] * np.sin(middle))[steps])
-        return np.append(sums - start, _NOISE * pivot / _PIVOT)
+        step = off[:, 1] * np.cos(middle) - off[:, 0] * np.sin(middle)
+        sums = [np.append(0.0, np.cumsum(step[piece[:-1]])) for piece in pieces]
+        return np.concatenate([*(one - one.mean() for one in sums), [_NOISE * pivot / _PIVOT]])
 
-    return float(least_squares(sideways, np.zeros(3), loss="soft_l1", f_scale=_OUTLYING).x[0])
+    return float(least_squares(sideways, np.zeros(2), loss="soft_l1", f_scale=_OUTLYING).x[0])
 
 
 def _stances(

@@ -1,14 +1,12 @@
-"""Where one more photo, or every frame of one more film, was taken from, by the frames and sparse points of a built
-scene.
+"""Where one more photo was taken from, by the frames and sparse points of a built scene.
 
 A *landmark* is a feature of a frame that lies where a sparse point falls that the frame sees: so its place is known. A
 *match* pairs a feature of the photo with a landmark; *inliers* are the matches that one pose explains. The work happens
-in the worker process (`worker.py`), as all of COLMAP's does; `register` and `register_film` start it and read what it
-found.
+in the worker process (`worker.py`), as all of COLMAP's does; `register` starts it and reads what it found.
 """
 
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +31,7 @@ from twin.geometry.poses import Array, inverse_pose
 from twin.scene import SceneDir, read_json, write_json
 
 MIN_INLIERS = 25
-_MAX_SIZE = 1280  # [px] longer side the photo's features are looked for at
+MAX_SIZE = 1280  # [px] longer side the photo's features are looked for at
 _FEATURES = 4000
 _FIRST_FRAMES = 48  # looked at first, spread evenly over every film
 _BEST_FRAMES = 4  # whose neighbours are looked at next
@@ -42,12 +40,9 @@ _TRUSTED_FRAMES = 24  # with the most matches; the others' matches are chance
 _RATIO = 0.8  # to the second best, Lowe 2004
 _NEAR = 1.5  # [px] from a sparse point's place in the frame
 _TOLERANCE = 0.006  # of an inlier [longer sides]
-_GUESSED_FOCAL = 1.2  # [longer sides]
+GUESSED_FOCAL = 1.2  # [longer sides]
 _ESTIMATED = "estimated"
 _DISTORTION_INLIERS = 100  # enough to tell distortion from noise
-_FILM_NEIGHBOURS = 12  # frames that a film's next frame is compared with
-_OUTLYING = 3.0  # [px] an inlier's error that counts as no more
-_FOCAL_ROUNDS = 4
 _CLEARLY_MORE = 1.25  # an earlier lens is kept unless a later one explains so many times more matches
 
 Image = NDArray[np.uint8]
@@ -76,7 +71,7 @@ def register(photo: Image, facts: PhotoFacts, scene: SceneDir, seed: int = 0) ->
         InputError: too few of its features fit the place.
     """
     full = photo.shape[1], photo.shape[0]
-    size = fitted_size(*full, _MAX_SIZE)
+    size = fitted_size(*full, MAX_SIZE)
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         write_image(work / "photo.png", cv2.cvtColor(np.asarray(resize(photo, *size), np.uint8), cv2.COLOR_RGB2GRAY))
@@ -114,76 +109,14 @@ def candidate_lenses(size: tuple[int, int], facts: PhotoFacts, scene: SceneDir) 
         if same_aspect(size, (width, height)):
             focal = float(np.median(cameras.intrinsics[mine, 0])) * size[0] / width
             found.append((simple(focal), False, f"the camera of {name!r}"))
-    found.append((simple(_GUESSED_FOCAL * max(size)), False, _ESTIMATED))
+    found.append((simple(GUESSED_FOCAL * max(size)), False, _ESTIMATED))
     return list({repr(lens): (lens, held, said) for lens, held, said in reversed(found)}.values())[::-1]
-
-
-@dataclass(frozen=True)
-class FilmRegistration:
-    """Places of a film's frames, all of one pinhole lens."""
-
-    frames: NDArray[np.int64]
-    """Indices of the frames that were found, shape (n,)."""
-    camera_to_world: Array
-    """OpenCV axes, metres, shape (n, 4, 4)."""
-    lens: Lens
-    """At the frames' size."""
-    focal_error: float
-    """Standard error of its focal length [px]; 0 where it was given."""
-    error: float
-    """Median over the frames of their inliers' mean reprojection error [px]."""
-
-
-def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, seed: int = 0) -> FilmRegistration:
-    """The poses and the focal length of a film's frames (h, w, 3), whose principal point is taken as `given` has it.
-
-    Args:
-        frames: In order, of one camera without distortion.
-        given: Its lens where that is known; else its focal length is found, and its principal point is the middle.
-        scene: Built.
-        seed: Of what is drawn at random.
-
-    Raises:
-        InputError: no frame fits the place.
-    """
-    full = frames[0].shape[1], frames[0].shape[0]
-    size = fitted_size(*full, _MAX_SIZE)
-    lens = given.scaled(*size) if given else None
-    if lens is None:
-        focal = _focal_like(size, Cameras.load(scene.stage("metric")))
-        lens = Lens("SIMPLE_PINHOLE", (focal, 0.5 * size[0], 0.5 * size[1]), *size)
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
-        names = [f"{i:06d}.png" for i in range(len(frames))]
-        for name, frame in zip(names, frames, strict=True):
-            write_image(work / name, cv2.cvtColor(np.asarray(resize(frame, *size), np.uint8), cv2.COLOR_RGB2GRAY))
-        job = {"task": "register_film", "metric": str(scene.stage("metric").resolve()), "work": folder, "seed": seed}
-        run_worker(job | {"photos": names, "lens": vars(lens), "held": given is not None}, work)
-        found = read_json(work / "result.json")
-    scale = full[0] / size[0]
-    return FilmRegistration(
-        np.array(found["frames"]),
-        np.array(found["camera_to_world"]),
-        lens.with_intrinsics(np.array([found["focal"], found["focal"], *lens.intrinsics[2:]])).scaled(*full)
-        if given is None
-        else given,
-        found["focal_error"] * scale,
-        found["error"] * scale,
-    )
-
-
-def _focal_like(size: tuple[int, int], cameras: Cameras) -> float:
-    """The focal length of the scene's camera whose picture has the same shape, or a guess [px]."""
-    width, height = (int(v) for v in cameras.sizes[0])
-    if same_aspect(size, (width, height)):
-        return float(np.median(cameras.intrinsics[:, 0])) * size[0] / width
-    return _GUESSED_FOCAL * max(size)
 
 
 # ---- in the worker
 
 
-class _Place:
+class Place:
     """A built scene's frames and sparse points, and features of the frames that were looked at."""
 
     def __init__(self, metric: Path) -> None:
@@ -209,10 +142,6 @@ class _Place:
             self._seen[i] = self.features(self.cameras.image_path(i))
         return frame_matches(*self._seen[i], descriptors, self.cameras, self.points, i)
 
-    def first_frames(self) -> list[int]:
-        """Spread evenly over every film."""
-        return [int(i) for i in regular_choice(len(self.cameras), _FIRST_FRAMES)]
-
     def near(self, positions: Array, count: int) -> set[int]:
         """The frames nearest to each of some positions (n, 3)."""
         away = np.linalg.norm(self.cameras.positions[:, None] - positions, axis=-1)
@@ -230,9 +159,9 @@ def solve(job: dict[str, Any]) -> None:
     Raises:
         InputError: too few inliers.
     """
-    place, work = _Place(Path(job["metric"])), Path(job["work"])
+    place, work = Place(Path(job["metric"])), Path(job["work"])
     pixels, descriptors = place.features(work / "photo.png")
-    pairs = place.pairs(_matched_frames(place, descriptors))
+    pairs = place.pairs(matched_frames(place, descriptors, bars=True))
     image, points = pixels[pairs[:, 0]], place.points.xyz[pairs[:, 1]]
     poses = [_posed(image, points, lens, job["seed"]) for lens in job["lenses"]]
     most = max((pose["inliers"] for pose in poses if pose), default=0)
@@ -246,144 +175,33 @@ def solve(job: dict[str, Any]) -> None:
     write_json(work / "result.json", best | {"matches": len(pairs)})
 
 
-def solve_film(job: dict[str, Any]) -> None:
-    """Runs a job of `register_film` and leaves `result.json` in its work folder.
-
-    A frame is looked for near where the one before it was, else everywhere. All share one focal length: the one that
-    brings their inliers nearest.
-
-    Raises:
-        InputError: no frame was found.
-    """
-    place, work = _Place(Path(job["metric"])), Path(job["work"])
-    lens = job["lens"] | {"held": job["held"], "said": ""}
-    sights: list[_Sight] = []
-    tell(bar="frames of the film", total=len(job["photos"]))
-    for k, name in enumerate(job["photos"]):
-        pixels, descriptors = place.features(work / name)
-        wheres = [sorted(place.near(sights[-1].position[None], _FILM_NEIGHBOURS))] if sights else []
-        for where in (*wheres, place.first_frames()):
-            pairs = place.pairs(place.matches(descriptors, i) for i in where)
-            sight = _sighted(k, pixels[pairs[:, 0]], place.points.xyz[pairs[:, 1]], lens, job["seed"])
-            if sight:
-                sights.append(sight)
-                break
-        tell(step=1)
-    if not sights:
-        raise InputError(
-            f"none of the {len(job['photos'])} frames shows the place; film from the robot on the filmed path, and in "
-            "light that shows the texture some film shows: night and day share little"
-        )
-    start = float(np.median([sight.focal for sight in sights]))
-    focal, error = (start, 0.0) if job["held"] else _shared_focal(sights, lens, start)
-    poses, errors = zip(*(sight.posed(_with_focal(lens, focal)) for sight in sights), strict=True)
-    write_json(
-        work / "result.json",
-        {
-            "frames": [sight.frame for sight in sights],
-            "camera_to_world": [pose.tolist() for pose in poses],
-            "focal": focal,
-            "focal_error": error,
-            "error": float(np.median([np.sqrt((e**2).sum(1)).mean() for e in errors])),
-        },
-    )
-
-
-@dataclass(frozen=True)
-class _Sight:
-    """A frame of a film that was found: inliers in it [px] (m, 2) and in the place [m] (m, 3)."""
-
-    frame: int
-    image: Array
-    place: Array
-    camera_from_world: Any
-    focal: float
-    """As this frame alone has it [px]."""
-
-    @property
-    def position(self) -> Array:
-        """[m], shape (3,)."""
-        return inverse_pose(np.vstack([self.camera_from_world.matrix(), [0.0, 0.0, 0.0, 1.0]]))[:3, 3]
-
-    def posed(self, lens: dict[str, Any]) -> tuple[Array, Array]:
-        """camera_to_world (4, 4) under a lens, and the inliers' errors [px] (m, 2)."""
-        camera, everything = _camera(lens), np.ones(len(self.image), bool)
-        options = pycolmap.AbsolutePoseRefinementOptions()
-        options.refine_focal_length = options.refine_extra_params = False
-        found = pycolmap.refine_absolute_pose(
-            self.camera_from_world, self.image, self.place, everything, camera, options
-        )
-        pose = found["cam_from_world"] if found else self.camera_from_world
-        errors = np.asarray(camera.img_from_cam(pose * self.place)) - self.image
-        return inverse_pose(np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])), errors
-
-
-def _sighted(frame: int, image: Array, place: Array, lens: dict[str, Any], seed: int) -> _Sight | None:
-    """A frame's place by its matches; None where too few fit."""
-    if len(image) < MIN_INLIERS:
-        return None
-    camera, estimation = _camera(lens), _estimation(lens, seed)
-    found = pycolmap.estimate_absolute_pose(image, place, camera, estimation)
-    if found is None or found["num_inliers"] < MIN_INLIERS:
-        return None
-    inlier = np.asarray(found["inlier_mask"], bool)
-    options = pycolmap.AbsolutePoseRefinementOptions()
-    options.refine_focal_length, options.refine_extra_params = not lens["held"], False
-    better = pycolmap.refine_absolute_pose(found["cam_from_world"], image, place, inlier, camera, options)
-    pose = (better or found)["cam_from_world"]
-    return _Sight(frame, image[inlier], place[inlier], pose, float(camera.params[0]))
-
-
-def _shared_focal(sights: Sequence[_Sight], lens: dict[str, Any], start: float) -> tuple[float, float]:
-    """The focal length with which all inliers come nearest, and its standard error [px].
-
-    A parabola through the costs; errors beyond `_OUTLYING` count as that much, and a frame counts as one measurement of
-    two numbers, as neighbouring inliers err together.
-    """
-    focals = start * np.array([0.98, 0.99, 1.0, 1.01, 1.02])
-    for _ in range(_FOCAL_ROUNDS):
-        costs = np.zeros(len(focals))
-        for i, focal in enumerate(focals):
-            each = [sight.posed(_with_focal(lens, focal))[1] for sight in sights]
-            costs[i] = np.mean([np.minimum((e**2).sum(1), _OUTLYING**2).mean() for e in each])
-        curve = np.polyfit(focals - start, costs, 2)
-        if curve[0] <= 0.0:
-            raise InputError("the film does not show the camera's focal length; give camera_intrinsics in [robot]")
-        best = start - curve[1] / (2.0 * curve[0])
-        if abs(best - focals[2]) <= 0.5 * (focals[1] - focals[0]):
-            break
-        focals = focals + (best - focals[2])
-    return float(best), float(np.sqrt(np.polyval(curve, best - start) / (2.0 * curve[0] * len(sights))))
-
-
-def _with_focal(lens: dict[str, Any], focal: float) -> dict[str, Any]:
-    """A SIMPLE_PINHOLE with another focal length; a lens that is given stays."""
-    return lens if lens["held"] else lens | {"params": [focal, *lens["params"][1:]]}
-
-
-def _camera(lens: dict[str, Any]) -> pycolmap.Camera:
+def camera_of(lens: dict[str, Any]) -> pycolmap.Camera:
+    """COLMAP's own object of a job's lens."""
     return Lens(lens["model"], tuple(lens["params"]), lens["width"], lens["height"]).camera
 
 
-def _estimation(lens: dict[str, Any], seed: int) -> pycolmap.AbsolutePoseEstimationOptions:
+def estimation(lens: dict[str, Any], seed: int, focal: bool) -> pycolmap.AbsolutePoseEstimationOptions:
+    """How a pose is estimated from matches, and with it the focal length if that is wanted."""
     options = pycolmap.AbsolutePoseEstimationOptions()
-    options.estimate_focal_length = lens["said"] == _ESTIMATED
+    options.estimate_focal_length = focal
     options.ransac.max_error = _TOLERANCE * max(lens["width"], lens["height"])
     options.ransac.min_inlier_ratio, options.ransac.random_seed = 0.02, seed
     return options
 
 
-def _matched_frames(place: _Place, descriptors: NDArray) -> list[NDArray[np.int64]]:
-    """Matches of the photo in frames that resemble it: rows of photo feature and sparse point, shapes (m, 2)."""
+def matched_frames(place: Place, descriptors: NDArray, bars: bool) -> list[NDArray[np.int64]]:
+    """Matches of a photo in frames that resemble it: rows of photo feature and sparse point, shapes (m, 2)."""
     found: dict[int, NDArray[np.int64]] = {}
 
     def look(frames: list[int]) -> None:
-        tell(bar="frames like the photo", total=len(frames))
+        if bars:
+            tell(bar="frames like the photo", total=len(frames))
         for i in frames:
             found[i] = place.matches(descriptors, i)
-            tell(step=1)
+            if bars:
+                tell(step=1)
 
-    look(place.first_frames())
+    look([int(i) for i in regular_choice(len(place.cameras), _FIRST_FRAMES)])
     best = sorted(found, key=lambda i: -len(found[i]))[:_BEST_FRAMES]
     look(sorted(place.near(place.cameras.positions[best], _NEIGHBOURS + 1) - set(found)))
     return list(found.values())
@@ -428,8 +246,9 @@ def _posed(image: Array, place: Array, lens: dict[str, Any], seed: int) -> dict[
     """The pose that explains most matches under one lens; None where there is none."""
     if len(image) < MIN_INLIERS:
         return None
-    camera, held = _camera(lens), lens["held"]
-    found = pycolmap.estimate_absolute_pose(image, place, camera, _estimation(lens, seed))
+    camera, held = camera_of(lens), lens["held"]
+    options = estimation(lens, seed, focal=lens["said"] == _ESTIMATED)
+    found = pycolmap.estimate_absolute_pose(image, place, camera, options)
     if found is None:
         return None
     inlier = np.asarray(found["inlier_mask"], bool)

@@ -161,10 +161,10 @@ def main(argv: list[str]) -> int:
     """The worker. Exit status: 0 done, 2 bad input (said in the news), 1 anything else."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Loaded here only: the parent needs no COLMAP to start a worker.
-    from twin.capture import mapping, register
+    from twin.capture import mapping, register, register_film
 
     job = json.loads(Path(argv[0]).read_text(encoding="utf-8"))
-    tasks = {"map": mapping.solve, "register": register.solve, "register_film": register.solve_film}
+    tasks = {"map": mapping.solve, "register": register.solve, "register_film": register_film.solve}
     solve = tasks[job["task"]]
     try:
         solve(job)

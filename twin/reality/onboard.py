@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.env.options import Options
+from twin.errors import InputError
 from twin.progress import track
 from twin.reality import world as worlds
 from twin.reality.eye import Eye
@@ -31,7 +32,13 @@ _CONTROL = 0.05  # [s]
 
 
 def write(path: Path) -> None:
-    """Drives and films; a few frames a second will do, as the robot is slow."""
+    """Drives and films; a few frames a second will do, as the robot is slow.
+
+    Raises:
+        InputError: no name of a film.
+    """
+    if path.suffix != ".mp4" or path.is_dir():
+        raise InputError(f"{path}: expected the name of a film, such as robot.mp4")
     husky = robot()
     width, height = husky.params.camera_size
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ _GREY = 0.3  # of this the mean of pictures is to be, as automatic exposure woul
 
 
 def _day(number: int) -> Lighting:
-    """A day: its sun, its clouds and its air are uniform in the ranges below, its colours follow from these."""
+    """A day: its sun, its clouds and its air are drawn from the ranges below, its colours follow from these."""
     rng = np.random.default_rng([SEED, 51, number])
     elevation, azimuth = rng.uniform(6.0, 60.0), rng.uniform(0.0, 2.0 * np.pi)
     clouds, veil = rng.uniform(0.1, 1.0), rng.uniform(0.0, 1.0)
