@@ -5,6 +5,8 @@ import hashlib
 from dataclasses import asdict
 from pathlib import Path
 
+import av
+import mujoco
 import numpy as np
 import pytest
 from dm_control.rl import control
@@ -16,15 +18,17 @@ from twin.env.drivers import RouteDriver
 from twin.env.options import parse_options
 from twin.env.stretches import STANDARD
 from twin.errors import InputError
+from twin.geometry.images import read_image
 from twin.learn.architecture import Architecture
 from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.mjcf.world import arc_lengths, point_at
-from twin.reality import drive, log, road
+from twin.reality import drive, log, onboard, road
 from twin.reality import place as places
 from twin.reality.__main__ import main
 from twin.reality.drive import Test
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.robot import Robot, robot
+from twin.reality.route import Route
 from twin.reality.weather import WEATHER
 from twin.report.trials import Cell, read_results, read_trials
 from twin.robot import HuskyParams
@@ -236,6 +240,49 @@ def test_only_a_policy_file_drives(what, tmp_path, capsys):
 
 
 # ---- drive log
+
+
+class Recorder:
+    """Stands for a raster of full size; notes where it was asked to look from, and at what light."""
+
+    def __init__(self, model, intrinsics, size) -> None:
+        self.poses, self.size = [], size
+        Recorder.last = self
+
+    def __call__(self, pose):
+        self.poses.append(pose)
+        width, height = self.size
+        return np.full((height, width, 3), 0.4, np.float32), np.full((height, width), 5.0, np.float32)
+
+
+def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
+    """It weaves, stays on the road, and is of the camera's full size; nothing but a film comes out."""
+    monkeypatch.setattr(onboard, "Raster", Recorder)
+    monkeypatch.setattr(onboard.worlds, "spec", lambda light, place: mujoco.MjSpec())
+    monkeypatch.setattr(onboard, "_FPS", 1)
+    path = tmp_path / "robot.mp4"
+    assert main(["onboard", "--out", str(path)]) == 0
+    positions = np.array(Recorder.last.poses)[:, :3, 3]
+    station, lateral = Route().project(positions[:, :2])
+    assert station[0] < 5.0 and 26.0 < station[-1] < 32.0 and np.all(np.diff(station)[5:] > 0.05)
+    assert lateral.min() < -0.3 and lateral.max() > 0.3 and np.abs(lateral).max() < 1.0
+    with av.open(str(path)) as film:
+        assert (film.streams.video[0].width, film.streams.video[0].height) == robot().params.camera_size
+    assert [one.name for one in tmp_path.iterdir()] == ["robot.mp4"]
+
+
+def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
+    lights: list = []
+    monkeypatch.setattr(onboard, "Raster", Recorder)
+    monkeypatch.setattr(onboard.worlds, "spec", lambda light, place: lights.append(light) or mujoco.MjSpec())
+    path = tmp_path / "photos" / "haze.png"
+    assert main(["photo", "--lighting", "haze", "--out", str(path)]) == 0
+    assert lights == [WEATHER["haze"]] and read_image(path).shape == (*robot().params.camera_size[::-1], 3)
+    capsys.readouterr()
+    assert main(["photo", "--lighting", "haze", "--out", str(tmp_path / "haze.txt")]) == 2
+    assert "expected the name of a picture" in capsys.readouterr().err
+    assert main(["onboard", "--out", str(tmp_path)]) == 2
+    assert "expected the name of a film" in capsys.readouterr().err
 
 
 def test_the_log_is_what_alignment_reads(tmp_path):

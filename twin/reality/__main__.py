@@ -4,10 +4,12 @@
     python -m twin.reality drive --policy FILE... --task straight|right_turn --out results.csv
     python -m twin.reality log --out drive.csv
     python -m twin.reality onboard --out robot.mp4
+    python -m twin.reality photo --lighting dawn --out dawn.png
 
 `film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `drive` is the real test. `log`, and
-`onboard`, a film by the robot's own camera, are what `twin.align` may learn of the robot. All are random only through
-the seeds stated in the code, so the same command gives the same files.
+`onboard`, a film by the robot's own camera, are what `twin.align` may learn of the robot; `photo` is what
+`twin.relight` may learn of the weather of a trial. All are random only through the seeds stated in the code, so the
+same command gives the same files.
 """
 
 import argparse
@@ -87,6 +89,9 @@ def main(given: list[str] | None = None) -> int:
     command.add_argument("--duration", type=float, default=300.0, help="[s] (default %(default)g)")
     command = commands.add_parser("onboard", help="a film by the world's Husky's own camera, for twin.align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
+    command = commands.add_parser("photo", help="a photo by that camera in the weather of a trial, for twin.relight")
+    command.add_argument("--lighting", required=True, choices=sorted(WEATHER))
+    command.add_argument("--out", type=Path, required=True, help="photo.png")
     options = parser.parse_args(given)
     try:
         if options.command == "film":
@@ -96,6 +101,8 @@ def main(given: list[str] | None = None) -> int:
             log.write(options.out, log.record(options.duration))
         elif options.command == "onboard":
             onboard.write(options.out)
+        elif options.command == "photo":
+            onboard.photograph(options.lighting, options.out)
         else:
             trials = drive.run(
                 options.policy,

@@ -1,5 +1,8 @@
-"""A film by the camera of reality's Husky while someone drives it down the filmed road, in light that was filmed, too:
-what `twin.align` may learn of how the camera sits. No poses come with it."""
+"""What the camera of reality's Husky takes besides trials: no poses come with it.
+
+A film while someone drives it down the filmed road, in light that was filmed, too, tells `twin.align` how the camera
+sits. A photo in the weather of a trial, from where the robot then stands, tells `twin.relight` what day it is.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,16 +13,18 @@ from numpy.typing import NDArray
 
 from twin.env.options import Options
 from twin.errors import InputError
+from twin.geometry.images import write_image
 from twin.progress import track
 from twin.reality import world as worlds
 from twin.reality.eye import Eye
 from twin.reality.film import Plan, encode
-from twin.reality.lighting import LIGHTINGS
+from twin.reality.lighting import LIGHTINGS, Lighting
 from twin.reality.raster import Raster
 from twin.reality.road import Road, place
 from twin.reality.robot import robot
 from twin.reality.route import Route
 from twin.reality.things import SEED
+from twin.reality.weather import WEATHER
 
 LIGHTING = "overcast"
 
@@ -47,17 +52,41 @@ def write(path: Path) -> None:
     encode(track(_pictures(frames), "film from the robot", unit="frame", total=frames), plan, path)
 
 
-def _pictures(count: int) -> Iterator[NDArray[np.uint8]]:
-    husky, line = robot(), Route()
-    road = Road("straight", husky, Options(pixels=False))
-    size = husky.params.camera_size
+def photograph(weather: str, path: Path) -> None:
+    """Writes a photo, as `twin.relight` reads it.
+
+    Raises:
+        InputError: no such weather, or no name of a picture.
+    """
+    if weather not in WEATHER:
+        raise InputError(f"lighting {weather!r}: reality's are {', '.join(WEATHER)}")
+    if path.suffix not in (".png", ".jpg") or path.is_dir():
+        raise InputError(f"{path}: expected the name of a picture, such as dawn.png")
+    road, eye = _camera(WEATHER[weather])
+    _stand(road, Route())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, eye.look(road.physics.camera_to_world, 0.0))
+
+
+def _camera(light: Lighting) -> tuple[Road, Eye]:
+    """The road, and the robot's camera on it with pictures of its full size."""
+    husky = robot()
+    road, size = Road("straight", husky, Options(pixels=False)), husky.params.camera_size
     intrinsics = road.intrinsics(size)
-    light = LIGHTINGS[LIGHTING]
     raster = Raster(worlds.spec(light, place()).compile(), intrinsics, size)
-    eye = Eye(raster, light, husky, intrinsics, size, np.random.default_rng([SEED, 43]))
-    physics = road.physics.robot
+    return road, Eye(raster, light, husky, intrinsics, size, np.random.default_rng([SEED, 43]))
+
+
+def _stand(road: Road, line: Route) -> None:
+    """Puts the robot on the road."""
     start = line.at(_STATIONS[0])
-    physics.place(float(start[0]), float(start[1]), float(line.heading(_STATIONS[0])))
+    road.physics.robot.place(float(start[0]), float(start[1]), float(line.heading(_STATIONS[0])))
+
+
+def _pictures(count: int) -> Iterator[NDArray[np.uint8]]:
+    line, (road, eye) = Route(), _camera(LIGHTINGS[LIGHTING])
+    _stand(road, line)
+    physics = road.physics.robot
     for i in range(count):
         yield eye.look(road.physics.camera_to_world, i / _FPS)
         for _ in range(round(1.0 / _FPS / _CONTROL)):
