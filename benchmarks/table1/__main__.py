@@ -1,27 +1,36 @@
 """The paper's table 1, on a road whose reality is known.
 
-    python benchmarks/table1 SCENE [--seeds 0] [--jobs 2] [--steps train validate real forecast]
+    python benchmarks/table1 SCENE [--seeds 0] [--jobs 2] [--steps train validate photos real forecast]
 
 films reality and builds the twin in SCENE (unless that is done), aligns its robot to a drive log of reality's Husky and
 to a film by that one's camera, trains the three setups on both tasks, validates every policy in the twin under held-out
 lightings, as filmed and with all else drawn anew, drives them in reality under weather that neither has seen, and
-forecasts. Every step is a command of `twin`, goes on where it was cut off, and adds to what is there: the same call
-with more seeds keeps all runs. `results.json` beside this file holds every run. Setups, sizes, checkpoints: `plan.py`.
+forecasts: once from held-out lightings, by who knows nothing of the weather, and once, after all training, from a photo
+of each day of the test. Every step is a command of `twin`, goes on where it was cut off, and adds to what is there: the
+same call with more seeds keeps all runs. `results.json` beside this file holds every run. Setups, sizes, checkpoints:
+`plan.py`.
 """
 
 import argparse
+import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from plan import EPISODES, LIGHTINGS, SETUPS, STEPS, TASKS, TRIALS, Run, runs
-from results import collect, table
+from plan import EPISODES, LIGHTINGS, PHOTO_EPISODES, PHOTOS, SETUPS, STEPS, TASKS, TRIALS, Run, runs
+from results import HELD_OUT_FORECAST, collect, table
 
-STAGES = ("train", "validate", "real", "forecast")
+from twin.config import RANDOMISED
+from twin.nerf.added import added_lightings
+from twin.reality.weather import WEATHER
+from twin.scene import SceneDir
+
+STAGES = ("train", "validate", "photos", "real", "forecast")
 
 
 def verb(*arguments: str | Path) -> None:
@@ -57,17 +66,46 @@ def validate(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
             verb("twin.validate", scene, "--task", TASKS[task], "--policy", *policies, *options)
 
 
+def photos(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
+    """Validates in the light of each day of the test, as a photo tells it."""
+    for name in WEATHER:
+        if name not in added_lightings(SceneDir(scene))[0]:
+            photo = scene / "photos" / f"{name}.png"
+            verb("twin.reality", "photo", "--lighting", name, "--out", photo)
+            verb("twin.relight", scene, photo, "--name", name)
+    policies = [path for run in every if run.task == task for path in _policies(scene, run)]
+    if policies:
+        options = ("--lightings", *PHOTOS, "--episodes", str(PHOTO_EPISODES), "--processes", str(jobs))
+        verb("twin.validate", scene, "--task", TASKS[task], "--policy", *policies, *options)
+
+
 def real(scene: Path, run: Run) -> None:
     out = ("--task", TASKS[run.task], "--out", scene / "real" / f"{run.name}.csv")
     verb("twin.reality", "drive", "--policy", *_policies(scene, run), "--trials", str(TRIALS), *out)
 
 
 def forecast(scene: Path) -> None:
-    tables = sorted(path for path in (scene / "real").glob("*_*.csv") if not path.stem.endswith("_trials"))
-    lines = [path.read_text(encoding="utf-8").splitlines() for path in tables]
-    text = "\n".join([lines[0][0], *(row for table in lines for row in table[1:])]) + "\n"
-    (scene / "real" / "results.csv").write_text(text, encoding="utf-8")
-    verb("twin.forecast", scene, "--real", scene / "real" / "results.csv")
+    """Of what was driven: from held-out lightings, kept in `HELD_OUT_FORECAST`, and then from photos, if validated."""
+    tables = sorted(path for path in (scene / "real").glob("*_*.csv") if path.stem.split("_")[0] in TASKS)
+    rows = [row for path in tables if not path.stem.endswith("_trials") for row in _rows(path)]
+    validated = {row["lighting"] for row in _rows(scene / "validation" / "episodes.csv")}
+    _forecast(scene, "results.csv", rows)
+    if set(PHOTOS) <= validated:
+        shutil.copytree(scene / "forecast", scene / HELD_OUT_FORECAST, dirs_exist_ok=True)
+        _forecast(scene, "by_photo.csv", [row | {"twin_lighting": row["lighting"] + RANDOMISED} for row in rows])
+
+
+def _forecast(scene: Path, name: str, rows: list[dict[str, str]]) -> None:
+    with (scene / "real" / name).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    verb("twin.forecast", scene, "--real", scene / "real" / name)
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def _policies(scene: Path, run: Run) -> list[Path]:
@@ -93,6 +131,9 @@ def main() -> None:
         if "validate" in given.steps:
             for task in given.tasks:
                 validate(given.scene, task, done, given.jobs)
+        if "photos" in given.steps:
+            for task in given.tasks:
+                photos(given.scene, task, done, given.jobs)
         if "real" in given.steps:
             list(pool.map(lambda run: real(given.scene, run), done))
     if "forecast" in given.steps:
@@ -103,8 +144,9 @@ def main() -> None:
     out = Path(__file__).with_name("results.json")
     out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print(table(results))
-    for task, group in results["forecast"].items():
-        print(task, json.dumps(group))
+    for kind in ("forecast", "forecast_by_photo"):
+        for task, group in results[kind].items():
+            print(kind, task, json.dumps(group))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from twin.config import HELD_OUT, RANDOMISED
+from twin.reality.weather import WEATHER
 from twin.report.statistics import MIN_TRIALS
 from twin.report.training import CHOICE
 from twin.scene import read_json
@@ -28,6 +29,10 @@ EPISODES = 50
 """In the twin, per policy and lighting."""
 LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMISED), "checkpoint": (HELD_OUT + RANDOMISED,)}
 """Of the twin. The latter is what reality is compared with; the former, for finished policies, is the paper's."""
+PHOTOS = tuple(f"{name}{RANDOMISED}" for name in WEATHER)
+"""Of the twin, by a photo of each day of the test: what reality is compared with, weather by weather."""
+PHOTO_EPISODES = 5
+"""In the twin, per policy and weather."""
 TRIALS = MIN_TRIALS
 """In reality, per policy and weather; there are ten. From fewer nothing is forecast."""
 PAPER: dict[tuple[str, str], tuple[float, float, float]] = {

@@ -4,15 +4,17 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from plan import PAPER, SETUPS, TASKS, Run
+from plan import PAPER, PHOTOS, SETUPS, TASKS, Run
 
-from twin.config import RANDOMISED
+from twin.config import HELD_OUT, RANDOMISED
 from twin.report.statistics import wilson
 from twin.report.training import CHOICE, read_episodes
 from twin.report.trials import RECENT, Trial, read_trials
 from twin.scene import read_json
 
-_JUDGED = ("validate", "validate_randomised", "real")
+_JUDGED = ("validate", "validate_randomised", "validate_by_photo", "real")
+HELD_OUT_FORECAST = "forecast_held_out"
+"""Folder beside `forecast`, which then is of photos."""
 FORECAST = (
     "pearson",
     "spearman",
@@ -37,12 +39,15 @@ def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
             | _training(run.folder(scene))
             | {"policies": [_judged(name, twin, real) for name in policies]}
         )
-    return {"runs": rows, "forecast": _forecast(scene / "forecast" / "forecast.json")}
+    by_photo = scene / HELD_OUT_FORECAST  # is there where `forecast` is of the photos
+    kinds = (by_photo, scene / "forecast") if by_photo.exists() else (scene / "forecast", by_photo)
+    held_out, photo = (_forecast(folder / "forecast.json") for folder in kinds)
+    return {"runs": rows, "forecast": held_out, "forecast_by_photo": photo}
 
 
 def table(results: dict[str, Any]) -> str:
     """The paper's table with ours beside it, in Markdown; finished policies of all seeds together."""
-    told = "train / validate / (ours: the same, randomised) / real"
+    told = "train / validate / (ours: another day / a photo of each day of the test) / real"
     lines = [f"| | | straight: {told} | right turn: {told} |", "|---|---|---|---|"]
     for setup in SETUPS:
         lines.append(f"| paper | {setup} | " + " | ".join(_numbers(PAPER[setup, task]) for task in TASKS) + " |")
@@ -86,9 +91,9 @@ def _training(folder: Path) -> dict[str, Any]:
 
 def _judged(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
     out: dict[str, Any] = {"policy": name}
-    drawn = [trial for trial in twin if trial.lighting.endswith(RANDOMISED)]
-    plain = [trial for trial in twin if not trial.lighting.endswith(RANDOMISED)]
-    for where, trials in zip(_JUDGED, (plain, drawn, real), strict=True):
+    parts = [[t for t in twin if t.lighting == HELD_OUT], [t for t in twin if t.lighting == HELD_OUT + RANDOMISED]]
+    photos = [trial for trial in twin if trial.lighting in PHOTOS]
+    for where, trials in zip(_JUDGED, (*parts, photos, real), strict=True):
         mine = [trial for trial in trials if trial.policy == name]
         out[where] = _rate([trial.success for trial in mine]) | {
             "by_lighting": {
