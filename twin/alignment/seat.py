@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from twin.errors import InputError
+from twin.geometry.cameras import opencv_to_mujoco
 from twin.mjcf.export import rest_pose
 from twin.robot import BASE_HEIGHT, HuskyParams
 
@@ -91,9 +92,9 @@ def seated(params: HuskyParams, position: Array, heading: float, ground_at: Call
     """camera_to_world (4, 4), OpenCV axes, of a robot's camera at x, y (2,) [m] whose base heads some way [rad]."""
     base, rotation = _base(position, heading, ground_at, np.array(params.camera_position))
     pose = np.eye(4)
-    pose[:3, :3] = rotation @ params.camera_rotation * [1.0, -1.0, -1.0]
+    pose[:3, :3] = rotation @ params.camera_rotation
     pose[:3, 3] = base + rotation @ params.camera_position
-    return pose
+    return opencv_to_mujoco(pose)  # which turns either into the other
 
 
 def heading_of(camera_to_world: Array, yaw: float) -> Array:
