@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from test_forecast import Text
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
@@ -17,6 +18,7 @@ from twin.errors import InputError
 from twin.report.training import RECENT, binned, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.report.validation import rate, share, summary, typical_episode, worst_episode
+from twin.report.validation_figures import rates
 from twin.report.validation_page import Curve, validation_page
 from twin.report.validation_words import FAILURES, chance_words, pair_words, percent, unknowns, verdicts, why
 from twin.report.video import describe
@@ -301,3 +303,13 @@ def test_whose_robot_is_judged_is_said():
     assert "another one drives every episode" in cautions("held-out+randomised", robot_known=[])
     assert "another one" not in cautions("held-out+randomised", robot_known=["friction"])
     assert "another one" not in cautions("held-out", robot_known=[])
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+@pytest.mark.parametrize("lights", [2, 11])
+def test_names_of_many_lightings_leave_room_for_the_rates(lights):
+    """A legend wider than the figure would squeeze its axes to nothing."""
+    names = [f"afternoon_of_day_{k}+randomised" for k in range(lights)]
+    figure = rates(summary([trial(light=name) for name in names])["cells"])
+    FigureCanvasAgg(figure).draw()
+    assert figure.axes[0].get_position().width > 0.5

@@ -85,14 +85,17 @@ def real(scene: Path, run: Run) -> None:
 
 
 def forecast(scene: Path) -> None:
-    """Of what was driven: from held-out lightings, kept in `HELD_OUT_FORECAST`, and then from photos, if validated."""
+    """From held-out lightings, kept in `HELD_OUT_FORECAST`; then from photos, of what was validated in their light."""
     tables = sorted(path for path in (scene / "real").glob("*_*.csv") if path.stem.split("_")[0] in TASKS)
     rows = [row for path in tables if not path.stem.endswith("_trials") for row in _rows(path)]
-    validated = {row["lighting"] for row in _rows(scene / "validation" / "episodes.csv")}
     _forecast(scene, "results.csv", rows)
-    if set(PHOTOS) <= validated:
+    episodes = _rows(scene / "validation" / "episodes.csv")
+    validated = {(row["policy"], row["task"], row["lighting"]) for row in episodes}
+    by_photo = [row | {"twin_lighting": row["lighting"] + RANDOMISED} for row in rows]
+    by_photo = [row for row in by_photo if (row["policy"], row["task"], row["twin_lighting"]) in validated]
+    if by_photo:
         shutil.copytree(scene / "forecast", scene / HELD_OUT_FORECAST, dirs_exist_ok=True)
-        _forecast(scene, "by_photo.csv", [row | {"twin_lighting": row["lighting"] + RANDOMISED} for row in rows])
+        _forecast(scene, "by_photo.csv", by_photo)
 
 
 def _forecast(scene: Path, name: str, rows: list[dict[str, str]]) -> None:

@@ -1,4 +1,4 @@
-"""The lightings of the real test. None of them is ever filmed, and nothing but a trial may know them.
+"""The lightings of the real test. None of them is ever filmed; a twin knows of them by a photo at most.
 
 The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Five are
 stated here, five more are *days*, drawn once with a fixed seed as a calendar would: sun, clouds and air are whatever

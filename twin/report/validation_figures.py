@@ -12,6 +12,7 @@ from twin.report.forecast_figures import LIMITS, TICKS, legend_below, short
 from twin.report.training import draw_curve
 
 _ROW = 0.17  # [in] per point
+_LETTERS = 55  # in a row of the legend, with four for each marker
 _APART = 0.18  # between two lightings of a policy, of the distance of two policies; less where there are many
 
 
@@ -34,7 +35,8 @@ def rates(cells: Sequence[dict[str, Any]]) -> Figure:
         label = "success rate" if len(lightings) > 1 else f"success rate in the light {lightings[0]}"
         axes.set(xlim=LIMITS, ylim=(len(policies) - 0.5, -0.5), xlabel=label, xticks=TICKS)
     if len(lightings) > 1:
-        legend_below(axes, min(4, len(lightings)), height)
+        fitting = max(1, _LETTERS // (max(map(len, lightings)) + 4))  # wider than the figure, it would leave no axes
+        legend_below(axes, min(4, fitting, len(lightings)), height)
     return figure
 
 
