@@ -42,6 +42,7 @@ def speed(scene: Path, quick: bool) -> dict[str, Any]:
 
     `ratio_to_software_gl` is one world's speed over that of the same environment whose picture is MuJoCo's own of the
     extracted mesh, drawn by `mujoco.Renderer` with OpenGL in software (Mesa through EGL), alternately in one process.
+    `ratio_to_one_process` is that of many worlds in two processes over the same in one with two threads, alternately.
     `cpu_ms_per_step` is processor time, which other work on the machine disturbs less. `load_s` is `twin.load` and the
     first reset, kernels cached.
     """
@@ -55,7 +56,7 @@ def speed(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def memory(scene: Path, quick: bool) -> dict[str, Any]:
-    """Peak memory of a process with 64 worlds that have been stepped with pixels."""
+    """Peak memory of all processes of 64 worlds that have been stepped with pixels."""
     return worker("memory", scene, 4 if quick else 64, cores=2)
 
 

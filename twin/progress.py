@@ -17,6 +17,10 @@ def set_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
+def is_quiet() -> bool:
+    return _quiet
+
+
 def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
     """A bar to be driven by hand: `update(n)`, `set_postfix_str(s)`, `close()`; also a context manager.
 

@@ -12,7 +12,8 @@ GPU `mujoco_warp` steps them all at once, and all are judged at once, see `devic
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import dm_env
 import numpy as np
@@ -21,12 +22,18 @@ from numpy.typing import NDArray
 from twin.cores import cores
 from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
-from twin.env.options import CPU
+from twin.env.options import CPU, parse_options
 from twin.env.suite import Stage
 from twin.env.tasks import Drive
+from twin.loading import Twin
+
+if TYPE_CHECKING:
+    from twin.env.process_worlds import ProcessWorlds
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+
+_FEWEST = 2  # worlds of a process: the memory of one more is worth it from there on
 
 
 @dataclass(frozen=True)
@@ -139,6 +146,18 @@ class Worlds:
         """Of world i's episode so far, JSON-able."""
         return self.tasks[i].info(self._physics[i]) | (self.pixels.info(i) if self.pixels else {})
 
+    def get(self, i: int, name: str) -> Any:
+        """An attribute of world i's task."""
+        return getattr(self.tasks[i], name)
+
+    def set(self, i: int, name: str, value: Any) -> None:
+        """Sets one."""
+        setattr(self.tasks[i], name, value)
+
+    def call(self, i: int, name: str, *args: Any, **kwargs: Any) -> Any:
+        """Calls a method of world i's task."""
+        return getattr(self.tasks[i], name)(*args, **kwargs)
+
     def close(self) -> None:
         if self._pool:
             self._pool.shutdown()
@@ -147,12 +166,33 @@ class Worlds:
         return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]
 
 
-def worlds_of(stage: Stage, seeds: Sequence[int | None]) -> Worlds:
-    """n worlds on the device that the stage's options say; see `Worlds`."""
-    if stage.options.device == CPU:
-        return Worlds(stage, seeds)
+def worlds_of(
+    scene: str | Path | Twin,
+    task: str,
+    options: dict[str, Any],
+    seeds: Sequence[int | None],
+    processes: int | None = None,
+) -> "Worlds | ProcessWorlds":
+    """n worlds on the device that the options say, see `Worlds`; on a CPU in several processes where that is faster.
+
+    Args:
+        scene: See `twin.load`.
+        task: See `twin.load`.
+        options: See `twin.env.options.Options`.
+        seeds: One per world, of its sequence of episodes; None: unpredictable.
+        processes: How many step the worlds on a CPU; None: one per core, but no more than half as many as worlds.
+    """
+    if parse_options(options).device == CPU:
+        if processes is None:
+            processes = min(cores(), len(seeds) // _FEWEST)
+        if processes > 1:
+            from twin.env.process_worlds import ProcessWorlds  # which needs this module
+
+            return ProcessWorlds(scene, task, options, seeds, min(processes, len(seeds)))
+        return Worlds(Stage.open(scene, task, options), seeds)
     from twin.env.device_worlds import DeviceWorlds  # slow to import
 
+    stage = Stage.open(scene, task, options)
     return DeviceWorlds(stage, seeds, stage.options.device)
 
 

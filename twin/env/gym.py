@@ -21,11 +21,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from twin.env.batch import Worlds, worlds_of
-from twin.env.suite import Stage
+from twin.env.process_worlds import ProcessWorlds
 from twin.loading import Twin
 
 
-def spaces_of(worlds: Worlds) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def spaces_of(worlds: Worlds | ProcessWorlds) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Observation and action space of one world."""
     action = gymnasium.spaces.Box(-1.0, 1.0, (worlds.actions,), np.float32)
     if worlds.pixels:
@@ -48,7 +48,7 @@ class DriveEnv(gymnasium.Env):
     ) -> None:
         """See `twin.load`; `render_mode` is None or rgb_array."""
         self.render_mode = render_mode
-        self.worlds = worlds_of(Stage.open(scene, task, options), [None])
+        self.worlds = worlds_of(scene, task, options, [None])
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.worlds.options.control_timestep)}
         self.observation_space, self.action_space = spaces_of(self.worlds)
 
@@ -88,11 +88,12 @@ class DriveVectorEnv(VectorEnv):
         scene: str | Path | Twin,
         task: str = "right_turn",
         render_mode: str | None = None,
+        processes: int | None = None,
         **options: Any,
     ) -> None:
-        """See `twin.load`."""
+        """See `twin.load`; for `processes` see `worlds_of`."""
         self.num_envs, self.render_mode = num_envs, render_mode
-        self.worlds = worlds_of(Stage.open(scene, task, options), [None] * num_envs)
+        self.worlds = worlds_of(scene, task, options, [None] * num_envs, processes)
         self.single_observation_space, self.single_action_space = spaces_of(self.worlds)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

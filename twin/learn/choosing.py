@@ -14,7 +14,6 @@ import numpy as np
 
 from twin import progress
 from twin.env.batch import worlds_of
-from twin.env.suite import Stage
 from twin.learn.judging import Driven, episodes
 from twin.learn.policy import copy_policy, load_policy
 from twin.learn.state import saved_steps
@@ -49,10 +48,10 @@ def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
     drawn = np.random.SeedSequence([config.seed, _STREAM]).generate_state(config.trials + FRESH)
     seeds = tuple(int(seed) for seed in drawn)
     shared, fresh = seeds[: config.trials], seeds[config.trials :]
-    stage = Stage.open(twin, config.task, {**config.options(), "start_along": 0.0})
+    options = {**config.options(), "start_along": 0.0}
     tried = []
     bar = progress.bar("choose", len(candidates) * len(shared) + len(fresh), "episode")
-    with closing(worlds_of(stage, [None] * config.worlds)) as worlds, bar:
+    with closing(worlds_of(twin, config.task, options, [None] * config.worlds)) as worlds, bar:
 
         def told(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
             return {"step": int(path.name)} | _summed(episodes(load_policy(path), worlds, which, bar.update))

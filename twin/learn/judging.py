@@ -16,6 +16,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from twin.env.batch import Worlds
+from twin.env.process_worlds import ProcessWorlds
 from twin.env.randomisation import Ranges, asked
 from twin.env.suite import Stage
 from twin.learn.policy import Policy, load_policy
@@ -69,7 +70,7 @@ def drive(chunk: Chunk) -> list[Driven]:
 
 
 def episodes(
-    policy: Policy, worlds: Worlds, seeds: Sequence[int], watch: Callable[[], object] = lambda: None
+    policy: Policy, worlds: Worlds | ProcessWorlds, seeds: Sequence[int], watch: Callable[[], object] = lambda: None
 ) -> list[Driven]:
     """Drives an episode of every seed, as many at once as there are worlds; in the order of the seeds.
 

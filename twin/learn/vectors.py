@@ -10,7 +10,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from twin.env.batch import worlds_of
 from twin.env.gym import spaces_of
-from twin.env.suite import Stage
 from twin.loading import Twin
 
 
@@ -26,6 +25,7 @@ class DriveVecEnv(VecEnv):
         task: str = "right_turn",
         n_envs: int = 8,
         seed: int | None = None,
+        processes: int | None = None,
         **options: Any,
     ) -> None:
         """
@@ -34,9 +34,10 @@ class DriveVecEnv(VecEnv):
             task: See `twin.load`.
             n_envs: Number of worlds.
             seed: World i has the episodes of seed + i; None: unpredictable.
+            processes: See `worlds_of`.
             options: See `twin.env.options.Options`.
         """
-        self.worlds = worlds_of(Stage.open(scene, task, options), [None] * n_envs)
+        self.worlds = worlds_of(scene, task, options, [None] * n_envs, processes)
         super().__init__(n_envs, *spaces_of(self.worlds))
         self._returns, self._lengths = np.zeros(n_envs), np.zeros(n_envs, int)
         self.seed(seed)
@@ -85,14 +86,14 @@ class DriveVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         if attr_name == "render_mode":
             return ["rgb_array"] * self.num_envs
-        return [getattr(self.worlds.tasks[i], attr_name) for i in self._get_indices(indices)]
+        return [self.worlds.get(i, attr_name) for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         for i in self._get_indices(indices):
-            setattr(self.worlds.tasks[i], attr_name, value)
+            self.worlds.set(i, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        return [getattr(self.worlds.tasks[i], method_name)(*args, **kwargs) for i in self._get_indices(indices)]
+        return [self.worlds.call(i, method_name, *args, **kwargs) for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]

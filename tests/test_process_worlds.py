@@ -1,0 +1,131 @@
+"""Worlds in several processes go through what they would in one, and tell what goes wrong there."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+from tiny_twin import tiny_twin
+
+import twin
+from twin import progress
+from twin.env.batch import Worlds, worlds_of
+from twin.env.process_worlds import ProcessWorlds
+from twin.env.suite import Stage
+from twin.errors import InputError
+
+PICTURES = {"size": (32, 18), "randomise": True, "time_limit": 1.5}
+STATES = {"pixels": False, "randomise": True, "obstacles": 2, "time_limit": 1.5}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    progress.set_quiet(True)
+    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
+
+
+@pytest.fixture
+def spread(scene):
+    worlds = ProcessWorlds(scene, "bend", {"pixels": False}, [1, 2, 3], 2)
+    yield worlds
+    worlds.close()
+
+
+@pytest.mark.parametrize("options", [PICTURES, STATES], ids=["pictures", "states"])
+def test_they_are_as_in_one_process(scene, options):
+    """Rewards, ends, pictures, states, infos, bit by bit; with some of the worlds left out, in any order."""
+    seeds = [5, 6, 7]
+    here = Worlds(Stage.open(scene, "bend", options), seeds)
+    there = ProcessWorlds(scene, "bend", options, seeds, 2)
+    assert (len(there), there.actions, there.states) == (len(here), here.actions, here.states)
+    rng, over = np.random.default_rng(0), 0
+    for worlds in (here, there):
+        worlds.begin(range(3))
+    for k in range(30):
+        which = [[2, 0], [1], [0, 1, 2]][k % 3]
+        actions = rng.uniform(-1, 1, (len(which), here.actions))
+        a, b = (worlds.step(actions, which) for worlds in (here, there))
+        for name in ("reward", "terminated", "truncated"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        np.testing.assert_array_equal(here.observation(), there.observation())
+        assert here.pixels is None or np.array_equal(here.pixels.trust, there.pixels.trust)
+        for i in range(3):
+            np.testing.assert_array_equal(here.state(i), there.state(i))
+            assert here.info(i) == there.info(i)
+        ended = [i for i, end in zip(which, a.over, strict=True) if end]
+        over += len(ended)
+        if ended:
+            for worlds in (here, there):
+                worlds.seed(ended[0], 40 + k)
+                worlds.begin(ended)
+    assert over > 1
+    for worlds in (here, there):
+        worlds.close()
+
+
+def test_tasks_are_asked_where_they_are(spread):
+    spread.begin(range(3))
+    before = spread.get(2, "time_limit")
+    spread.set(2, "time_limit", before + 1.0)
+    assert spread.get(2, "time_limit") == before + 1.0 and spread.get(1, "time_limit") == before
+    assert spread.call(0, "action_spec", None) is not None
+    with pytest.raises(RuntimeError, match="no attribute 'colour'"):
+        spread.get(0, "colour")
+    assert spread.get(0, "time_limit") == before  # and it goes on
+
+
+def test_bad_input_is_told_in_one_line(scene):
+    with pytest.raises(InputError, match="nowhere"):
+        ProcessWorlds(scene, "nowhere", {"pixels": False}, [1, 2], 2)
+    with pytest.raises(InputError, match="did you mean 'lighting'"):
+        ProcessWorlds(scene, "bend", {"lightning": "day"}, [1, 2], 2)
+
+
+def test_a_process_that_dies_is_an_error_with_a_cure(spread):
+    spread.begin(range(3))
+    os.kill(spread._children[1]._process.pid, signal.SIGKILL)
+    with pytest.raises(InputError, match=r"exit status -9.*processes=1"):
+        for _ in range(2):
+            spread.step(np.zeros((3, spread.actions)))
+
+
+def test_interrupts_are_the_parents(spread):
+    """Who saves at Ctrl-C or SIGTERM, which reach every process of a terminal, needs the worlds for it."""
+    spread.begin(range(3))
+    for child in spread._children:
+        for one in (signal.SIGINT, signal.SIGTERM):
+            os.kill(child._process.pid, one)
+    assert np.isfinite(spread.step(np.zeros((3, spread.actions))).reward).all()
+
+
+def test_they_end_with_their_parent(scene):
+    """However it ends, and though its script has no `if __name__ == "__main__"`."""
+    script = f"""
+        import os, signal
+        from twin.env.process_worlds import ProcessWorlds
+        worlds = ProcessWorlds({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
+        worlds.begin([0, 1])
+        print(*(child._process.pid for child in worlds._children), flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True)
+    children = [int(pid) for pid in done.stdout.split()]
+    assert done.returncode == -signal.SIGKILL and len(children) == 2, done.stderr
+    import psutil
+
+    _, alive = psutil.wait_procs([psutil.Process(p) for p in children if psutil.pid_exists(p)], timeout=20)
+    assert not alive
+
+
+def test_few_worlds_stay_here(scene, monkeypatch):
+    monkeypatch.setattr("twin.env.batch.cores", lambda: 4)
+    options = {"pixels": False}
+    for count, processes, kind in ((1, None, Worlds), (3, None, Worlds), (4, None, ProcessWorlds), (4, 1, Worlds)):
+        worlds = worlds_of(scene, "bend", options, list(range(count)), processes)
+        assert type(worlds) is kind, (count, processes)
+        if isinstance(worlds, ProcessWorlds):
+            assert len(worlds._children) == 2
+        worlds.close()
