@@ -1,5 +1,6 @@
 """Worlds in several processes go through what they would in one, and tell what goes wrong there."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -13,7 +14,7 @@ from tiny_twin import tiny_twin
 import twin
 from twin import progress
 from twin.env.batch import Worlds, worlds_of
-from twin.env.process_worlds import ProcessWorlds
+from twin.env.process_worlds import ProcessWorlds, _Child
 from twin.env.suite import Stage
 from twin.errors import InputError
 
@@ -72,32 +73,63 @@ def test_tasks_are_asked_where_they_are(spread):
     spread.set(2, "time_limit", before + 1.0)
     assert spread.get(2, "time_limit") == before + 1.0 and spread.get(1, "time_limit") == before
     assert spread.call(0, "action_spec", None) is not None
-    with pytest.raises(RuntimeError, match="no attribute 'colour'"):
+    with pytest.raises(AttributeError, match="no attribute 'colour'"):
         spread.get(0, "colour")
-    assert spread.get(0, "time_limit") == before  # and it goes on
+    spread.set(0, "episode_seed", 77)
+    assert spread.info(0)["episode_seed"] == 77 and spread.get(-1, "time_limit") == before + 1.0  # and it goes on
+    with pytest.raises(IndexError):
+        spread.step(np.zeros((1, spread.actions)), [3])
+
+
+class _Foreign:
+    """A class that no child can import: it is of this process's `__main__`."""
+
+
+def test_what_a_child_cannot_read_is_told(spread, monkeypatch):
+    monkeypatch.setattr(_Foreign, "__module__", "__main__")
+    monkeypatch.setattr(sys.modules["__main__"], "_Foreign", _Foreign, raising=False)
+    with pytest.raises(AttributeError, match="_Foreign"):
+        spread.set(0, "time_limit", _Foreign())
+    spread.begin(range(3))  # and it goes on
 
 
 def test_bad_input_is_told_in_one_line(scene):
     with pytest.raises(InputError, match="nowhere"):
         ProcessWorlds(scene, "nowhere", {"pixels": False}, [1, 2], 2)
+    with pytest.raises(InputError, match="processes = 0"):
+        worlds_of(scene, "bend", {}, [1, 2], 0)
     with pytest.raises(InputError, match="did you mean 'lighting'"):
         ProcessWorlds(scene, "bend", {"lightning": "day"}, [1, 2], 2)
 
 
 def test_a_process_that_dies_is_an_error_with_a_cure(spread):
     spread.begin(range(3))
-    os.kill(spread._children[1]._process.pid, signal.SIGKILL)
-    with pytest.raises(InputError, match=r"exit status -9.*processes=1"):
-        for _ in range(2):
-            spread.step(np.zeros((3, spread.actions)))
+    os.kill(spread._children[1].process.pid, signal.SIGKILL)
+    with pytest.raises(InputError, match=r"exit status -9.*fewer processes"):
+        spread.step(np.zeros((3, spread.actions)))
+    with pytest.raises(InputError, match="make them anew"):
+        spread.begin(range(3))
+
+
+def test_a_step_that_was_interrupted_is_never_heard_later(spread):
+    """As by Ctrl-C in a notebook: what children then say would answer the next request."""
+    spread.begin(range(3))
+    hear = _Child.hear
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(_Child, "hear", lambda child: (_ for _ in ()).throw(KeyboardInterrupt))
+        spread.step(np.zeros((3, spread.actions)))
+    assert _Child.hear is hear
+    with pytest.raises(InputError, match="make them anew"):
+        spread.begin(range(3))
+    spread.close()
 
 
 def test_interrupts_are_the_parents(spread):
-    """Who saves at Ctrl-C or SIGTERM, which reach every process of a terminal, needs the worlds for it."""
+    """Who saves at Ctrl-C, which reaches the whole group of processes, or SIGTERM needs the worlds for it."""
     spread.begin(range(3))
     for child in spread._children:
-        for one in (signal.SIGINT, signal.SIGTERM):
-            os.kill(child._process.pid, one)
+        assert os.getpgid(child.process.pid) != os.getpgid(0)
+        os.kill(child.process.pid, signal.SIGTERM)
     assert np.isfinite(spread.step(np.zeros((3, spread.actions))).reward).all()
 
 
@@ -108,16 +140,30 @@ def test_they_end_with_their_parent(scene):
         from twin.env.process_worlds import ProcessWorlds
         worlds = ProcessWorlds({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
         worlds.begin([0, 1])
-        print(*(child._process.pid for child in worlds._children), flush=True)
+        fork = os.fork()
+        if not fork:  # has the sockets, too, and outlives us
+            os.close(1)
+            os.close(2)
+            signal.pause()
+        print(fork, *(child.process.pid for child in worlds._children), flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True)
-    children = [int(pid) for pid in done.stdout.split()]
+    fork, *children = [int(pid) for pid in done.stdout.split()]
     assert done.returncode == -signal.SIGKILL and len(children) == 2, done.stderr
     import psutil
 
     _, alive = psutil.wait_procs([psutil.Process(p) for p in children if psutil.pid_exists(p)], timeout=20)
+    os.kill(fork, signal.SIGKILL)
     assert not alive
+
+
+def test_nobody_is_left_when_they_are_dropped(scene):
+    worlds = ProcessWorlds(scene, "bend", {"pixels": False}, [1, 2], 2)
+    processes = [child.process for child in worlds._children]
+    del worlds
+    gc.collect()
+    assert all(process.poll() is not None for process in processes)
 
 
 def test_few_worlds_stay_here(scene, monkeypatch):

@@ -8,13 +8,23 @@ import psutil
 _PERIOD = 0.2  # [s]
 
 
+def resident() -> int:
+    """Sum of the resident sizes of this process and everything it started; shared pages count in each [bytes]."""
+    this, total = psutil.Process(), 0
+    for process in (this, *this.children(recursive=True)):
+        try:
+            total += process.memory_info().rss
+        except psutil.Error:
+            continue  # it ended between the listing and the look
+    return total
+
+
 class PeakMemory:
-    """Context manager; `bytes` is the largest sum of resident sizes seen (shared pages count in each process)."""
+    """Context manager; `bytes` is the largest `resident()` seen."""
 
     def __init__(self) -> None:
         self.bytes = 0
         self._stop = threading.Event()
-        self._process = psutil.Process()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> "PeakMemory":
@@ -27,12 +37,6 @@ class PeakMemory:
 
     def _watch(self) -> None:
         while True:
-            total = 0
-            for process in (self._process, *self._process.children(recursive=True)):
-                try:
-                    total += process.memory_info().rss
-                except psutil.Error:
-                    continue  # it ended between the listing and the look
-            self.bytes = max(self.bytes, total)
+            self.bytes = max(self.bytes, resident())
             if self._stop.wait(_PERIOD):
                 return

@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = TrainConfig(**{**PRESETS[given.preset], **asked})
         twin, folder = load_scene(given.scene), given.scene / "runs" / given.run
         with alone(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
-            chosen = _trained(twin, folder, config)
+            chosen = _trained(twin, folder, config, given.processes)
         picture = success_curve(folder)
     except (InputError, OSError) as error:
         return refuse(error)
@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _trained(twin: Twin, folder: Path, config: "TrainConfig") -> dict[str, Any]:
+def _trained(twin: Twin, folder: Path, config: "TrainConfig", processes: int | None) -> dict[str, Any]:
     """Trains under a bar; returns what the best of the late policies did."""
     try:
         from twin.learn import training
@@ -74,10 +74,10 @@ def _trained(twin: Twin, folder: Path, config: "TrainConfig") -> dict[str, Any]:
                     f"success {sum(now.recent)}/{len(now.recent)} ({low:.2f} to {high:.2f})", refresh=False
                 )
 
-        training.train(twin, folder, config, watch)
+        training.train(twin, folder, config, watch, processes)
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        return choose(twin, folder, config)["chosen"]
+        return choose(twin, folder, config, processes)["chosen"]
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -93,6 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--action", choices=("steering", "twist"), help="steering at fixed speed unless given")
     parser.add_argument("--steps", type=int, help="control steps of all worlds together")
     parser.add_argument("--worlds", type=int, help="how many are driven at once")
+    parser.add_argument("--processes", type=int, help="that step the worlds; as many as pay unless given")
     parser.add_argument("--updates", type=float, help="of the networks per step")
     parser.add_argument("--steering", type=float, help="share of a step's worth that full steering costs")
     parser.add_argument("--entropy", type=float, help="of each number of an action [nat]; more explores more")

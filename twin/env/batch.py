@@ -5,8 +5,9 @@ episode: every world is the dm_control environment that `twin.load` gives, stepp
 through exactly what it would alone, on a CPU.
 
 `mujoco.batch.Batch` would step faster by what Python does between the looks at the contacts; it has no contacts to look
-at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock. On a
-GPU `mujoco_warp` steps them all at once, and all are judged at once, see `device_worlds.py`.
+at and no controller between small steps, so the worlds are stepped from threads, outside the interpreter's lock, and
+in several processes, see `process_worlds.py`. On a GPU `mujoco_warp` steps them all at once, and all are judged at
+once, see `device_worlds.py`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -25,6 +26,7 @@ from twin.env.dm_physics import DrivePhysics
 from twin.env.options import CPU, parse_options
 from twin.env.suite import Stage
 from twin.env.tasks import Drive
+from twin.errors import InputError
 from twin.loading import Twin
 
 if TYPE_CHECKING:
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-_FEWEST = 2  # worlds of a process: the memory of one more is worth it from there on
+_FEWEST, _MOST = 2, 8  # worlds of a process, and processes unless asked for: each takes its memory
 
 
 @dataclass(frozen=True)
@@ -180,11 +182,17 @@ def worlds_of(
         task: See `twin.load`.
         options: See `twin.env.options.Options`.
         seeds: One per world, of its sequence of episodes; None: unpredictable.
-        processes: How many step the worlds on a CPU; None: one per core, but no more than half as many as worlds.
+        processes: How many step the worlds on a CPU; None: one per core, at most 8, and no more than half
+                as many as worlds.
+
+    Raises:
+        InputError: as `Stage.open`, or no process at all.
     """
+    if processes is not None and processes < 1:
+        raise InputError(f"processes = {processes}; expected at least 1")
     if parse_options(options).device == CPU:
         if processes is None:
-            processes = min(cores(), len(seeds) // _FEWEST)
+            processes = min(cores(), len(seeds) // _FEWEST, _MOST)
         if processes > 1:
             from twin.env.process_worlds import ProcessWorlds  # which needs this module
 

@@ -2,17 +2,20 @@
 
 Much of a step is Python, which does one thing at a time in a process however many cores there are: what is in view,
 what is touched, the judge. So each *child* (`world_process.py`) has `Worlds` of its own and does with them what its
-parent asks. They talk in pickles, over a socket that nobody else has. A world goes through the same in any process.
+parent asks. They talk in pickles, over a socket of their own. A world goes through the same in any process.
 """
 
 import contextlib
+import copy
 import os
 import pickle
-import socket
 import subprocess
 import sys
+import threading
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +27,6 @@ from twin.env.batch import Outcome
 from twin.env.options import parse_options
 from twin.errors import InputError
 from twin.loading import Twin
-
-BAD_INPUT, BUG = "bad input", "bug"
-"""What a reply begins with where there is no result."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class Shown:
 
 
 class ProcessWorlds:
-    """n worlds of one scene and task, spread over processes. What is public here is as of `Worlds`."""
+    """n worlds of one scene and task, spread over processes: `Worlds`, but for `physics`, `tasks` and most of `pixels`,
+    which are elsewhere."""
 
     def __init__(
         self,
@@ -72,14 +73,17 @@ class ProcessWorlds:
             InputError: as `Stage.open`.
         """
         self.options, self.processes, count = parse_options(options), processes, len(seeds)
-        self._share = np.array_split(np.arange(count), processes)
-        share = max(1, cores.cores() // processes)
-        self._children = [_Child(share) for _ in self._share]
-        self._all = range(processes)
+        parts = np.array_split(np.arange(count), processes)
+        self._home = [(c, k) for c, part in enumerate(parts) for k in range(len(part))]
+        self._lock = threading.Lock()
+        self._children: list[_Child] = []
+        self._end = weakref.finalize(self, _end, self._children)
         try:
-            quiet = [progress.is_quiet() or c > 0 for c in self._all]  # one shows what all of them wait for
-            mine = [[seeds[i] for i in share] for share in self._share]
-            opened = self._ask({c: ("open", quiet[c], scene, task, options, mine[c]) for c in self._all})
+            for _ in parts:
+                self._children.append(_Child(max(1, cores.cores() // processes)))
+            quiet = [progress.is_quiet() or c > 0 for c in range(processes)]  # one shows what all of them wait for
+            mine = [[seeds[i] for i in part] for part in parts]
+            opened = self._ask({c: ("open", quiet[c], scene, task, options, mine[c]) for c in range(processes)})
         except BaseException:
             self.close()
             raise
@@ -88,10 +92,11 @@ class ProcessWorlds:
         shape = count, self.options.stack, 3, height, width
         self.pixels = Shown(np.zeros(shape, np.uint8), np.zeros(count)) if self.options.pixels else None
         self._states = np.zeros((count, self.states), np.float32)
-        self._infos: list[dict[str, Any]] = [{} for _ in range(count)]
+        self._infos: list[dict[str, Any] | None] = [None] * count
+        """As last told; None where it may be another by now."""
 
     def __len__(self) -> int:
-        return len(self._infos)
+        return len(self._home)
 
     def seed(self, i: int, seed: int | None) -> None:
         self._of(i, "seed", seed)
@@ -125,42 +130,53 @@ class ProcessWorlds:
         return self._states[i].copy()
 
     def info(self, i: int) -> dict[str, Any]:
-        return dict(self._infos[i])
+        told = self._infos[i]
+        return self._of(i, "info") if told is None else copy.deepcopy(told)
 
     def get(self, i: int, name: str) -> Any:
         return self._of(i, "get", name)
 
     def set(self, i: int, name: str, value: Any) -> None:
+        self._infos[i] = None
         self._of(i, "set", name, value)
 
     def call(self, i: int, name: str, *args: Any, **kwargs: Any) -> Any:
+        self._infos[i] = None
         return self._of(i, "call", name, *args, **kwargs)
 
     def close(self) -> None:
-        for child in self._children:
-            child.close()
+        self._end()
 
     def _split(self, some: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], list[int]]]:
         """Children that have some of these worlds: which of `some` these are, and their numbers there."""
-        for c, share in enumerate(self._share):
-            at = np.flatnonzero((some >= share[0]) & (some <= share[-1]))
-            if len(at):
-                yield c, at, (some[at] - share[0]).tolist()
+        homes = np.array([self._home[i] for i in some.tolist()]).reshape(-1, 2)
+        for c in np.unique(homes[:, 0]).tolist():
+            at = np.flatnonzero(homes[:, 0] == c)
+            yield c, at, homes[at, 1].tolist()
 
     def _of(self, i: int, what: str, *args: Any, **kwargs: Any) -> Any:
-        ((c, _, (local,)),) = self._split(np.array([i]))
+        c, local = self._home[i]
         return self._ask({c: (what, local, *args)}, kwargs)[c]
 
     def _ask(self, requests: dict[int, tuple[Any, ...]], keywords: dict[str, Any] | None = None) -> dict[int, Any]:
         """Has children do something, all at the same time; what came of it."""
-        for c, request in requests.items():
-            self._children[c].tell((*request, keywords or {}))
-        replies = {c: self._children[c].hear() for c in requests}  # of all, even if one fails
-        for failed, said in replies.values():
-            if failed == BAD_INPUT:
-                raise InputError(said)
+        messages = {c: pickled((*request, keywords or {})) for c, request in requests.items()}
+        with self._lock:
+            if not self._end.alive:
+                raise InputError(
+                    "these worlds are closed, be it that a step was interrupted or one of their processes ended; "
+                    "expected open ones, so make them anew"
+                )
+            try:
+                for c, message in messages.items():
+                    self._children[c].tell(message)
+                replies = {c: self._children[c].hear() for c in requests}  # of all, even if one fails
+            except BaseException:  # some have been told, or heard, and others not
+                self.close()
+                raise
+        for failed, _ in replies.values():
             if failed:
-                raise RuntimeError(f"in a process of worlds:\n{said}")
+                raise failed
         return {c: said for c, (_, said) in replies.items()}
 
     def _take(self, which: NDArray[np.int64], news: News, fills: bool) -> None:
@@ -177,37 +193,48 @@ class _Child:
     """The parent's end of a child."""
 
     def __init__(self, share: int) -> None:
-        ours, theirs = socket.socketpair()
+        self.pipe, theirs = Pipe()
+        path = os.pathsep.join(str(folder or Path.cwd()) for folder in sys.path)
         with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "twin.env.world_process", str(share)],
-                stdin=theirs.fileno(),
-                stdout=2,  # whoever prints there does not print into our output
-                env=os.environ | {"OMP_NUM_THREADS": str(share)},
+            self.process = subprocess.Popen(
+                # -P: it imports what this process would, not what else lies in the current folder.
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "twin.env.world_process",
+                    *map(str, (theirs.fileno(), os.getpid(), share)),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=(theirs.fileno(),),
+                process_group=0,  # Ctrl-C is for the parent, who may want to save first
+                env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": str(share)},
             )
-        with ours:
-            self._pipe = ours.makefile("rwb")  # closed by our death, however it comes; the child then ends, too
 
-    def tell(self, request: tuple[Any, ...]) -> None:
+    def tell(self, message: bytes) -> None:
         with contextlib.suppress(OSError):  # `hear` says why
-            self._pipe.write(pickled(*request))
-            self._pipe.flush()
+            self.pipe.send_bytes(message)
 
-    def hear(self) -> tuple[str, Any]:
+    def hear(self) -> tuple[Exception | None, Any]:
         try:
-            return pickle.load(self._pipe)
+            return pickle.loads(self.pipe.recv_bytes())
         except (EOFError, OSError):
-            code = self._process.wait()
-            return BAD_INPUT, (
-                f"a process of worlds ended with exit status {code}; expected it to go on. If memory ran out, "
-                "take fewer worlds, or processes=1"
-            )
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._pipe.close()
-        self._process.wait()
+            code = self.process.wait()
+            raise InputError(
+                f"a process of worlds ended with exit status {code}; expected it to go on. "
+                + ("If memory ran out, take fewer processes (1: none)" if code == -9 else "It may have said why above")
+            ) from None
 
 
-def pickled(*thing: Any) -> bytes:
+def _end(children: list[_Child]) -> None:
+    """Ends children, which have nothing to save."""
+    for child in children:
+        child.pipe.close()
+        child.process.kill()
+    for child in children:
+        child.process.wait()
+
+
+def pickled(thing: Any) -> bytes:
     return pickle.dumps(thing, pickle.HIGHEST_PROTOCOL)

@@ -1,13 +1,15 @@
 """A process with some of the worlds of `ProcessWorlds`, whose requests it answers.
 
-python -m twin.env.world_process CORES
+python -m twin.env.world_process SOCKET PARENT CORES
 """
 
+import contextlib
+import os
 import pickle
 import signal
-import socket
 import sys
 import traceback
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,10 @@ from numpy.typing import NDArray
 
 from twin import cores, progress
 from twin.env.batch import Outcome, Worlds
-from twin.env.process_worlds import BAD_INPUT, BUG, News, pickled
+from twin.env.process_worlds import News, pickled
 from twin.env.suite import Stage
-from twin.errors import InputError
+
+_LOOK = 2.0  # [s] between two looks whether the parent is still there
 
 
 class Server:
@@ -25,10 +28,19 @@ class Server:
 
     worlds: Worlds
 
-    def answer(self, what: str, *arguments: Any) -> Any:
-        *args, kwargs = arguments
-        owner = self if what in ("open", "begin", "step") else self.worlds
-        return getattr(owner, what)(*args, **kwargs)
+    def answer(self, request: bytes) -> bytes:
+        """What came of a request: an exception or None, and what was asked for."""
+        try:
+            what, *args, kwargs = pickle.loads(request)
+            owner = self if what in ("open", "begin", "step") else self.worlds
+            return pickled((None, getattr(owner, what)(*args, **kwargs)))
+        except Exception as error:
+            error.add_note(f"in a process of worlds:\n{traceback.format_exc()}")
+            with contextlib.suppress(Exception):
+                reply = pickled((error, None))
+                pickle.loads(reply)  # which not every exception bears
+                return reply
+            return pickled((RuntimeError(error.__notes__[-1]), None))
 
     def open(self, quiet: bool, *stage: Any) -> tuple[int, int]:
         progress.set_quiet(quiet)
@@ -52,25 +64,17 @@ class Server:
 
 
 def main() -> None:
-    for one in (signal.SIGINT, signal.SIGTERM):  # are the parent's, who may want to save first
-        signal.signal(one, signal.SIG_IGN)
-    cores.use(int(sys.argv[1]))
+    socket, parent, share = map(int, sys.argv[1:])
+    os.set_inheritable(socket, False)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # where all processes get it: the parent may want to save first
+    cores.use(share)
     server = Server()
-    with socket.socket(fileno=0) as ours:
-        pipe = ours.makefile("rwb")
-    while True:
-        try:
-            request = pickle.load(pipe)
-        except (EOFError, OSError):  # the parent has closed it, or is gone
-            return
-        try:
-            reply = pickled("", server.answer(*request))
-        except InputError as error:
-            reply = pickled(BAD_INPUT, str(error))
-        except Exception:
-            reply = pickled(BUG, traceback.format_exc())
-        pipe.write(reply)
-        pipe.flush()
+    with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent has closed it
+        while True:
+            while not pipe.poll(_LOOK):
+                if os.getppid() != parent:  # gone, though somebody it forked may still have the socket
+                    return
+            pipe.send_bytes(server.answer(pipe.recv_bytes()))
 
 
 if __name__ == "__main__":

@@ -29,13 +29,14 @@ _CANDIDATES = 4
 _STREAM = 7  # with a run's seed, what the seeds of these episodes are drawn from
 
 
-def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
+def choose(twin: Twin, folder: Path, config: TrainConfig, processes: int | None = None) -> dict[str, Any]:
     """Makes the best policy of a finished training the run's; does nothing where that is done.
 
     Args:
         twin: What was trained in.
         folder: Of the run.
         config: Of the run; `trials` is the number of episodes each candidate drives.
+        processes: See `worlds_of`.
 
     Returns:
         What `choice.json` holds: steps that were trained; for every candidate its step, trials, successes and mean
@@ -51,7 +52,7 @@ def choose(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any]:
     options = {**config.options(), "start_along": 0.0}
     tried = []
     bar = progress.bar("choose", len(candidates) * len(shared) + len(fresh), "episode")
-    with closing(worlds_of(twin, config.task, options, [None] * config.worlds)) as worlds, bar:
+    with closing(worlds_of(twin, config.task, options, [None] * config.worlds, processes)) as worlds, bar:
 
         def told(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
             return {"step": int(path.name)} | _summed(episodes(load_policy(path), worlds, which, bar.update))

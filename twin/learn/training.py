@@ -21,12 +21,12 @@ import signal
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
@@ -44,6 +44,7 @@ from twin.learn.state import has_state, load_state, save_state
 from twin.learn.train_config import TrainConfig
 from twin.learn.vectors import DriveVecEnv
 from twin.loading import Twin
+from twin.memory import resident
 from twin.report.training import CHOICE
 from twin.report.trials import RECENT, csv_text
 from twin.scene import read_json, write_json, write_text
@@ -89,7 +90,13 @@ class Progress:
     """Success of the last episodes from the beginning of the stretch, `RECENT` at most."""
 
 
-def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progress], None] | None = None) -> None:
+def train(
+    twin: Twin,
+    folder: Path,
+    config: TrainConfig,
+    watch: Callable[[Progress], None] | None = None,
+    processes: int | None = None,
+) -> None:
     """Trains a policy, or goes on where it was stopped or killed.
 
     Args:
@@ -97,6 +104,7 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
         folder: Of the run.
         config: Of the run; a run that is there must have the same but for `steps`.
         watch: Is told at every step of the worlds.
+        processes: That step the worlds; see `worlds_of`. What is learnt is the same.
 
     SIGINT and SIGTERM save, and then raise KeyboardInterrupt.
 
@@ -116,32 +124,32 @@ def train(twin: Twin, folder: Path, config: TrainConfig, watch: Callable[[Progre
         (folder / "state").mkdir(exist_ok=True)
     if go_on and not (folder / "state" / "pictures.bin").exists():
         raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
-    worlds = PreparedVecEnv(DriveVecEnv(twin, config.task, config.worlds, config.seed, **config.options()), config.pool)
-    model = _model(worlds, config, folder / "state" / "pictures.bin")
-    before: dict[str, Any] = load_state(folder / "state", model) if go_on else {"wall": 0.0, "resumed": -1}
-    resumed = before["resumed"] + 1
-    worlds.seed(int(np.random.SeedSequence([config.seed, resumed, _SEEDS]).generate_state(1, np.uint64)[0]))
-    updates = max(1, round(config.updates * config.worlds))
+    vectors = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, **config.options())
+    with closing(PreparedVecEnv(vectors, config.pool)) as worlds:
+        model = _model(worlds, config, folder / "state" / "pictures.bin")
+        before: dict[str, Any] = load_state(folder / "state", model) if go_on else {"wall": 0.0, "resumed": -1}
+        resumed = before["resumed"] + 1
+        worlds.seed(int(np.random.SeedSequence([config.seed, resumed, _SEEDS]).generate_state(1, np.uint64)[0]))
+        updates = max(1, round(config.updates * config.worlds))
 
-    def learn() -> None:
-        if model.num_timesteps > config.starts:
-            model.train(updates, config.batch)
+        def learn() -> None:
+            if model.num_timesteps > config.starts:
+                model.train(updates, config.batch)
 
-    worlds.meanwhile = learn
-    keeper = _Keeper(folder, config, said, twin, before["wall"], resumed, watch)
-    before_us = {one: signal.signal(one, keeper.stop) for one in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        left = config.steps - model.num_timesteps
-        if left > 0:
-            (folder / CHOICE).unlink(missing_ok=True)  # what it says will not be so
-            model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
-            keeper.end()
-            if keeper.stopped:
-                raise KeyboardInterrupt
-    finally:
-        for one, handler in before_us.items():
-            signal.signal(one, handler)
-        worlds.close()
+        worlds.meanwhile = learn
+        keeper = _Keeper(folder, config, said, twin, before["wall"], resumed, watch)
+        before_us = {one: signal.signal(one, keeper.stop) for one in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            left = config.steps - model.num_timesteps
+            if left > 0:
+                (folder / CHOICE).unlink(missing_ok=True)  # what it says will not be so
+                model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
+                keeper.end()
+                if keeper.stopped:
+                    raise KeyboardInterrupt
+        finally:
+            for one, handler in before_us.items():
+                signal.signal(one, handler)
 
 
 def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
@@ -285,7 +293,7 @@ class _Keeper(BaseCallback):
             *(model.num_timesteps, f"{self.wall:.1f}", model._n_updates),
             f"{(model.num_timesteps - self._first) / elapsed:.2f}",
             f"{(model._n_updates - self._first_updates) / elapsed:.2f}",
-            round(psutil.Process().memory_info().rss / 2**20),
+            round(resident() / 2**20),
             *(f"{logged.get(f'train/{name}', float('nan')):.4g}" for name in ("ent_coef", "value")),
         )
         _append(self._folder / "log.csv", [row])

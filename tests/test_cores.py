@@ -1,0 +1,32 @@
+"""How many cores there are to use."""
+
+import os
+
+import pytest
+
+from twin import cores
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch):
+    monkeypatch.setattr(cores, "_most", None)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda who: set(range(8)), raising=False)
+    cores._quota.cache_clear()
+    yield
+    cores._quota.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("said", "wanted"), [("max 100000", 8), ("250000 100000", 2), ("10000 100000", 1), ("what", 8), (None, 8)]
+)
+def test_a_container_may_have_fewer(tmp_path, monkeypatch, said, wanted):
+    file = tmp_path / "cpu.max"
+    if said:
+        file.write_text(said + "\n")
+    monkeypatch.setattr(cores, "_QUOTA", file)
+    assert cores.cores() == wanted
+
+
+def test_one_of_several_processes_uses_its_share():
+    cores.use(3)
+    assert cores.cores() == min(3, cores._quota() or 3)
