@@ -25,8 +25,9 @@ from twin.loading import Twin
 from twin.report.trials import Trial, read_trials
 from twin.report.validation import lines, pairs, rate, summary
 from twin.robot import HuskyParams
+from twin.validate import seeds_of
 
-FIRST = 1_000_000
+FIRST = seeds_of("day", 1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +160,13 @@ def test_more_policies_and_episodes_are_added(fresh):
     assert said["robot_known"] == []  # as published
     assert [c["trials"] for c in said["cells"]] == [3, 3]
     assert (fresh / "validation" / "failures_ahead.png").stat().st_size > 5_000
+
+
+def test_episodes_are_those_of_every_policy_but_of_one_lighting_alone(fresh):
+    run(fresh, "ahead", "left", lightings=["day", "night"], episodes=2)
+    trials = read_trials(fresh / "validation" / "episodes.csv")
+    by = {name: {t.seed for t in trials if t.policy == name} for name in ("ahead", "left")}
+    assert by["ahead"] == by["left"] and len(by["ahead"]) == 4
 
 
 def test_another_policy_of_the_same_name_is_refused(fresh, tmp_path):

@@ -1,7 +1,7 @@
 """Verb: a film of a drive in a built scene, to be judged by eye.
 
     python -m twin.film scenes/demo --task right_turn --lighting night --obstacles 4
-    python -m twin.film scenes/demo --policy first --task straight --lighting held-out --seed 1000007 --out drive.mp4
+    python -m twin.film scenes/demo --policy first --task straight --lighting held-out --seed 7 --out drive.mp4
 
 Shows what the robot sees, the robot from behind, where it is, its speed and its reward. The driver is scripted unless a
 policy is named: whatever `twin.validate` takes, in the environment that the policy asks for. Task, lighting and seed

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 from twin import progress
 from twin.alone import alone
@@ -32,7 +33,7 @@ from twin.scene import SceneDir, digest_file, digest_json, read_json, write_json
 DEFAULT_LIGHTINGS = (HELD_OUT, HELD_OUT + RANDOMISED)
 """As the place was filmed but for its light; and nearer to what a road does."""
 
-_FIRST_SEED = 1_000_000  # of validation
+_FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # of validation; see `seeds_of`
 _SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
 _LIGHTS, _LOOKS, _FINALISTS = 16, 4, 4  # lights drawn, episodes in each, and how many are looked at more closely
 
@@ -139,8 +140,8 @@ def validate(
         _mend(folder / "worst.csv")
         _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
         todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
-        seeds = range(_FIRST_SEED, _FIRST_SEED + episodes)
-        driven = todo.drive([(name, lighting, seeds) for name in policies for lighting in lightings], "validate")
+        wanted = [(name, one, seeds_of(one, episodes)) for name in policies for one in lightings]
+        driven = todo.drive(wanted, "validate")
         if worst:
             searched = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
             for name in policies:
@@ -211,6 +212,16 @@ def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[T
         mine.append(told | files)
     key = trials[0].policy, trials[0].task
     write_json(noted, [one for one in before if (one["policy"], one["task"]) != key] + mine)
+
+
+def seeds_of(lighting: str, episodes: int) -> range:
+    """Of a lighting's episodes, the same for every policy.
+
+    Another lighting has others: a seed decides start, robot, weather and bystanders, too, so that one seed in ten
+    lightings would be hardly more than one episode, and an interval that counts ten too narrow.
+    """
+    first = _FIRST_SEED + _PER_LIGHTING * (crc32(lighting.encode()) % _BLOCKS)
+    return range(first, first + episodes)
 
 
 def _search(search: Campaign, policy: str, episodes: int) -> None:
