@@ -46,7 +46,7 @@ def test_they_are_as_in_one_process(scene, options):
     for worlds in (here, there):
         worlds.begin(range(3))
     for k in range(30):
-        which = [[2, 0], [1], [0, 1, 2]][k % 3]
+        which = [[2, 1, 0], [1], [0, 2]][k % 3]
         actions = rng.uniform(-1, 1, (len(which), here.actions))
         a, b = (worlds.step(actions, which) for worlds in (here, there))
         for name in ("reward", "terminated", "truncated"):
@@ -75,8 +75,8 @@ def test_tasks_are_asked_where_they_are(spread):
     assert spread.call(0, "action_spec", None) is not None
     with pytest.raises(AttributeError, match="no attribute 'colour'"):
         spread.get(0, "colour")
-    spread.set(0, "episode_seed", 77)
-    assert spread.info(0)["episode_seed"] == 77 and spread.get(-1, "time_limit") == before + 1.0  # and it goes on
+    spread.set(1, "episode_seed", 77)
+    assert spread.info(1)["episode_seed"] == 77 and spread.get(-1, "time_limit") == before + 1.0  # and it goes on
     with pytest.raises(IndexError):
         spread.step(np.zeros((1, spread.actions)), [3])
 
@@ -156,6 +156,15 @@ def test_they_end_with_their_parent(scene):
     _, alive = psutil.wait_procs([psutil.Process(p) for p in children if psutil.pid_exists(p)], timeout=20)
     os.kill(fork, signal.SIGKILL)
     assert not alive
+
+
+def test_closing_does_not_wait_for_who_else_has_the_sockets(spread):
+    """As a process forked meanwhile has them."""
+    held = [os.dup(child.pipe.fileno()) for child in spread._children]
+    spread.close()
+    assert all(child.process.poll() == -signal.SIGKILL for child in spread._children)
+    for one in held:
+        os.close(one)
 
 
 def test_nobody_is_left_when_they_are_dropped(scene):
