@@ -18,6 +18,7 @@ def set_quiet(quiet: bool) -> None:
 
 
 def is_quiet() -> bool:
+    """Whether bars are silenced in this process."""
     return _quiet
 
 

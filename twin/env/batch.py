@@ -132,10 +132,7 @@ class Worlds:
 
     def observation(self) -> NDArray:
         """Pictures uint8 (n, 3 · stack, height, width), the newest last; or the states, float32 (n, k)."""
-        if self.pixels:
-            stacks = self.pixels.stacks
-            return stacks.reshape(len(self), -1, *stacks.shape[3:]).copy()
-        return self._states.copy()
+        return stacked(self.pixels.stacks) if self.pixels else self._states.copy()
 
     def state(self, i: int) -> NDArray[np.float32]:
         """What a driver of world i that knows the map would know, see `Drive.get_observation`; shape (k,).
@@ -202,6 +199,11 @@ def worlds_of(
 
     stage = Stage.open(scene, task, options)
     return DeviceWorlds(stage, seeds, stage.options.device)
+
+
+def stacked(stacks: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pictures of n worlds as networks take them, see `Worlds.observation`, of stacks (n, stack, 3, height, width)."""
+    return stacks.reshape(len(stacks), -1, *stacks.shape[3:]).copy()
 
 
 def _state(step: dm_env.TimeStep) -> NDArray[np.float32]:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import cores, progress
-from twin.env.batch import Outcome
+from twin.env.batch import Outcome, stacked
 from twin.env.options import parse_options
 from twin.errors import InputError
 from twin.loading import Twin
@@ -121,10 +121,7 @@ class ProcessWorlds:
         return out
 
     def observation(self) -> NDArray:
-        if self.pixels:
-            stacks = self.pixels.stacks
-            return stacks.reshape(len(self), -1, *stacks.shape[3:]).copy()
-        return self._states.copy()
+        return stacked(self.pixels.stacks) if self.pixels else self._states.copy()
 
     def state(self, i: int) -> NDArray[np.float32]:
         return self._states[i].copy()
