@@ -18,9 +18,10 @@ from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
-from twin.nerf.evaluate import evaluate, fit_embedding
+from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
 from twin.nerf.fit import Trainer, fit, free_segments
+from twin.nerf.fit_light import fit_embedding
 from twin.nerf.losses import bending
 from twin.nerf.stage import constant_height, run
 from twin.nerf.workspace import CameraArrays

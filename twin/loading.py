@@ -51,7 +51,8 @@ class Twin:
         from twin.nerf.field import RadianceField
 
         field = RadianceField.load(self._folder("field"))
-        field.add_lightings(*added_lightings(self.scene))
+        fresh, stale, _ = added_lightings(self.scene)
+        field.add_lightings(fresh, stale)
         return field
 
     def world(self) -> World:

@@ -2,10 +2,11 @@
 
     python -m twin.relight scenes/demo photo.jpg --name afternoon
 
-finds where the photo was taken (`capture/register.py`), then the appearance embedding under which the frozen field
-looks most like it. The lighting goes to `<scene>/lightings/afternoon.json`, with a picture beside it: the photo, the
-field under the lighting fitted, and under the most similar filmed one. From then on `twin.load_scene(scene).field()`
-has it: `lighting="afternoon"`, `"sun:afternoon:0.5"`.
+finds where the photo was taken (`capture/register.py`), then the appearance embedding and the air under which the
+frozen field looks most like it. The lighting goes to `<scene>/lightings/afternoon.json`, with a picture beside it: the
+photo, the field under the lighting fitted, and under the most similar filmed one. From then on
+`twin.load_scene(scene).field()` has it: `lighting="afternoon"`, `"sun:afternoon:0.5"`; environments lay its air over
+their pictures.
 """
 
 import argparse
@@ -18,14 +19,18 @@ from numpy.typing import NDArray
 
 from twin import progress
 from twin.errors import InputError, refuse
+from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.nerf.added import AddedLighting, check_name, field_result
+from twin.nerf.air import Air
 from twin.scene import SceneDir
 
+_CLEAR = Air()
 _MAX_WIDTH = 480  # [px] longer side of the picture fitted, as that of the frames trained on
 _STEPS = 300
 _RAYS = 10_000  # fitted at most, spread evenly
 _LOOK_RAYS = 1000  # that tell which filmed frame is most like the photo
+_HAZY = 0.2  # [dB]
 _GAP = 4  # [px] between the pictures
 
 
@@ -37,6 +42,8 @@ class Relit:
     """The filmed lighting that looks most like the photo."""
     embedding: NDArray[np.float32]
     """Shape (dim,)."""
+    air: Air
+    """Clear where haze does not explain the picture better."""
     pictures: tuple[NDArray, NDArray, NDArray]
     """Photo, field under the fitted lighting, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
     psnr_nearest: float
@@ -45,10 +52,15 @@ class Relit:
     """[dB]"""
     psnr_other_half: float
     """[dB] of each half of the picture, left and right, under what was fitted to the other; mean over both."""
+    psnr_clear_other_half: float
+    """[dB] The same with the air taken for clear."""
 
 
 def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArray) -> Relit:
-    """The lighting of a photo, by optimisation with the field frozen.
+    """The lighting of a photo and its air, by optimisation with the field frozen.
+
+    The air is taken for clear unless what is fitted to one half of the picture then explains the other half better by
+    `_HAZY`.
 
     Args:
         field: A `RadianceField`.
@@ -59,22 +71,28 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     import torch
 
     from twin.nerf.compute import single_threaded_torch
-    from twin.nerf.evaluate import fit_embedding
+    from twin.nerf.fit_light import fit_embedding, fit_light_and_air
     from twin.nerf.workspace import CameraArrays
 
     height, width = photo.shape[:2]
     v, u = np.mgrid[:height, :width] + 0.5
     cameras = CameraArrays(np.asarray(camera_to_world)[None], np.asarray(intrinsics)[None], field.where)
     pixel = np.stack([u.ravel(), v.ravel()], -1)
-    features, harmonics, _, _ = field.trace(cameras, np.zeros(len(pixel), int), pixel)
+    features, harmonics, depth, _ = field.trace(cameras, np.zeros(len(pixel), int), pixel)
+    rays = unproject(pixel_grid(width, height), np.asarray(intrinsics))
+    distance = depth.cpu().numpy().reshape(height, width) * np.linalg.norm(rays, axis=-1).astype(np.float32)
+    distances = torch.as_tensor(distance.ravel(), device=field.where)
     colours = torch.as_tensor(photo.reshape(-1, 3).astype(np.float32), device=field.where)
 
-    def picture(embedding: NDArray) -> NDArray:
-        return field.colour(features, harmonics, embedding).reshape(photo.shape)
+    def picture(embedding: NDArray, air: Air = _CLEAR) -> NDArray:
+        return air.over(field.colour(features, harmonics, embedding).reshape(photo.shape), distance)
 
-    def fitted(use: NDArray, start: NDArray) -> NDArray:
+    def fitted(use: NDArray, start: NDArray, hazy: bool) -> tuple[NDArray, Air]:
         some = torch.as_tensor(use[:: max(1, len(use) // _RAYS)], device=field.where)
-        return fit_embedding(field, features[some], harmonics[some], colours[some], start, _STEPS)
+        seen = field, features[some], harmonics[some], colours[some]
+        if hazy:
+            return fit_light_and_air(*seen, distances[some], start, _STEPS)
+        return fit_embedding(*seen, start, _STEPS), _CLEAR
 
     filmed = {name: picture(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
@@ -86,12 +104,16 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     start = starts[int(np.argmin([((look - photo.reshape(-1, 3)[some]) ** 2).mean() for look in looks]))]
     left = np.broadcast_to(np.arange(width) < width // 2, (height, width))
     with single_threaded_torch():
-        embedding = fitted(np.arange(height * width), start)
-        halves = [psnr(picture(fitted(np.flatnonzero(half), start)), photo, ~half) for half in (left, ~left)]
-    shown = picture(embedding)
+        clear, hazy = (
+            float(np.mean([psnr(picture(*fitted(np.flatnonzero(h), start, air)), photo, ~h) for h in (left, ~left)]))
+            for air in (False, True)
+        )
+        is_hazy = hazy > clear + _HAZY
+        embedding, air = fitted(np.arange(height * width), start, is_hazy)
+    shown = picture(embedding, air)
     return Relit(
-        *(nearest, embedding, (photo, shown, filmed[nearest])),
-        *(psnr(filmed[nearest], photo), psnr(shown, photo), float(np.mean(halves))),
+        *(nearest, embedding, air, (photo, shown, filmed[nearest])),
+        *(psnr(filmed[nearest], photo), psnr(shown, photo), hazy if is_hazy else clear, clear),
     )
 
 
@@ -138,25 +160,28 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
         "psnr_nearest": round(relit.psnr_nearest, 3),
         "psnr_fitted": round(relit.psnr_fitted, 3),
         "psnr_other_half": round(relit.psnr_other_half, 3),
+        "psnr_clear_other_half": round(relit.psnr_clear_other_half, 3),
     }
     gap = np.ones((lens.height, _GAP, 3), np.float32)
     a, b, c = relit.pictures
     write_image(scene.lightings / f"{name}.png", np.hstack([a, gap, b, gap, c]))
-    lighting = AddedLighting(name, [float(x) for x in relit.embedding], result, str(photo), figures)
+    lighting = AddedLighting(name, [float(x) for x in relit.embedding], relit.air, result, str(photo), figures)
     lighting.save(scene)
     return lighting
 
 
 def summary(lighting: AddedLighting) -> str:
     """The lines printed at the end."""
-    f = lighting.figures
+    f, air = lighting.figures, lighting.air
+    clear = f"in clear air those halves have {f['psnr_clear_other_half']:.1f} dB"
     x, y, z = np.array(f["camera_to_world"])[:3, 3]
     return (
         f"registered with {f['inliers']} inliers of {f['matches']} matches at ({x:.2f}, {y:.2f}, {z:.2f}) m, "
         f"{f['from_path_m']:.2f} m from the nearest frame; {f['reprojection_error_px']:.2f} px; "
         f"focal length {f['focal_px']:.0f} px ({f['focal_from']})\n"
         f"{lighting.name}: {f['psnr_nearest']:.1f} dB under the nearest filmed lighting ({f['nearest']}), "
-        f"{f['psnr_fitted']:.1f} dB fitted; each half of the picture by the other's fit {f['psnr_other_half']:.1f} dB"
+        f"{f['psnr_fitted']:.1f} dB fitted; each half of the picture by the other's fit {f['psnr_other_half']:.1f} dB\n"
+        + (f"visibility {3.0 / air.extinction:.0f} m; {clear}" if air.extinction else "the air is clear")
     )
 
 
@@ -165,7 +190,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m twin.relight",
         description="Learn one more lighting of a built place from a single photo of it: find where it was taken, then "
-        "fit the field's appearance to it. What it looks like this afternoon, the twin then looks like, everywhere.",
+        "fit the field's appearance and the air to it. What it looks like this afternoon, the twin then looks like, "
+        "everywhere.",
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")

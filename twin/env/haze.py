@@ -1,9 +1,4 @@
-"""Air that the film did not have, laid into a picture by its depth.
-
-*Extinction* is the share of light that a metre of air takes away [1/m]: what is seen over a distance d keeps
-exp(−extinction · d) of its light and gains the rest from the *airlight*, which the air itself scatters towards the
-camera (Koschmieder 1924). *Visibility*, as meteorologists say it, is the distance over which 5 % are kept: 3 over the
-extinction.
+"""Air that the film did not have, of an episode whose air nobody knows: see `nerf/air.py` for what it does.
 
 The airlight has the colour that the sky has near the horizon in the episode's own light, as its first picture shows it.
 """
@@ -11,10 +6,11 @@ The airlight has the colour that the sky has near the horizon in the episode's o
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.nerf.air import REACH, Air
+
 Floats = NDArray[np.float32]
 
 _FAR = 40.0  # [m] what is farther has nearly the horizon's colour
-_HIGH = 100.0  # [m] that haze reaches at most: it lies low, so the sky shines through
 _FEW = 0.01  # share of a picture that must be so far for its colour to count
 
 
@@ -27,22 +23,21 @@ class Haze:
             extinction: [1/m].
             airlight: Its brightness as a share of the horizon's.
         """
-        self._extinction, self._gain = np.float32(extinction), np.float32(airlight)
-        self._airlight: Floats | None = None
+        self._extinction, self._gain = extinction, np.float32(airlight)
+        self._air: Air | None = None
 
-    def over(self, rgb: Floats, depth: Floats, lengths: Floats) -> Floats:
+    def over(self, rgb: Floats, distance: Floats) -> Floats:
         """A picture as seen through the air; an episode's first one tells the airlight.
 
         Args:
             rgb: Shape (height, width, 3).
-            depth: z-depth [m], shape (height, width).
-            lengths: Of the pixels' rays where z = 1, shape (height, width).
+            distance: Along the pixels' rays [m], shape (height, width).
         """
-        distance = np.minimum(depth * lengths, np.float32(_HIGH))
-        if self._airlight is None:
-            self._airlight = np.minimum(self._gain * _horizon(rgb, distance), np.float32(1.0))
-        kept = np.exp(-self._extinction * distance)[..., None]
-        return kept * rgb + (1.0 - kept) * self._airlight
+        if self._air is None:
+            horizon = _horizon(rgb, np.minimum(distance, np.float32(REACH)))
+            red, green, blue = np.minimum(self._gain * horizon, np.float32(1.0)).tolist()
+            self._air = Air(self._extinction, (red, green, blue))
+        return self._air.over(rgb, distance)
 
 
 def _horizon(rgb: Floats, distance: Floats) -> Floats:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
+from twin.nerf.air import Air
 from twin.nerf.baked import BakedField
 
 Floats = NDArray[np.float32]
@@ -51,6 +52,8 @@ class Light:
     """As it was asked for, or how it was drawn."""
     start: Floats
     """Embedding at the beginning, shape (dim,)."""
+    air: Air | None = None
+    """Of the beginning, which stays, where a photo told it; None: the film's."""
     end: Floats | None = None
     """Embedding after `duration`; None where it stays."""
     duration: float = 0.0
@@ -159,25 +162,26 @@ def draw_light(
     Raises:
         InputError: an unknown lighting, or none that fits.
     """
-    name, start = _one(wanted, sets, rng)
+    name, start, air = _one(wanted, sets, rng)
     if not drift:
-        return Light(name, start)
-    other, end = _one(wanted, sets, rng)
+        return Light(name, start, air)
+    other, end, _ = _one(wanted, sets, rng)
     if isinstance(wanted, str) and wanted not in RESERVED_LIGHTINGS:
         names = [n for n in sets.field.lightings if n != wanted]
         if not names:
             raise InputError(f"lighting {wanted!r} cannot drift: the field has no other; give lighting_drift=False")
-        other, end = _one(tuple(names), sets, rng)
-    return Light(f"{name} → {other}", start, end, duration)
+        other, end, _ = _one(tuple(names), sets, rng)
+    return Light(f"{name} → {other}", start, air, end, duration)
 
 
-def _one(wanted: str | Sequence[str], sets: LightSets, rng: np.random.Generator) -> tuple[str, Floats]:
+def _one(wanted: str | Sequence[str], sets: LightSets, rng: np.random.Generator) -> tuple[str, Floats, Air | None]:
+    """A light's name, embedding and air."""
     if not isinstance(wanted, str):
         if not wanted:
             raise InputError("lighting = (): expected at least one name")
         wanted = wanted[int(rng.integers(len(wanted)))]
     if wanted == ANY:
-        return ANY, sets.field.sample_lighting(rng)
+        return ANY, sets.field.sample_lighting(rng), None
     if wanted in (TRAINING, HELD_OUT):
-        return wanted, sets.sample(wanted, rng)
-    return wanted, sets.field.embedding(wanted)
+        return wanted, sets.sample(wanted, rng), None
+    return wanted, sets.field.embedding(wanted), sets.field.air(wanted)

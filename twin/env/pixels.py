@@ -66,7 +66,10 @@ class Pixels:
                 self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
             if o.camera:
                 self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
-            self._weather[i] = Weather(task.draw, task.rng(WEATHER)) if o.randomise else None
+            air = self.lights[i].air  # type: ignore[union-attr]
+            if air and o.randomise and o.randomise.hold_known:
+                task.weathered(task.draw.on_a_known_day())
+            self._weather[i] = Weather(task.draw, task.rng(WEATHER), air) if air or o.randomise else None
         if len(which):
             self._show(which, fills=True)
 

@@ -26,7 +26,7 @@ from twin.env.obstacles import add_obstacles
 from twin.env.options import CPU, NERF, Options, parse_options
 from twin.env.overlay import Overlay
 from twin.env.pixels import Pixels
-from twin.env.randomisation import ANOTHER_DAY, VERSION, Ranges
+from twin.env.randomisation import ANOTHER_DAY, UNTOLD, VERSION, Ranges
 from twin.env.scene_model import episode_spec
 from twin.env.simulator_view import SimulatorView
 from twin.env.stretches import Stretch, find_task
@@ -82,7 +82,10 @@ class Stage:
     @property
     def _bare(self) -> bool:
         """Whether nothing is put into pictures of the field, not even the robot itself."""
-        if self.options.randomise or self.options.camera or self.obstacles.pool:
+        lighting = self.options.lighting
+        asked = (lighting,) if isinstance(lighting, str) else tuple(lighting)
+        air = self.field is not None and any(self.field.air(name) for name in asked)
+        if self.options.randomise or self.options.camera or self.obstacles.pool or air:
             return False
         data, camera = mujoco.MjData(self.model), self.model.camera("front").id
         mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("spawn").id)
@@ -119,7 +122,7 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
     ranges = [dataclasses.asdict(one) for one in (Ranges(), ANOTHER_DAY)]  # of training and of judging
     drawn = {"version": VERSION, "ranges": ranges} if lighting.endswith(RANDOMISED) else {}
     plain = lighting.removesuffix(RANDOMISED)
-    photos = [twin.scene.lightings / f"{name}.json" for name in plain.split(":")]
+    photos = [path for name in plain.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()]
     return digest_json(
         {
             "stages": [read_json(twin.scene.stamp(stage))["result"] for stage in ("field", "mjcf")],
@@ -127,7 +130,8 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
             **({"randomise": drawn} if drawn else {}),
             **({"lights": lightings.VERSION} if plain in (TRAINING, HELD_OUT) else {}),
-            "photos": [digest_file(path) for path in photos if path.exists()],
+            "photos": [digest_file(path) for path in photos],
+            **({"untold": UNTOLD} if photos and drawn else {}),
         }
     )
 

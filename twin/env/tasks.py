@@ -79,6 +79,10 @@ class Drive(control.Task):
         """Starts another sequence of episodes."""
         self._rng = np.random.default_rng(seed)
 
+    def weathered(self, draw: Draw) -> None:
+        """Takes another draw for that of the episode under way, which differs from it in the weather alone."""
+        self.draw, self._record = draw, draw.record()
+
     def rng(self, stream: int) -> np.random.Generator:
         """A generator of the episode under way."""
         return np.random.default_rng([self.episode_seed, stream])

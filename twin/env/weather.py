@@ -1,5 +1,6 @@
 """What the weather of an episode lays over its pictures: another sun's light on what stands (`sides.py`), that sun's
-shadows (`shade.py`), and then the air (`haze.py`)."""
+shadows (`shade.py`), and then the air: that of the episode's own light, where a photo told it (`nerf/air.py`), and what
+was drawn besides (`haze.py`)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from twin.env.haze import Haze
 from twin.env.randomisation import Draw
 from twin.env.shade import Shade
 from twin.env.sides import REACH, Sides
+from twin.nerf.air import Air
 
 Floats = NDArray[np.float32]
 
@@ -17,11 +19,12 @@ _ELEVATION = (10.0, 55.0)  # [°] of the sun
 class Weather:
     """The weather of one episode."""
 
-    def __init__(self, draw: Draw, rng: np.random.Generator) -> None:
+    def __init__(self, draw: Draw, rng: np.random.Generator, air: Air | None = None) -> None:
         """
         Args:
             draw: Of the episode.
             rng: Of its sun, light and shadows.
+            air: Of the episode's light, where it is known.
         """
         elevation, azimuth = np.deg2rad(rng.uniform(*_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
         level = np.cos(elevation)
@@ -30,7 +33,9 @@ class Weather:
         sides, shade = rng.spawn(2)
         self._sides = Sides(draw.sunlight, sun, sides) if draw.sunlight else None
         self._shade = Shade(draw.shade, sun, shade) if draw.shade else None
-        self._haze = Haze(draw.extinction, draw.airlight) if draw.extinction else None
+        self._airs: list[Air | Haze] = [air] if air and air.extinction else []
+        if draw.extinction:
+            self._airs.append(Haze(draw.extinction, draw.airlight))
 
     def over(self, rgb: Floats, depth: Floats, rays: NDArray, pose: NDArray) -> Floats:
         """A picture in this weather.
@@ -47,4 +52,8 @@ class Weather:
                 rgb = self._sides.over(rgb, depth, around.astype(np.float32))
             if self._shade:
                 rgb = self._shade.over(rgb, depth, around + pose[:3, 3])
-        return self._haze.over(rgb, depth, np.linalg.norm(rays, axis=-1).astype(np.float32)) if self._haze else rgb
+        if self._airs:
+            distance = depth * np.linalg.norm(rays, axis=-1).astype(np.float32)
+            for air in self._airs:
+                rgb = air.over(rgb, distance)
+        return rgb

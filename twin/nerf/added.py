@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
+from twin.nerf.air import Air
 from twin.scene import SceneDir, read_json, write_json
 
-_FORMAT = 1
+_FORMAT = 2  # which has the air
 _NAME = re.compile(r"\w[\w.-]*")
 
 
@@ -26,6 +27,8 @@ class AddedLighting:
     name: str
     embedding: list[float]
     """Length dim."""
+    air: Air
+    """What was in the air when the photo was taken."""
     field: str
     """`result` in the stamp of the field stage it belongs to."""
     photo: str
@@ -59,27 +62,38 @@ def field_result(scene: SceneDir) -> str:
     return str(read_json(path)["result"])
 
 
-def added_lightings(scene: SceneDir) -> tuple[dict[str, NDArray[np.float32]], tuple[str, ...]]:
-    """Embeddings (dim,) by name of the lightings added to a scene's present field, and the names of the stale ones.
+def added_lightings(
+    scene: SceneDir,
+) -> tuple[dict[str, NDArray[np.float32]], tuple[str, ...], dict[str, Air]]:
+    """Embeddings (dim,) by name of the lightings added to a scene's present field, the names of the stale ones, and
+    the air of each.
 
     Raises:
         InputError: a file there is damaged or of another format.
     """
     result = field_result(scene)
     fresh: dict[str, NDArray[np.float32]] = {}
+    airs: dict[str, Air] = {}
     stale = []
     for path in sorted(scene.lightings.glob("*.json")):
         try:
             head = read_json(path)
-            form, made_by, vector = head["format"], head["field"], np.array(head["embedding"], np.float32)
+            form = head["format"]
+            if form != _FORMAT:
+                raise InputError(f"{path}: format {form}, expected {_FORMAT}; fit it again or delete it")
+            made_by, vector = head["field"], np.array(head["embedding"], np.float32)
+            red, green, blue = map(float, head["air"]["airlight"])
+            air = Air(float(head["air"]["extinction"]), (red, green, blue))
+            if not 0.0 <= air.extinction < np.inf:
+                raise ValueError(f"extinction {air.extinction}")
+        except InputError:
+            raise
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(
                 f"{path}: no lighting ({type(error).__name__}: {error}); fit it again or delete it"
             ) from None
-        if form != _FORMAT:
-            raise InputError(f"{path}: format {form}, expected {_FORMAT}; fit it again or delete it")
         if made_by == result:
-            fresh[path.stem] = vector
+            fresh[path.stem], airs[path.stem] = vector, air
         else:
             stale.append(path.stem)
-    return fresh, tuple(stale)
+    return fresh, tuple(stale), airs

@@ -7,7 +7,7 @@ baked field shows its place under every lighting.
 
 import itertools
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
@@ -23,6 +23,7 @@ from safetensors.numpy import save as to_bytes
 from twin.cores import cores
 from twin.errors import InputError
 from twin.geometry.cameras import Posed, resized
+from twin.nerf.air import Air
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bytes
 from twin.nerf.kernels.composite import CHANNELS, Channels
@@ -140,13 +141,19 @@ class BakedField:
         """See `Lightings.embedding`."""
         return self.lightings_by_name.embedding(lighting)
 
+    def air(self, lighting: str) -> Air | None:
+        """See `Lightings.air`. Pictures are rendered without it."""
+        return self.lightings_by_name.air(lighting)
+
     def sample_lighting(self, rng: np.random.Generator) -> Floats:
         """The embedding of a random lighting that could have been filmed, shape (dim,). See `Lightings.sample`."""
         return self.lightings_by_name.sample(rng)
 
-    def add_lightings(self, more: dict[str, Floats], stale: tuple[str, ...] = ()) -> None:
+    def add_lightings(
+        self, more: Mapping[str, Floats], stale: tuple[str, ...] = (), airs: Mapping[str, Air] | None = None
+    ) -> None:
         """See `Lightings.added`."""
-        self.lightings_by_name = self.lightings_by_name.added(more, stale)
+        self.lightings_by_name = self.lightings_by_name.added(more, stale, airs)
 
     def render(
         self,

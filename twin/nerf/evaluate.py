@@ -13,48 +13,16 @@ from numpy.typing import NDArray
 
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import psnr, ssim
-from twin.nerf import network
 from twin.nerf.baked import BakedField
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import load_frame
 from twin.nerf.field import RadianceField
+from twin.nerf.fit_light import fit_embedding
 from twin.nerf.workspace import CameraArrays
 from twin.progress import track
 
-_FIT_STEPS = 40
 _FIT_RAYS = 4000  # of a half picture, spread evenly
-_FIT_RATE = 0.05
-_FIT_PRIOR = 1e-3  # pull towards the lighting's embedding, as residuals are in training
 _MAX_FRAMES = 6  # held-out frames scored per lighting, spread evenly
-
-
-def fit_embedding(
-    field: RadianceField,
-    features: torch.Tensor,
-    harmonics: torch.Tensor,
-    colours: torch.Tensor,
-    start: NDArray[np.float32],
-    steps: int = _FIT_STEPS,
-) -> NDArray[np.float32]:
-    """The embedding under which traced rays (see `RadianceField.trace`) look like `colours`, field frozen.
-
-    Args:
-        features: Shape (n, CHANNELS − 1).
-        harmonics: Shape (n, 16).
-        colours: In [0, 1], shape (n, 3).
-        start: Embedding to start from and stay near to, shape (dim,).
-    """
-    origin = torch.as_tensor(start, device=features.device)
-    embedding = origin.clone().requires_grad_(True)
-    optimiser = torch.optim.Adam([embedding], lr=_FIT_RATE)
-    for step in range(steps):
-        for group in optimiser.param_groups:
-            group["lr"] = _FIT_RATE * (1.0 - step / steps)
-        rgb = network.head(field.parameters, features, harmonics, embedding)
-        loss = ((rgb - colours) ** 2).mean() + _FIT_PRIOR * ((embedding - origin) ** 2).mean()
-        (embedding.grad,) = torch.autograd.grad(loss, [embedding])
-        optimiser.step()
-    return embedding.detach().cpu().numpy()
 
 
 def score_frame(

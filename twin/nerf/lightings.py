@@ -5,7 +5,8 @@ way from day to night. One that nobody filmed can be drawn at random, see `plaus
 was trained on those may be *added* that photos were fitted for, see `added.py`.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.nerf import plausible
+from twin.nerf.air import Air
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Lightings:
     """Lightings that were added to another build of the field, and mean nothing to this one."""
     count_added: int = 0
     """How many of the last ones were added."""
+    airs: Mapping[str, Air] = field(default_factory=dict)
+    """Of those added, by name: what was in the air when their photos were taken."""
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """The embedding of a lighting, a frame or a mixture, shape (dim,).
@@ -61,6 +65,14 @@ class Lightings:
             )
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
 
+    def air(self, lighting: str) -> Air | None:
+        """The air of a lighting that a photo told, or of a mixture with one; None where it is the film's."""
+        if lighting in self.names or lighting.count(":") != 2:
+            return self.airs.get(lighting)
+        a, b, share = lighting.split(":")
+        one, other = self.air(a), self.air(b)
+        return (one or Air()).mixed(other or Air(), float(share)) if one or other else None
+
     def sample(self, rng: np.random.Generator) -> NDArray[np.float32]:
         """The embedding of a random lighting that could have been filmed, shape (dim,); `plausible.py` has the rule.
 
@@ -80,8 +92,13 @@ class Lightings:
             )
         return plausible.Judge(self.probes, self.vectors, self.frame_vectors)
 
-    def added(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> "Lightings":
-        """With more lightings, embeddings (dim,) by name, and the names of those that are not to be used."""
+    def added(
+        self,
+        more: Mapping[str, NDArray[np.float32]],
+        stale: tuple[str, ...] = (),
+        airs: Mapping[str, Air] | None = None,
+    ) -> "Lightings":
+        """With more lightings, embeddings (dim,) by name, the names of those that are not to be used, and airs."""
         vectors = np.concatenate([self.vectors, *(vector[None] for vector in more.values())])
         return replace(
             self,
@@ -89,9 +106,10 @@ class Lightings:
             vectors=vectors,
             stale=(*self.stale, *stale),
             count_added=self.count_added + len(more),
+            airs={**self.airs, **(airs or {})},
         )
 
     def filmed(self) -> "Lightings":
         """Without those that were added."""
         count = len(self.names) - self.count_added
-        return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0)
+        return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0, airs={})

@@ -1,0 +1,41 @@
+"""The air between a camera and a place, laid into a picture by its depth.
+
+*Extinction* is the share of light that a metre of air takes away [1/m]: what is seen over a distance d keeps
+exp(−extinction · d) of its light and gains the rest from the *airlight*, which the air itself scatters towards the
+camera (Koschmieder 1924). *Visibility*, as meteorologists say it, is the distance over which 5 % are kept: 3 over the
+extinction.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+REACH = 100.0
+"""[m] that air reaches at most: haze lies low, so the sky shines through."""
+
+
+@dataclass(frozen=True)
+class Air:
+    """Over that of the film; clear by default."""
+
+    extinction: float = 0.0
+    """[1/m]"""
+    airlight: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1]."""
+
+    def over(self, rgb: Floats, distance: Floats) -> Floats:
+        """A picture (..., 3) as seen through this air; distance along the rays [m], shape (...)."""
+        kept = np.exp(np.float32(-self.extinction) * np.minimum(distance, np.float32(REACH)))[..., None]
+        return kept * rgb + (np.float32(1.0) - kept) * np.asarray(self.airlight, np.float32)
+
+    def mixed(self, other: "Air", share: float) -> "Air":
+        """The air `share` of the way to another; each airlight counts by how much air there is of it."""
+        mine, its = (1.0 - share) * self.extinction, share * other.extinction
+        total = mine + its
+        if not total:
+            return Air()
+        red, green, blue = (mine * np.array(self.airlight) + its * np.array(other.airlight)) / total
+        return Air(total, (float(red), float(green), float(blue)))
