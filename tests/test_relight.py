@@ -1,18 +1,21 @@
 """One photo adds its lighting: the fit, the file, what it is tied to, and what the verb refuses."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
+import torch
 from textured import SIZE, K, filmed_corridor, picture, pose_at
 
 import twin
 from twin import progress
 from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints
+from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.added import AddedLighting, added_lightings, check_name
+from twin.nerf.air import Air
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.field import RadianceField, untrained
 from twin.nerf.lightings import Lightings
@@ -57,6 +60,48 @@ def test_a_fit_finds_the_light_of_a_photo():
     assert psnr(there[1], there[0]) > 25.0
 
 
+def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
+    rng, field = np.random.default_rng(2), small_field()
+    pose, size = pose_at(0.0), (64, 48)
+    seen = field.render(Viewpoints.of(pose[None], K / 5, size), field.embedding("night"))
+    depth = rng.uniform(2.0, 120.0, (6, 8)).astype(np.float32).repeat(8, 0).repeat(8, 1)
+    trace = field.trace
+
+    def traced(*rays):
+        features, harmonics, _, opacity = trace(*rays)
+        return features, harmonics, torch.as_tensor(depth.ravel()), opacity
+
+    monkeypatch.setattr(field, "trace", traced)  # an untrained field is as near everywhere
+    distance = depth * np.linalg.norm(unproject(pixel_grid(*size), K / 5), axis=-1)
+    noise = rng.normal(0.0, 0.01, seen.rgb[0].shape).astype(np.float32)
+    hidden = Air(0.02, (0.8, 0.7, 0.6))
+    hazy = fit_photo(field, hidden.over(seen.rgb[0], distance.astype(np.float32)) + noise, pose, K / 5)
+    assert hazy.air.extinction == pytest.approx(0.02, rel=0.2)
+    np.testing.assert_allclose(hazy.air.airlight, hidden.airlight, atol=0.05)
+    assert hazy.psnr_other_half > hazy.psnr_clear_other_half + 0.2
+    clear = fit_photo(field, seen.rgb[0] + noise, pose, K / 5)
+    assert clear.air == Air() and clear.psnr_other_half == clear.psnr_clear_other_half
+
+
+def test_air_by_closed_forms_and_between_two_lightings():
+    rgb, distance = np.full((1, 2, 3), 0.5, np.float32), np.array([[0.0, 1e6]], np.float32)
+    np.testing.assert_array_equal(Air().over(rgb, distance), rgb)
+    near, far = Air(0.03, (1.0, 0.0, 0.5)).over(rgb, distance)[0]
+    kept = np.exp(-3.0)  # air reaches 100 m
+    np.testing.assert_allclose(near, 0.5)
+    np.testing.assert_allclose(far, kept * 0.5 + (1 - kept) * np.array([1.0, 0.0, 0.5]), rtol=1e-5)
+    names, vectors = ("filmed", "a", "b"), np.eye(3, dtype=np.float32)
+    airs = {"a": Air(0.02, (1.0, 1.0, 1.0)), "b": Air(0.06, (0.0, 0.0, 0.0))}
+    mine = Lightings(names[:1], vectors[:1], ("filmed/0",), vectors[:1])
+    mine = mine.added(dict(zip(names[1:], vectors[1:], strict=True)), airs=airs)
+    assert mine.air("filmed") is None and mine.air("filmed/0") is None and mine.air("any") is None
+    assert mine.air("a") == airs["a"] and mine.filmed().airs == {}
+    assert mine.air("filmed:a:0.5") == Air(0.01, (1.0, 1.0, 1.0))
+    mixed = mine.air("a:b:0.5")
+    assert mixed and mixed.extinction == pytest.approx(0.04) and mixed.airlight == pytest.approx((0.25,) * 3)
+    assert Air().mixed(Air(), 0.5) == Air()
+
+
 def _filmed(field, pose, size):
     return [field.render(Viewpoints.of(pose[None], K / 5, size), name).rgb[0] for name in field.lightings]
 
@@ -82,7 +127,7 @@ def _without_gaps(picture: np.ndarray) -> np.ndarray:
 
 
 def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
-    AddedLighting("old", [0.0] * 8, "first", "photo.png", {}).save(scene)
+    AddedLighting("old", [0.0] * 8, Air(), "first", "photo.png", {}).save(scene)
     assert "old" in added_lightings(scene)[0]
     write_json(scene.stamp("field"), {"result": "second"})
     try:
@@ -119,10 +164,20 @@ def test_what_cannot_be_used_ends_with_one_line_and_status_2(scene, tmp_path, ca
 def test_a_damaged_file_is_named(scene):
     path = scene.lightings / "broken.json"
     scene.lightings.mkdir(exist_ok=True)
-    path.write_text('{"format": 1}')
+    whole = asdict(AddedLighting("broken", [0.0] * 8, Air(), "first", "photo.png", {})) | {"format": 2}
+    without_air = {key: value for key, value in whole.items() if key != "air"}
+    bad_air = whole | {"air": {"extinction": -0.1, "airlight": [1, 1, 1]}}
     try:
-        with pytest.raises(InputError, match=r"broken\.json: no lighting \(KeyError"):
-            added_lightings(scene)
+        for head, words in (
+            ({"format": 2}, r"no lighting \(KeyError"),
+            (without_air, r"no lighting \(KeyError: 'air'"),
+            (bad_air, r"no lighting \(ValueError: extinction -0\.1\)"),
+            ({"format": 1}, "format 1, expected 2; fit it again"),
+        ):
+            path.write_text(json.dumps(head))
+            with pytest.raises(InputError, match=rf"broken\.json: {words}") as error:
+                added_lightings(scene)
+            assert "\n" not in str(error.value)
     finally:
         path.unlink()
 

@@ -1,5 +1,7 @@
 """Weather that the film did not have, and what stands beside the corridor of randomised episodes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tiny_twin import tiny_twin
@@ -7,12 +9,16 @@ from tiny_twin import tiny_twin
 import twin
 from twin import progress
 from twin.env.haze import Haze
-from twin.env.randomisation import Draw, Ranges
+from twin.env.randomisation import ANOTHER_DAY, UNTOLD, Draw, Ranges
 from twin.env.shade import _solids
 from twin.env.sides import Sides
+from twin.env.suite import Stage
 from twin.env.tasks import Drive
 from twin.env.weather import Weather
-from twin.geometry.cameras import pixel_grid, unproject
+from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
+from twin.nerf.added import AddedLighting, field_result
+from twin.nerf.air import Air
+from twin.scene import SceneDir
 
 SMALL = {"size": (32, 18)}
 
@@ -24,21 +30,20 @@ def scene(tmp_path_factory):
 
 
 def test_haze_hides_by_distance_and_spares_what_is_near():
-    depth = np.array([[1000.0, 1000.0], [20.0, 2.0]], np.float32)
+    distance = np.array([[1500.0, 1500.0], [30.0, 3.0]], np.float32)
     rgb = np.array([[[0.8] * 3, [0.6] * 3], [[0.1] * 3, [0.1] * 3]], np.float32)
-    lengths = np.full((2, 2), 1.5, np.float32)
-    np.testing.assert_array_equal(Haze(0.0).over(rgb, depth, lengths), rgb)
-    hazy = Haze(0.05).over(rgb, depth, lengths)
+    np.testing.assert_array_equal(Haze(0.0).over(rgb, distance), rgb)
+    hazy = Haze(0.05).over(rgb, distance)
     np.testing.assert_allclose(hazy[0], 0.7, atol=1e-3)  # the horizon, whose mean is the airlight
     for column, metres in ((0, 30.0), (1, 3.0)):
         kept = np.exp(-0.05 * metres)
         np.testing.assert_allclose(hazy[1, column], kept * 0.1 + (1 - kept) * 0.7, rtol=1e-5)
-    np.testing.assert_allclose(Haze(0.05, 0.5).over(rgb, depth, lengths)[0], 0.35, atol=4e-3)
+    np.testing.assert_allclose(Haze(0.05, 0.5).over(rgb, distance)[0], 0.35, atol=4e-3)
     air = Haze(0.05)
-    air.over(rgb, depth, lengths)
-    np.testing.assert_allclose(air.over(0.0 * rgb, depth, lengths)[0], 0.7, atol=6e-3)  # that of the first picture
-    near = np.ones_like(depth)
-    np.testing.assert_allclose(Haze(1e3).over(rgb, near, lengths)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
+    air.over(rgb, distance)
+    np.testing.assert_allclose(air.over(0.0 * rgb, distance)[0], 0.7, atol=6e-3)  # that of the first picture
+    near = np.ones_like(distance)
+    np.testing.assert_allclose(Haze(1e3).over(rgb, near)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
 
 
 def _pose(x: float, turned: float) -> np.ndarray:
@@ -96,6 +101,55 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
     assert any(differ)
     rng = np.random.default_rng(0)
     assert {Ranges(bystanders=(0, 3)).draw(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
+
+
+def test_a_picture_under_a_photos_light_is_seen_through_its_air(tmp_path):
+    scene = SceneDir(tiny_twin(tmp_path))
+    day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
+    for name, air in (("clear", Air()), ("foggy", Air(0.1, (0.9, 0.8, 0.7)))):
+        AddedLighting(name, day, air, field_result(scene), "photo.png", {}).save(scene)
+    built = twin.load_scene(scene.root)
+
+    def first(lighting: str, **options):
+        environment = twin.load(built, "ahead", 3, lighting=lighting, **SMALL, **options)
+        return environment.reset().observation["pixels"][-1].astype(float), environment
+
+    plain, environment = first("day")
+    np.testing.assert_array_equal(first("clear")[0], plain)
+    view = Viewpoints.of(
+        environment.physics.camera_to_world[None], environment.pixels._overlay.intrinsics, SMALL["size"]
+    )
+    seen = built.field().render(view, "day")
+    rays = unproject(pixel_grid(*SMALL["size"]), environment.pixels._overlay.intrinsics)
+    kept = np.exp(-0.1 * np.minimum(seen.depth[0] * np.linalg.norm(rays, axis=-1), 100.0))[..., None]
+    expected = kept * np.clip(seen.rgb[0], 0.0, 1.0) + (1.0 - kept) * [0.9, 0.8, 0.7]
+    np.testing.assert_allclose(first("foggy")[0], 255.0 * expected, atol=2.0)
+    half = first("day:foggy:0.5")[0]
+    assert np.abs(half - plain).mean() < np.abs(first("foggy")[0] - plain).mean()
+    bare = [
+        Stage.open(built, "ahead", {"lighting": name, **SMALL})._bare for name in ("day", "foggy", ("day", "foggy"))
+    ]
+    assert bare == [True, False, False]  # pictures that stay on a device have no air
+    drifting, _ = first("foggy", lighting_drift=True)
+    np.testing.assert_array_equal(drifting, first("foggy")[0])
+
+
+def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows_are_weaker(tmp_path):
+    scene = SceneDir(tiny_twin(tmp_path))
+    day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
+    AddedLighting("photo", day, Air(0.02), field_result(scene), "photo.png", {}).save(scene)
+    built = twin.load_scene(scene.root)
+
+    def draw(lighting: str, ranges: Ranges) -> Draw:
+        environment = twin.load(built, "ahead", 5, lighting=lighting, **SMALL, randomise=ranges)
+        environment.reset()
+        told = environment.task.draw
+        return told if environment.task.info(environment.physics)["randomisation"] == told.record() else Draw()
+
+    unknown, known = draw("day", ANOTHER_DAY), draw("photo", ANOTHER_DAY)
+    assert unknown.extinction > 0.0
+    assert known == replace(unknown, extinction=0.0, sunlight=UNTOLD * unknown.sunlight, shade=UNTOLD * unknown.shade)
+    assert draw("photo", replace(ANOTHER_DAY, hold_known=False)) == unknown  # as in training
 
 
 def test_solid_shadows_have_straight_edges_and_no_seam():
