@@ -1,0 +1,139 @@
+"""What one photo tells of a day, and what it leaves to be drawn.
+
+    python benchmarks/day.py SCENE [--policies RUN ...] [--json FILE] [--pictures FOLDER]
+
+The scene has been built from the stand-in's film and knows its days by a photo each (`benchmarks/table1`, step
+`photos`). Pictures of every day at eight places of the road are compared with the twin's from there under the photo's
+light and air: by dB, and by how they change the steering of policies, against how another day's sun and shadows change
+it that are drawn over the twin's. *Lasting* is the mean over places of a day's change (rms over days), *local* the
+rest.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.env.obstacle_view import camera_intrinsics
+from twin.env.randomisation import ANOTHER_DAY, UNTOLD, Draw
+from twin.env.weather import Weather
+from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
+from twin.geometry.images import psnr, resize, write_image
+from twin.learn.policy import find_policy, load_policy
+from twin.loading import load_scene
+from twin.progress import track
+from twin.reality import onboard
+from twin.reality.route import Route
+from twin.reality.truth import Truth
+from twin.reality.weather import WEATHER
+from twin.report.truth import align_rigid, matched_poses
+
+STATIONS = (4.0, 14.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the photos were taken at the first
+STRAIGHT = 3  # of them, where policies of the straight road drive
+SIZE = (160, 90)
+DRAWS = 8  # of the weather, per day
+SCALES = (1.0, UNTOLD)  # of another day's sun and shadows
+
+Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
+
+
+def real() -> tuple[Pictures, NDArray[np.float64]]:
+    """Pictures of every day at every station, and the camera's poses there, (stations, 4, 4), in the true world."""
+    line, rows, poses = Route(), [], np.zeros((len(STATIONS), 4, 4))
+    for light in track(WEATHER.values(), "pictures of days", unit="day"):
+        road, eye = onboard._camera(light)
+        row = []
+        for k, station in enumerate(STATIONS):
+            x, y = line.at(station).tolist()
+            road.physics.robot.place(x, y, float(line.heading(station)))
+            poses[k] = road.physics.camera_to_world
+            row.append(np.asarray(resize(eye.look(poses[k], 0.0), *SIZE), np.float32) / 255.0)
+        rows.append(row)
+    return np.array(rows), poses
+
+
+def lasting_and_local(change: NDArray) -> NDArray:
+    """Of changes (days, stations): rms over days of the mean over stations, and rms of the rest."""
+    mean = change.mean(1, keepdims=True)
+    return np.sqrt([(mean**2).mean(), ((change - mean) ** 2).mean()])
+
+
+def steering(policy: Callable, pictures: Pictures) -> NDArray:
+    """The last of a policy's actions (days, stations) before pictures that stand still."""
+    stacks = (np.clip(np.moveaxis(pictures, -1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    return np.array([[policy(np.tile(one, (4, 1, 1)))[-1] for one in row] for row in stacks])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--policies", nargs="*", default=[], help="runs of the scene, named after their task")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures: day, twin, twin with weather drawn")
+    given = parser.parse_args()
+    twin = load_scene(given.scene)
+    field, cameras = twin.field(), Cameras.load(twin.scene.stage("metric"))
+    model = twin.world().model()
+    intrinsics = camera_intrinsics(model, model.camera("front").id, SIZE)
+    rays = unproject(pixel_grid(*SIZE), intrinsics)
+    lengths = np.linalg.norm(rays, axis=-1).astype(np.float32)
+    shown, true_poses = real()
+    to_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras))
+    poses = to_truth.inverse().poses(true_poses)
+    views = Viewpoints.of(poses, intrinsics, SIZE)
+    clear = [field.render(views, name) for name in WEATHER]
+    depth = clear[0].depth
+    hazed = np.array([field.air(name).over(one.rgb, depth * lengths) for name, one in zip(WEATHER, clear, strict=True)])
+    filmed = [field.render(views, name).rgb for name in field.lightings_by_name.filmed().names]
+    figures: dict[str, float] = {}
+
+    def tell(name: str, value: float) -> None:
+        figures[name] = float(value)
+        print(f"{name:44} {value:8.3f}", flush=True)
+
+    for i, name in enumerate(WEATHER):
+        tell(f"day.extinction.{name}", field.air(name).extinction)
+        for what, many in (("filmed", filmed), ("photo", [hazed[i]])):
+            means = [np.mean([psnr(a, b) for a, b in zip(p[1:], shown[i, 1:], strict=True)]) for p in many]
+            tell(f"day.psnr.{what}.{name}", max(means))
+
+    rng = np.random.default_rng(0)
+    drawn = [[ANOTHER_DAY.draw(rng) for _ in WEATHER] for _ in range(DRAWS)]
+    seeds = rng.integers(2**31, size=(DRAWS, len(WEATHER)))
+
+    def weathered(scale: float) -> list[Pictures]:
+        def over(draw: Draw, seed: int, pictures: NDArray) -> NDArray:
+            weaker = Draw(sunlight=scale * draw.sunlight, shade=scale * draw.shade)
+            weather = Weather(weaker, np.random.default_rng(seed))
+            return np.array([weather.over(p, d, rays, q) for p, d, q in zip(pictures, depth, poses, strict=True)])
+
+        rows = zip(drawn, seeds, strict=True)
+        return [np.array([over(*one) for one in zip(d, s, hazed, strict=True)]) for d, s in rows]
+
+    pictures = {scale: weathered(scale) for scale in SCALES}
+    if given.pictures:
+        for i, name in enumerate(WEATHER):
+            both = np.hstack([np.vstack(p[i]) for p in (shown, hazed, pictures[UNTOLD][0])])
+            write_image(given.pictures / f"{name}.png", (np.clip(both, 0.0, 1.0) * 255.0).astype(np.uint8))
+    ratios: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
+    for source in track(given.policies, "policies", unit="policy"):
+        policy = load_policy(str(find_policy(given.scene, source)), False)
+        count = STRAIGHT if Path(source).name.startswith("straight") else len(STATIONS)
+        before = steering(policy, hazed[:, :count])
+        gap = lasting_and_local(steering(policy, shown[:, :count]) - before)
+        for scale, many in pictures.items():
+            moved = np.concatenate([steering(policy, one[:, :count]) - before for one in many])
+            ratios[scale].append(np.log(gap / lasting_and_local(moved)))
+    for scale, rows in ratios.items():
+        for k, kind in enumerate(("lasting", "local")):
+            if rows:
+                tell(f"day.change_over_drawn.{kind}.{scale:g}", np.exp(np.mean(rows, 0)[k]))
+    if given.json:
+        given.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
