@@ -27,7 +27,7 @@ VERSION = 4
 """Of what comes out of a draw. Raised where haze, light, shadows or bystanders of the same draw become others."""
 
 UNTOLD = 0.6
-"""Share of another day's sun and shadows that is left untold by a photo of it. With this much of them drawn, the steering
+"""Share of another day's sun and shadows that a photo of it leaves untold. With this much of them drawn, the steering
 of twelve policies changes as much as it does from the twin, under a photo's light and air, to pictures of that day:
 0.99 times for what lasts all day, 1.09 for what differs from place to place (`benchmarks/day.py`)."""
 
