@@ -3,10 +3,10 @@
     python benchmarks/day.py SCENE [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
 The scene has been built from the stand-in's film and knows its days by a photo each (`benchmarks/table1`, step
-`photos`). Pictures of every day at eight places of the road are compared with the twin's from there under the photo's
-light and air: by dB, and by how they change the steering of policies, against how another day's sun and shadows change
-it that are drawn over the twin's. *Lasting* is the mean over places of a day's change (rms over days), *local* the
-rest.
+`photos`). Pictures of every day at seven other places of the road are compared with the twin's from there under the
+photo's light and air: by dB, and by how they change the steering of policies, against how another day's sun and shadows
+change it that are drawn over the twin's. *Lasting* is the mean over places of a day's change (rms over days), *local*
+the rest.
 """
 
 import argparse
@@ -31,11 +31,12 @@ from twin.reality.truth import Truth
 from twin.reality.weather import WEATHER
 from twin.report.truth import align_rigid, matched_poses
 
-STATIONS = (4.0, 14.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the photos were taken at the first
-STRAIGHT = 3  # of them, where policies of the straight road drive
+STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the photos were taken at the first
+STRAIGHT = 4  # of them, where policies of the straight road drive
 SIZE = (160, 90)
 DRAWS = 8  # of the weather, per day
-SCALES = (1.0, UNTOLD)  # of another day's sun and shadows
+RESAMPLED = 500  # times, for intervals of 90 %
+SCALES = (1.0, 0.8, 0.7, UNTOLD, 0.5)  # of another day's sun and shadows
 
 Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 
@@ -65,6 +66,22 @@ def steering(policy: Callable, pictures: Pictures) -> NDArray:
     """The last of a policy's actions (days, stations) before pictures that stand still."""
     stacks = (np.clip(np.moveaxis(pictures, -1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     return np.array([[policy(np.tile(one, (4, 1, 1)))[-1] for one in row] for row in stacks])
+
+
+def ratios(gaps: list[NDArray], moved: list[NDArray], rng: np.random.Generator | None = None) -> NDArray:
+    """What lasts and what is local of changes over the same of others, geometric means over policies.
+
+    Args:
+        gaps: Of every policy, (days, stations).
+        moved: The others, (more days, stations).
+        rng: Resamples policies and days, if given.
+    """
+    policies = np.arange(len(gaps))
+    days, others = np.arange(len(gaps[0])), np.arange(len(moved[0]))
+    if rng:
+        policies, days, others = (rng.choice(one, len(one)) for one in (policies, days, others))
+    each = [np.log(lasting_and_local(gaps[k][days]) / lasting_and_local(moved[k][others])) for k in policies]
+    return np.exp(np.mean(each, 0))
 
 
 def main() -> None:
@@ -104,33 +121,36 @@ def main() -> None:
     drawn = [[ANOTHER_DAY.draw(rng) for _ in WEATHER] for _ in range(DRAWS)]
     seeds = rng.integers(2**31, size=(DRAWS, len(WEATHER)))
 
-    def weathered(scale: float) -> list[Pictures]:
-        def over(draw: Draw, seed: int, pictures: NDArray) -> NDArray:
+    def weathered(scale: float, days: list[Draw], numbers: NDArray) -> Pictures:
+        rows = []
+        for i, (name, draw, number) in enumerate(zip(WEATHER, days, numbers, strict=True)):
             weaker = Draw(sunlight=scale * draw.sunlight, shade=scale * draw.shade)
-            weather = Weather(weaker, np.random.default_rng(seed))
-            return np.array([weather.over(p, d, rays, q) for p, d, q in zip(pictures, depth, poses, strict=True)])
+            weather = Weather(weaker, np.random.default_rng(number), field.air(name))
+            seen = zip(clear[i].rgb, depth, poses, strict=True)
+            rows.append([weather.over(rgb, far, rays, pose) for rgb, far, pose in seen])
+        return np.array(rows)
 
-        rows = zip(drawn, seeds, strict=True)
-        return [np.array([over(*one) for one in zip(d, s, hazed, strict=True)]) for d, s in rows]
-
-    pictures = {scale: weathered(scale) for scale in SCALES}
+    pictures = {scale: [weathered(scale, *one) for one in zip(drawn, seeds, strict=True)] for scale in SCALES}
     if given.pictures:
         for i, name in enumerate(WEATHER):
             both = np.hstack([np.vstack(p[i]) for p in (shown, hazed, pictures[UNTOLD][0])])
             write_image(given.pictures / f"{name}.png", (np.clip(both, 0.0, 1.0) * 255.0).astype(np.uint8))
-    ratios: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
+    gaps: list[NDArray] = []
+    moves: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
     for source in track(given.policies, "policies", unit="policy"):
         policy = load_policy(str(find_policy(given.scene, source)), False)
-        count = STRAIGHT if Path(source).name.startswith("straight") else len(STATIONS)
-        before = steering(policy, hazed[:, :count])
-        gap = lasting_and_local(steering(policy, shown[:, :count]) - before)
+        places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # not where photos were taken
+        before = steering(policy, hazed[:, places])
+        gaps.append(steering(policy, shown[:, places]) - before)
         for scale, many in pictures.items():
-            moved = np.concatenate([steering(policy, one[:, :count]) - before for one in many])
-            ratios[scale].append(np.log(gap / lasting_and_local(moved)))
-    for scale, rows in ratios.items():
+            moves[scale].append(np.concatenate([steering(policy, one[:, places]) - before for one in many]))
+    for scale, moved in moves.items() if gaps else ():
+        low, high = np.quantile([ratios(gaps, moved, rng) for _ in range(RESAMPLED)], (0.05, 0.95), axis=0)
         for k, kind in enumerate(("lasting", "local")):
-            if rows:
-                tell(f"day.change_over_drawn.{kind}.{scale:g}", np.exp(np.mean(rows, 0)[k]))
+            name = f"day.change_over_drawn.{kind}.{scale:g}"
+            tell(name, ratios(gaps, moved)[k])
+            tell(f"{name}.low", low[k])
+            tell(f"{name}.high", high[k])
     if given.json:
         given.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 

@@ -21,7 +21,7 @@ from twin.nerf.dataset import TrainingPixels, load_frame
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
 from twin.nerf.fit import Trainer, fit, free_segments
-from twin.nerf.fit_light import fit_embedding
+from twin.nerf.fit_light import fit_light
 from twin.nerf.losses import bending
 from twin.nerf.stage import constant_height, run
 from twin.nerf.workspace import CameraArrays
@@ -219,7 +219,7 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
     pixels = np.stack([column.ravel() + 0.5 for column in np.mgrid[:HEIGHT, :WIDTH][::-1]], -1)
     features, harmonics, _, _ = field.trace(one, np.zeros(len(pixels), int), pixels)
     colours = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
-    fitted = fit_embedding(field, features, harmonics, colours, field.embedding("day"))
+    fitted, _ = fit_light(field, features, harmonics, colours, field.embedding("day"))
     seen = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), fitted).rgb[0]
     assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
 

@@ -1,7 +1,7 @@
 """One photo adds its lighting: the fit, the file, what it is tied to, and what the verb refuses."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.added import AddedLighting, added_lightings, check_name
-from twin.nerf.air import Air
+from twin.nerf.air import Air, mixed
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.field import RadianceField, untrained
 from twin.nerf.lightings import Lightings
@@ -62,8 +62,8 @@ def test_a_fit_finds_the_light_of_a_photo():
 
 def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
     rng, field = np.random.default_rng(2), small_field()
-    pose, size = pose_at(0.0), (64, 48)
-    seen = field.render(Viewpoints.of(pose[None], K / 5, size), field.embedding("night"))
+    pose, size, wide = pose_at(0.0), (64, 48), K / [20, 20, 5, 5]  # corners are thrice as far as their depth
+    seen = field.render(Viewpoints.of(pose[None], wide, size), field.embedding("night"))
     depth = rng.uniform(2.0, 120.0, (6, 8)).astype(np.float32).repeat(8, 0).repeat(8, 1)
     trace = field.trace
 
@@ -72,14 +72,15 @@ def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
         return features, harmonics, torch.as_tensor(depth.ravel()), opacity
 
     monkeypatch.setattr(field, "trace", traced)  # an untrained field is as near everywhere
-    distance = depth * np.linalg.norm(unproject(pixel_grid(*size), K / 5), axis=-1)
+    distance = depth * np.linalg.norm(unproject(pixel_grid(*size), wide), axis=-1)
     noise = rng.normal(0.0, 0.01, seen.rgb[0].shape).astype(np.float32)
     hidden = Air(0.02, (0.8, 0.7, 0.6))
-    hazy = fit_photo(field, hidden.over(seen.rgb[0], distance.astype(np.float32)) + noise, pose, K / 5)
-    assert hazy.air.extinction == pytest.approx(0.02, rel=0.2)
-    np.testing.assert_allclose(hazy.air.airlight, hidden.airlight, atol=0.05)
+    hazy = fit_photo(field, hidden.over(seen.rgb[0], distance.astype(np.float32)) + noise, pose, wide)
+    assert hazy.air.extinction == pytest.approx(0.02, rel=0.05)
+    np.testing.assert_allclose(hazy.air.airlight, hidden.airlight, atol=0.03)
+    assert psnr(hazy.pictures[1], hidden.over(seen.rgb[0], distance.astype(np.float32))) > 40.0
     assert hazy.psnr_other_half > hazy.psnr_clear_other_half + 0.2
-    clear = fit_photo(field, seen.rgb[0] + noise, pose, K / 5)
+    clear = fit_photo(field, seen.rgb[0] + noise, pose, wide)
     assert clear.air == Air() and clear.psnr_other_half == clear.psnr_clear_other_half
 
 
@@ -97,9 +98,12 @@ def test_air_by_closed_forms_and_between_two_lightings():
     assert mine.air("filmed") is None and mine.air("filmed/0") is None and mine.air("any") is None
     assert mine.air("a") == airs["a"] and mine.filmed().airs == {}
     assert mine.air("filmed:a:0.5") == Air(0.01, (1.0, 1.0, 1.0))
-    mixed = mine.air("a:b:0.5")
-    assert mixed and mixed.extinction == pytest.approx(0.04) and mixed.airlight == pytest.approx((0.25,) * 3)
-    assert Air().mixed(Air(), 0.5) == Air()
+    between = mine.air("a:b:0.25")
+    assert between and between.extinction == pytest.approx(0.03) and between.airlight == pytest.approx((0.5,) * 3)
+    assert mixed(Air(), None, 0.5) == Air() and mixed(None, None, 0.5) is None
+    for share in ("x", "3"):
+        with pytest.raises(InputError, match="a:b:"):
+            mine.air(f"a:b:{share}")
 
 
 def _filmed(field, pose, size):
@@ -171,8 +175,9 @@ def test_a_damaged_file_is_named(scene):
         for head, words in (
             ({"format": 2}, r"no lighting \(KeyError"),
             (without_air, r"no lighting \(KeyError: 'air'"),
-            (bad_air, r"no lighting \(ValueError: extinction -0\.1\)"),
-            ({"format": 1}, "format 1, expected 2; fit it again"),
+            (bad_air, r"no lighting \(ValueError: air -0\.1"),
+            (whole | {"air": {"extinction": 0.1, "airlight": [1, 2, 1]}}, r"no lighting \(ValueError: air 0\.1"),
+            (whole | {"format": 3}, "format 3, expected 2; fit it again"),
         ):
             path.write_text(json.dumps(head))
             with pytest.raises(InputError, match=rf"broken\.json: {words}") as error:
@@ -180,6 +185,32 @@ def test_a_damaged_file_is_named(scene):
             assert "\n" not in str(error.value)
     finally:
         path.unlink()
+
+
+def test_a_lighting_from_before_photos_told_the_air_is_stale(scene):
+    path = scene.lightings / "early.json"
+    path.write_text('{"format": 1, "name": "early", "embedding": [0, 0, 0, 0, 0, 0, 0, 0], "field": "first"}')
+    try:
+        fresh, stale, airs = added_lightings(scene)
+        assert stale == ("early",) and "early" not in {**fresh, **airs}
+        with pytest.raises(
+            InputError, match=r"'early': .* by an older twin; fit its photo again: python -m twin\.relight"
+        ):
+            twin.load_scene(scene.root).radiance_field().embedding("early")
+    finally:
+        path.unlink()
+
+
+def test_the_air_of_a_hazy_photo_is_kept_and_told(scene, monkeypatch, capsys):
+    air = Air(0.03, (0.9, 0.8, 0.7))
+
+    def hazy(field, photo, camera_to_world, intrinsics):
+        return replace(fit_photo(field, photo, camera_to_world, intrinsics), air=air, psnr_clear_other_half=12.34)
+
+    monkeypatch.setattr("twin.relight.fit_photo", hazy)
+    assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "hazy"]) == 0
+    assert "visibility 100 m; in clear air those halves have 12.3 dB" in capsys.readouterr().out
+    assert added_lightings(scene)[2]["hazy"] == air
 
 
 def test_plain_lightings_take_more_too():

@@ -9,11 +9,12 @@ from tiny_twin import tiny_twin
 import twin
 from twin import progress
 from twin.env.haze import Haze
+from twin.env.lightings import LightSets, draw_light
 from twin.env.randomisation import ANOTHER_DAY, UNTOLD, Draw, Ranges
 from twin.env.shade import _solids
 from twin.env.sides import Sides
-from twin.env.suite import Stage
-from twin.env.tasks import Drive
+from twin.env.suite import Stage, fingerprint
+from twin.env.tasks import WEATHER, Drive
 from twin.env.weather import Weather
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.added import AddedLighting, field_result
@@ -103,12 +104,22 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
     assert {Ranges(bystanders=(0, 3)).draw(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
 
 
-def test_a_picture_under_a_photos_light_is_seen_through_its_air(tmp_path):
-    scene = SceneDir(tiny_twin(tmp_path))
+FOG = Air(0.1, (0.9, 0.8, 0.7))
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """A built scene that also knows the light of its first lighting in two airs."""
+    progress.set_quiet(True)
+    scene = SceneDir(tiny_twin(tmp_path_factory.mktemp("photos")))
     day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
-    for name, air in (("clear", Air()), ("foggy", Air(0.1, (0.9, 0.8, 0.7)))):
+    for name, air in (("clear", Air()), ("foggy", FOG)):
         AddedLighting(name, day, air, field_result(scene), "photo.png", {}).save(scene)
-    built = twin.load_scene(scene.root)
+    return twin.load_scene(scene.root)
+
+
+def test_a_picture_under_a_photos_light_is_seen_through_its_air(photos):
+    built = photos
 
     def first(lighting: str, **options):
         environment = twin.load(built, "ahead", 3, lighting=lighting, **SMALL, **options)
@@ -126,30 +137,77 @@ def test_a_picture_under_a_photos_light_is_seen_through_its_air(tmp_path):
     np.testing.assert_allclose(first("foggy")[0], 255.0 * expected, atol=2.0)
     half = first("day:foggy:0.5")[0]
     assert np.abs(half - plain).mean() < np.abs(first("foggy")[0] - plain).mean()
-    bare = [
-        Stage.open(built, "ahead", {"lighting": name, **SMALL})._bare for name in ("day", "foggy", ("day", "foggy"))
-    ]
-    assert bare == [True, False, False]  # pictures that stay on a device have no air
-    drifting, _ = first("foggy", lighting_drift=True)
-    np.testing.assert_array_equal(drifting, first("foggy")[0])
+    bare = [Stage.open(built, "ahead", {"lighting": name, **SMALL})._bare for name in ("day", "clear", "foggy")]
+    assert bare == [True, True, False]  # pictures that stay on a device have no air
+    assert not Stage.open(built, "ahead", {"lighting": ("day", "foggy"), **SMALL})._bare
 
 
-def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows_are_weaker(tmp_path):
-    scene = SceneDir(tiny_twin(tmp_path))
-    day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
-    AddedLighting("photo", day, Air(0.02), field_result(scene), "photo.png", {}).save(scene)
-    built = twin.load_scene(scene.root)
+def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
+    strong = {"sunlight": (0.7, 0.7), "shade": (0.75, 0.75), "extinction": (0.3, 0.3), "bystanders": (0, 0)}
+    still = dict.fromkeys(("friction", "wheel_radius", "airlight"), (1.0, 1.0))
+    still |= dict.fromkeys(("payload", "latency", "wheel_difference", "camera_shift", "camera_turn"), (0.0, 0.0))
+    ranges = Ranges(**(still | strong), hold_known=True)
+    environment = twin.load(photos, "ahead", 3, lighting="foggy", **SMALL, randomise=ranges)
+    shown = environment.reset().observation["pixels"][-1].astype(float)
+    intrinsics, task = environment.pixels._overlay.intrinsics, environment.task
+    pose, rays = environment.physics.camera_to_world, unproject(pixel_grid(*SMALL["size"]), intrinsics)
+    seen = photos.field().render(Viewpoints.of(pose[None], intrinsics, SMALL["size"]), "day")
+    left = Draw(sunlight=0.7 * UNTOLD, shade=0.75 * UNTOLD)
+    lit = Weather(left, task.rng(WEATHER)).over(seen.rgb[0], seen.depth[0], rays, pose)
+    distance = seen.depth[0] * np.linalg.norm(rays, axis=-1)
+    expected = FOG.over(lit, distance.astype(np.float32))
+    np.testing.assert_allclose(shown, 255.0 * np.clip(expected, 0.0, 1.0), atol=1.0)
+    assert np.abs(255.0 * expected - 255.0 * FOG.over(seen.rgb[0], distance)).max() > 10.0  # it shows
 
+
+def test_the_air_drifts_with_the_light(photos):
+    sets = LightSets(photos.field())
+
+    def light(wanted, seed: int = 0):
+        return draw_light(wanted, True, 10.0, sets, np.random.default_rng(seed))
+
+    ends = {light("foggy", seed).name for seed in range(20)}
+    assert ends == {"foggy → day", "foggy → night"}  # filmed ones
+    away = light("foggy")
+    for time, share in ((0.0, 1.0), (2.5, 0.75), (5.0, 0.5), (10.0, 0.0), (99.0, 0.0)):
+        air = away.air_at(time)
+        assert air.extinction == pytest.approx(share * FOG.extinction)
+        assert not share or air.airlight == pytest.approx(FOG.airlight)
+    extinctions = {
+        air if air is None else round(air.extinction, 6)
+        for air in (light(("day", "foggy"), seed).air_at(99.0) for seed in range(20))
+    }
+    assert extinctions == {None, 0.0, FOG.extinction}
+    environment = twin.load(photos, "ahead", 3, lighting="foggy", **SMALL, lighting_drift=True)
+    environment.reset()
+    environment.pixels.lights[0] = replace(environment.pixels.lights[0], duration=0.1)
+    cleared = environment.step(np.zeros(2)).observation["pixels"][-1].astype(float)
+    environment.pixels.lights[0] = replace(environment.pixels.lights[0], end_air=FOG)
+    assert np.abs(environment.step(np.zeros(2)).observation["pixels"][-1] - cleared).mean() > 5.0
+
+
+@pytest.mark.parametrize("lighting", ["foggy", "clear"])
+def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows_are_weaker(photos, lighting):
     def draw(lighting: str, ranges: Ranges) -> Draw:
-        environment = twin.load(built, "ahead", 5, lighting=lighting, **SMALL, randomise=ranges)
+        environment = twin.load(photos, "ahead", 5, lighting=lighting, **SMALL, randomise=ranges)
         environment.reset()
         told = environment.task.draw
-        return told if environment.task.info(environment.physics)["randomisation"] == told.record() else Draw()
+        assert environment.task.info(environment.physics)["randomisation"] == told.record()
+        return told
 
-    unknown, known = draw("day", ANOTHER_DAY), draw("photo", ANOTHER_DAY)
+    unknown, known = draw("day", ANOTHER_DAY), draw(lighting, ANOTHER_DAY)
     assert unknown.extinction > 0.0
-    assert known == replace(unknown, extinction=0.0, sunlight=UNTOLD * unknown.sunlight, shade=UNTOLD * unknown.shade)
-    assert draw("photo", replace(ANOTHER_DAY, hold_known=False)) == unknown  # as in training
+    weaker = {"sunlight": UNTOLD * unknown.sunlight, "shade": UNTOLD * unknown.shade}
+    assert known == replace(unknown, extinction=0.0, airlight=1.0, **weaker)
+    assert draw(lighting, replace(ANOTHER_DAY, hold_known=False)) == unknown  # as in training
+
+
+def test_validations_know_how_much_a_photo_leaves_to_be_drawn(photos, monkeypatch):
+    names = ("foggy", "foggy+randomised", "day+randomised")
+    before = [fingerprint(photos, "ahead", name) for name in names]
+    monkeypatch.setattr("twin.env.suite.UNTOLD", 0.5)
+    after = [fingerprint(photos, "ahead", name) for name in names]
+    assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, True]
 
 
 def test_solid_shadows_have_straight_edges_and_no_seam():

@@ -54,7 +54,7 @@ def vertex_colours(views: Views, vertices: NDArray) -> NDArray[np.uint8]:
 
 
 def export(scene: Path, lighting: str | None, glb: Path | None, ply: Path | None) -> list[str]:
-    """Writes the files asked for, and returns a line on each.
+    """Writes the files asked for, and returns a line on each. Colours are as in clear air, whatever a photo told.
 
     Raises:
         InputError: a scene that is not built, an unknown lighting, or a folder that is not there.

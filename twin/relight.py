@@ -4,7 +4,7 @@
 
 finds where the photo was taken (`capture/register.py`), then the appearance embedding and the air under which the
 frozen field looks most like it. The lighting goes to `<scene>/lightings/afternoon.json`, with a picture beside it: the
-photo, the field under the lighting fitted, and under the most similar filmed one. From then on
+photo, the field under what was fitted, and under the most similar filmed one. From then on
 `twin.load_scene(scene).field()` has it: `lighting="afternoon"`, `"sun:afternoon:0.5"`; environments lay its air over
 their pictures.
 """
@@ -45,7 +45,7 @@ class Relit:
     air: Air
     """Clear where haze does not explain the picture better."""
     pictures: tuple[NDArray, NDArray, NDArray]
-    """Photo, field under the fitted lighting, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
+    """Photo, field under the fitted lighting and air, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
     psnr_nearest: float
     """[dB]"""
     psnr_fitted: float
@@ -71,7 +71,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     import torch
 
     from twin.nerf.compute import single_threaded_torch
-    from twin.nerf.fit_light import fit_embedding, fit_light_and_air
+    from twin.nerf.fit_light import fit_light
     from twin.nerf.workspace import CameraArrays
 
     height, width = photo.shape[:2]
@@ -90,9 +90,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     def fitted(use: NDArray, start: NDArray, hazy: bool) -> tuple[NDArray, Air]:
         some = torch.as_tensor(use[:: max(1, len(use) // _RAYS)], device=field.where)
         seen = field, features[some], harmonics[some], colours[some]
-        if hazy:
-            return fit_light_and_air(*seen, distances[some], start, _STEPS)
-        return fit_embedding(*seen, start, _STEPS), _CLEAR
+        return fit_light(*seen, start, _STEPS, distances[some] if hazy else None)
 
     filmed = {name: picture(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))

@@ -70,7 +70,7 @@ class DevicePixels(Pixels):
         Args:
             field: Of the place; its device is where pictures stay.
             trust: What was filmed of it.
-            options: Size, stack, lighting; no camera effects, nothing drawn anew.
+            options: Size, stack, lighting; no camera effects, nothing drawn anew, no light of a hazy photo.
             worlds: Whose episodes are observed, without obstacles.
         """
         self.options, self.worlds, self._field = options, list(worlds), field

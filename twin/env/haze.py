@@ -1,4 +1,4 @@
-"""Air that the film did not have, of an episode whose air nobody knows: see `nerf/air.py` for what it does.
+"""Air that is drawn for an episode, over what a photo told of it if one did: see `nerf/air.py` for what it does.
 
 The airlight has the colour that the sky has near the horizon in the episode's own light, as its first picture shows it.
 """

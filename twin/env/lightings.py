@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
-from twin.nerf.air import Air
+from twin.nerf.air import Air, mixed
 from twin.nerf.baked import BakedField
 
 Floats = NDArray[np.float32]
@@ -52,19 +52,28 @@ class Light:
     """As it was asked for, or how it was drawn."""
     start: Floats
     """Embedding at the beginning, shape (dim,)."""
-    air: Air | None = None
-    """Of the beginning, which stays, where a photo told it; None: the film's."""
     end: Floats | None = None
     """Embedding after `duration`; None where it stays."""
     duration: float = 0.0
     """[s]"""
+    air: Air | None = None
+    """Of the beginning, where a photo told it; None: the film's."""
+    end_air: Air | None = None
+    """Of the end."""
 
     def at(self, time: float) -> Floats:
         """The embedding after `time` [s], shape (dim,)."""
         if self.end is None:
             return self.start
-        share = float(np.clip(time / self.duration, 0.0, 1.0))
+        share = self._share(time)
         return ((1.0 - share) * self.start + share * self.end).astype(np.float32)
+
+    def air_at(self, time: float) -> Air | None:
+        """The air after `time` [s]; None: the film's."""
+        return self.air if self.end is None else mixed(self.air, self.end_air, self._share(time))
+
+    def _share(self, time: float) -> float:
+        return float(np.clip(time / self.duration, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -164,14 +173,14 @@ def draw_light(
     """
     name, start, air = _one(wanted, sets, rng)
     if not drift:
-        return Light(name, start, air)
-    other, end, _ = _one(wanted, sets, rng)
+        return Light(name, start, air=air)
+    other, end, end_air = _one(wanted, sets, rng)
     if isinstance(wanted, str) and wanted not in RESERVED_LIGHTINGS:
-        names = [n for n in sets.field.lightings if n != wanted]
+        names = [n for n in sets.field.lightings_by_name.filmed().names if n != wanted]
         if not names:
             raise InputError(f"lighting {wanted!r} cannot drift: the field has no other; give lighting_drift=False")
-        other, end, _ = _one(tuple(names), sets, rng)
-    return Light(f"{name} → {other}", start, air, end, duration)
+        other, end, end_air = _one(tuple(names), sets, rng)
+    return Light(f"{name} → {other}", start, end, duration, air, end_air)
 
 
 def _one(wanted: str | Sequence[str], sets: LightSets, rng: np.random.Generator) -> tuple[str, Floats, Air | None]:

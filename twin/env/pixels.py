@@ -66,10 +66,12 @@ class Pixels:
                 self.lights[i] = draw_light(o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHT))
             if o.camera:
                 self._effects[i] = CameraEffects(o.camera, task.rng(CAMERA))
-            air = self.lights[i].air  # type: ignore[union-attr]
-            if air and o.randomise and o.randomise.hold_known:
+            air = self.lights[i].air_at(0.0)  # type: ignore[union-attr]
+            # Air that a photo told to be clear is known, too.
+            if air is not None and o.randomise and o.randomise.hold_known:
                 task.weathered(task.draw.on_a_known_day())
-            self._weather[i] = Weather(task.draw, task.rng(WEATHER), air) if air or o.randomise else None
+            has_any = air is not None or o.randomise
+            self._weather[i] = Weather(task.draw, task.rng(WEATHER), air) if has_any else None
         if len(which):
             self._show(which, fills=True)
 
@@ -95,6 +97,9 @@ class Pixels:
         lights = [self.lights[i].at(data.time) for i, data in zip(which, seen, strict=True)]  # type: ignore[union-attr]
         effects = [self._effects[i] for i in which] if self.options.camera else None
         weather = [self._weather[i] for i in which]
+        for i, sky, data in zip(which, weather, seen, strict=True):
+            if sky:
+                sky.air = self.lights[i].air_at(data.time)  # type: ignore[union-attr]
         out = self._overlay.render(seen, lights, effects, weather)  # type: ignore[arg-type]
         self.trust[list(which)] = self._trust.of(poses, out)
         return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -6,6 +6,7 @@ another sun lights what stands (see `sides.py`) and throws shadows that the film
 
 *Ranges* say how far each may be from what was built and filmed; a *draw* is what one episode got, every value uniform
 in its range and independent of the others. What is the robot's is applied to the episode's own copy of the model.
+What is known of the robot, and of a day by a photo, need not be drawn: see `Ranges.hold_known`.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -27,9 +28,10 @@ VERSION = 4
 """Of what comes out of a draw. Raised where haze, light, shadows or bystanders of the same draw become others."""
 
 UNTOLD = 0.6
-"""Share of another day's sun and shadows that a photo of it leaves untold. With this much of them drawn, the steering
-of twelve policies changes as much as it does from the twin, under a photo's light and air, to pictures of that day:
-0.99 times for what lasts all day, 1.09 for what differs from place to place (`benchmarks/day.py`)."""
+"""Share of another day's sun and shadows that a photo of it leaves untold. Pictures of a day change the steering of
+twelve policies, from the twin under its photo's light and air, 0.8 times as much as all of them do (0.6 to 0.96). As
+this share of them does, they change it 1.1 times as much in what lasts for the day (0.8 to 1.4), and 1.2 times in what
+differs from place to place (1.0 to 1.4); see `benchmarks/day.py`."""
 
 _PAYLOAD_SIDE = 0.3  # [m] of the cube that the payload's inertia is of
 _TYRE = "_tyre"
@@ -145,8 +147,8 @@ class Draw:
     bystanders: int = 0
 
     def on_a_known_day(self) -> "Draw":
-        """The same on a day whose light and air a photo told: clear but for that air, and sun and shadows weaker."""
-        return replace(self, extinction=0.0, sunlight=UNTOLD * self.sunlight, shade=UNTOLD * self.shade)
+        """The same on a day whose light and air a photo told: no haze but that air, and sun and shadows weaker."""
+        return replace(self, extinction=0.0, airlight=1.0, sunlight=UNTOLD * self.sunlight, shade=UNTOLD * self.shade)
 
     def record(self) -> dict[str, Any]:
         """For the episode's record, JSON-able."""

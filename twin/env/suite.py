@@ -84,7 +84,8 @@ class Stage:
         """Whether nothing is put into pictures of the field, not even the robot itself."""
         lighting = self.options.lighting
         asked = (lighting,) if isinstance(lighting, str) else tuple(lighting)
-        air = self.field is not None and any(self.field.air(name) for name in asked)
+        airs = [self.field.air(name) for name in asked] if self.field else []
+        air = any(one and one.extinction for one in airs)
         if self.options.randomise or self.options.camera or self.obstacles.pool or air:
             return False
         data, camera = mujoco.MjData(self.model), self.model.camera("front").id

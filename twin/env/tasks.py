@@ -69,7 +69,7 @@ class Drive(control.Task):
         self.episode_seed = 0
         """Of the episode under way."""
         self.draw = Draw()
-        """The robot of the episode under way."""
+        """Of the episode under way: its robot and its weather."""
         self._record = self.draw.record()
         self.obstacles: tuple[ObstacleConfig, ...] = ()
         """Of the episode under way."""

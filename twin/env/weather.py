@@ -24,8 +24,10 @@ class Weather:
         Args:
             draw: Of the episode.
             rng: Of its sun, light and shadows.
-            air: Of the episode's light, where it is known.
+            air: See `air`.
         """
+        self.air = air
+        """Of the episode's light as it is now, where a photo told it; clear or None: nothing of its own."""
         elevation, azimuth = np.deg2rad(rng.uniform(*_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
         level = np.cos(elevation)
         sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
@@ -33,9 +35,7 @@ class Weather:
         sides, shade = rng.spawn(2)
         self._sides = Sides(draw.sunlight, sun, sides) if draw.sunlight else None
         self._shade = Shade(draw.shade, sun, shade) if draw.shade else None
-        self._airs: list[Air | Haze] = [air] if air and air.extinction else []
-        if draw.extinction:
-            self._airs.append(Haze(draw.extinction, draw.airlight))
+        self._haze = Haze(draw.extinction, draw.airlight) if draw.extinction else None
 
     def over(self, rgb: Floats, depth: Floats, rays: NDArray, pose: NDArray) -> Floats:
         """A picture in this weather.
@@ -52,8 +52,9 @@ class Weather:
                 rgb = self._sides.over(rgb, depth, around.astype(np.float32))
             if self._shade:
                 rgb = self._shade.over(rgb, depth, around + pose[:3, 3])
-        if self._airs:
+        if self.air or self._haze:
             distance = depth * np.linalg.norm(rays, axis=-1).astype(np.float32)
-            for air in self._airs:
-                rgb = air.over(rgb, distance)
+            airs: list[Air | Haze] = [one for one in (self.air, self._haze) if one]
+            for one in airs:
+                rgb = one.over(rgb, distance)
         return rgb

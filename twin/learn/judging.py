@@ -40,7 +40,8 @@ class Chunk:
     trust: bool
     lighting: str
     """See `env/lightings.py`; or `drawn_<number>`: the light that this seed draws, see `drawn_light`. With
-    `+randomised` robot, air and bystanders are drawn for every episode, too, see `env/randomisation.py`."""
+    `+randomised` robot, weather and bystanders are drawn for every episode, too, as far as they are not known, see
+    `env/randomisation.py`."""
     seeds: tuple[int, ...]
 
 

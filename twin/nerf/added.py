@@ -78,14 +78,16 @@ def added_lightings(
     for path in sorted(scene.lightings.glob("*.json")):
         try:
             head = read_json(path)
-            form = head["format"]
-            if form != _FORMAT:
-                raise InputError(f"{path}: format {form}, expected {_FORMAT}; fit it again or delete it")
+            if head["format"] == 1:  # without its air
+                stale.append(path.stem)
+                continue
+            if head["format"] != _FORMAT:
+                raise InputError(f"{path}: format {head['format']}, expected {_FORMAT}; fit it again or delete it")
             made_by, vector = head["field"], np.array(head["embedding"], np.float32)
             red, green, blue = map(float, head["air"]["airlight"])
             air = Air(float(head["air"]["extinction"]), (red, green, blue))
-            if not 0.0 <= air.extinction < np.inf:
-                raise ValueError(f"extinction {air.extinction}")
+            if not (0.0 <= air.extinction < np.inf and all(0.0 <= share <= 1.0 for share in air.airlight)):
+                raise ValueError(f"air {air.extinction}, {air.airlight}")
         except InputError:
             raise
         except (ValueError, TypeError, KeyError) as error:

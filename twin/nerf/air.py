@@ -28,14 +28,23 @@ class Air:
 
     def over(self, rgb: Floats, distance: Floats) -> Floats:
         """A picture (..., 3) as seen through this air; distance along the rays [m], shape (...)."""
+        if not self.extinction:
+            return rgb
         kept = np.exp(np.float32(-self.extinction) * np.minimum(distance, np.float32(REACH)))[..., None]
         return kept * rgb + (np.float32(1.0) - kept) * np.asarray(self.airlight, np.float32)
 
-    def mixed(self, other: "Air", share: float) -> "Air":
-        """The air `share` of the way to another; each airlight counts by how much air there is of it."""
-        mine, its = (1.0 - share) * self.extinction, share * other.extinction
-        total = mine + its
-        if not total:
-            return Air()
-        red, green, blue = (mine * np.array(self.airlight) + its * np.array(other.airlight)) / total
-        return Air(total, (float(red), float(green), float(blue)))
+
+def mixed(one: Air | None, other: Air | None, share: float) -> Air | None:
+    """The air `share` of the way from one to another; None is the film's, and both of them None give None.
+
+    Each airlight counts by how much there is of its air.
+    """
+    if one is None and other is None:
+        return None
+    a, b = one or Air(), other or Air()
+    mine, its = (1.0 - share) * a.extinction, share * b.extinction
+    total = mine + its
+    if not total:
+        return Air()
+    red, green, blue = (mine * np.array(a.airlight) + its * np.array(b.airlight)) / total
+    return Air(total, (float(red), float(green), float(blue)))

@@ -142,7 +142,7 @@ class BakedField:
         return self.lightings_by_name.embedding(lighting)
 
     def air(self, lighting: str) -> Air | None:
-        """See `Lightings.air`. Pictures are rendered without it."""
+        """See `Lightings.air`. `render` shows the place without it; environments lay it over their pictures."""
         return self.lightings_by_name.air(lighting)
 
     def sample_lighting(self, rng: np.random.Generator) -> Floats:
@@ -162,7 +162,7 @@ class BakedField:
         size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
     ) -> Rendering:
-        """What n cameras see.
+        """What n cameras see, in air as clear as the film's.
 
         Args:
             cameras: `Cameras` of a scene, or `Viewpoints`.

@@ -17,7 +17,7 @@ from twin.nerf.baked import BakedField
 from twin.nerf.compute import single_threaded_torch
 from twin.nerf.dataset import load_frame
 from twin.nerf.field import RadianceField
-from twin.nerf.fit_light import fit_embedding
+from twin.nerf.fit_light import fit_light
 from twin.nerf.workspace import CameraArrays
 from twin.progress import track
 
@@ -51,7 +51,7 @@ def score_frame(
         if not len(fit_on) or not score_on.any():
             continue
         some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // _FIT_RAYS)], device=field.where)
-        shown = picture(fit_embedding(field, features[some], harmonics[some], colours[some], start))
+        shown = picture(fit_light(field, features[some], harmonics[some], colours[some], start)[0])
         psnrs.append(psnr(shown, image, score_on))
         # Masked pixels are made equal: they neither help nor harm beyond their windows.
         shown[~mask] = image[~mask]

@@ -1,5 +1,7 @@
 """The light and the air that a picture of a field's place was taken in, by optimisation with the field frozen."""
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -12,19 +14,21 @@ _STEPS = 40
 _RATE = 0.05
 _PRIOR = 1e-3  # pull towards the embedding to start from, as residuals are in training
 _EXTINCTION = 2.5e-3  # [1/m] to start from
-_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.01  # the first of its logarithm
+_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.3, 0.05  # the first of its logarithm
+_MOST_EXTINCTION = 0.1  # [1/m], a visibility of 30 m: a veil over what is nearer is rather of the lens
 _FAR = 0.25  # share of the rays, the farthest, whose mean colour the airlight starts from
 
 
-def fit_embedding(
+def fit_light(
     field: RadianceField,
     features: torch.Tensor,
     harmonics: torch.Tensor,
     colours: torch.Tensor,
     start: NDArray[np.float32],
     steps: int = _STEPS,
-) -> NDArray[np.float32]:
-    """The embedding under which traced rays (see `RadianceField.trace`) look like `colours`, in clear air.
+    distances: torch.Tensor | None = None,
+) -> tuple[NDArray[np.float32], Air]:
+    """The embedding and the air under which traced rays (see `RadianceField.trace`) look like `colours`.
 
     Args:
         field: Stays as it is.
@@ -33,51 +37,21 @@ def fit_embedding(
         colours: In [0, 1], shape (n, 3).
         start: Embedding to start from and stay near to, shape (dim,).
         steps: Of the optimiser.
+        distances: Along the rays [m], shape (n,); without them the air is taken for clear.
     """
-    return _fit(field, features, harmonics, colours, start, steps, None)[0]
-
-
-def fit_light_and_air(
-    field: RadianceField,
-    features: torch.Tensor,
-    harmonics: torch.Tensor,
-    colours: torch.Tensor,
-    distances: torch.Tensor,
-    start: NDArray[np.float32],
-    steps: int = _STEPS,
-) -> tuple[NDArray[np.float32], Air]:
-    """As `fit_embedding`, and the air through which they look so; distances along the rays [m], shape (n,)."""
-    embedding, air = _fit(field, features, harmonics, colours, start, steps, distances)
-    assert air is not None
-    return embedding, air
-
-
-def _fit(
-    field: RadianceField,
-    features: torch.Tensor,
-    harmonics: torch.Tensor,
-    colours: torch.Tensor,
-    start: NDArray[np.float32],
-    steps: int,
-    distances: torch.Tensor | None,
-) -> tuple[NDArray[np.float32], Air | None]:
     origin = torch.as_tensor(start, device=features.device)
     embedding = origin.clone().requires_grad_(True)
-    groups = [{"params": [embedding], "rate": _RATE}]
+    parameters, rates = [embedding], [_RATE]
     if distances is not None:
         distances = distances.clamp(max=REACH)
         farthest = distances.topk(max(1, int(_FAR * len(distances)))).indices
-        log_extinction = torch.tensor(float(np.log(_EXTINCTION)), device=features.device, requires_grad=True)
+        log_extinction = torch.tensor(math.log(_EXTINCTION), device=features.device, requires_grad=True)
         airlight = colours[farthest].mean(0).clone().requires_grad_(True)
-        groups += [
-            {"params": [log_extinction], "rate": _EXTINCTION_RATE},
-            {"params": [airlight], "rate": _AIRLIGHT_RATE},
-        ]
-    parameters = [p for group in groups for p in group["params"]]  # type: ignore[attr-defined]
-    optimiser = torch.optim.Adam(groups, lr=_RATE)
-    for step in range(steps):
-        for group in optimiser.param_groups:
-            group["lr"] = group["rate"] * (1.0 - step / steps)
+        parameters += [log_extinction, airlight]
+        rates += [_EXTINCTION_RATE, _AIRLIGHT_RATE]
+    optimiser = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(parameters, rates, strict=True)])
+    falls = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: 1.0 - step / steps)
+    for _ in range(steps):
         rgb = network.head(field.parameters, features, harmonics, embedding)
         if distances is not None:
             kept = torch.exp(-torch.exp(log_extinction) * distances)[:, None]
@@ -86,8 +60,13 @@ def _fit(
         for parameter, slope in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
             parameter.grad = slope
         optimiser.step()
-    air = None
+        falls.step()
+        if distances is not None:
+            with torch.no_grad():
+                log_extinction.clamp_(max=math.log(_MOST_EXTINCTION))
+                airlight.clamp_(0.0, 1.0)
+    air = Air()
     if distances is not None:
-        red, green, blue = airlight.detach().clamp(0.0, 1.0).tolist()
-        air = Air(float(log_extinction.exp().detach()), (red, green, blue))
+        red, green, blue = airlight.tolist()
+        air = Air(float(log_extinction.detach().exp()), (red, green, blue))
     return embedding.detach().cpu().numpy(), air

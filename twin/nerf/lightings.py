@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.nerf import plausible
-from twin.nerf.air import Air
+from twin.nerf.air import Air, mixed
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Lightings:
     probes: plausible.Probes | None = None
     """What a random lighting is judged on; a baked field has them."""
     stale: tuple[str, ...] = ()
-    """Lightings that were added to another build of the field, and mean nothing to this one."""
+    """Lightings that were added to another build of the field, or by an older twin, and mean nothing to this one."""
     count_added: int = 0
     """How many of the last ones were added."""
     airs: Mapping[str, Air] = field(default_factory=dict)
@@ -46,32 +46,26 @@ class Lightings:
             return self.vectors[self.names.index(lighting)]
         if lighting in self.frames:
             return self.frame_vectors[self.frames.index(lighting)]
-        if lighting.count(":") == 2:
-            a, b, share = lighting.split(":")
-            try:
-                s = float(share)
-            except ValueError:
-                raise InputError(f"lighting {lighting!r}: {share!r} is no number; expected a:b:share") from None
-            if not 0.0 <= s <= 1.0:
-                raise InputError(
-                    f"lighting {lighting!r}: the share {share} is not from 0 to 1; give {a}:{b}:0.3 for 30 % of the "
-                    f"way from {a} to {b}"
-                )
-            return ((1.0 - s) * self.embedding(a) + s * self.embedding(b)).astype(np.float32)
+        if mixture := _mixture(lighting):
+            a, b, share = mixture
+            return ((1.0 - share) * self.embedding(a) + share * self.embedding(b)).astype(np.float32)
         if lighting in self.stale:
             raise InputError(
-                f"lighting {lighting!r}: fitted to another build of this field; fit its photo again: "
-                f"python -m twin.relight SCENE PHOTO --name {lighting}"
+                f"lighting {lighting!r}: fitted to another build of this field, or by an older twin; fit its photo "
+                f"again: python -m twin.relight SCENE PHOTO --name {lighting}"
             )
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
 
     def air(self, lighting: str) -> Air | None:
-        """The air of a lighting that a photo told, or of a mixture with one; None where it is the film's."""
-        if lighting in self.names or lighting.count(":") != 2:
-            return self.airs.get(lighting)
-        a, b, share = lighting.split(":")
-        one, other = self.air(a), self.air(b)
-        return (one or Air()).mixed(other or Air(), float(share)) if one or other else None
+        """The air that a photo told of a lighting, or of a mixture with one; None where it is the film's.
+
+        Raises:
+            InputError: as `embedding`, where a mixture is none.
+        """
+        if lighting in self.airs:
+            return self.airs[lighting]
+        mixture = None if lighting in self.names else _mixture(lighting)
+        return mixed(self.air(mixture[0]), self.air(mixture[1]), mixture[2]) if mixture else None
 
     def sample(self, rng: np.random.Generator) -> NDArray[np.float32]:
         """The embedding of a random lighting that could have been filmed, shape (dim,); `plausible.py` has the rule.
@@ -113,3 +107,20 @@ class Lightings:
         """Without those that were added."""
         count = len(self.names) - self.count_added
         return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0, airs={})
+
+
+def _mixture(lighting: str) -> tuple[str, str, float] | None:
+    """The two lightings and the share of `a:b:share`; None where it is not of that form."""
+    if lighting.count(":") != 2:
+        return None
+    a, b, share = lighting.split(":")
+    try:
+        s = float(share)
+    except ValueError:
+        raise InputError(f"lighting {lighting!r}: {share!r} is no number; expected a:b:share") from None
+    if not 0.0 <= s <= 1.0:
+        raise InputError(
+            f"lighting {lighting!r}: the share {share} is not from 0 to 1; give {a}:{b}:0.3 for 30 % of the "
+            f"way from {a} to {b}"
+        )
+    return a, b, s

@@ -48,8 +48,8 @@ def light_words(lighting: str) -> str:
     if lighting.endswith(RANDOMISED):
         plain = light_words(lighting.removesuffix(RANDOMISED))
         return (
-            f"{plain}; and for every episode another sun, haze, shadows, things beside the corridor, and another robot "
-            "but for what is known of yours"
+            f"{plain}; and for every episode another sun, other shadows, haze unless a photo told the air, things "
+            "beside the corridor, and another robot but for what is known of yours"
         )
     if lighting.startswith("drawn_"):
         return f"light number {lighting[6:]} of those drawn in the search"
