@@ -84,6 +84,13 @@ def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
     assert clear.air == Air() and clear.psnr_other_half == clear.psnr_clear_other_half
 
 
+def test_a_half_is_judged_by_what_was_fitted_to_the_other():
+    field, pose = small_field(), pose_at(0.0)
+    day, night = _filmed(field, pose, (64, 48))
+    torn = fit_photo(field, np.hstack([day[:, :32], night[:, 32:]]), pose, K / 5)
+    assert torn.psnr_clear_other_half == pytest.approx(psnr(day, night), abs=3.0)  # each half fits one of them
+
+
 def test_air_by_closed_forms_and_between_two_lightings():
     rgb, distance = np.full((1, 2, 3), 0.5, np.float32), np.array([[0.0, 1e6]], np.float32)
     np.testing.assert_array_equal(Air().over(rgb, distance), rgb)
