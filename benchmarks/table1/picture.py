@@ -2,15 +2,16 @@
 
     python benchmarks/table1/picture.py SCENE docs/forecast.jpg
 
-The road as randomised episodes of the twin show it, the road of the real test in its weather, success on the road over
-success in the twin for every policy that drove, and success along a training. SCENE holds what `benchmarks/table1`
-left there.
+The road as randomised episodes of the twin show it, the road of the real test in its weather and the twin by a photo of
+each, success on the road over success in the twin for every policy that drove, and success along a training. SCENE
+holds what `benchmarks/table1` left there.
 """
 
 import argparse
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ Picture = NDArray[np.uint8]
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
 _PER_ROW = 5  # pictures
-_SEEDS = range(1, 1 + len(WEATHER))  # of the twin's pictures
+_SEEDS = range(1, 1 + _PER_ROW)  # of the twin's pictures
 _PAPER = {
     INK: "#16202a",
     MUTED: "#5b6670",
@@ -56,10 +57,12 @@ def main() -> None:
     drawn = twin_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(success_curve(run)))[..., ::-1]
     parts = [
-        _caption("The road as the twin shows it in randomised episodes: lights, suns, shadows and haze are drawn anew"),
-        *_rows([_first(given.scene, seed) for seed in _SEEDS]),
+        _caption("The road as the twin shows it in training: lights, suns, shadows and haze are drawn anew"),
+        *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),
         _caption("The road of the real test: weather that nobody filmed, things that were moved"),
         *_rows(road, list(WEATHER)),
+        _caption("The twin by one photo of each of these days, which told its light and its air"),
+        *_rows([_first(given.scene, 1, lighting=name) for name in WEATHER], list(WEATHER)),
         _side_by_side(_drawn(drawn), curve),
     ]
     whole = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
@@ -67,9 +70,9 @@ def main() -> None:
         parser.error(f"{given.out} cannot be written")
 
 
-def _first(scene: Path, seed: int) -> Picture:
+def _first(scene: Path, seed: int, **options: Any) -> Picture:
     """The first picture of an episode."""
-    step = twin.load(scene, "straight", seed, randomise=True).reset()
+    step = twin.load(scene, "straight", seed, **options).reset()
     return step.observation["pixels"][-1]
 
 
