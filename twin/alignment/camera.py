@@ -127,7 +127,7 @@ def pictures(
         heading = float(heading_of(pose, np.deg2rad(alignment.seat.yaw)))
         here = Viewpoints.of(seated(robot, pose[:2, 3], heading, ground.at), np.array(lens.intrinsics), size)
         filmed = cv2.resize(frames[alignment.film.frames[k]], size, interpolation=cv2.INTER_AREA)
-        seen = [field.render(here, lighting).rgb[0] for lighting in field.lightings_by_name.filmed().names]
+        seen = [field.render(here, lighting).rgb[0] for lighting in field.lightings]
         best = max(seen, key=lambda rgb: psnr(rgb, filmed / np.float32(255.0)))
         rows.append(np.hstack([filmed, (np.clip(best, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)]))
     write_image(folder / "camera.png", np.vstack(rows))
