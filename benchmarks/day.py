@@ -3,7 +3,7 @@
     python benchmarks/day.py SCENE [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
 The scene has been built from the stand-in's film and knows its days by a photo each (`benchmarks/table1`, step
-`photos`). Pictures of every day at seven other places of the road are compared with the twin's from there under the
+`photos`). Pictures of every day at eight other places of the road are compared with the twin's from there under the
 photo's light and air: by dB, and by how they change the steering of policies, against how another day's sun and shadows
 change it that are drawn over the twin's. *Lasting* is the mean over places of a day's change (rms over days), *local*
 the rest.

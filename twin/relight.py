@@ -30,7 +30,7 @@ _MAX_WIDTH = 480  # [px] longer side of the picture fitted, as that of the frame
 _STEPS = 300
 _RAYS = 10_000  # fitted at most, spread evenly
 _LOOK_RAYS = 1000  # that tell which filmed frame is most like the photo
-_HAZY = 0.2  # [dB]
+_HAZY = 0.2  # [dB] by which haze has to explain the other half better
 _GAP = 4  # [px] between the pictures
 
 

@@ -79,7 +79,7 @@ class Ranges:
     """Things beside the corridor: cones, boxes, bollards in any colour."""
     hold_known: bool = False
     """Whether only that is drawn which is not known: of the robot by the scene, see `for_robot`; of the weather by the
-    photo that the episode's light was fitted to, see `Draw.on_a_known_day`."""
+    photo that the episode's light, or a part of its mixture, was fitted to, see `Draw.on_a_known_day`."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.each().items():
