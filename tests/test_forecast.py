@@ -12,6 +12,7 @@ from scipy.special import expit
 from twin.env.options import CAUSES
 from twin.errors import InputError
 from twin.forecast import forecast, main
+from twin.report import forecast_figures
 from twin.report.forecast import ALL_TASKS, Estimate, Forecast
 from twin.report.forecast_page import forecast_page
 from twin.report.forecast_words import CSV_COLUMNS, STATISTICS, candidates_csv, show, summary, unknowns, verdicts
@@ -216,6 +217,26 @@ def test_uneven_lightings_are_told() -> None:
     assert any("driven on the road under the same lightings" in what for what in told)
 
 
+def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
+    """Of a policy in a light, in the twin and on the road, both figures hold the rate."""
+    few, many = (
+        make_forecast("road", *cells(n=6, driven=6, tasks=tasks)) for tasks in (("straight",), ("a", "b", "c"))
+    )
+    assert len(few.pairs) <= 24 < len(many.pairs)
+    short, long = (html[html.index('<section id="cells"') :] for html in map(forecast_page, (few, many)))
+    assert "<svg" not in short and "<details" not in short
+    assert long.count("<svg") == 2 * len(many.tasks) and long.count("<details") == 1
+    mine = [pair for pair in many.pairs if pair.task == "b"]
+    for road in (False, True):
+        (axes,) = forecast_figures.cells(many.of("b"), mine, road).axes
+        names, lights = (
+            [text.get_text() for text in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels())
+        )
+        told = {(names[round(t.xy[1])], lights[round(t.xy[0])]): t.get_text() for t in axes.texts}
+        wanted = {(p.policy, p.lighting): (p.real if road else p.twin).value for p in mine}
+        assert told == {key: f"{100 * value:.0f}" for key, value in wanted.items()}
+
+
 def test_one_policy_alone() -> None:
     made = make_forecast("road", [Cell("p", "straight", "sun", 10, 5)], [])
     assert "one policy; there is nothing to rank" in summary(made)
@@ -228,14 +249,16 @@ def test_the_papers_table_has_training_twin_and_road_of_every_policy() -> None:
     made = make_forecast("road", twin, real, trained=trained)
     html = forecast_page(made)
     table = html[html.index('<section id="stages"') :]
-    rows = [row.split("<td>")[1:] for row in table[: table.index("</section>")].split("<tr>")[2:]]
-    found = {(c.policy, c.task): c for c in made.candidates}
-    assert len(rows) == 7
-    for row in rows:
-        policy, *cells_ = (Text(cell).text.strip() for cell in (part.split("</td>")[0] for part in row))
-        wanted = [e for task in made.tasks for c in [found[policy, task]] for e in (c.trained, c.twin, c.real)]
-        assert cells_ == [show(e, percent=True) for e in wanted]
-        assert (cells_[0] == "97% (93% to 99%)") == (policy == "p0") and (cells_[2] == "–") == (policy == "p6")
+    parts = [part.split("</h3>") for part in table[: table.index("</section>")].split("<h3>")[1:]]
+    assert tuple(task for task, _ in parts) == made.tasks == ("straight", "bend")
+    for task, rows in parts:
+        told = [row.split("<td>")[1:] for row in rows.split("<tr>")[2:]]
+        assert len(told) == 7
+        for row, c in zip(told, made.of(task), strict=True):
+            policy, *cells_ = (Text(cell).text.strip() for cell in (part.split("</td>")[0] for part in row))
+            assert policy == c.policy and cells_ == [show(e, percent=True) for e in (c.trained, c.twin, c.real)]
+            assert (cells_[0] == "97% (93% to 99%)") == ((policy, task) == ("p0", "straight"))
+            assert (cells_[2] == "–") == (policy == "p6")
     assert candidates_csv(made).count("0.97,0.93,0.99") == 1
 
 

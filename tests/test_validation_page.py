@@ -18,7 +18,7 @@ from twin.errors import InputError
 from twin.report.training import RECENT, binned, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.report.validation import rate, share, summary, typical_episode, worst_episode
-from twin.report.validation_figures import rates
+from twin.report.validation_figures import MANY, better, rates
 from twin.report.validation_page import Curve, validation_page
 from twin.report.validation_words import FAILURES, chance_words, pair_words, percent, unknowns, verdicts, why
 from twin.report.video import describe
@@ -150,8 +150,8 @@ def test_a_weak_light_and_untrusted_pictures_are_headlines():
 
 def test_differences_are_named_by_chance():
     pair = {"a": "x", "b": "y", "only_a": 9, "only_b": 1, "p": 0.02}
-    assert pair_words(pair) == "x is better"
-    assert pair_words(pair | {"only_a": 1, "only_b": 9}) == "y is better"
+    assert pair_words(pair) == "first is better"
+    assert pair_words(pair | {"only_a": 1, "only_b": 9}) == "second is better"
     assert pair_words(pair | {"p": 0.3}) == "within chance" and pair_words(pair | {"only_b": 9}) == "no difference"
     assert [chance_words(p) for p in (1e-5, 0.0213, 0.62, 1.0)] == ["<0.1%", "2.1%", "62%", "100%"]
 
@@ -177,7 +177,7 @@ def test_the_page_says_the_tables_numbers(tmp_path):
     for cell in [*said["cells"], *worst]:
         assert percent(cell) in text and why(cell) in text
     assert percent(trained["a"]) in text and "after 300 steps" in text and "in varying light" in text
-    assert "19" in text and "only first arrived" in text and "a is better" in text  # 31 - 12 episodes
+    assert "19" in text and "only first arrived" in text and "first is better" in text  # 31 - 12 episodes
     assert percent(said["cells"][0]["low_trust"]) in text
     assert "drawn_3" in text and "5 rolled over" in text
     assert all(v.text in text for v in verdicts(said)) and all(c.what in text for c in unknowns(said))
@@ -313,3 +313,62 @@ def test_names_of_many_lightings_leave_room_for_the_rates(lights):
     figure = rates(summary([trial(light=name) for name in names])["cells"])
     FigureCanvasAgg(figure).draw()
     assert figure.axes[0].get_position().width > 0.5
+
+
+def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
+    """Text and colour of every tile of a figure, by its row's and its column's name."""
+    (axes,) = figure.axes
+    rows, columns = ([t.get_text() for t in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels()))
+    faces = axes.collections[0].get_facecolor()
+    at = [(rows[round(t.xy[1])], columns[round(t.xy[0])]) for t in axes.texts]
+    return {key: (t.get_text(), tuple(f)) for key, t, f in zip(at, axes.texts, faces, strict=True)}
+
+
+def test_many_lightings_are_tiles_with_their_mean():
+    trials = [
+        trial("a", seed, "goal" if seed < k else "collision", light=f"day_{k}") for k in range(5) for seed in range(4)
+    ]
+    trials += [trial("b", seed, light=f"day_{k}") for k in range(4) for seed in range(4)]
+    assert MANY < 5
+    drawn = tiles(rates(summary(trials)["cells"]))
+    assert {light: text for (policy, light), (text, _) in drawn.items() if policy == "a"} == {
+        "mean": "50", "day_0": "0", "day_1": "25", "day_2": "50", "day_3": "75", "day_4": "100"
+    }  # fmt: skip
+    assert ("b", "day_4") not in drawn and drawn["b", "mean"][0] == "100"  # nothing is made up of what was not driven
+    shades = [drawn["a", f"day_{k}"][1][3] for k in range(5)]
+    assert shades == sorted(set(shades))
+
+
+def test_who_beats_whom_is_shown_with_the_best_on_top():
+    """`good` arrives in 20 episodes, `fair` in 2, `poor` in none: two more may be chance."""
+    won = {"poor": 0, "good": 20, "fair": 2}
+    trials = [trial(name, seed, "goal" if seed < n else "collision") for name, n in won.items() for seed in range(20)]
+    drawn = tiles(better(summary(trials)["pairs"]))
+    assert {key: text for key, (text, _) in drawn.items()} == {
+        ("good  1", "2"): "18", ("good  1", "3"): "20", ("fair  2", "1"): "18",
+        ("fair  2", "3"): "2", ("poor  3", "1"): "20", ("poor  3", "2"): "2",
+    }  # fmt: skip
+    colour = {key: face for key, (_, face) in drawn.items()}
+    assert colour["good  1", "2"] == colour["good  1", "3"] != colour["fair  2", "1"] == colour["poor  3", "1"]
+    chance = colour["fair  2", "3"]
+    assert chance == colour["poor  3", "2"] and chance[3] < colour["good  1", "2"][3]
+
+
+def test_long_tables_are_folded_away_below_what_sums_them_up(tmp_path):
+    policies, lights = [f"p{k}" for k in range(8)], [f"day_{k}" for k in range(5)]
+    trials = [
+        trial(p, seed, trust=0.9 if seed else 0.1, light=light)
+        for p in policies
+        for light in lights
+        for seed in range(3)
+    ]
+    said = told(trials)
+    page(tmp_path, said)
+    html = validation_page("road", tmp_path, said, [])
+    rates_, better_, trust_ = (html[html.index(f'<section id="{name}"') :] for name in ("arrive", "better", "trust"))
+    for section in (rates_, better_, trust_):
+        section = section[: section.index("</section>")]
+        assert section.count("<details") >= 1
+    summed = trust_[: trust_.index("<details")]
+    assert summed.count("<code>") == len(policies) and "100% (79% to 100%)" in summed  # 10 of 10, 5 of 5
+    assert summed.count('<td class="n">10</td><td>') == summed.count('<td class="n">5</td></tr>') == len(policies)

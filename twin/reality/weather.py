@@ -1,7 +1,7 @@
 """The lightings of the real test. None of them is ever filmed; a twin knows of them by a photo at most.
 
 The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Five are
-stated here, five more are *days*, drawn once with a fixed seed as a calendar would: sun, clouds and air are whatever
+stated here, fifteen more are *days*, drawn once with a fixed seed as a calendar would: sun, clouds and air are whatever
 they are. What a trial adds of its own is only the camera's drift of exposure.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from twin.reality.lighting import Colour, Lighting
 from twin.reality.things import SEED
 
-_DAYS = 5
+_DAYS = 15
 _WHITE, _RED = np.array([1.0, 0.94, 0.83]), np.array([1.0, 0.60, 0.34])  # of a high sun, and of one at the horizon
 _REDDENED = 14.0  # [°] over which a rising sun loses all but 1/e of its red
 _GREY = 0.3  # of this the mean of pictures is to be, as automatic exposure would have it

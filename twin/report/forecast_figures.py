@@ -6,8 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.report.figures import CARD, INK, MUTED, SERIES, new_figure, style
-from twin.report.forecast import Candidate, Estimate, Forecast
+from twin.report.figures import CARD, MUTED, SERIES, new_figure, style
+from twin.report.forecast import Candidate, Estimate, Forecast, Pair
+from twin.report.tiles import tiles
 
 LIMITS = (-0.04, 1.04)
 """Of an axis of rates."""
@@ -16,7 +17,7 @@ TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _NAMED = 3  # points furthest off, which are named
 _NAME = (0.5, 0.06)  # width and height of a name, in units of the axes
 _LONGEST = 26  # characters of a name
-_ROW = 0.34  # [in]
+_ROW = 0.34  # [in] of three points with their intervals
 _SQUARE = 4.6  # [in]
 
 
@@ -74,22 +75,21 @@ def rates(candidates: Sequence[Candidate]) -> Figure:
 def rank_chances(candidates: Sequence[Candidate]) -> Figure:
     """Probability of every rank in the twin, one row per candidate."""
     n = len(candidates)
-    figure, axes = new_figure(0.7 + 0.28 * n)
     chance = np.array([c.twin_ranks for c in candidates])
-    with style():
-        axes.grid(False)
-        # Alpha over the page instead of a colour map: it reads in light and dark.
-        for i in range(n):
-            for k in range(n):
-                if chance[i, k] >= 0.005:
-                    axes.barh(i, 0.96, left=k + 0.52, height=0.92, color=SERIES[0], alpha=0.12 + 0.78 * chance[i, k])
-                    if n <= 16:
-                        percent = f"{100 * chance[i, k]:.0f}"
-                        axes.annotate(percent, (k + 1, i), ha="center", va="center", fontsize=7, color=INK)
-        _names(axes, candidates)
-        step = max(1, n // 12)
-        axes.set(xlim=(0.5, n + 0.5), ylim=(n - 0.5, -0.5), xticks=range(1, n + 1, step), xlabel="rank in the twin [%]")
-    return figure
+    percents = np.array([[f"{100 * each:.0f}" for each in row] for row in chance])
+    ranks = [str(k + 1) if k % -(-n // 12) == 0 else "" for k in range(n)]
+    shown = np.where(chance < 0.005, np.nan, chance)
+    return tiles(shown, [short(c.policy) for c in candidates], ranks, percents, "rank in the twin [%]")
+
+
+def cells(candidates: Sequence[Candidate], pairs: Sequence[Pair], road: bool) -> Figure:
+    """Success of every driven candidate in every lighting of the road, in the twin or on the road, in per cent."""
+    lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
+    found = {(pair.policy, pair.lighting): (pair.real if road else pair.twin).value for pair in pairs}
+    policies = [c.policy for c in candidates if c.driven]
+    rate = np.array([[found.get((policy, light)) for light in lightings] for policy in policies], float)
+    percents = np.array([[f"{100 * each:.0f}" for each in row] for row in rate])
+    return tiles(rate, [short(name) for name in policies], [short(name) for name in lightings], percents)
 
 
 def _square(x: str, y: str) -> tuple[Figure, Axes]:

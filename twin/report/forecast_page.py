@@ -10,7 +10,8 @@ from twin.report.markup import Html, caution, document, element, join, table
 from twin.report.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.scene import write_text
 
-_STYLE = ".whole { white-space:nowrap }\n"
+_STYLE = ".whole, td code { white-space:nowrap }\n"
+_LONG = 24  # rows from which on a table is folded away, below figures that say the same
 
 
 def write_forecast_page(forecast: Forecast, folder: Path) -> None:
@@ -107,7 +108,7 @@ def _refusal(group: Group) -> Html:
 
 
 def _stages(forecast: Forecast) -> Html:
-    """The table that papers print: a row per policy, and for every task its rates where it learnt and was judged."""
+    """The table that papers print: for every task a row per policy, its rates where it learnt and was judged."""
     lead = element(
         "p",
         "Train: success over the last episodes before it was saved, exploring. Validate: success in the twin, in the "
@@ -116,19 +117,17 @@ def _stages(forecast: Forecast) -> Html:
         "or chance.",
         class_="done",
     )
-    policies = dict.fromkeys(c.policy for c in forecast.candidates)
-    found = {(c.policy, c.task): c for c in forecast.candidates}
-    rows: list[list[str]] = []
-    for policy in policies:
-        mine = [found.get((policy, task)) for task in forecast.tasks]
-        rates = [_stage(e) for c in mine for e in ((c.trained, c.twin, c.real) if c else (None,) * 3)]
-        rows.append([element("code", policy), *rates])
-    heads = ["policy", *(f"{task}: {stage}" for task in forecast.tasks for stage in ("train", "validate", "real"))]
-    return join(lead, table(heads, rows))
+    parts = [lead]
+    for task in forecast.tasks:
+        rows: list[list[str]] = [
+            [element("code", c.policy), *map(_stage, (c.trained, c.twin, c.real))] for c in forecast.of(task)
+        ]
+        parts += [element("h3", task), table(["policy", "train", "validate", "real"], rows)]
+    return join(*parts)
 
 
-def _stage(estimate: Estimate | None) -> Html:
-    return Html("–") if estimate is None or estimate.value is None else _show(estimate, True)
+def _stage(estimate: Estimate) -> Html:
+    return Html("–") if estimate.value is None else _show(estimate, True)
 
 
 def _policies(forecast: Forecast) -> Html:
@@ -247,7 +246,19 @@ def _cells(forecast: Forecast) -> Html:
         rows.append([element("code", pair.policy), pair.task, light, *counts, _show(pair.bias, True), luck])
     heads = ["policy", "task", "lighting", "twin", "n", "road", "n", "road minus twin", ""]
     lead = f"{beyond} of {len(rows)} cells differ by more than chance; one in ten would if the twin were perfect."
-    return join(element("p", lead, class_="done"), table(heads, rows, (4, 6)))
+    parts, told = [element("p", lead, class_="done")], table(heads, rows, (4, 6))
+    if len(rows) <= _LONG:
+        return join(*parts, told)
+    for task in forecast.tasks:
+        mine = [pair for pair in forecast.pairs if pair.task == task]
+        figures = [
+            _chart(f"{place} [%]", svg(draw.cells(forecast.of(task), mine, road)))
+            for place, road in (("In the twin", False), ("On the road", True))
+            if mine
+        ]
+        parts += [element("h3", task), element("div", *figures, class_="charts")] if mine else []
+    title = element("summary", "Every policy in every lighting, with intervals")
+    return join(*parts, element("details", title, told))
 
 
 def _chart(title: str, drawing: str) -> Html:

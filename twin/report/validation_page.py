@@ -17,6 +17,7 @@ from twin.report import validation_figures as draw
 from twin.report.figures import svg
 from twin.report.markup import Html, caution, data_url, document, element, join, picture, table
 from twin.report.trials import RECENT
+from twin.report.validation import share
 from twin.report.validation_words import (
     FAILURES,
     LUCK,
@@ -34,11 +35,13 @@ from twin.report.words import listing
 from twin.scene import SceneDir, write_text
 
 _STYLE = """.whole, td code { white-space:nowrap }
-th, td { overflow-wrap:normal } #better td:last-child { overflow-wrap:anywhere; min-width:9em }
+th, td { overflow-wrap:normal }
 img { background:#fff }
 """
 
 Section = tuple[str, str, Html]
+
+_LONG = 24  # rows from which on a table is folded away, below a figure that says the same
 
 
 @dataclass(frozen=True)
@@ -123,8 +126,11 @@ def _cells(said: dict[str, Any]) -> Html:
                 rows.append([*name, light, _rate(c), str(c["trials"]), why(c)])
                 name = ["", ""]
         heads = ["policy", "in training", "light", "arrived", "episodes", "the others"]
-        chart = _chart("Share of episodes that reached the goal", svg(draw.rates(mine)))
-        parts += [element("h3", task), element("div", chart, class_="charts"), table(heads, rows, (4,))]
+        many = len({c["lighting"] for c in mine}) > draw.MANY
+        title = "Episodes that reached the goal [%]" if many else "Share of episodes that reached the goal"
+        chart = element("div", _chart(title, svg(draw.rates(mine))), class_="charts")
+        folded = _folded("Every policy in every light, with intervals and what went wrong", table(heads, rows, (4,)))
+        parts += [element("h3", task), chart, folded if len(rows) > _LONG else table(heads, rows, (4,))]
     causes = dict.fromkeys(cause for c in said["cells"] for cause in c["causes"])
     meanings = [(FAILURES[cause][0], FAILURES[cause][1]) for cause in causes]
     lights = [(name, light_words(name)) for name in dict.fromkeys(c["lighting"] for c in said["cells"])]
@@ -143,34 +149,41 @@ def _training(trained: dict[str, Any] | None) -> Html:
 def _better(said: dict[str, Any]) -> list[Section]:
     if not said["pairs"]:
         return []
-    several = len(tasks(said)) > 1
-    rows = [
-        [
-            element("code", p["a"]),
-            element("code", p["b"]),
-            *([p["task"]] if several else []),
-            str(p["episodes"]),
-            str(p["only_a"]),
-            str(p["only_b"]),
-            chance_words(p["p"]),
-            pair_words(p),
-        ]
-        for p in said["pairs"]
-    ]
-    numbers = ["episodes", "only first arrived", "only second", "by luck"]
-    heads = ["first", "second", *(["task"] if several else []), *numbers, "verdict"]
-    numeric = tuple(heads.index(name) for name in numbers)
+    count = len(said["pairs"])
     lead = (
         "Two policies are compared on the episodes that both drove, where start, robot and light were the same. Only "
         "those tell them apart in which one arrived and the other did not. “By luck” is how often two equally good "
         f"policies would differ as much; above {LUCK:.0%} the difference is called chance. "
     )
-    if len(rows) > 1:
+    if count > 1:
         lead += (
-            f"Were all of them equally good, luck would still call {LUCK * len(rows):.1f} of these {len(rows)} "
-            "comparisons a difference."
+            f"Were all of them equally good, luck would still call {LUCK * count:.1f} of these {count} comparisons a "
+            "difference."
         )
-    return [("better", "Which policy is better?", join(_lead(lead), table(heads, rows, numeric)))]
+    parts = [_lead(lead)]
+    numbers = ["episodes", "only first arrived", "only second", "by luck"]
+    for task in tasks(said):
+        mine = [p for p in said["pairs"] if p["task"] == task]
+        rows: list[list[str]] = [
+            [
+                element("code", p["a"]),
+                element("code", p["b"]),
+                *(str(p[key]) for key in ("episodes", "only_a", "only_b")),
+                chance_words(p["p"]),
+                pair_words(p),
+            ]
+            for p in mine
+        ]
+        if not rows:
+            continue
+        parts += [element("h3", task)] if len(tasks(said)) > 1 else []
+        told = table(["first", "second", *numbers, "verdict"], rows, (2, 3, 4, 5))
+        if len(rows) > _LONG:
+            title = "Episodes that a policy arrived in and another did not: more of them in blue, fewer in red, within "
+            title += "chance pale"
+            parts.append(element("div", _chart(title, svg(draw.better(mine))), class_="charts"))
+        parts.append(_folded("Every two policies", told) if len(rows) > _LONG else told)
+    return [("better", "Which policy is better?", join(*parts))]
 
 
 def _worst(said: dict[str, Any]) -> list[Section]:
@@ -206,20 +219,29 @@ def _trust(said: dict[str, Any]) -> Html:
     split = [c for c in said["cells"] if c["low_trust"]["trials"]]
     if not split:
         return join(lead, element("p", "There is no such episode here.", class_="na"))
-    rows: list[list[str]] = [
+    heads = ["arrived where trusted", "episodes", "arrived elsewhere", "episodes"]
+    rows: list[list[str]] = [[element("code", c["policy"]), c["task"], c["lighting"], *_by_trust([c])] for c in split]
+    told = table(["policy", "task", "light", *heads], rows, (4, 6))
+    if len(rows) <= _LONG:
+        return join(lead, told)
+    every = dict.fromkeys((c["policy"], c["task"]) for c in split)
+    summed: list[list[str]] = [
         [
-            element("code", c["policy"]),
-            c["task"],
-            c["lighting"],
-            _rate(c["trusted"]),
-            str(c["trusted"]["trials"]),
-            _rate(c["low_trust"]),
-            str(c["low_trust"]["trials"]),
+            element("code", policy),
+            task,
+            *_by_trust([c for c in said["cells"] if (c["policy"], c["task"]) == (policy, task)]),
         ]
-        for c in split
+        for policy, task in every
     ]
-    heads = ["policy", "task", "light", "arrived where trusted", "episodes", "arrived elsewhere", "episodes"]
-    return join(lead, table(heads, rows, (4, 6)))
+    return join(lead, table(["policy", "task", *heads], summed, (3, 5)), _folded("Light by light", told))
+
+
+def _by_trust(cells: Sequence[dict[str, Any]]) -> list[str]:
+    """Rate and episodes where pictures are trusted, and elsewhere."""
+    rates = [
+        share(*(sum(c[key][n] for c in cells) for n in ("successes", "trials"))) for key in ("trusted", "low_trust")
+    ]
+    return [text for rate in rates for text in (_rate(rate), str(rate["trials"]))]
 
 
 def _maps(folder: Path, said: dict[str, Any]) -> Html:
@@ -283,6 +305,10 @@ def _curves(said: dict[str, Any], curves: Sequence[Curve]) -> list[Section]:
         "intervals. Dashed lines are where the policies were saved that are validated here."
     )
     return [("training", "How they were trained", join(_lead(lead), element("div", *charts, class_="charts")))]
+
+
+def _folded(title: str, content: Html) -> Html:
+    return element("details", element("summary", title), content)
 
 
 def _lead(text: str) -> Html:

@@ -110,7 +110,9 @@ def pair_words(pair: dict[str, Any]) -> str:
     """Whether a paired difference is more than luck."""
     if pair["only_a"] == pair["only_b"]:
         return "no difference"
-    return "within chance" if pair["p"] > LUCK else f"{pair['a' if pair['only_a'] > pair['only_b'] else 'b']} is better"
+    return (
+        "within chance" if pair["p"] > LUCK else f"{'first' if pair['only_a'] > pair['only_b'] else 'second'} is better"
+    )
 
 
 def chance_words(p: float) -> str:
