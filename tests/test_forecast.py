@@ -237,6 +237,16 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
         assert told == {key: f"{100 * value:.0f}" for key, value in wanted.items()}
 
 
+def test_ranks_that_are_hardly_possible_have_no_tile() -> None:
+    made = make_forecast("road", *cells(n=8))
+    ranks = np.array([c.twin_ranks for c in made.candidates])
+    assert (ranks < 0.005).sum() > 0
+    (axes,) = forecast_figures.rank_chances(made.candidates).axes
+    assert {(round(t.xy[1]), round(t.xy[0])) for t in axes.texts} == set(
+        map(tuple, np.argwhere(ranks >= 0.005).tolist())
+    )
+
+
 def test_one_policy_alone() -> None:
     made = make_forecast("road", [Cell("p", "straight", "sun", 10, 5)], [])
     assert "one policy; there is nothing to rank" in summary(made)

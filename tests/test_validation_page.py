@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from test_forecast import Text
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
 from twin import film, progress, validate
 from twin.errors import InputError
+from twin.report.figures import SERIES
 from twin.report.training import RECENT, binned, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.report.validation import rate, share, summary, typical_episode, worst_episode
@@ -319,7 +321,10 @@ def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
     """Text and colour of every tile of a figure, by its row's and its column's name."""
     (axes,) = figure.axes
     rows, columns = ([t.get_text() for t in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels()))
-    faces = axes.collections[0].get_facecolor()
+    (drawn,) = axes.collections
+    faces = drawn.get_facecolor()
+    middles = [path.vertices[:4].mean(0) for path in drawn.get_paths()]
+    assert np.allclose(middles, [t.xy for t in axes.texts])
     at = [(rows[round(t.xy[1])], columns[round(t.xy[0])]) for t in axes.texts]
     return {key: (t.get_text(), tuple(f)) for key, t, f in zip(at, axes.texts, faces, strict=True)}
 
@@ -349,6 +354,7 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
         ("fair  2", "3"): "2", ("poor  3", "1"): "20", ("poor  3", "2"): "2",
     }  # fmt: skip
     colour = {key: face for key, (_, face) in drawn.items()}
+    assert to_hex(colour["good  1", "2"]) == SERIES[0] and to_hex(colour["fair  2", "1"]) == SERIES[1]
     assert colour["good  1", "2"] == colour["good  1", "3"] != colour["fair  2", "1"] == colour["poor  3", "1"]
     chance = colour["fair  2", "3"]
     assert chance == colour["poor  3", "2"] and chance[3] < colour["good  1", "2"][3]
@@ -366,6 +372,8 @@ def test_long_tables_are_folded_away_below_what_sums_them_up(tmp_path):
     page(tmp_path, said)
     html = validation_page("road", tmp_path, said, [])
     rates_, better_, trust_ = (html[html.index(f'<section id="{name}"') :] for name in ("arrive", "better", "trust"))
+    page(tmp_path, few := told(trials[:6]))
+    assert validation_page("road", tmp_path, few, []).count("<details") == 1  # the words' meanings
     for section in (rates_, better_, trust_):
         section = section[: section.index("</section>")]
         assert section.count("<details") >= 1

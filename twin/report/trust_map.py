@@ -72,6 +72,7 @@ def trust_picture(s: Array, beside: Array, trust: Array) -> Picture:
     for k, offset in enumerate(beside[::-1]):
         draw_text(out, f"{offset:+.1f} m", 58, _EDGE + k * high + 1, 11, MUTED, align="right")
     for at in np.arange(0, s[-1] + 1, 10):
-        draw_text(out, f"{at:.0f} m", 64 + round(at / _STEP * wide), out.shape[0] - _EDGE + 5, 12, MUTED)
+        x = min(64 + round(at / _STEP * wide), out.shape[1] - 36)
+        draw_text(out, f"{at:.0f} m", x, out.shape[0] - _EDGE + 5, 12, MUTED)
     draw_text(out, "trust, dark 0 to bright 1; along the route, and beside it", 64, 5, 12, INK)
     return out
