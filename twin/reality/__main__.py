@@ -26,6 +26,7 @@ from twin.reality.film import CAMERA_HEIGHT, Plan, depths, shoot
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import HALF_WIDTH, Film, Truth
 from twin.reality.weather import WEATHER
+from twin.report.statistics import MIN_TRIALS
 from twin.report.trials import cells_text, tally
 
 TINY = Plan(
@@ -71,9 +72,15 @@ def main(given: list[str] | None = None) -> int:
     command = commands.add_parser("drive", help="the real test: drive a policy file in weather that was not filmed")
     command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
     command.add_argument("--task", choices=TASKS, required=True)
-    command.add_argument("--trials", type=int, default=50, help="per policy and lighting (default %(default)s)")
     command.add_argument(
-        "--lightings", nargs="+", choices=sorted(WEATHER), default=list(WEATHER), help="default: all of them"
+        "--trials",
+        type=int,
+        default=MIN_TRIALS,
+        help="per policy and lighting (default %(default)s, for twin.forecast)",
+    )
+    among = f"among {', '.join(WEATHER)}"
+    command.add_argument(
+        "--lightings", nargs="+", choices=WEATHER, default=list(WEATHER), metavar="NAME", help=f"{among}; default: all"
     )
     command.add_argument(
         "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
@@ -90,7 +97,7 @@ def main(given: list[str] | None = None) -> int:
     command = commands.add_parser("onboard", help="a film by the world's Husky's own camera, for twin.align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
     command = commands.add_parser("photo", help="a photo by that camera in the weather of a trial, for twin.relight")
-    command.add_argument("--lighting", required=True, choices=sorted(WEATHER))
+    command.add_argument("--lighting", required=True, choices=WEATHER, metavar="NAME", help=among)
     command.add_argument("--out", type=Path, required=True, help="photo.png")
     options = parser.parse_args(given)
     try:
