@@ -34,7 +34,7 @@ PHOTOS = tuple(f"{name}{RANDOMISED}" for name in WEATHER)
 PHOTO_EPISODES = 5
 """In the twin, per policy and weather."""
 TRIALS = MIN_TRIALS
-"""In reality, per policy and weather; there are ten. From fewer nothing is forecast."""
+"""In reality, per policy and weather. From fewer nothing is forecast."""
 PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
     ("simulator", "straight"): (0.94, 0.57, 0.00),
     ("one_light", "straight"): (1.00, 0.19, 0.00),
