@@ -17,6 +17,7 @@ from twin.report.forecast import ALL_TASKS, Estimate, Forecast
 from twin.report.forecast_page import forecast_page
 from twin.report.forecast_words import CSV_COLUMNS, STATISTICS, candidates_csv, show, summary, unknowns, verdicts
 from twin.report.forecasting import make_forecast
+from twin.report.markup import LONG
 from twin.report.statistics import mmrv, pearson, spearman, wilson
 from twin.report.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 
@@ -217,34 +218,50 @@ def test_uneven_lightings_are_told() -> None:
     assert any("driven on the road under the same lightings" in what for what in told)
 
 
+def tile_texts(figure) -> dict[tuple[str, str], str]:
+    """By row and column."""
+    (axes,) = figure.axes
+    rows, columns = ([text.get_text() for text in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels()))
+    assert len(axes.collections[0].get_paths()) == len(axes.texts)
+    return {(rows[round(t.xy[1])], columns[round(t.xy[0])]): t.get_text() for t in axes.texts}
+
+
 def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
-    """Of a policy in a light, in the twin and on the road, both figures hold the rate."""
+    """The twin's by its own lightings: one that stands for many of the road is shown once."""
     few, many = (
         make_forecast("road", *cells(n=6, driven=6, tasks=tasks)) for tasks in (("straight",), ("a", "b", "c"))
     )
-    assert len(few.pairs) <= 24 < len(many.pairs)
+    assert len(few.pairs) <= LONG < len(many.pairs)
     short, long = (html[html.index('<section id="cells"') :] for html in map(forecast_page, (few, many)))
     assert "<svg" not in short and "<details" not in short
-    assert long.count("<svg") == 2 * len(many.tasks) and long.count("<details") == 1
-    mine = [pair for pair in many.pairs if pair.task == "b"]
-    for road in (False, True):
-        (axes,) = forecast_figures.cells(many.of("b"), mine, road).axes
-        names, lights = (
-            [text.get_text() for text in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels())
+    assert long.count("<svg") == 3 * len(many.tasks) and long.count("<details") == 1
+    candidates, pairs = many.of("b"), [pair for pair in many.pairs if pair.task == "b"]
+    assert {p.lighting for p in pairs} == {"sun", "dusk"} and {p.twin_lighting for p in pairs} == {"sun", "held-out"}
+    twin, road, off = (
+        {(p.policy, light(p)): value(p) for p in pairs}
+        for light, value in (
+            (lambda p: p.twin_lighting, lambda p: p.twin.value),
+            (lambda p: p.lighting, lambda p: p.real.value),
+            (lambda p: p.lighting, lambda p: p.bias.value),
         )
-        told = {(names[round(t.xy[1])], lights[round(t.xy[0])]): t.get_text() for t in axes.texts}
-        wanted = {(p.policy, p.lighting): (p.real if road else p.twin).value for p in mine}
-        assert told == {key: f"{100 * value:.0f}" for key, value in wanted.items()}
+    )
+    for figure, wanted in ((forecast_figures.twin_cells, twin), (forecast_figures.road_cells, road)):
+        assert tile_texts(figure(candidates, pairs)) == {key: f"{100 * rate:.0f}" for key, rate in wanted.items()}
+    figure = forecast_figures.road_minus_twin(candidates, pairs)
+    told = tile_texts(figure)
+    assert {key: int(text.replace("−", "-")) for key, text in told.items()} == {
+        key: round(100 * bias) for key, bias in off.items()
+    }
+    alpha = dict(zip(told, figure.axes[0].collections[0].get_facecolor()[:, 3].tolist(), strict=True))
+    assert {(p.policy, p.lighting) for p in pairs if p.within_chance} == {k for k, v in alpha.items() if v < 0.1}
 
 
 def test_ranks_that_are_hardly_possible_have_no_tile() -> None:
     made = make_forecast("road", *cells(n=8))
     ranks = np.array([c.twin_ranks for c in made.candidates])
     assert (ranks < 0.005).sum() > 0
-    (axes,) = forecast_figures.rank_chances(made.candidates).axes
-    assert {(round(t.xy[1]), round(t.xy[0])) for t in axes.texts} == set(
-        map(tuple, np.argwhere(ranks >= 0.005).tolist())
-    )
+    told, names = tile_texts(forecast_figures.rank_chances(made.candidates)), [c.policy for c in made.candidates]
+    assert told == {(names[i], str(k + 1)): f"{100 * ranks[i, k]:.0f}" for i, k in np.argwhere(ranks > 0.005).tolist()}
 
 
 def test_one_policy_alone() -> None:

@@ -20,7 +20,7 @@ from twin.report.figures import SERIES
 from twin.report.training import RECENT, binned, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.report.validation import rate, share, summary, typical_episode, worst_episode
-from twin.report.validation_figures import MANY, better, rates
+from twin.report.validation_figures import FEW, better, rate_tiles, rates
 from twin.report.validation_page import Curve, validation_page
 from twin.report.validation_words import FAILURES, chance_words, pair_words, percent, unknowns, verdicts, why
 from twin.report.video import describe
@@ -308,11 +308,12 @@ def test_whose_robot_is_judged_is_said():
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
-@pytest.mark.parametrize("lights", [2, 11])
+@pytest.mark.parametrize("lights", [2, FEW, 11])
 def test_names_of_many_lightings_leave_room_for_the_rates(lights):
-    """A legend wider than the figure would squeeze its axes to nothing."""
+    """A legend wider than the figure, or names taller than it, would squeeze its axes to nothing."""
     names = [f"afternoon_of_day_{k}+randomised" for k in range(lights)]
-    figure = rates(summary([trial(light=name) for name in names])["cells"])
+    cells = summary([trial(light=name) for name in names])["cells"]
+    figure = rates(cells) if lights <= FEW else rate_tiles(cells, {})
     FigureCanvasAgg(figure).draw()
     assert figure.axes[0].get_position().width > 0.5
 
@@ -329,19 +330,33 @@ def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
     return {key: (t.get_text(), tuple(f)) for key, t, f in zip(at, axes.texts, faces, strict=True)}
 
 
-def test_many_lightings_are_tiles_with_their_mean():
+def test_many_lightings_are_tiles_with_the_mean_of_those_that_all_drove():
+    """`a` is better in every light; a mean over what each drove, or over episodes, would say otherwise."""
+    assert FEW < 6
+    won = {"a": [0, 25, 100, 100, 100, 100], "b": [None, None, 100, 75, 75, 75]}
     trials = [
-        trial("a", seed, "goal" if seed < k else "collision", light=f"day_{k}") for k in range(5) for seed in range(4)
+        trial(policy, seed, "goal" if seed < rate * n / 100 else "collision", light=f"day_{k}")
+        for policy, rates_ in won.items()
+        for k, rate in enumerate(rates_)
+        if rate is not None
+        for n in [20 if k == 2 else 4]
+        for seed in range(n)
     ]
-    trials += [trial("b", seed, light=f"day_{k}") for k in range(4) for seed in range(4)]
-    assert MANY < 5
-    drawn = tiles(rates(summary(trials)["cells"]))
+    drawn = tiles(rate_tiles(summary(trials)["cells"], {"a": 0.5, "b": None}))
     assert {light: text for (policy, light), (text, _) in drawn.items() if policy == "a"} == {
-        "mean": "50", "day_0": "0", "day_1": "25", "day_2": "50", "day_3": "75", "day_4": "100"
+        "in training": "50", "mean": "100",
+        "day_0": "0", "day_1": "25", "day_2": "100", "day_3": "100", "day_4": "100", "day_5": "100",
     }  # fmt: skip
-    assert ("b", "day_4") not in drawn and drawn["b", "mean"][0] == "100"  # nothing is made up of what was not driven
-    shades = [drawn["a", f"day_{k}"][1][3] for k in range(5)]
+    assert drawn["b", "mean"][0] == "81"  # (100 + 3 * 75) / 4; of the episodes 91 %
+    assert ("b", "day_1") not in drawn and ("b", "in training") not in drawn
+    shades = [drawn["a", name][1][3] for name in ("day_0", "day_1", "in training", "day_2")]
     assert shades == sorted(set(shades))
+
+
+def test_where_no_lighting_is_shared_there_is_no_mean():
+    trials = [trial("ab"[k % 2], seed, light=f"day_{k}") for k in range(6) for seed in range(3)]
+    drawn = tiles(rate_tiles(summary(trials)["cells"], {}))
+    assert set(drawn) == {("ab"[k % 2], f"day_{k}") for k in range(6)}
 
 
 def test_who_beats_whom_is_shown_with_the_best_on_top():
@@ -350,8 +365,8 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
     trials = [trial(name, seed, "goal" if seed < n else "collision") for name, n in won.items() for seed in range(20)]
     drawn = tiles(better(summary(trials)["pairs"]))
     assert {key: text for key, (text, _) in drawn.items()} == {
-        ("good  1", "2"): "18", ("good  1", "3"): "20", ("fair  2", "1"): "18",
-        ("fair  2", "3"): "2", ("poor  3", "1"): "20", ("poor  3", "2"): "2",
+        ("good  1", "2"): "+18", ("good  1", "3"): "+20", ("fair  2", "1"): "−18",
+        ("fair  2", "3"): "+2", ("poor  3", "1"): "−20", ("poor  3", "2"): "−2",
     }  # fmt: skip
     colour = {key: face for key, (_, face) in drawn.items()}
     assert to_hex(colour["good  1", "2"]) == SERIES[0] and to_hex(colour["fair  2", "1"]) == SERIES[1]
@@ -360,23 +375,25 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
     assert chance == colour["poor  3", "2"] and chance[3] < colour["good  1", "2"][3]
 
 
-def test_long_tables_are_folded_away_below_what_sums_them_up(tmp_path):
+def test_what_never_drove_the_same_is_not_compared():
+    assert summary([trial("a", 1), trial("b", 2), trial("c", 1, light="night")])["pairs"] == []
+    (pair,) = summary([trial("a", 1), trial("b", 1), trial("c", 2)])["pairs"]
+    assert (pair["a"], pair["b"], pair["episodes"]) == ("a", "b", 1)
+
+
+def test_long_tables_are_folded_away_below_a_figure(tmp_path):
     policies, lights = [f"p{k}" for k in range(8)], [f"day_{k}" for k in range(5)]
-    trials = [
-        trial(p, seed, trust=0.9 if seed else 0.1, light=light)
-        for p in policies
-        for light in lights
-        for seed in range(3)
-    ]
-    said = told(trials)
-    page(tmp_path, said)
-    html = validation_page("road", tmp_path, said, [])
-    rates_, better_, trust_ = (html[html.index(f'<section id="{name}"') :] for name in ("arrive", "better", "trust"))
-    page(tmp_path, few := told(trials[:6]))
-    assert validation_page("road", tmp_path, few, []).count("<details") == 1  # the words' meanings
-    for section in (rates_, better_, trust_):
-        section = section[: section.index("</section>")]
-        assert section.count("<details") >= 1
-    summed = trust_[: trust_.index("<details")]
-    assert summed.count("<code>") == len(policies) and "100% (79% to 100%)" in summed  # 10 of 10, 5 of 5
-    assert summed.count('<td class="n">10</td><td>') == summed.count('<td class="n">5</td></tr>') == len(policies)
+    many = [(p, light, seed) for p in policies for light in lights for seed in range(3)]
+    trials = [trial(p, seed, trust=0.9 if seed else 0.1, light=light) for p, light, seed in many]
+
+    def sections(trials) -> list[tuple[int, int]]:
+        """Figures and folded parts of each section with tables."""
+        said = told(trials)
+        page(tmp_path, said)
+        html = validation_page("road", tmp_path, said, [])
+        starts = [html.index(f'<section id="{name}"') for name in ("arrive", "better", "trust")]
+        parts = [html[start : html.index("</section>", start)] for start in starts]
+        return [(part.count("<svg"), part.count("<details")) for part in parts]
+
+    assert sections(trials) == [(1, 2), (1, 1), (0, 1)]  # the first has what the words mean, too
+    assert sections([t for t in trials if t.policy in "p0 p1"]) == [(1, 1), (0, 0), (0, 0)]

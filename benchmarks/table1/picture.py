@@ -4,8 +4,7 @@
 
 The road as randomised episodes of the twin show it, the road of the real test in some of its weather and the twin by a
 photo of each, success on the road over success in the twin for every policy that drove, and success along a training.
-SCENE
-holds what `benchmarks/table1` left there.
+SCENE holds what `benchmarks/table1` left there.
 """
 
 import argparse
@@ -62,7 +61,7 @@ def main() -> None:
         _caption("The road as the twin shows it in training: lights, suns, shadows and haze are drawn anew"),
         *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),
         _caption(
-            f"The road of the real test, ten of its {len(WEATHER)} weathers: nobody filmed them; things were moved"
+            f"The road of the real test in {len(_SHOWN)} of its {len(WEATHER)} weathers, none filmed; things were moved"
         ),
         *_rows(road, _SHOWN),
         _caption("The twin by one photo of each of these days, which told its light and its air"),

@@ -76,7 +76,7 @@ def main(given: list[str] | None = None) -> int:
         "--trials",
         type=int,
         default=MIN_TRIALS,
-        help="per policy and lighting (default %(default)s, for twin.forecast)",
+        help="per policy and lighting (default %(default)s, the least that twin.forecast takes)",
     )
     among = f"among {', '.join(WEATHER)}"
     command.add_argument(

@@ -50,6 +50,11 @@ class Pair:
     bias: Estimate
     """Real minus twin rate."""
 
+    @property
+    def within_chance(self) -> bool:
+        """Whether its bias may be none."""
+        return (self.bias.low or 0.0) <= 0.0 <= (self.bias.high or 0.0)
+
 
 @dataclass(frozen=True)
 class Candidate:

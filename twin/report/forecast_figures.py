@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from twin.report.figures import CARD, MUTED, SERIES, new_figure, style
 from twin.report.forecast import Candidate, Estimate, Forecast, Pair
-from twin.report.tiles import tiles
+from twin.report.tiles import WHOLE, matrix, percents, tiles
 
 LIMITS = (-0.04, 1.04)
 """Of an axis of rates."""
@@ -76,20 +76,36 @@ def rank_chances(candidates: Sequence[Candidate]) -> Figure:
     """Probability of every rank in the twin, one row per candidate."""
     n = len(candidates)
     chance = np.array([c.twin_ranks for c in candidates])
-    percents = np.array([[f"{100 * each:.0f}" for each in row] for row in chance])
     ranks = [str(k + 1) if k % -(-n // 12) == 0 else "" for k in range(n)]
-    shown = np.where(chance < 0.005, np.nan, chance)
-    return tiles(shown, [short(c.policy) for c in candidates], ranks, percents, "rank in the twin [%]")
+    shown = np.where(chance > 0.005, chance, np.nan)
+    return tiles(shown, [short(c.policy) for c in candidates], ranks, percents(chance), "rank in the twin [%]")
 
 
-def cells(candidates: Sequence[Candidate], pairs: Sequence[Pair], road: bool) -> Figure:
-    """Success of every driven candidate in every lighting of the road, in the twin or on the road, in per cent."""
-    lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
-    found = {(pair.policy, pair.lighting): (pair.real if road else pair.twin).value for pair in pairs}
+def twin_cells(candidates: Sequence[Candidate], pairs: Sequence[Pair]) -> Figure:
+    """Success of every driven candidate in every lighting of the twin that the road is compared with, in per cent."""
+    return _cells(candidates, {(pair.policy, pair.twin_lighting): pair.twin.value for pair in pairs})
+
+
+def road_cells(candidates: Sequence[Candidate], pairs: Sequence[Pair]) -> Figure:
+    """Success of every driven candidate in every lighting of the road, in per cent."""
+    return _cells(candidates, {(pair.policy, pair.lighting): pair.real.value for pair in pairs})
+
+
+def _cells(candidates: Sequence[Candidate], rates: dict[tuple[str, str], float | None]) -> Figure:
+    policies, lightings = [c.policy for c in candidates if c.driven], list(dict.fromkeys(light for _, light in rates))
+    rate = matrix(rates, policies, lightings)
+    return tiles(rate, [short(name) for name in policies], [short(name) for name in lightings], percents(rate))
+
+
+def road_minus_twin(candidates: Sequence[Candidate], pairs: Sequence[Pair]) -> Figure:
+    """In points, in every lighting of the road; coloured where it is more than chance."""
     policies = [c.policy for c in candidates if c.driven]
-    rate = np.array([[found.get((policy, light)) for light in lightings] for policy in policies], float)
-    percents = np.array([[f"{100 * each:.0f}" for each in row] for row in rate])
-    return tiles(rate, [short(name) for name in policies], [short(name) for name in lightings], percents)
+    lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
+    bias = matrix({(pair.policy, pair.lighting): pair.bias.value for pair in pairs}, policies, lightings)
+    beyond = {(pair.policy, pair.lighting): float(not pair.within_chance) for pair in pairs}
+    texts = np.array([[f"{100 * each:+.0f}".replace("-", "−") for each in row] for row in bias])
+    shown = np.sign(bias) * matrix(beyond, policies, lightings)
+    return tiles(shown, [short(name) for name in policies], [short(name) for name in lightings], texts, "", WHOLE)
 
 
 def _square(x: str, y: str) -> tuple[Figure, Axes]:

@@ -6,12 +6,11 @@ from twin.report import forecast_figures as draw
 from twin.report.figures import svg
 from twin.report.forecast import Estimate, Forecast, Group
 from twin.report.forecast_words import SHARES, STATISTICS, chance, plan_words, points, show, unknowns, verdicts
-from twin.report.markup import Html, caution, document, element, join, table
+from twin.report.markup import LONG, Html, caution, document, element, folded, join, table
 from twin.report.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.scene import write_text
 
 _STYLE = ".whole, td code { white-space:nowrap }\n"
-_LONG = 24  # rows from which on a table is folded away, below figures that say the same
 
 
 def write_forecast_page(forecast: Forecast, folder: Path) -> None:
@@ -195,8 +194,7 @@ def _predictions(forecast: Forecast) -> Html:
     if further:
         parts += [element("h3", "Not yet driven"), table(heads, further)]
     if driven:
-        title = element("summary", "The driven ones, each predicted without itself")
-        parts.append(element("details", title, table(heads, driven)))
+        parts.append(folded("The driven ones, each predicted without itself", table(heads, driven)))
     if forecast.left_out:
         out = [
             [
@@ -235,30 +233,33 @@ def _cells(forecast: Forecast) -> Html:
         return element("p", "No real trials were given.", class_="na")
     rows, beyond = [], 0
     for pair in forecast.pairs:
-        low, high = pair.bias.low or 0.0, pair.bias.high or 0.0
         light = (
             pair.lighting if pair.lighting == pair.twin_lighting else f"{pair.lighting} (twin: {pair.twin_lighting})"
         )
-        inside = low <= 0.0 <= high
-        beyond += not inside
-        luck = element("span" if inside else "b", "within chance" if inside else "beyond chance", class_="whole")
+        beyond += not pair.within_chance
+        tag, words = ("span", "within chance") if pair.within_chance else ("b", "beyond chance")
+        luck = element(tag, words, class_="whole")
         counts = _show(pair.twin, True), str(pair.twin.n), _show(pair.real, True), str(pair.real.n)
         rows.append([element("code", pair.policy), pair.task, light, *counts, _show(pair.bias, True), luck])
     heads = ["policy", "task", "lighting", "twin", "n", "road", "n", "road minus twin", ""]
     lead = f"{beyond} of {len(rows)} cells differ by more than chance; one in ten would if the twin were perfect."
     parts, told = [element("p", lead, class_="done")], table(heads, rows, (4, 6))
-    if len(rows) <= _LONG:
+    if len(rows) <= LONG:
         return join(*parts, told)
     for task in forecast.tasks:
         mine = [pair for pair in forecast.pairs if pair.task == task]
-        figures = [
-            _chart(f"{place} [%]", svg(draw.cells(forecast.of(task), mine, road)))
-            for place, road in (("In the twin", False), ("On the road", True))
-            if mine
-        ]
-        parts += [element("h3", task), element("div", *figures, class_="charts")] if mine else []
-    title = element("summary", "Every policy in every lighting, with intervals")
-    return join(*parts, element("details", title, told))
+        if mine:
+            every = forecast.of(task)
+            beside = element(
+                "div",
+                _chart("In the twin [%]", svg(draw.twin_cells(every, mine))),
+                _chart("On the road [%]", svg(draw.road_cells(every, mine))),
+                class_="charts",
+            )
+            title = "Road minus twin [points]: red where the twin promised more, blue less, pale within chance"
+            off = element("div", _chart(title, svg(draw.road_minus_twin(every, mine))), class_="charts")
+            parts += [element("h3", task), beside, off]
+    return join(*parts, folded("Every policy in every lighting, with intervals", told))
 
 
 def _chart(title: str, drawing: str) -> Html:

@@ -8,6 +8,9 @@ from PIL import Image
 
 from twin.report.words import Caution
 
+LONG = 24
+"""Rows that a table has at most; a longer one is folded away, below a figure that says the same."""
+
 _STRIP = 2.4  # width over height from which on a picture is a strip
 
 
@@ -67,6 +70,11 @@ def table(head: list[str], rows: list[list[str]], numeric: tuple[int, ...] = ())
 
     body = element("table", element("thead", row("th", head)), element("tbody", *(row("td", cells) for cells in rows)))
     return element("div", body, class_="scroll")
+
+
+def folded(title: str, *content: str) -> Html:
+    """What is shown when its title is clicked."""
+    return element("details", element("summary", title), *content)
 
 
 def picture(path: Path, caption: str) -> Html:

@@ -23,7 +23,7 @@ _SIZE = (80, 45)  # [px] of the pictures that are judged
 _BATCH = 32
 _LOW = 0.5  # below, a picture counts as not to be trusted
 _CELL = (18, 16)  # [px] width at least, height
-_EDGE = 26  # [px]
+_EDGE, _LAST = 26, 40  # [px] above and below; right, for the last label
 
 
 def trust_along(field: Field, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
@@ -66,13 +66,12 @@ def trust_picture(s: Array, beside: Array, trust: Array) -> Picture:
     wide, high = max(2, _CELL[0] * 40 // max(len(s), 1)), _CELL[1]
     cells = (colormaps["viridis"](trust[::-1])[..., :3] * 255 + 0.5).astype(np.uint8)
     body = cv2.resize(cells, (wide * len(s), high * len(beside)), interpolation=cv2.INTER_NEAREST)
-    out = np.empty((body.shape[0] + 2 * _EDGE, body.shape[1] + 70, 3), np.uint8)
+    out = np.empty((body.shape[0] + 2 * _EDGE, body.shape[1] + 64 + _LAST, 3), np.uint8)
     out[:] = GROUND
-    out[_EDGE : _EDGE + body.shape[0], 64:-6] = body
+    out[_EDGE : _EDGE + body.shape[0], 64:-_LAST] = body
     for k, offset in enumerate(beside[::-1]):
         draw_text(out, f"{offset:+.1f} m", 58, _EDGE + k * high + 1, 11, MUTED, align="right")
     for at in np.arange(0, s[-1] + 1, 10):
-        x = min(64 + round(at / _STEP * wide), out.shape[1] - 36)
-        draw_text(out, f"{at:.0f} m", x, out.shape[0] - _EDGE + 5, 12, MUTED)
+        draw_text(out, f"{at:.0f} m", 64 + round(at / _STEP * wide), out.shape[0] - _EDGE + 5, 12, MUTED)
     draw_text(out, "trust, dark 0 to bright 1; along the route, and beside it", 64, 5, 12, INK)
     return out

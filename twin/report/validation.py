@@ -61,7 +61,7 @@ def summary(trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Every two policies on the episodes that both drove."""
+    """Every two policies on the episodes that both drove, if there are any."""
     by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
     for t in trials:
         by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
@@ -71,6 +71,8 @@ def pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
             continue
         mine, theirs = by_policy[task, a], by_policy[task, b]
         both = [(mine[key], theirs[key]) for key in mine if key in theirs]
+        if not both:
+            continue
         only_a, only_b = sum(x and not y for x, y in both), sum(y and not x for x, y in both)
         chance = float(binomtest(only_a, only_a + only_b).pvalue) if only_a + only_b else 1.0
         out.append(

@@ -1,6 +1,6 @@
 """The validation's figures: success per policy and light, who beats whom, and success along the trainings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,74 +10,77 @@ from numpy.typing import NDArray
 from twin.config import RANDOMISED
 from twin.report.figures import INK, SERIES, new_figure, style
 from twin.report.forecast_figures import LIMITS, TICKS, legend_below, short
-from twin.report.tiles import tiles
+from twin.report.tiles import WHOLE, matrix, percents, tiles
 from twin.report.training import draw_curve
 from twin.report.validation_words import LUCK
 
-MANY = 4
-"""Lightings up to which every rate is drawn with its interval."""
+FEW = 4
+"""Lightings at most, of which every rate is drawn with its interval."""
 
 _ROW = 0.17  # [in] per point
 _LETTERS = 55  # in a row of the legend, with four for each marker
-_APART = 0.18  # between two lightings of a policy, of the distance of two policies; less where there are many
+_APART = 0.18  # between two lightings of a policy, of the distance of two policies
 
 
 def rates(cells: Sequence[dict[str, Any]]) -> Figure:
-    """Success in the cells of a task: one row per policy, one colour per lighting; or tiles where these are many."""
+    """One row per policy, one colour per lighting, `FEW` at most: success in the cells of a task with its interval."""
     policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
-    if len(lightings) > MANY:
-        return _rate_tiles(cells, policies, lightings)
     height = 0.9 + max(0.34, _ROW * len(lightings)) * len(policies)
     figure, axes = new_figure(height)
-    apart = min(_APART, 0.8 / len(lightings))
     with style():
         for k, lighting in enumerate(lightings):
             mine = [c for c in cells if c["lighting"] == lighting]
-            y = np.array([policies.index(c["policy"]) for c in mine]) + (k - (len(lightings) - 1) / 2) * apart
+            y = np.array([policies.index(c["policy"]) for c in mine]) + (k - (len(lightings) - 1) / 2) * _APART
             x, low, high = (np.array([c[key] for c in mine], float) for key in ("rate", "low", "high"))
             ends = np.maximum([x - low, high - x], 0.0)
-            colour, marker = SERIES[k % len(SERIES)], "osD^v"[k // len(SERIES) % 5]
-            axes.errorbar(x, y, xerr=ends, fmt=marker, color=colour, ms=3.5, lw=1.1, label=lighting)
+            axes.errorbar(x, y, xerr=ends, fmt="o", color=SERIES[k], ms=3.5, lw=1.1, label=lighting)
         axes.set_yticks(range(len(policies)), [short(name) for name in policies])
         axes.grid(False, axis="y")
         label = "success rate" if len(lightings) > 1 else f"success rate in the light {lightings[0]}"
         axes.set(xlim=LIMITS, ylim=(len(policies) - 0.5, -0.5), xlabel=label, xticks=TICKS)
     if len(lightings) > 1:
         fitting = max(1, _LETTERS // (max(map(len, lightings)) + 4))  # wider than the figure, it would leave no axes
-        legend_below(axes, min(4, fitting, len(lightings)), height)
+        legend_below(axes, min(fitting, len(lightings)), height)
     return figure
 
 
-def _rate_tiles(cells: Sequence[dict[str, Any]], policies: list[str], lightings: list[str]) -> Figure:
-    """Per cent of episodes, for every policy in every lighting and on average over these."""
-    found = {(c["policy"], c["lighting"]): c["rate"] for c in cells}
-    rate = np.array([[found.get((policy, light)) for light in lightings] for policy in policies], float)
-    rate = np.column_stack([np.nanmean(rate, 1), rate])
-    percents = np.array([[f"{100 * each:.0f}" for each in row] for row in rate])
+def rate_tiles(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | None]) -> Figure:
+    """Per cent of episodes in the cells of a task: a row per policy, a column per lighting.
+
+    Before them stand the policies' rates in training, and the mean over the lightings that all of them drove in.
+    """
+    policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
+    rate = matrix({(c["policy"], c["lighting"]): c["rate"] for c in cells}, policies, lightings)
+    common = rate[:, np.isfinite(rate).all(0)]
+    means = common.mean(1) if common.size else np.full(len(policies), np.nan)
+    training = np.array([trained.get(policy) for policy in policies], float)
+    shown = np.column_stack([training, means, rate])
     alike = all(name.endswith(RANDOMISED) for name in lightings)
-    names = ["mean", *(short(name.removesuffix(RANDOMISED) if alike else name) for name in lightings)]
-    return tiles(rate, [short(policy) for policy in policies], names, percents, f"light, {RANDOMISED}" if alike else "")
+    names = [short(name.removesuffix(RANDOMISED) if alike else name) for name in lightings]
+    label = f"lights, all of them {RANDOMISED}" if alike else ""
+    columns = ["in training", "mean", *names]
+    return tiles(shown, [short(policy) for policy in policies], columns, percents(shown), label, WHOLE)
 
 
 def better(pairs: Sequence[dict[str, Any]]) -> Figure:
     """Who beats whom on a task: a row's policy is better than a column's in blue, worse in red, or it may be chance.
 
-    The numbers are how many more, or fewer, of the episodes that both drove the row's policy arrived in; who beats most
-    is on top, and columns have the rows' order.
+    The numbers are how many more of the episodes that both drove the row's policy arrived in. Who beats more than beat
+    it is above; columns have the rows' order.
     """
     policies = list(dict.fromkeys(p[key] for p in pairs for key in ("a", "b")))
     ahead, surely = (np.full((len(policies), len(policies)), np.nan) for _ in range(2))
     for pair in pairs:
         i, j, more = policies.index(pair["a"]), policies.index(pair["b"]), pair["only_a"] - pair["only_b"]
         ahead[i, j], ahead[j, i] = more, -more
-        surely[i, j] = 0.0 if pair["p"] > LUCK else 0.5 * np.sign(more)
+        surely[i, j] = 0.0 if pair["p"] > LUCK else np.sign(more)
         surely[j, i] = -surely[i, j]
     order = np.lexsort([-np.nansum(ahead, 1), -np.nansum(surely, 1)])
     ahead, surely = ahead[order][:, order], surely[order][:, order]
     numbers = [str(k + 1) for k in range(len(policies))]
     rows = [f"{short(policies[i])}  {number}" for i, number in zip(order, numbers, strict=True)]
-    texts = np.array([[f"{abs(each):.0f}" for each in row] for row in ahead])
-    return tiles(surely, rows, numbers, texts, "compared with")
+    texts = np.array([[f"{each:+.0f}".replace("-", "−") if each else "0" for each in row] for row in ahead])
+    return tiles(surely, rows, numbers, texts, "compared with the policy of this number", WHOLE)
 
 
 def along_training(steps: NDArray[np.int64], success: NDArray[np.int64], saved: Sequence[int]) -> Figure:

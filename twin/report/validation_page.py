@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from twin.report import validation_figures as draw
 from twin.report.figures import svg
-from twin.report.markup import Html, caution, data_url, document, element, join, picture, table
+from twin.report.markup import LONG, Html, caution, data_url, document, element, folded, join, picture, table
 from twin.report.trials import RECENT
-from twin.report.validation import share
 from twin.report.validation_words import (
     FAILURES,
     LUCK,
@@ -40,8 +39,6 @@ img { background:#fff }
 """
 
 Section = tuple[str, str, Html]
-
-_LONG = 24  # rows from which on a table is folded away, below a figure that says the same
 
 
 @dataclass(frozen=True)
@@ -125,17 +122,25 @@ def _cells(said: dict[str, Any]) -> Html:
                 light = element("span", c["lighting"], class_="whole")
                 rows.append([*name, light, _rate(c), str(c["trials"]), why(c)])
                 name = ["", ""]
-        heads = ["policy", "in training", "light", "arrived", "episodes", "the others"]
-        many = len({c["lighting"] for c in mine}) > draw.MANY
-        title = "Episodes that reached the goal [%]" if many else "Share of episodes that reached the goal"
-        chart = element("div", _chart(title, svg(draw.rates(mine))), class_="charts")
-        folded = _folded("Every policy in every light, with intervals and what went wrong", table(heads, rows, (4,)))
-        parts += [element("h3", task), chart, folded if len(rows) > _LONG else table(heads, rows, (4,))]
+        told = table(["policy", "in training", "light", "arrived", "episodes", "the others"], rows, (4,))
+        if len({c["lighting"] for c in mine}) <= draw.FEW:
+            chart = _chart("Share of episodes that reached the goal", svg(draw.rates(mine)))
+        else:
+            least, most = min(c["trials"] for c in mine), max(c["trials"] for c in mine)
+            each = f"{least}" if least == most else f"{least} to {most}"
+            title = (
+                f"Episodes that reached the goal [%], of {each} in each light; the mean is of the lights all drove in"
+            )
+            drawn = draw.rate_tiles(mine, {policy: rate["rate"] for policy, rate in trained.items()})
+            chart = _chart(title, svg(drawn))
+        if len(rows) > LONG:
+            told = folded("Every policy in every light, with intervals and what went wrong", told)
+        parts += [element("h3", task), element("div", chart, class_="charts"), told]
     causes = dict.fromkeys(cause for c in said["cells"] for cause in c["causes"])
     meanings = [(FAILURES[cause][0], FAILURES[cause][1]) for cause in causes]
     lights = [(name, light_words(name)) for name in dict.fromkeys(c["lighting"] for c in said["cells"])]
     words = [element("li", element("b", name), f": {meaning}") for name, meaning in (*lights, *meanings)]
-    parts.append(element("details", element("summary", "What the words mean"), element("ul", *words)))
+    parts.append(folded("What the words mean", element("ul", *words)))
     return join(*parts)
 
 
@@ -157,33 +162,38 @@ def _better(said: dict[str, Any]) -> list[Section]:
     )
     if count > 1:
         lead += (
-            f"Were all of them equally good, luck would still call {LUCK * count:.1f} of these {count} comparisons a "
-            "difference."
+            f"Were all of them equally good, luck would still call up to {LUCK * count:.1f} of these {count} "
+            "comparisons a difference."
         )
     parts = [_lead(lead)]
-    numbers = ["episodes", "only first arrived", "only second", "by luck"]
     for task in tasks(said):
         mine = [p for p in said["pairs"] if p["task"] == task]
-        rows: list[list[str]] = [
-            [
-                element("code", p["a"]),
-                element("code", p["b"]),
-                *(str(p[key]) for key in ("episodes", "only_a", "only_b")),
-                chance_words(p["p"]),
-                pair_words(p),
-            ]
-            for p in mine
-        ]
-        if not rows:
+        if not mine:
             continue
         parts += [element("h3", task)] if len(tasks(said)) > 1 else []
-        told = table(["first", "second", *numbers, "verdict"], rows, (2, 3, 4, 5))
-        if len(rows) > _LONG:
-            title = "Episodes that a policy arrived in and another did not: more of them in blue, fewer in red, within "
-            title += "chance pale"
+        if len(mine) > LONG:
+            title = (
+                "How many more episodes a policy arrived in than another: in blue it is the better one, in red the "
+                "worse; pale is within chance"
+            )
             parts.append(element("div", _chart(title, svg(draw.better(mine))), class_="charts"))
-        parts.append(_folded("Every two policies", told) if len(rows) > _LONG else told)
+        parts.append(folded("Every two policies", _pairs(mine)) if len(mine) > LONG else _pairs(mine))
     return [("better", "Which policy is better?", join(*parts))]
+
+
+def _pairs(pairs: Sequence[dict[str, Any]]) -> Html:
+    heads = ["first", "second", "episodes", "only first arrived", "only second", "by luck", "verdict"]
+    rows: list[list[str]] = [
+        [
+            element("code", p["a"]),
+            element("code", p["b"]),
+            *(str(p[key]) for key in ("episodes", "only_a", "only_b")),
+            chance_words(p["p"]),
+            pair_words(p),
+        ]
+        for p in pairs
+    ]
+    return table(heads, rows, (2, 3, 4, 5))
 
 
 def _worst(said: dict[str, Any]) -> list[Section]:
@@ -219,29 +229,18 @@ def _trust(said: dict[str, Any]) -> Html:
     split = [c for c in said["cells"] if c["low_trust"]["trials"]]
     if not split:
         return join(lead, element("p", "There is no such episode here.", class_="na"))
-    heads = ["arrived where trusted", "episodes", "arrived elsewhere", "episodes"]
-    rows: list[list[str]] = [[element("code", c["policy"]), c["task"], c["lighting"], *_by_trust([c])] for c in split]
-    told = table(["policy", "task", "light", *heads], rows, (4, 6))
-    if len(rows) <= _LONG:
-        return join(lead, told)
-    every = dict.fromkeys((c["policy"], c["task"]) for c in split)
-    summed: list[list[str]] = [
+    rows: list[list[str]] = [
         [
-            element("code", policy),
-            task,
-            *_by_trust([c for c in said["cells"] if (c["policy"], c["task"]) == (policy, task)]),
+            element("code", c["policy"]),
+            c["task"],
+            c["lighting"],
+            *(text for rate in (c["trusted"], c["low_trust"]) for text in (_rate(rate), str(rate["trials"]))),
         ]
-        for policy, task in every
+        for c in split
     ]
-    return join(lead, table(["policy", "task", *heads], summed, (3, 5)), _folded("Light by light", told))
-
-
-def _by_trust(cells: Sequence[dict[str, Any]]) -> list[str]:
-    """Rate and episodes where pictures are trusted, and elsewhere."""
-    rates = [
-        share(*(sum(c[key][n] for c in cells) for n in ("successes", "trials"))) for key in ("trusted", "low_trust")
-    ]
-    return [text for rate in rates for text in (_rate(rate), str(rate["trials"]))]
+    heads = ["policy", "task", "light", "arrived where trusted", "episodes", "arrived elsewhere", "episodes"]
+    told = table(heads, rows, (4, 6))
+    return join(lead, folded(f"{len(rows)} policies and lights with such episodes", told) if len(rows) > LONG else told)
 
 
 def _maps(folder: Path, said: dict[str, Any]) -> Html:
@@ -305,10 +304,6 @@ def _curves(said: dict[str, Any], curves: Sequence[Curve]) -> list[Section]:
         "intervals. Dashed lines are where the policies were saved that are validated here."
     )
     return [("training", "How they were trained", join(_lead(lead), element("div", *charts, class_="charts")))]
-
-
-def _folded(title: str, content: Html) -> Html:
-    return element("details", element("summary", title), content)
 
 
 def _lead(text: str) -> Html:
