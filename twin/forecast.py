@@ -54,8 +54,8 @@ _EPILOG = f"""\
 results.csv, one line per policy and lighting:
 
   {",".join(RESULT_COLUMNS)}
-  runs/nerf,morning,10,8
-  runs/nerf,dusk,10,6
+  first,morning,10,8
+  first,dusk,10,6
 
 Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task. Light that
 the twin does not know by name is compared with one that it does, named in a column twin_lighting, such as
