@@ -14,6 +14,7 @@ from twin.errors import InputError
 from twin.forecast import forecast, main
 from twin.report import forecast_figures
 from twin.report.forecast import ALL_TASKS, Estimate, Forecast
+from twin.report.forecast_figures import columns_of
 from twin.report.forecast_page import forecast_page
 from twin.report.forecast_words import CSV_COLUMNS, STATISTICS, candidates_csv, show, summary, unknowns, verdicts
 from twin.report.forecasting import make_forecast
@@ -254,6 +255,8 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
     }
     alpha = dict(zip(told, figure.axes[0].collections[0].get_facecolor()[:, 3].tolist(), strict=True))
     assert {(p.policy, p.lighting) for p in pairs if p.within_chance} == {k for k, v in alpha.items() if v < 0.1}
+    assert columns_of(["sun+randomised", "any+randomised"]) == (["sun", "any"], "lights, all of them +randomised")
+    assert columns_of(["sun", "sun+randomised"]) == (["sun", "sun+randomised"], "")
 
 
 def test_ranks_that_are_hardly_possible_have_no_tile() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from twin.config import RANDOMISED
 from twin.report.figures import CARD, MUTED, SERIES, new_figure, style
 from twin.report.forecast import Candidate, Estimate, Forecast, Pair
 from twin.report.tiles import WHOLE, matrix, percents, tiles
@@ -94,7 +95,8 @@ def road_cells(candidates: Sequence[Candidate], pairs: Sequence[Pair]) -> Figure
 def _cells(candidates: Sequence[Candidate], rates: dict[tuple[str, str], float | None]) -> Figure:
     policies, lightings = [c.policy for c in candidates if c.driven], list(dict.fromkeys(light for _, light in rates))
     rate = matrix(rates, policies, lightings)
-    return tiles(rate, [short(name) for name in policies], [short(name) for name in lightings], percents(rate))
+    names, label = columns_of(lightings)
+    return tiles(rate, [short(name) for name in policies], names, percents(rate), label)
 
 
 def road_minus_twin(candidates: Sequence[Candidate], pairs: Sequence[Pair]) -> Figure:
@@ -103,9 +105,10 @@ def road_minus_twin(candidates: Sequence[Candidate], pairs: Sequence[Pair]) -> F
     lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
     bias = matrix({(pair.policy, pair.lighting): pair.bias.value for pair in pairs}, policies, lightings)
     beyond = {(pair.policy, pair.lighting): float(not pair.within_chance) for pair in pairs}
-    texts = np.array([[f"{100 * each:+.0f}".replace("-", "−") for each in row] for row in bias])
-    shown = np.sign(bias) * matrix(beyond, policies, lightings)
-    return tiles(shown, [short(name) for name in policies], [short(name) for name in lightings], texts, "", WHOLE)
+    texts = np.array([[f"{100 * each:+.0f}".replace("-", "−") if each else "0" for each in row] for row in bias])
+    shown = bias * matrix(beyond, policies, lightings)
+    names, label = columns_of(lightings)
+    return tiles(shown, [short(name) for name in policies], names, texts, label, WHOLE)
 
 
 def _square(x: str, y: str) -> tuple[Figure, Axes]:
@@ -152,6 +155,13 @@ def legend_below(axes: Axes, columns: int, height: float) -> None:
     """A legend below the axes of a figure of this height [in]."""
     with style():
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.45 / height), ncols=columns, handlelength=1.4)
+
+
+def columns_of(lightings: Sequence[str]) -> tuple[list[str], str]:
+    """Names of lightings above tiles, without what is the same in all of them, and a label that tells that."""
+    if all(name.endswith(RANDOMISED) for name in lightings):
+        return [short(name.removesuffix(RANDOMISED)) for name in lightings], f"lights, all of them {RANDOMISED}"
+    return [short(name) for name in lightings], ""
 
 
 def short(name: str) -> str:

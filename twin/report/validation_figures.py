@@ -7,9 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from twin.config import RANDOMISED
 from twin.report.figures import INK, SERIES, new_figure, style
-from twin.report.forecast_figures import LIMITS, TICKS, legend_below, short
+from twin.report.forecast_figures import LIMITS, TICKS, columns_of, legend_below, short
 from twin.report.tiles import WHOLE, matrix, percents, tiles
 from twin.report.training import draw_curve
 from twin.report.validation_words import LUCK
@@ -55,9 +54,7 @@ def rate_tiles(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | No
     means = common.mean(1) if common.size else np.full(len(policies), np.nan)
     training = np.array([trained.get(policy) for policy in policies], float)
     shown = np.column_stack([training, means, rate])
-    alike = all(name.endswith(RANDOMISED) for name in lightings)
-    names = [short(name.removesuffix(RANDOMISED) if alike else name) for name in lightings]
-    label = f"lights, all of them {RANDOMISED}" if alike else ""
+    names, label = columns_of(lightings)
     columns = ["in training", "mean", *names]
     return tiles(shown, [short(policy) for policy in policies], columns, percents(shown), label, WHOLE)
 
