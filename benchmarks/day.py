@@ -1,6 +1,6 @@
 """What one photo tells of a day, and what it leaves to be drawn.
 
-    python benchmarks/day.py SCENE [--policies RUN ...] [--json FILE] [--pictures FOLDER]
+    python benchmarks/day.py SCENE [--days NAME ...] [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
 The scene has been built from the stand-in's film and knows its days by a photo each (`benchmarks/table1`, step
 `photos`). Pictures of every day at eight other places of the road are compared with the twin's from there under the
@@ -41,10 +41,10 @@ SCALES = (1.0, 0.8, 0.7, UNTOLD, 0.5)  # of another day's sun and shadows
 Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 
 
-def real() -> tuple[Pictures, NDArray[np.float64]]:
+def real(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
     """Pictures of every day at every station, and the camera's poses there, (stations, 4, 4), in the true world."""
     line, rows, poses = Route(), [], np.zeros((len(STATIONS), 4, 4))
-    for light in track(WEATHER.values(), "pictures of days", unit="day"):
+    for light in track([WEATHER[name] for name in days], "pictures of days", unit="day"):
         road, eye = onboard._camera(light)
         row = []
         for k, station in enumerate(STATIONS):
@@ -87,6 +87,9 @@ def ratios(gaps: list[NDArray], moved: list[NDArray], rng: np.random.Generator |
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
+    parser.add_argument(
+        "--days", nargs="+", choices=WEATHER, default=list(WEATHER), metavar="NAME", help="default: all"
+    )
     parser.add_argument("--policies", nargs="*", default=[], help="runs of the scene, named after their task")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--pictures", type=Path, help="folder for pictures: day, twin, twin with weather drawn")
@@ -97,13 +100,15 @@ def main() -> None:
     intrinsics = camera_intrinsics(model, model.camera("front").id, SIZE)
     rays = unproject(pixel_grid(*SIZE), intrinsics)
     lengths = np.linalg.norm(rays, axis=-1).astype(np.float32)
-    shown, true_poses = real()
+    shown, true_poses = real(given.days)
     to_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras))
     poses = to_truth.inverse().poses(true_poses)
     views = Viewpoints.of(poses, intrinsics, SIZE)
-    clear = [field.render(views, name) for name in WEATHER]
+    clear = [field.render(views, name) for name in given.days]
     depth = clear[0].depth
-    hazed = np.array([field.air(name).over(one.rgb, depth * lengths) for name, one in zip(WEATHER, clear, strict=True)])
+    hazed = np.array(
+        [field.air(name).over(one.rgb, depth * lengths) for name, one in zip(given.days, clear, strict=True)]
+    )
     filmed = [field.render(views, name).rgb for name in field.lightings_by_name.filmed().names]
     figures: dict[str, float] = {}
 
@@ -111,19 +116,19 @@ def main() -> None:
         figures[name] = float(value)
         print(f"{name:44} {value:8.3f}", flush=True)
 
-    for i, name in enumerate(WEATHER):
+    for i, name in enumerate(given.days):
         tell(f"day.extinction.{name}", field.air(name).extinction)
         for what, many in (("filmed", filmed), ("photo", [hazed[i]])):
             means = [np.mean([psnr(a, b) for a, b in zip(p[1:], shown[i, 1:], strict=True)]) for p in many]
             tell(f"day.psnr.{what}.{name}", max(means))
 
     rng = np.random.default_rng(0)
-    drawn = [[ANOTHER_DAY.draw(rng) for _ in WEATHER] for _ in range(DRAWS)]
-    seeds = rng.integers(2**31, size=(DRAWS, len(WEATHER)))
+    drawn = [[ANOTHER_DAY.draw(rng) for _ in given.days] for _ in range(DRAWS)]
+    seeds = rng.integers(2**31, size=(DRAWS, len(given.days)))
 
     def weathered(scale: float, days: list[Draw], numbers: NDArray) -> Pictures:
         rows = []
-        for i, (name, draw, number) in enumerate(zip(WEATHER, days, numbers, strict=True)):
+        for i, (name, draw, number) in enumerate(zip(given.days, days, numbers, strict=True)):
             weaker = Draw(sunlight=scale * draw.sunlight, shade=scale * draw.shade)
             weather = Weather(weaker, np.random.default_rng(number), field.air(name))
             seen = zip(clear[i].rgb, depth, poses, strict=True)
@@ -132,7 +137,7 @@ def main() -> None:
 
     pictures = {scale: [weathered(scale, *one) for one in zip(drawn, seeds, strict=True)] for scale in SCALES}
     if given.pictures:
-        for i, name in enumerate(WEATHER):
+        for i, name in enumerate(given.days):
             both = np.hstack([np.vstack(p[i]) for p in (shown, hazed, pictures[UNTOLD][0])])
             write_image(given.pictures / f"{name}.png", (np.clip(both, 0.0, 1.0) * 255.0).astype(np.uint8))
     gaps: list[NDArray] = []
