@@ -139,7 +139,7 @@ class Alignment:
 
     @property
     def slope(self) -> Array:
-        """Gravity along x and y [m/s²], shape (n, 2)."""
+        """Gravity along x and y [m/s²], shape (n, 2); see `slope.gravity`."""
         return slope.gravity(self.windows, self.icr)
 
 

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 from twin.alignment.commands import AHEAD, STEP
 from twin.alignment.logs import PERIOD, SAMPLES, _read_npz
-from twin.alignment.simulate import COARSE, drive
+from twin.alignment.simulate import BEFORE, COARSE, drive
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
 
@@ -102,8 +102,8 @@ def simulated_effort(steady: Steady, params: HuskyParams) -> Effort:
     straight = straight[:: max(1, len(straight) // 20)]
     both = np.concatenate([turning, straight]) / WHEEL_RADIUS
     steps = round((SAMPLES + AHEAD) * PERIOD / STEP)
-    told = np.repeat(both[:, None], steps, 1)
-    out = drive(replace(params, servo_lag=0.0), told, both, np.zeros((len(both), 2)), COARSE)
+    told, before = (np.repeat(both[:, None], count, 1) for count in (steps, 2 * BEFORE + 1))
+    out = drive(replace(params, servo_lag=0.0), told, before, np.zeros((len(both), 2)), COARSE)
     torque = np.maximum(out.torques[:, SAMPLES // 2 :].mean(1), 0.0)
     return _effort(turning, torque[: len(turning)], torque[len(turning) :])
 

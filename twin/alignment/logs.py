@@ -70,6 +70,17 @@ class Windows:
         """Which windows may be fitted to; the others are for scoring. Shape (n,)."""
         return self.groups % 2 == 0
 
+    @property
+    def before(self) -> Array:
+        """Wheel speeds of the `DURATION` before each window and at its start [rad/s], shape (n, k + 1, 2).
+
+        Those of the window before, where this one follows it, else as they are at the start.
+        """
+        out = np.repeat(self.wheels[:, :1], self.wheels.shape[1] + 1, 1)
+        follows = np.flatnonzero(self.follows)
+        out[follows, :-1] = self.wheels[follows - 1]
+        return out
+
     def of(self, which: NDArray) -> "Windows":
         """Some of the windows; none of them follows another."""
         return Windows(

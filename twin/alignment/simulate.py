@@ -1,8 +1,8 @@
 """Windows of a log driven by the Husky's MJCF on a plane, many at once.
 
-Each starts rolling: the robot stands settled on the plane, gets the wheel speeds that the log starts with, and holds
-them for `LEAD` before time starts, so that body and tyres are in the motion that goes with them. Then the servo is told
-what the controller makes of the log's commands (`commands.targets`). Nothing else of the log enters but the slope.
+Each starts rolling: the robot stands settled on the plane, and before time starts its wheels do what the log's did
+before the window (`Windows.before`), so that body and tyres are in the motion that goes with them. Then the servo is
+told what the controller makes of the log's commands (`commands.targets`). Nothing else of the log enters but the slope.
 `mujoco.rollout` steps windows in threads; gravity is tilted rather than the plane.
 """
 
@@ -24,7 +24,6 @@ from twin.robot import WHEELS, HuskyParams
 
 Array = NDArray[np.float64]
 
-LEAD = 0.4  # [s]
 BEFORE, EARLY = 4, 3  # samples by which poses may be late against the wheel speeds, and ahead of them
 COARSE = 0.005  # [s] time step to begin a fit with; poses after 2 s are up to 1 cm and 0.8° off those of a fine one
 
@@ -76,24 +75,26 @@ def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.Mj
     return spec.compile()
 
 
-def drive(params: HuskyParams, told: Array, start: Array, slope: Array, timestep: float | None = None) -> Drives:
+def drive(params: HuskyParams, told: Array, before: Array, slope: Array, timestep: float | None = None) -> Drives:
     """Drives every window.
 
     Args:
-        params: The robot and its ground; its `servo_lag` acts on `told`.
+        params: The robot and its ground; its `servo_lag` acts on `told`, but not on `before`.
         told: Wheel speeds the servos are told, left and right [rad/s], `commands.STEP` [s] apart, shape (n, steps, 2).
-        start: Wheel speeds at the start [rad/s], shape (n, 2).
-        slope: Gravity along x and y [m/s²], shape (n, 2).
+        before: Wheel speeds until time starts, left and right [rad/s], `PERIOD` [s] apart; the last are those at the
+            start. Shape (n, ≥ BEFORE + 2, 2).
+        slope: Gravity along x and y of the robot where `before` begins [m/s²], shape (n, 2).
         timestep: [s], a whole fraction of `PERIOD`; the shipped one by default.
     """
     model = plane_model(params, timestep)
     step = model.opt.timestep
-    lead, per_sample = round(LEAD / step), round(PERIOD / step)
+    per_sample = round(PERIOD / step)
+    lead = (before.shape[1] - 1) * per_sample
     count = told.shape[1] * STEP
     index = np.minimum((np.arange(round(count / step)) * step / STEP + 1e-9).astype(int), told.shape[1] - 1)
-    control = np.concatenate([np.repeat(start[:, None], lead, 1), told[:, index]], 1)
+    control = np.concatenate([_led(before, per_sample, params.servo_lag), told[:, index]], 1)
     limit = model.actuator_ctrlrange[0, 1]
-    states, joints = _starts(model, params, np.clip(start, -limit, limit))
+    states, joints = _starts(model, params, np.clip(before[:, 0], -limit, limit))
     models = _tilted(model, slope)
     threads = min(cores(), len(told))
     states, sensors = rollout.rollout(models, [mujoco.MjData(model) for _ in range(threads)], states, control)
@@ -108,6 +109,23 @@ def drive(params: HuskyParams, told: Array, start: Array, slope: Array, timestep
         np.stack([velocity[:, BEFORE : BEFORE + k, joints[[i, i + 2]]].mean(-1) for i in (0, 1)], -1),
         torques[:, : (k - 1) * per_sample].reshape(n, k - 1, per_sample, 2).mean(2),
     )
+
+
+def _led(wheels: Array, count: int, lag: float) -> Array:
+    """What servos that lag are told so that wheels go from sample to sample in straight lines.
+
+    Args:
+        wheels: Shape (n, k, 2), `PERIOD` [s] apart.
+        count: Steps from one to the next.
+        lag: [s], of first order: what comes out is as much behind as it changes in that time.
+
+    Returns:
+        Shape (n, (k − 1) · count, 2).
+    """
+    share = (np.arange(count) + 0.5)[:, None] / count
+    change = np.diff(wheels, axis=1)[:, :, None]
+    told = wheels[:, :-1, None] + (share + lag / PERIOD) * change
+    return told.reshape(len(wheels), -1, wheels.shape[2])
 
 
 def _starts(model: mujoco.MjModel, params: HuskyParams, start: Array) -> tuple[Array, NDArray[np.int64]]:
