@@ -184,7 +184,7 @@ def fit_ground(
         return replace(found, values=kept | found.values, refused=hidden | found.refused)
 
     # At a coarse time step, with a third of many windows, the neighbourhood is found in a tenth of the time; what those
-    # cannot tell, all together may. Values fitted at a coarse step make up for it, so the last word is the shipped one's.
+    # cannot tell, all together may. What is fitted at a coarse step makes up for it: the shipped one has the last word.
     some = fitting
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))
