@@ -186,16 +186,17 @@ def test_a_reading_that_cannot_be_ground_spoils_no_other():
     assert np.abs(struck - plain)[np.abs(np.arange(n) - 30) > 10].max() < 0.15
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_readings_without_noise_are_taken(value):
-    wheels = np.full((40, logs.SAMPLES, 2), 3.0)
-    windows = replace(windows_of(wheels), follows=np.arange(40) > 0, acceleration=np.full_like(wheels, value))
+    n = 400
+    wheels = np.full((n, logs.SAMPLES, 2), 3.0)
+    windows = replace(windows_of(wheels), follows=np.arange(n) > 0, acceleration=np.full_like(wheels, value))
     assert not slope.gravity(windows, kinematics.NOMINAL).any()
-    turning = np.array(0.7 * np.exp(-0.3j * np.arange(40)))
-    found, _ = slope.smoothed(
-        slope.terrain(turning, np.full(40, 0.3), windows.follows), turning, np.full(40, 0.3), windows.follows
-    )
-    assert found == pytest.approx(turning, abs=0.02)
+    turn, readings = np.full(n, 0.3), 0.7 * np.exp(-0.3j * np.arange(n))
+    for exact in (readings, 0 * readings):
+        found, _ = slope.smoothed(slope.terrain(exact, turn, windows.follows), exact, turn, windows.follows)
+        assert found == pytest.approx(exact, abs=0.02)
 
 
 def test_wheels_do_what_they_did_before_the_window():
