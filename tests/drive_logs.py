@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.alignment import logs
 from twin.alignment.simulate import plane_model
 from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.robot import WHEELS, HuskyParams
@@ -77,3 +78,19 @@ def write_csv(path: Path, table: dict[str, NDArray]) -> Path:
         writer.writerow(table)
         writer.writerows(np.stack(list(table.values()), 1).tolist())
     return path
+
+
+def windows_of(wheels: NDArray, poses: NDArray | None = None, **others) -> logs.Windows:
+    """Windows of these wheel speeds, commanded as they are, that do not follow each other."""
+    n, k = wheels.shape[:2]
+    return logs.Windows(
+        **{
+            "commands": wheels.copy(),
+            "twist": False,
+            "wheels": wheels,
+            "poses": np.zeros((n, k + 1, 3)) if poses is None else poses,
+            "groups": np.arange(n),
+            "follows": np.zeros(n, bool),
+        }
+        | others
+    )
