@@ -88,7 +88,8 @@ class HuskyParams:
     friction: float = 0.7
     """Sliding friction of a tyre, on whatever it touches."""
     rolling_resistance: float = 0.015
-    """Rolling resistance coefficient Crr: force / load."""
+    """Rolling resistance coefficient Crr: force / load. Rolling and sliding share a tyre's grip: it slides at
+    Crr / friction · s / √(1 − s²) of its rolling speed under a share s of its grip, next to nothing by default."""
     wheel_radius: tuple[float, float] = (WHEEL_RADIUS, WHEEL_RADIUS)
     """Effective radius of the left and of the right tyres [m]: pressure and wear. The robot's own controller goes on
     reckoning with the nominal one."""

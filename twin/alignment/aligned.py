@@ -35,6 +35,7 @@ _DRIVE_FIELDS = {  # a field of HuskyParams → what of the drive shows it
 _GROUND_FIELDS = {
     "friction": ("friction",),
     "spin_friction": ("spin_friction",),
+    "rolling_resistance": ("rolling_resistance",),
     "slip_stiffness": ("creep",),
     "ground_viscosity": ("ground_viscosity",),
     "center_of_mass": ("center_of_mass_x", "center_of_mass_y", "center_of_mass_z"),

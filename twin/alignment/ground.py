@@ -40,7 +40,7 @@ from twin.alignment.commands import Drive, targets
 from twin.alignment.identify import Fit, Parameter, fit
 from twin.alignment.kinematics import residuals
 from twin.alignment.logs import PERIOD, Windows
-from twin.alignment.simulate import BEFORE, COARSE, EARLY, Drives, drive, retimed
+from twin.alignment.simulate import COARSE, EARLY, LATE, Drives, drive, retimed
 from twin.robot import WHEEL_RADIUS, HuskyParams
 
 Array = NDArray[np.float64]
@@ -48,15 +48,16 @@ Array = NDArray[np.float64]
 # Start, span, lowest and highest value, unit, and what would show it; starts are those of soft ground. Creep is the
 # inverse of slip stiffness, which slip grows with in proportion.
 _MANY = 100  # windows
-_FEW = 5  # evaluations of the search that begins near the end
+_NEAR = 0.25  # spans that the search's first step may take which begins near the end
 _SPREAD = "hard turns at several speeds"
 _TORQUE = "motor currents or torques"
 _BRAKING = "hard braking, or slopes"
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
-    "friction": (0.25, 0.2, 0.05, 1.5, "", _SPREAD),
-    "spin_friction": (0.02, 0.03, 0.0, 0.3, "m", _SPREAD),
-    "creep": (40.0, 30.0, 0.01, 300.0, "", "gentle bends as well as hard turns"),
-    "ground_viscosity": (5.0, 5.0, 0.0, 80.0, "Pa s", "turns while driving at several speeds"),
+    "friction": (0.3, 0.2, 0.05, 1.5, "", _SPREAD),
+    "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _SPREAD),
+    "rolling_resistance": (0.12, 0.05, 0.0, 0.5, "", "gentle bends as well as hard turns"),
+    "creep": (15.0, 15.0, 0.01, 300.0, "", "gentle bends as well as hard turns"),
+    "ground_viscosity": (1.0, 2.0, 0.0, 80.0, "Pa s", "turns while driving at several speeds"),
     "center_of_mass_x": (-0.05, 0.05, -0.2, 0.2, "m", "turns forward and backward at speed"),
     "center_of_mass_y": (0.0, 0.03, -0.1, 0.1, "m", "turns to both sides"),
     "center_of_mass_z": (0.062, 0.1, -0.1, 0.45, "m", _BRAKING),
@@ -65,7 +66,7 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "log10_servo_gain": (np.log10(800.0), 0.3, 1.0, 4.0, "", _TORQUE),
     "pose_x": (0.0, 0.2, -1.0, 1.0, "m", "turns on the spot"),
     "pose_y": (0.0, 0.1, -1.0, 1.0, "m", "turns on the spot"),
-    "pose_late": (0.0, 0.1, -EARLY * PERIOD, BEFORE * PERIOD, "s", "turns that begin and end"),
+    "pose_late": (0.0, 0.1, -EARLY * PERIOD, LATE * PERIOD, "s", "turns that begin and end"),
 }
 
 
@@ -77,6 +78,7 @@ def robot(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
         params,
         friction=values["friction"],
         spin_friction=values["spin_friction"],
+        rolling_resistance=values["rolling_resistance"],
         slip_stiffness=1 / values["creep"],
         ground_viscosity=values["ground_viscosity"],
         center_of_mass=(
@@ -96,6 +98,7 @@ def usual(params: HuskyParams) -> dict[str, float]:
     return {
         "friction": params.friction,
         "spin_friction": params.spin_friction,
+        "rolling_resistance": params.rolling_resistance,
         "creep": 1 / params.slip_stiffness,
         "ground_viscosity": params.ground_viscosity,
         "center_of_mass_x": x,
@@ -122,12 +125,14 @@ def simulated(
     told, _ = targets(drive_, windows)
     fitted = robot(replace(params, servo_lag=drive_.lag, max_wheel_speed=5.0), values)
     out = drive(fitted, told, windows.before, slope, timestep)
-    return replace(out, poses=told_poses(out, values))
+    return replace(out, poses=told_poses(out, values, windows))
 
 
-def told_poses(drives: Drives, values: dict[str, float]) -> Array:
-    """Poses of drives as the log tells them: of its own origin, and with its own clock. Shape (n, ≥ k + 2, 3)."""
-    return moved_origin(retimed(drives.poses, values["pose_late"]), values["pose_x"], values["pose_y"])
+def told_poses(drives: Drives, values: dict[str, float], windows: Windows) -> Array:
+    """Poses of drives as these windows tell them: of the log's own origin, with its own clock, since its first pose was
+    measured. Shape (n, k + OLDEST + 1, 3)."""
+    seen = retimed(drives.poses, values["pose_late"] - windows.measured[:, 0])
+    return moved_origin(seen, values["pose_x"], values["pose_y"])
 
 
 def moved_origin(poses: Array, x: float, y: float) -> Array:
@@ -154,7 +159,7 @@ def fit_ground(
         progress: Told a line now and then.
     """
     kept = usual(params)
-    hidden = {"rolling_resistance": f"rolling_resistance = {params.rolling_resistance:.4g}: needs {_TORQUE}"}
+    hidden: dict[str, str] = {}
     if not slope.any():
         height = kept["center_of_mass_z"]
         hidden["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
@@ -170,17 +175,15 @@ def fit_ground(
     before = windows.before
     base = replace(params, servo_lag=drive_.lag, max_wheel_speed=5.0)
 
-    def fit_to(
-        which: NDArray[np.int64], starts: dict[str, float], timestep: float | None, evaluations: int = 12
-    ) -> Fit:
+    def fit_to(which: NDArray[np.int64], starts: dict[str, float], timestep: float | None, reach: float = 1.0) -> Fit:
         some = windows.of(which)
 
         def error(values: dict[str, float]) -> Array:
             out = drive(robot(base, values), told[which], before[which], slope[which], timestep)
-            return residuals(told_poses(out, kept | values), some)
+            return residuals(told_poses(out, kept | values, some), some)
 
         begin = [replace(p, start=starts.get(p.name, p.start)) for p in table]
-        found = fit(begin, error, some.groups, evaluations, progress)
+        found = fit(begin, error, some.groups, reach=reach, progress=progress)
         return replace(found, values=kept | found.values, refused=hidden | found.refused)
 
     # At a coarse time step, with a third of many windows, the neighbourhood is found in a tenth of the time; what those
@@ -189,4 +192,4 @@ def fit_ground(
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))
     rough = fit_to(some, {}, COARSE)
-    return fit_to(fitting, {name: rough.values[name] for name in rough.errors}, None, _FEW)
+    return fit_to(fitting, {name: rough.values[name] for name in rough.errors}, None, _NEAR)

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 SHARE = 0.5  # of its span that a parameter's standard error may be
 _HOPELESS = 10.0  # the same before the first fit
 _STEP = 0.05  # of its span, for differences
+_EVALUATIONS = 20  # at most, per round of the search; those that lead on take one per free parameter besides
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def fit(
     table: list[Parameter],
     error: Callable[[dict[str, float]], Array],
     groups: NDArray[np.int64],
-    evaluations: int = 12,
+    reach: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
     """Fits what the data identify of a table of parameters.
@@ -71,7 +72,7 @@ def fit(
         table: What may be fitted.
         error: Residuals of every window for values by name, in units of a good model's miss, shape (n, looks, ...).
         groups: Of the windows, shape (n,).
-        evaluations: At most, per round of the search; each takes one `error` per free parameter besides.
+        reach: How far the search's first step may go, in spans; less where it begins near the end.
         progress: Told a line per round and per step of the search.
     """
     free = {p.name: p for p in table}
@@ -116,9 +117,9 @@ def fit(
         if not names:
             continue
         progress(f"fitting {', '.join(names)}")
-        # In spans from where the search begins: SciPy's first step is then one span at most, and its tolerances mean
-        # the same for every parameter.
-        spans = np.array([free[n].span for n in names])
+        # In spans from where the search begins: SciPy's first step is then `reach` of them at most, and its tolerances
+        # mean the same for every parameter.
+        spans = reach * np.array([free[n].span for n in names])
         low = np.array([free[n].low for n in names])
         high = np.array([free[n].high for n in names])
         origin = np.clip([values[n] for n in names], low + 1e-6 * spans, high - 1e-6 * spans)
@@ -139,7 +140,7 @@ def fit(
             bounds=((low - origin) / spans, (high - origin) / spans),
             ftol=3e-4,
             xtol=3e-3,
-            max_nfev=evaluations,
+            max_nfev=_EVALUATIONS,
         )
         values |= dict(zip(names, (origin + found.x * spans).tolist(), strict=True))
         fitted = True

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from twin.alignment.logs import PERIOD, SAMPLES, Windows, wrapped
+from twin.alignment.logs import OLDEST, PERIOD, SAMPLES, Windows, wrapped
 from twin.robot import TRACK, WHEEL_RADIUS
 
 Array = NDArray[np.float64]
@@ -60,8 +60,8 @@ def integrate(motion: Array) -> Array:
 
 
 def predict(model: Icr, windows: Windows) -> Array:
-    """Poses by measured wheel speeds, one sample beyond the end, shape (n, k + 2, 3)."""
-    wheels = np.concatenate([windows.wheels, windows.wheels[:, -1:]], 1)
+    """Poses by measured wheel speeds, which are held beyond the end, shape (n, k + OLDEST + 1, 3)."""
+    wheels = np.concatenate([windows.wheels, np.repeat(windows.wheels[:, -1:], OLDEST, 1)], 1)
     return integrate(model.motion(wheels))
 
 

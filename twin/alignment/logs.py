@@ -2,8 +2,8 @@
 
 A *window* is two seconds of a log, sampled evenly: commands, wheel speeds, poses relative to the first one, and, where
 there was an IMU, accelerations. Windows of one *group* share an experiment; groups of even number are for fitting, odd
-ones for scoring. A window *follows* the one before it where it begins when that one ends. A pose is *stale* when it
-repeats the one before: it was measured when it first appeared.
+ones for scoring. A window *follows* the one before it where it begins when that one ends. A pose is *fresh* when it
+differs from the one before, *stale* when it repeats it.
 
 `read_log` takes
 
@@ -17,10 +17,12 @@ repeats the one before: it was measured when it first appeared.
 
 import csv
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import theilslopes
 
 from twin.errors import InputError
 
@@ -29,9 +31,11 @@ Array = NDArray[np.float64]
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
+OLDEST = 4  # samples that the first pose of a window may have been measured before its start, at most
 MAX_GAP = 0.5  # [s] between two rows of a table; a window that reaches into a longer one is left out
 MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds would show
 
+_FAST = 1.75  # samples; sensors of a shorter period tell more by when their poses appear than by how many did
 _TICK = 1e-6  # [s] instants nearer than this are the same
 _GROUP_WINDOWS = 3  # of a table without groups: six seconds
 _CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change from one window to the next
@@ -93,21 +97,48 @@ class Windows:
             None if self.acceleration is None else self.acceleration[which],
         )
 
+    @cached_property
+    def measured(self) -> Array:
+        """When each pose was measured [s], but for a lateness common to all; time starts with the first sample.
+
+        A sensor of poses measures at a steady rate, but what it measures gets into the log sooner or later: from a
+        fresh pose to the next a robot moves as far after 0.05 s as after 0.15 s (DRIVE's log: within windows that turn,
+        yaw is smooth to 0.3° over the number of fresh poses, to 0.7° over when they appeared). So the n-th measurement
+        counts as of n periods after the first one. Where fresh poses are later for good by more than half a period,
+        some were lost. The first one is older than the window, by at most `OLDEST`. Shape (n, k + 1).
+        """
+        fresh = np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
+        appeared = [np.flatnonzero(row) + 1.0 for row in fresh]
+        slopes = [theilslopes(each).slope for each in appeared if len(each) > 1]
+        period = float(np.median(slopes)) if slopes else 1.0
+        out = np.zeros(self.poses.shape[:2])
+        for time, new, each in zip(out, fresh, appeared, strict=True):
+            if len(each):
+                measured = _measured(each, period) if period > _FAST else np.append(0.0, each)
+                time[:] = measured[np.append(0, np.cumsum(new))]
+        return out * PERIOD
+
     @property
     def elapsed(self) -> Array:
-        """Time from the measurement of the first pose to that of each [s], shape (n, k + 1).
+        """Time from the measurement of the first pose to that of each [s], shape (n, k + 1)."""
+        return self.measured - self.measured[:, :1]
 
-        A stale pose counts as of when it first appeared. The first one may itself be stale: where poses come in runs of
-        r samples and the first run is cut short, by what is missing of it.
-        """
-        n, count = self.poses.shape[:2]
-        fresh = np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
-        first = np.zeros((n, count), int)
-        for i in range(1, count):
-            first[:, i] = np.where(fresh[:, i - 1], i, first[:, i - 1])
-        run = 1 if fresh.mean() > 0.75 else round(1 / max(float(fresh.mean()), 1e-3))
-        leading = np.where(fresh.any(1), fresh.argmax(1), count - 1)
-        return (first + np.maximum(run - 1 - leading, 0)[:, None]) * PERIOD
+
+def _measured(appeared: Array, period: float) -> Array:
+    """When a window's first pose and its fresh ones were measured; see `Windows.measured`.
+
+    Args:
+        appeared: When fresh poses did [samples].
+        period: Of the sensor [samples].
+    """
+    number = np.arange(1.0, len(appeared) + 1)
+    lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
+    number += np.minimum.accumulate(lost[::-1])[::-1]  # what comes late, but comes, was not lost
+    start = float(np.median(appeared - period * number))
+    start -= period * max(0.0, np.ceil(start / period - 0.5))  # the robot rested, or as many were lost at first
+    start = float(np.clip(start, -period, 0.0))
+    number += np.round((np.median(appeared - period * number) - start) / period)
+    return np.append(max(start, -OLDEST), start + period * number)
 
 
 def read_log(path: Path) -> Windows:

@@ -15,7 +15,7 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from twin.alignment.commands import AHEAD, STEP
-from twin.alignment.logs import PERIOD, SAMPLES, relative
+from twin.alignment.logs import OLDEST, PERIOD, SAMPLES, relative
 from twin.alignment.slope import GRAVITY
 from twin.cores import cores
 from twin.mjcf.husky import add_husky, set_options
@@ -24,7 +24,8 @@ from twin.robot import WHEELS, HuskyParams
 
 Array = NDArray[np.float64]
 
-BEFORE, EARLY = 4, 3  # samples by which poses may be late against the wheel speeds, and ahead of them
+LATE, EARLY = 4, 3  # samples by which poses may be late against the wheel speeds, and ahead of them
+BEFORE = LATE + OLDEST  # samples before time starts that are kept
 COARSE = 0.005  # [s] time step to begin a fit with; poses after 2 s are up to 1 cm and 0.8° off those of a fine one
 
 _SETTLE = 1.0  # [s]
@@ -44,20 +45,21 @@ class Drives:
     """Of the left and the right motor, at the wheels [N m], means over each `PERIOD`, shape (n, k + AHEAD − 1, 2)."""
 
 
-def retimed(poses: Array, late: float) -> Array:
-    """Poses as a log tells them whose poses lag its wheel speeds by `late` [s]; less than nothing: they are ahead.
+def retimed(poses: Array, late: Array) -> Array:
+    """Poses of robots from when each was first seen, `late` [s] before time starts; less than nothing: after that.
 
     Args:
         poses: Of `Drives`.
-        late: At most `BEFORE` samples, at least −`EARLY`.
+        late: At most `BEFORE` samples, at least −`EARLY`, shape (n,).
 
     Returns:
-        Relative to the one that the log has first, shape (n, k + AHEAD − EARLY, 3).
+        Relative to the first, shape (n, k + OLDEST + 1, 3).
     """
-    position = BEFORE - late / PERIOD + np.arange(SAMPLES + AHEAD - EARLY)
+    position = BEFORE - late[:, None] / PERIOD + np.arange(SAMPLES + OLDEST + 1)
     whole = np.clip(position.astype(int), 0, poses.shape[1] - 2)
-    share = (position - whole)[:, None]
-    return relative(poses[:, whole] * (1 - share) + poses[:, whole + 1] * share)
+    share = (position - whole)[..., None]
+    row = np.arange(len(poses))[:, None]
+    return relative(poses[row, whole] * (1 - share) + poses[row, whole + 1] * share)
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:
