@@ -164,7 +164,7 @@ def test_a_slope_pulls_downhill():
     however it stands on it when the window begins."""
     n = 12
     wheels = np.full((n, logs.SAMPLES, 2), [-3.0, 3.0])
-    turning = kinematics.Icr(y_left=0.49, y_right=-0.49)  # as SOFT turns
+    turning = kinematics.Icr(y_left=0.56, y_right=-0.56)  # as SOFT turns
     windows = replace(windows_of(wheels), follows=np.arange(n) > 0)
     poses = kinematics.predict(turning, windows)
     start = np.concatenate([[0.0], np.cumsum(poses[:-1, logs.SAMPLES, 2])])

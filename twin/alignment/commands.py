@@ -155,7 +155,7 @@ def fit_drive(windows: Windows, params: HuskyParams) -> tuple[Drive, Fit]:
     measured = windows.wheels[fitting]
     asked = np.abs(requested(windows)[fitting, -1])
     half = np.abs(measured[..., 1] - measured[..., 0]) / 2
-    # Gains start from how fast the wheels end up, limits from the fastest there was.
+    # What a glance tells serves as guesses: gains by how fast the wheels end up, limits by the fastest there was.
     start = {
         "mean_gain": 1.0 if windows.twist else _slope(asked[:, 0], np.abs(measured[:, -1].mean(1))),
         "half_gain": _slope(asked[:, 1], half[:, -1]),

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.alignment.commands import Drive, targets
-from twin.alignment.identify import Fit, Parameter, fit
+from twin.alignment.identify import Fit, Parameter, fit, search
 from twin.alignment.kinematics import residuals
 from twin.alignment.logs import PERIOD, Windows
 from twin.alignment.simulate import COARSE, EARLY, LATE, Drives, drive, retimed
@@ -45,7 +45,7 @@ from twin.robot import WHEEL_RADIUS, HuskyParams
 
 Array = NDArray[np.float64]
 
-# Start, span, lowest and highest value, unit, and what would show it; starts are those of soft ground. Creep is the
+# Guess, span, lowest and highest value, unit, and what would show it; guesses are those of soft ground. Creep is the
 # inverse of slip stiffness, which slip grows with in proportion.
 _MANY = 100  # windows
 _NEAR = 0.25  # spans that the search's first step may take which begins near the end
@@ -55,7 +55,7 @@ _BRAKING = "hard braking, or slopes"
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "friction": (0.3, 0.2, 0.05, 1.5, "", _SPREAD),
     "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _SPREAD),
-    "rolling_resistance": (0.12, 0.05, 0.0, 0.5, "", "gentle bends as well as hard turns"),
+    "rolling_resistance": (0.08, 0.08, 0.0, 0.5, "", "gentle bends as well as hard turns"),
     "creep": (15.0, 15.0, 0.01, 300.0, "", "gentle bends as well as hard turns"),
     "ground_viscosity": (1.0, 2.0, 0.0, 80.0, "Pa s", "turns while driving at several speeds"),
     "center_of_mass_x": (-0.05, 0.05, -0.2, 0.2, "m", "turns forward and backward at speed"),
@@ -167,29 +167,29 @@ def fit_ground(
     if len(fitting) < _MANY:  # where it is next to nothing, others would go astray for it
         hidden["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
     table = [
-        Parameter(name, start, span, low, high, kept[name], unit, cure)
-        for name, (start, span, low, high, unit, cure) in _TABLE.items()
+        Parameter(name, guess, span, low, high, kept[name], unit, cure)
+        for name, (guess, span, low, high, unit, cure) in _TABLE.items()
         if name not in hidden
     ]
     told, _ = targets(drive_, windows)
     before = windows.before
     base = replace(params, servo_lag=drive_.lag, max_wheel_speed=5.0)
 
-    def fit_to(which: NDArray[np.int64], starts: dict[str, float], timestep: float | None, reach: float = 1.0) -> Fit:
+    def error_of(which: NDArray[np.int64], timestep: float | None) -> Callable[[dict[str, float]], Array]:
         some = windows.of(which)
 
         def error(values: dict[str, float]) -> Array:
-            out = drive(robot(base, values), told[which], before[which], slope[which], timestep)
+            out = drive(robot(base, kept | values), told[which], before[which], slope[which], timestep)
             return residuals(told_poses(out, kept | values, some), some)
 
-        begin = [replace(p, start=starts.get(p.name, p.start)) for p in table]
-        found = fit(begin, error, some.groups, reach=reach, progress=progress)
-        return replace(found, values=kept | found.values, refused=hidden | found.refused)
+        return error
 
-    # At a coarse time step, with a third of many windows, the neighbourhood is found in a tenth of the time; what those
-    # cannot tell, all together may. What is fitted at a coarse step makes up for it: the shipped one has the last word.
+    # At a coarse time step, with a third of many windows, the neighbourhood is found in a tenth of the time, whatever
+    # those can tell. What is fitted at a coarse step makes up for it: the shipped one has the last word.
     some = fitting
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))
-    rough = fit_to(some, {}, COARSE)
-    return fit_to(fitting, {name: rough.values[name] for name in rough.errors}, None, _NEAR)
+    progress(f"looking around with {len(some)} windows")
+    near = search(table, error_of(some, COARSE), {p.name: p.guess for p in table}, progress=progress)
+    found = fit(table, error_of(fitting, None), windows.groups[fitting], near, _NEAR, progress)
+    return replace(found, values=kept | found.values, refused=hidden | found.refused)

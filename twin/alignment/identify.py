@@ -1,10 +1,12 @@
 """Least squares that says how sure it is, and leaves alone what the data do not show.
 
-A *parameter* has a span: how far from its usual value it may well be, known without any log (one standard deviation).
-The *rule*: a parameter is identified if its standard error, all others being free, is at most half its span. Of those
+A *parameter* has a guess and a span: what it is likely to be before any log, and how far off that may well be (a normal
+prior: mean and one standard deviation). What is fitted is the most probable, given both the log and the guesses; that
+keeps many parameters from conspiring to explain the noise of a short log. Where the guess is far off, a log of some
+minutes outweighs it. The *rule*: a parameter is identified if its standard error by the log alone, all others being
+free, is at most half its span. Of those
 that are not, the least certain one goes back to its usual value, the rest is judged anew, and what is left is fitted
-again, until a fit leaves none to go. Before the first fit, far from the best values, only hopeless ones go: those
-uncertain by ten times their span.
+again, until a fit leaves none to go.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
 any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible
@@ -23,7 +25,6 @@ from twin.alignment.kinematics import bend, bent_slopes, weighted
 Array = NDArray[np.float64]
 
 SHARE = 0.5  # of its span that a parameter's standard error may be
-_HOPELESS = 10.0  # the same before the first fit
 _STEP = 0.05  # of its span, for differences
 _EVALUATIONS = 20  # at most, per round of the search; those that lead on take one per free parameter besides
 
@@ -33,8 +34,7 @@ class Parameter:
     """One number that a log may show."""
 
     name: str
-    start: float
-    """Where the search begins."""
+    guess: float
     span: float
     low: float
     high: float
@@ -59,10 +59,59 @@ class Fit:
     """Mean of log(1 + s) over windows."""
 
 
+def search(
+    table: list[Parameter],
+    error: Callable[[dict[str, float]], Array],
+    begin: dict[str, float],
+    reach: float = 1.0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, float]:
+    """The most probable values of every parameter, whether or not the data identify it.
+
+    Args:
+        table: What is fitted.
+        error: Residuals of every window for values by name, in units of a good model's miss, shape (n, looks, ...).
+        begin: Values to begin at.
+        reach: How far the search's first step may go, in spans; less where it begins near the end.
+        progress: Told a line per step of the search.
+    """
+    # In spans from where the search begins: SciPy's first step is then `reach` of them at most, and its tolerances
+    # mean the same for every parameter.
+    guess, sigma, low, high = (np.array([getattr(p, of) for p in table]) for of in ("guess", "span", "low", "high"))
+    spans = reach * sigma
+    origin = np.clip([begin[p.name] for p in table], low + 1e-6 * spans, high - 1e-6 * spans)
+
+    def named(point: Array) -> dict[str, float]:
+        return dict(zip((p.name for p in table), point.tolist(), strict=True))
+
+    def shifted(z: Array) -> Array:
+        point = origin + z * spans
+        return np.append(bend(error(named(point))).ravel(), (point - guess) / sigma)
+
+    def tilted(z: Array) -> Array:
+        point = origin + z * spans
+        now = error(named(point))
+        progress(f"  mean log(1 + s) = {_cost(now):.4f}")
+        bent = bent_slopes(now, _slopes(table, error, named(point), now)).reshape(-1, len(table))
+        return np.concatenate([bent, np.diag(1 / sigma)]) * spans
+
+    found = least_squares(
+        shifted,
+        np.zeros(len(table)),
+        jac=tilted,
+        bounds=((low - origin) / spans, (high - origin) / spans),
+        ftol=1e-3,
+        xtol=3e-3,
+        max_nfev=_EVALUATIONS,
+    )
+    return named(origin + found.x * spans)
+
+
 def fit(
     table: list[Parameter],
     error: Callable[[dict[str, float]], Array],
     groups: NDArray[np.int64],
+    begin: dict[str, float] | None = None,
     reach: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
@@ -70,80 +119,58 @@ def fit(
 
     Args:
         table: What may be fitted.
-        error: Residuals of every window for values by name, in units of a good model's miss, shape (n, looks, ...).
+        error: As of `search`.
         groups: Of the windows, shape (n,).
-        reach: How far the search's first step may go, in spans; less where it begins near the end.
+        begin: Where the search begins, instead of at the guesses.
+        reach: As of `search`.
         progress: Told a line per round and per step of the search.
     """
-    free = {p.name: p for p in table}
-    values = {p.name: p.start for p in table}
+    free = list(table)
+    values = {p.name: p.guess for p in table} | (begin or {})
     refused: dict[str, str] = {}
 
-    def at(point: Array, names: list[str]) -> Array:
-        return error(values | dict(zip(names, point.tolist(), strict=True)))
+    def at(some: dict[str, float]) -> Array:
+        return error(values | some)
 
-    def slopes(point: Array, names: list[str], now: Array) -> Array:
-        columns = []
-        for i, name in enumerate(names):
-            p = free[name]
-            step = _STEP * p.span * (1 if point[i] + _STEP * p.span <= p.high else -1)
-            moved = point.copy()
-            moved[i] += step
-            columns.append((at(moved, names) - now) / step)
-        return np.stack(columns, -1) if columns else np.empty((*now.shape, 0))
-
-    fitted = False
     while True:  # comes to an end, as a parameter less is fitted every time
-        names = list(free)
-        point = np.array([values[name] for name in names])
-        now = at(point, names)
-        jacobian = slopes(point, names, now)
+        if free:
+            progress(f"fitting {', '.join(p.name for p in free)}")
+            values |= search(free, at, values, reach, progress)
+        now = error(values)
+        jacobian = _slopes(free, at, values, now)
+        count = len(free)
         while True:  # judge, drop the worst, judge again
-            errors = _standard_errors(jacobian, now, groups, np.array([free[n].span for n in names]))
-            relative = errors / [free[n].span for n in names]
-            worst = int(np.argmax(relative)) if names else -1
-            if worst < 0 or relative[worst] <= (SHARE if fitted else _HOPELESS):
+            spans = np.array([p.span for p in free])
+            errors = _standard_errors(jacobian, now, groups, spans)
+            worst = int(np.argmax(errors / spans)) if free else -1
+            if worst < 0 or errors[worst] <= SHARE * spans[worst]:
                 break
-            p = free.pop(names.pop(worst))
+            p = free.pop(worst)
             values[p.name] = p.usual
             refused[p.name] = (
                 f"{p.name} = {p.usual:.4g} {p.unit}".rstrip()
                 + f": standard error {_told(errors[worst])}, wanted at most {SHARE * p.span:.3g}; needs {p.cure}"
             )
             jacobian = np.delete(jacobian, worst, -1)
-        if (fitted or not names) and len(names) == len(point):  # nothing dropped after a fit, or nothing left to fit
-            cost = float((bend(now) ** 2).sum() / len(now))
-            return Fit(values, dict(zip(names, errors.tolist(), strict=True)), refused, cost)
-        if not names:
-            continue
-        progress(f"fitting {', '.join(names)}")
-        # In spans from where the search begins: SciPy's first step is then `reach` of them at most, and its tolerances
-        # mean the same for every parameter.
-        spans = reach * np.array([free[n].span for n in names])
-        low = np.array([free[n].low for n in names])
-        high = np.array([free[n].high for n in names])
-        origin = np.clip([values[n] for n in names], low + 1e-6 * spans, high - 1e-6 * spans)
+        if len(free) == count:
+            found = {p.name: float(e) for p, e in zip(free, errors, strict=True)}
+            return Fit(values, found, refused, _cost(now))
 
-        def shifted(z: Array, origin=origin, spans=spans, names=names) -> Array:
-            return bend(at(origin + z * spans, names)).ravel()
 
-        def tilted(z: Array, origin=origin, spans=spans, names=names) -> Array:
-            x = origin + z * spans
-            error_now = at(x, names)
-            progress(f"  mean log(1 + s) = {(bend(error_now) ** 2).sum() / len(error_now):.4f}")
-            return bent_slopes(error_now, slopes(x, names, error_now)).reshape(-1, len(names)) * spans
+def _slopes(
+    table: list[Parameter], error: Callable[[dict[str, float]], Array], values: dict[str, float], now: Array
+) -> Array:
+    """Of residuals `now` at these values by differences, one more axis for parameters."""
+    columns = []
+    for p in table:
+        step = _STEP * p.span * (1 if values[p.name] + _STEP * p.span <= p.high else -1)
+        columns.append((error(values | {p.name: values[p.name] + step}) - now) / step)
+    return np.stack(columns, -1) if columns else np.empty((*now.shape, 0))
 
-        found = least_squares(
-            shifted,
-            np.zeros(len(names)),
-            jac=tilted,
-            bounds=((low - origin) / spans, (high - origin) / spans),
-            ftol=3e-4,
-            xtol=3e-3,
-            max_nfev=_EVALUATIONS,
-        )
-        values |= dict(zip(names, (origin + found.x * spans).tolist(), strict=True))
-        fitted = True
+
+def _cost(error: Array) -> float:
+    """Mean of log(1 + s) over windows."""
+    return float((bend(error) ** 2).sum() / len(error))
 
 
 def _standard_errors(jacobian: Array, error: Array, groups: NDArray[np.int64], spans: Array) -> Array:
