@@ -183,29 +183,47 @@ def test_grip_grows_with_slip_over_rolling_speed(speed, share):
     assert np.mean(slip) == pytest.approx(np.sin(np.arctan(tangent)), rel=0.04)
 
 
-def test_identified_are_what_residuals_move():
+@pytest.mark.parametrize("guess", [None, 0.0])
+def test_identified_are_what_residuals_move(guess):
     """A line through noise: slope and offset come out with their textbook errors; what does nothing is refused."""
     rng = np.random.default_rng(3)
     x = np.linspace(-1, 1, 400)
     y = 2.0 * x + 0.5 + rng.normal(0, 0.1, 400)
     table = [
-        Parameter("slope", 0.0, 1.0, -10, 10, 1.0, ""),
-        Parameter("offset", 0.0, 1.0, -10, 10, 0.0, ""),
-        Parameter("nothing", 3.0, 1.0, -10, 10, 7.0, "m", "another log"),
+        Parameter("slope", guess, 1.0, -10, 10, 1.0, ""),
+        Parameter("offset", guess, 1.0, -10, 10, 0.0, ""),
+        Parameter("nothing", guess, 1.0, -10, 10, 7.0, "m", "another log"),
     ]
-    found = fit(table, lambda v: (v["slope"] * x + v["offset"] + 0 * v["nothing"] - y)[:, None, None], np.arange(400))
+
+    def error(v: dict[str, float]) -> np.ndarray:
+        return (v["slope"] * x + v["offset"] + 0 * v["nothing"] - y)[:, None, None]
+
+    found = fit(table, error, np.arange(400), {p.name: 0.0 for p in table})
     assert found.values["slope"] == pytest.approx(2.0, abs=0.03)
-    assert found.errors["slope"] == pytest.approx(0.1 / np.sqrt((x**2).sum()), rel=0.2)
-    assert found.errors["offset"] == pytest.approx(0.1 / 20, rel=0.2)
+    for name, shown in {"slope": (x**2).sum(), "offset": 400}.items():
+        prior = guess is not None
+        assert found.errors[name] == pytest.approx(np.sqrt(0.1**2 * shown + prior) / (shown + prior), rel=0.2)
     assert found.values["nothing"] == 7.0
     assert "nothing = 7 m" in found.refused["nothing"]
     assert "another log" in found.refused["nothing"]
 
 
-def test_nothing_identified_is_a_fit_too():
-    table = [Parameter(name, 3.0, 1.0, -10, 10, 7.0, "") for name in ("a", "b")]
+def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():
+    """One that says 1 and is √3 times as sure as the guess that says 0."""
+    table = [Parameter("a", 0.0, 1.0, -10, 10, 7.0, ""), Parameter("b", None, 1.0, -10, 10, 7.0, "")]
+    shown = np.sqrt(3 / 100) * np.repeat(np.eye(2), 100, 0)
+    found = fit(
+        table, lambda v: (shown @ [v["a"] - 1, v["b"] - 1])[:, None, None], np.arange(200), {"a": 5.0, "b": 5.0}
+    )
+    assert found.values == pytest.approx({"a": 0.75, "b": 1.0}, abs=0.01)
+    assert found.errors["a"] == pytest.approx(1 / 4, rel=0.02)
+
+
+@pytest.mark.parametrize("guess", [None, 3.0])
+def test_nothing_identified_is_a_fit_too(guess):
+    table = [Parameter(name, guess, 1.0, -10, 10, 7.0, "") for name in ("a", "b")]
     noise = np.random.default_rng(0).normal(size=(50, 1, 1))
-    found = fit(table, lambda v: noise + 0 * (v["a"] + v["b"]), np.arange(50))
+    found = fit(table, lambda v: noise + 0 * (v["a"] + v["b"]), np.arange(50), {"a": 3.0, "b": 3.0})
     assert found.values == {"a": 7.0, "b": 7.0}
     assert not found.errors and set(found.refused) == {"a", "b"}
     assert found.cost == pytest.approx(np.log1p(noise**2).mean())
@@ -225,18 +243,20 @@ def test_parameters_may_go_one_by_one(kept):
         off = (np.array([v[name] for name in names]) - 1.0) * shown
         return (off @ x + noise)[:, None, None]
 
-    found = fit(table, error, np.arange(400))
+    found = fit(table, error, np.arange(400), dict.fromkeys(names, 1.0))
     assert set(found.errors) == set(names[:kept]) and set(found.refused) == set(names[kept:])
     if kept:
         assert found.values["a"] == pytest.approx(1.0, abs=0.03)
-        assert found.errors["a"] == pytest.approx(0.1 / 20, rel=0.2)
+        assert found.errors["a"] == pytest.approx(np.sqrt(0.1**2 * 400 + 1) / 401, rel=0.2)
 
 
-def test_two_that_do_the_same_are_not_both_identified():
+@pytest.mark.parametrize("guess", [None, 0.0])
+def test_two_that_do_the_same_are_not_both_identified(guess):
     rng = np.random.default_rng(0)
     x, noise = rng.normal(size=200), 0.1 * rng.normal(size=200)
-    table = [Parameter(name, 0.0, 1.0, -10, 10, 0.0, "") for name in ("a", "b")]
-    found = fit(table, lambda v: ((v["a"] + v["b"] - 1.0) * x + noise)[:, None, None], np.arange(200))
+    table = [Parameter(name, guess, 1.0, -10, 10, 0.0, "") for name in ("a", "b")]
+    begin = {"a": 0.0, "b": 0.0}
+    found = fit(table, lambda v: ((v["a"] + v["b"] - 1.0) * x + noise)[:, None, None], np.arange(200), begin)
     assert len(found.errors) == 1
     assert sum(found.values.values()) == pytest.approx(1.0, abs=0.1)
 

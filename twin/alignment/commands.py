@@ -155,7 +155,7 @@ def fit_drive(windows: Windows, params: HuskyParams) -> tuple[Drive, Fit]:
     measured = windows.wheels[fitting]
     asked = np.abs(requested(windows)[fitting, -1])
     half = np.abs(measured[..., 1] - measured[..., 0]) / 2
-    # What a glance tells serves as guesses: gains by how fast the wheels end up, limits by the fastest there was.
+    # Gains start from how fast the wheels end up, limits from the fastest there was.
     start = {
         "mean_gain": 1.0 if windows.twist else _slope(asked[:, 0], np.abs(measured[:, -1].mean(1))),
         "half_gain": _slope(asked[:, 1], half[:, -1]),
@@ -188,10 +188,10 @@ def fit_drive(windows: Windows, params: HuskyParams) -> tuple[Drive, Fit]:
         del spans["mean_gain"]
     usual = _asdict(given)
     table = [
-        Parameter(name, start[name], span, low, high, usual[name], unit, _CURES[name])
+        Parameter(name, None, span, low, high, usual[name], unit, _CURES[name])
         for name, (span, low, high, unit) in spans.items()
     ]
-    found = fit(table, error, windows.groups[fitting])
+    found = fit(table, error, windows.groups[fitting], start)
     return Drive(**(usual | found.values)), found
 
 

@@ -190,6 +190,6 @@ def fit_ground(
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))
     progress(f"looking around with {len(some)} windows")
-    near = search(table, error_of(some, COARSE), {p.name: p.guess for p in table}, progress=progress)
+    near = search(table, error_of(some, COARSE), {p.name: _TABLE[p.name][0] for p in table}, progress=progress)
     found = fit(table, error_of(fitting, None), windows.groups[fitting], near, _NEAR, progress)
     return replace(found, values=kept | found.values, refused=hidden | found.refused)

@@ -1,12 +1,11 @@
 """Least squares that says how sure it is, and leaves alone what the data do not show.
 
-A *parameter* has a guess and a span: what it is likely to be before any log, and how far off that may well be (a normal
-prior: mean and one standard deviation). What is fitted is the most probable, given both the log and the guesses; that
-keeps many parameters from conspiring to explain the noise of a short log. Where the guess is far off, a log of some
-minutes outweighs it. The *rule*: a parameter is identified if its standard error by the log alone, all others being
-free, is at most half its span. Of those
-that are not, the least certain one goes back to its usual value, the rest is judged anew, and what is left is fitted
-again, until a fit leaves none to go.
+A *parameter* may have a guess, what it is likely to be before any log, and has a span: how far off that may well be (a
+normal prior: mean and one standard deviation). What is fitted is the most probable, given both the log and the guesses;
+that keeps many parameters from conspiring to explain the noise of a short log. Where a guess is far off, a log of some
+minutes outweighs it. The *rule*: a parameter is identified if the log leaves at most half of the doubt about it, all
+others being free: a standard error of half its span. Of those that are not, the least certain one goes back to its
+usual value, the rest is judged anew, and what is left is fitted again, until a fit leaves none to go.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
 any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible
@@ -34,7 +33,8 @@ class Parameter:
     """One number that a log may show."""
 
     name: str
-    guess: float
+    guess: float | None
+    """Nothing: all that is known of it is what the log says."""
     span: float
     low: float
     high: float
@@ -77,8 +77,10 @@ def search(
     """
     # In spans from where the search begins: SciPy's first step is then `reach` of them at most, and its tolerances
     # mean the same for every parameter.
-    guess, sigma, low, high = (np.array([getattr(p, of) for p in table]) for of in ("guess", "span", "low", "high"))
-    spans = reach * sigma
+    low, high = (np.array([getattr(p, of) for p in table]) for of in ("low", "high"))
+    spans = reach * np.array([p.span for p in table])
+    guess = np.array([p.guess or 0.0 for p in table])
+    sure = np.array([0.0 if p.guess is None else 1 / p.span for p in table])
     origin = np.clip([begin[p.name] for p in table], low + 1e-6 * spans, high - 1e-6 * spans)
 
     def named(point: Array) -> dict[str, float]:
@@ -86,14 +88,14 @@ def search(
 
     def shifted(z: Array) -> Array:
         point = origin + z * spans
-        return np.append(bend(error(named(point))).ravel(), (point - guess) / sigma)
+        return np.append(bend(error(named(point))).ravel(), (point - guess) * sure)
 
     def tilted(z: Array) -> Array:
         point = origin + z * spans
         now = error(named(point))
         progress(f"  mean log(1 + s) = {_cost(now):.4f}")
         bent = bent_slopes(now, _slopes(table, error, named(point), now)).reshape(-1, len(table))
-        return np.concatenate([bent, np.diag(1 / sigma)]) * spans
+        return np.concatenate([bent, np.diag(sure)]) * spans
 
     found = least_squares(
         shifted,
@@ -111,7 +113,7 @@ def fit(
     table: list[Parameter],
     error: Callable[[dict[str, float]], Array],
     groups: NDArray[np.int64],
-    begin: dict[str, float] | None = None,
+    begin: dict[str, float],
     reach: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
@@ -121,12 +123,12 @@ def fit(
         table: What may be fitted.
         error: As of `search`.
         groups: Of the windows, shape (n,).
-        begin: Where the search begins, instead of at the guesses.
+        begin: Values to begin at.
         reach: As of `search`.
         progress: Told a line per round and per step of the search.
     """
     free = list(table)
-    values = {p.name: p.guess for p in table} | (begin or {})
+    values = {p.name: begin[p.name] for p in table}
     refused: dict[str, str] = {}
 
     def at(some: dict[str, float]) -> Array:
@@ -141,7 +143,7 @@ def fit(
         count = len(free)
         while True:  # judge, drop the worst, judge again
             spans = np.array([p.span for p in free])
-            errors = _standard_errors(jacobian, now, groups, spans)
+            errors = _standard_errors(jacobian, now, groups, spans, np.array([p.guess is not None for p in free]))
             worst = int(np.argmax(errors / spans)) if free else -1
             if worst < 0 or errors[worst] <= SHARE * spans[worst]:
                 break
@@ -173,8 +175,10 @@ def _cost(error: Array) -> float:
     return float((bend(error) ** 2).sum() / len(error))
 
 
-def _standard_errors(jacobian: Array, error: Array, groups: NDArray[np.int64], spans: Array) -> Array:
-    """Cluster-robust, shape (p,), from slopes (n, ..., p) and residuals (n, ...); infinite where there is no slope."""
+def _standard_errors(
+    jacobian: Array, error: Array, groups: NDArray[np.int64], spans: Array, guessed: NDArray[np.bool_]
+) -> Array:
+    """Cluster-robust, shape (p,), from slopes (n, ..., p) and residuals (n, ...); infinite where nothing tells."""
     if not jacobian.shape[-1]:
         return np.zeros(0)
     scaled = weighted(error, jacobian * spans).reshape(len(error), -1, len(spans))
@@ -186,15 +190,16 @@ def _standard_errors(jacobian: Array, error: Array, groups: NDArray[np.int64], s
     for i in range(count):
         g = score[cluster == i].sum(0)
         meat += np.outer(g, g)
-    bread = np.einsum("nmp,nmq->pq", scaled, scaled)
-    # A direction without any slope gets next to no curvature, hence a huge error rather than a division by zero.
-    bread += np.eye(len(bread)) * 1e-9 * max(1.0, float(np.trace(bread)) / len(bread))
-    inverse = np.linalg.inv(bread)
-    robust = np.diag(inverse @ meat @ inverse) * count / max(1, count - 1)
+    told = np.einsum("nmp,nmq->pq", scaled, scaled)
+    # A direction that nothing tells of has next to no curvature, hence a huge error rather than a division by zero.
+    prior = np.diag(np.where(guessed, 1.0, 1e-9 * max(1.0, float(np.trace(told)) / len(told))))
+    inverse = np.linalg.inv(told + prior)
+    robust = np.diag(inverse @ (meat * count / max(1, count - 1) + prior) @ inverse)
     # Two that do exactly the same have no score where they differ, so only the classical error tells on them.
-    classical = np.diag(inverse) * (error**2).sum() / max(1, error.size - len(bread))
+    noise = (error**2).sum() / max(1, error.size - len(told))
+    classical = np.diag(inverse @ (told * noise + prior) @ inverse)
     variance = np.maximum(robust, classical)
-    flat = np.diag(bread) < 1e-6 * max(1.0, float(np.diag(bread).max()))
+    flat = ~guessed & (np.diag(told) < 1e-6 * max(1.0, float(np.diag(told).max())))
     return np.where(flat, np.inf, np.sqrt(np.maximum(variance, 0.0))) * spans
 
 

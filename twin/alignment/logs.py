@@ -108,7 +108,7 @@ class Windows:
         some were lost. The first one is older than the window, by at most `OLDEST`. Shape (n, k + 1).
         """
         fresh = np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
-        appeared = [np.flatnonzero(row) + 1.0 for row in fresh]
+        appeared = [np.flatnonzero(row).astype(np.float64) + 1 for row in fresh]
         slopes = [theilslopes(each).slope for each in appeared if len(each) > 1]
         period = float(np.median(slopes)) if slopes else 1.0
         out = np.zeros(self.poses.shape[:2])
