@@ -67,14 +67,14 @@ def test_stale_poses_were_measured_when_their_sensor_measured():
     late = [2, 4, 6, 11, 12, 13, *range(14, 41, 2)]  # two came late, none was lost
     lost = [2, 4, 6, 12, *range(14, 41, 2)]
     early = [*range(1, 38, 2), 38, 40]  # 21 of them: on the edge between two samples
-    resting = list(range(11, 41, 2))
+    resting = list(range(11, 41, 2))  # at first: it was last measured less than a period before
     measured = held([regular, old, late, lost, early, resting, []]).measured / logs.PERIOD
     np.testing.assert_allclose(measured[0], np.arange(41) // 2 * 2, atol=1e-9)
     np.testing.assert_allclose(measured[1], (np.arange(41) + 1) // 2 * 2 - 1, atol=1e-9)
     np.testing.assert_allclose(measured[2, [0, 6, 10, 11, 12, 13, 40]], [0, 6, 6, 8, 10, 12, 40], atol=1e-9)
     np.testing.assert_allclose(measured[3, [0, 6, 11, 12, 14, 40]], [0, 6, 6, 12, 14, 40], atol=1e-9)
     assert measured[4, -1] - measured[4, 0] == pytest.approx(42)
-    np.testing.assert_allclose(measured[5, [0, 10, 11, 39]], [-0.5, -0.5, 10.5, 38.5], atol=0.6)
+    np.testing.assert_allclose(measured[5, [0, 10, 11, 39]], [-1, -1, 11, 39], atol=1e-9)
     assert np.all(measured[6] == measured[6, 0])
 
 
@@ -138,7 +138,7 @@ def test_late_poses_are_those_of_before(late):
     time = (np.arange(simulate.BEFORE + logs.SAMPLES + commands.AHEAD) - simulate.BEFORE) * logs.PERIOD
     line = np.stack([(time + 1.0) ** 2, 0 * time, 0 * time], -1)
     circle = np.stack([np.sin(time), 1 - np.cos(time), time], -1)
-    told = simulate.retimed(np.stack([line, circle]), np.array([late, late]))[:, : logs.SAMPLES + 2]
+    told = logs.retimed(np.stack([line, circle]), np.array([late, late]), simulate.BEFORE)[:, : logs.SAMPLES + 2]
     t = np.arange(told.shape[1]) * logs.PERIOD
     assert len(t) == logs.SAMPLES + 2
     np.testing.assert_allclose(told[0, :, 0], (t - late + 1) ** 2 - (1 - late) ** 2, atol=1e-3)
@@ -201,17 +201,17 @@ def test_identified_are_what_residuals_move(guess):
     found = fit(table, error, np.arange(400), {p.name: 0.0 for p in table})
     assert found.values["slope"] == pytest.approx(2.0, abs=0.03)
     for name, shown in {"slope": (x**2).sum(), "offset": 400}.items():
-        prior = guess is not None
-        assert found.errors[name] == pytest.approx(np.sqrt(0.1**2 * shown + prior) / (shown + prior), rel=0.2)
+        prior = 0.0 if guess is None else 0.25
+        assert found.errors[name] == pytest.approx(np.sqrt(0.1**2 * shown + prior**2) / (shown + prior), rel=0.2)
     assert found.values["nothing"] == 7.0
     assert "nothing = 7 m" in found.refused["nothing"]
     assert "another log" in found.refused["nothing"]
 
 
 def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():
-    """One that says 1 and is √3 times as sure as the guess that says 0."""
+    """One that says 1 and has three times the weight of the guess that says 0."""
     table = [Parameter("a", 0.0, 1.0, -10, 10, 7.0, ""), Parameter("b", None, 1.0, -10, 10, 7.0, "")]
-    shown = np.sqrt(3 / 100) * np.repeat(np.eye(2), 100, 0)
+    shown = np.sqrt(0.75 / 100) * np.repeat(np.eye(2), 100, 0)
     found = fit(
         table, lambda v: (shown @ [v["a"] - 1, v["b"] - 1])[:, None, None], np.arange(200), {"a": 5.0, "b": 5.0}
     )
@@ -247,7 +247,7 @@ def test_parameters_may_go_one_by_one(kept):
     assert set(found.errors) == set(names[:kept]) and set(found.refused) == set(names[kept:])
     if kept:
         assert found.values["a"] == pytest.approx(1.0, abs=0.03)
-        assert found.errors["a"] == pytest.approx(np.sqrt(0.1**2 * 400 + 1) / 401, rel=0.2)
+        assert found.errors["a"] == pytest.approx(np.sqrt(0.1**2 * 400 + 0.25**2) / 400.25, rel=0.2)
 
 
 @pytest.mark.parametrize("guess", [None, 0.0])

@@ -174,7 +174,7 @@ def test_a_slope_pulls_downhill():
     assert np.hypot(*slopes.T) == pytest.approx(np.ones(n), abs=0.1)
     told = np.full((n, 225, 2), [-3.0, 3.0])
     driven = [ground.drive(SOFT, told, windows.before, s, 0.005).poses for s in (0 * slopes, slopes)]
-    still, moved = (simulate.retimed(poses, np.zeros(n)) for poses in driven)
+    still, moved = (logs.retimed(poses, np.zeros(n), simulate.BEFORE) for poses in driven)
     shift = (moved - still)[:, -1, :2] @ [1, 1j]
     assert np.abs(np.angle(shift / downhill)).max() < np.radians(20)
     assert np.abs(shift).min() > 0.05

@@ -3,9 +3,10 @@
 A *parameter* may have a guess, what it is likely to be before any log, and has a span: how far off that may well be (a
 normal prior: mean and one standard deviation). What is fitted is the most probable, given both the log and the guesses;
 that keeps many parameters from conspiring to explain the noise of a short log. Where a guess is far off, a log of some
-minutes outweighs it. The *rule*: a parameter is identified if the log leaves at most half of the doubt about it, all
-others being free: a standard error of half its span. Of those that are not, the least certain one goes back to its
-usual value, the rest is judged anew, and what is left is fitted again, until a fit leaves none to go.
+minutes outweighs it. What log(1 + s) of a window weighs against it is that of Cauchy's distribution of x, y and yaw,
+whose −2 log likelihood is 4 log(1 + s). The *rule*: a parameter is identified if the log leaves at most half of the
+doubt about it, all others being free: a standard error of half its span. Of those that are not, the least certain one
+goes back to its usual value, the rest is judged anew, and what is left is fitted again, until a fit leaves none to go.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
 any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible
@@ -24,6 +25,7 @@ from twin.alignment.kinematics import bend, bent_slopes, weighted
 Array = NDArray[np.float64]
 
 SHARE = 0.5  # of its span that a parameter's standard error may be
+_LIKELY = 0.25  # by which (value − guess)² / span² counts beside log(1 + s)
 _STEP = 0.05  # of its span, for differences
 _EVALUATIONS = 20  # at most, per round of the search; those that lead on take one per free parameter besides
 
@@ -34,7 +36,7 @@ class Parameter:
 
     name: str
     guess: float | None
-    """Nothing: all that is known of it is what the log says."""
+    """None: all that is known of it is what the log says."""
     span: float
     low: float
     high: float
@@ -72,7 +74,8 @@ def search(
         table: What is fitted.
         error: Residuals of every window for values by name, in units of a good model's miss, shape (n, looks, ...).
         begin: Values to begin at.
-        reach: How far the search's first step may go, in spans; less where it begins near the end.
+        reach: How far the search's first step may go, in spans, where no bound is near; less where it begins near the
+            end.
         progress: Told a line per step of the search.
     """
     # In spans from where the search begins: SciPy's first step is then `reach` of them at most, and its tolerances
@@ -80,7 +83,7 @@ def search(
     low, high = (np.array([getattr(p, of) for p in table]) for of in ("low", "high"))
     spans = reach * np.array([p.span for p in table])
     guess = np.array([p.guess or 0.0 for p in table])
-    sure = np.array([0.0 if p.guess is None else 1 / p.span for p in table])
+    sure = np.array([0.0 if p.guess is None else np.sqrt(_LIKELY) / p.span for p in table])
     origin = np.clip([begin[p.name] for p in table], low + 1e-6 * spans, high - 1e-6 * spans)
 
     def named(point: Array) -> dict[str, float]:
@@ -192,14 +195,15 @@ def _standard_errors(
         meat += np.outer(g, g)
     told = np.einsum("nmp,nmq->pq", scaled, scaled)
     # A direction that nothing tells of has next to no curvature, hence a huge error rather than a division by zero.
-    prior = np.diag(np.where(guessed, 1.0, 1e-9 * max(1.0, float(np.trace(told)) / len(told))))
+    prior = np.diag(np.where(guessed, _LIKELY, 1e-9 * max(1.0, float(np.trace(told)) / len(told))))
     inverse = np.linalg.inv(told + prior)
-    robust = np.diag(inverse @ (meat * count / max(1, count - 1) + prior) @ inverse)
+    doubt = prior * np.where(guessed, _LIKELY, 1.0)
+    robust = np.diag(inverse @ (meat * count / max(1, count - 1) + doubt) @ inverse)
     # Two that do exactly the same have no score where they differ, so only the classical error tells on them.
     noise = (error**2).sum() / max(1, error.size - len(told))
-    classical = np.diag(inverse @ (told * noise + prior) @ inverse)
+    classical = np.diag(inverse @ (told * noise + doubt) @ inverse)
     variance = np.maximum(robust, classical)
-    flat = ~guessed & (np.diag(told) < 1e-6 * max(1.0, float(np.diag(told).max())))
+    flat = np.diag(told) < 1e-6 * max(1.0, float(np.diag(told).max()))
     return np.where(flat, np.inf, np.sqrt(np.maximum(variance, 0.0))) * spans
 
 

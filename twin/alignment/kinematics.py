@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from twin.alignment.logs import OLDEST, PERIOD, SAMPLES, Windows, wrapped
+from twin.alignment.logs import OLDEST, PERIOD, SAMPLES, Windows, retimed, wrapped
 from twin.robot import TRACK, WHEEL_RADIUS
 
 Array = NDArray[np.float64]
@@ -60,9 +60,11 @@ def integrate(motion: Array) -> Array:
 
 
 def predict(model: Icr, windows: Windows) -> Array:
-    """Poses by measured wheel speeds, which are held beyond the end, shape (n, k + OLDEST + 1, 3)."""
-    wheels = np.concatenate([windows.wheels, np.repeat(windows.wheels[:, -1:], OLDEST, 1)], 1)
-    return integrate(model.motion(wheels))
+    """Poses by measured wheel speeds, which are held before and after, since each window's first pose was measured.
+    Shape (n, k + OLDEST + 1, 3)."""
+    held = [windows.wheels[:, :1]] * OLDEST, [windows.wheels[:, -1:]] * OLDEST
+    poses = integrate(model.motion(np.concatenate([*held[0], windows.wheels, *held[1]], 1)))
+    return retimed(poses, -windows.measured[:, 0], OLDEST)
 
 
 def fit_icr(windows: Windows) -> Icr:

@@ -135,10 +135,12 @@ def _measured(appeared: Array, period: float) -> Array:
     lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
     number += np.minimum.accumulate(lost[::-1])[::-1]  # what comes late, but comes, was not lost
     start = float(np.median(appeared - period * number))
-    start -= period * max(0.0, np.ceil(start / period - 0.5))  # the robot rested, or as many were lost at first
-    start = float(np.clip(start, -period, 0.0))
-    number += np.round((np.median(appeared - period * number) - start) / period)
-    return np.append(max(start, -OLDEST), start + period * number)
+    if start > period / 2:  # the robot rested, or as many were lost at first
+        first = start - period * np.ceil(start / period)
+    else:  # there was a pose when the window began
+        first = start = min(start, 0.0)
+    first = max(first, -OLDEST)
+    return np.append(first, np.maximum(first, start + period * number))
 
 
 def read_log(path: Path) -> Windows:
@@ -289,6 +291,24 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
         np.concatenate([[False], (jump < _CONTINUES) & (np.diff(step) <= 1) & (np.diff(step) >= 0)]),
         -np.stack([columns[name] for name in imu], -1),
     )
+
+
+def retimed(poses: Array, late: Array, before: int) -> Array:
+    """Poses of robots from when each was first seen, `late` [s] before time starts; less than nothing: after that.
+
+    Args:
+        poses: `PERIOD` [s] apart, shape (n, m, 3).
+        late: At most `before` samples, shape (n,).
+        before: Which of the poses is that at which time starts.
+
+    Returns:
+        Relative to the first, shape (n, k + OLDEST + 1, 3); straight on beyond the last one there is.
+    """
+    position = before - late[:, None] / PERIOD + np.arange(SAMPLES + OLDEST + 1)
+    whole = np.clip(position.astype(int), 0, poses.shape[1] - 2)
+    share = (position - whole)[..., None]
+    row = np.arange(len(poses))[:, None]
+    return relative(poses[row, whole] * (1 - share) + poses[row, whole + 1] * share)
 
 
 def relative(poses: Array) -> Array:

@@ -15,7 +15,7 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from twin.alignment.commands import AHEAD, STEP
-from twin.alignment.logs import OLDEST, PERIOD, SAMPLES, relative
+from twin.alignment.logs import OLDEST, PERIOD, SAMPLES
 from twin.alignment.slope import GRAVITY
 from twin.cores import cores
 from twin.mjcf.husky import add_husky, set_options
@@ -43,23 +43,6 @@ class Drives:
     """Of the left and of the right side [rad/s], shape (n, k + AHEAD, 2)."""
     torques: Array
     """Of the left and the right motor, at the wheels [N m], means over each `PERIOD`, shape (n, k + AHEAD − 1, 2)."""
-
-
-def retimed(poses: Array, late: Array) -> Array:
-    """Poses of robots from when each was first seen, `late` [s] before time starts; less than nothing: after that.
-
-    Args:
-        poses: Of `Drives`.
-        late: At most `BEFORE` samples, at least −`EARLY`, shape (n,).
-
-    Returns:
-        Relative to the first, shape (n, k + OLDEST + 1, 3).
-    """
-    position = BEFORE - late[:, None] / PERIOD + np.arange(SAMPLES + OLDEST + 1)
-    whole = np.clip(position.astype(int), 0, poses.shape[1] - 2)
-    share = (position - whole)[..., None]
-    row = np.arange(len(poses))[:, None]
-    return relative(poses[row, whole] * (1 - share) + poses[row, whole + 1] * share)
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:

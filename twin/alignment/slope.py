@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from twin.alignment.kinematics import Icr, predict
+from twin.alignment.kinematics import Icr, integrate
 from twin.alignment.logs import PERIOD, Windows
 
 Array = NDArray[np.float64]
@@ -53,15 +53,14 @@ def gravity(windows: Windows, model: Icr) -> Array:
     """
     if windows.acceleration is None:
         return np.zeros((len(windows), 2))
-    poses = predict(model, windows)
-    yaw = poses[:, : windows.wheels.shape[1], 2]
     motion = model.motion(windows.wheels)
+    turned = integrate(motion)[..., 2]
+    yaw, turn = turned[:, :-1], turned[:, -1]
     own = np.stack([np.gradient(motion[..., 0], PERIOD, axis=1), motion[..., 0] * motion[..., 2]], -1)
     down = -(windows.acceleration - own)
     down = down - np.median(down.mean(1), axis=0)
     readings = ((down[..., 0] + 1j * down[..., 1]) * np.exp(1j * yaw)).mean(1)
     readings *= np.minimum(1.0, STEEPEST * GRAVITY / np.maximum(np.abs(readings), 1e-9))
-    turn = poses[:, windows.wheels.shape[1], 2]
     slopes, _ = smoothed(terrain(readings, turn, windows.follows), readings, turn, windows.follows)
     slopes *= np.exp(1j * model.motion(windows.before[:, :-1])[..., 2].sum(1) * PERIOD)
     return np.stack([slopes.real, slopes.imag], -1)
