@@ -275,11 +275,11 @@ def test_a_known_robot_is_recovered(drive, tmp_path):
         "separation_multiplier": 0.05,
         "friction": 0.07,
         "ground_viscosity": 1.0,
+        "rolling_resistance": 0.01,
     }.items():
         assert found[name][0] == pytest.approx(getattr(SOFT, name), abs=tolerance), name
     assert found["center_of_mass"][0][0] == pytest.approx(-0.06, abs=0.03)
     assert found["wheel_radius"][0] == pytest.approx((WHEEL_RADIUS, WHEEL_RADIUS), abs=0.004)
-    assert result.robot.rolling_resistance == pytest.approx(SOFT.rolling_resistance, abs=0.01)
     held_out = ~windows.fitting
     ours, theirs = result.fitted.score(held_out), result.baseline.score(held_out)
     # The ICR model knows what the wheels did, ours what they were told, by a controller whose clock is not the log's.
