@@ -3,7 +3,7 @@ currents on asphalt beside simulated torques; as JSON where asked.
 
     python benchmarks/align.py [--data FOLDER] [--work FOLDER] [--json FILE]
 
-`--data` holds `husky_drive` and `borealtc_asphalt`. Takes 15 minutes on one core of the machine of
+`--data` holds `husky_drive` and `borealtc_asphalt`. Takes about 20 minutes on two cores of the machine of
 `docs/benchmarks.md`. Exit status 1 where a target is missed.
 """
 

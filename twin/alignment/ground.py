@@ -15,7 +15,7 @@ that log and scored on its odd ones (median error of the pose after 2 s):
     + the lateness of poses against wheel speeds       0.13 m, 4.8°
     + wheels and slope as before each window           0.12 m, 4.7°: a body keeps its motion for half a second
     + poses as of when they were measured              0.12 m, 4.8°: and less of it is noise (`Windows.measured`)
-    + rolling resistance                               ROW
+    + rolling resistance                               0.12 m, 4.8°: tyres that roll grip by their slip; drag goes
     the same, drag on all bodies or the chassis alone  worse by 5 % of the cost
     the same, a part of the weight slides, no drag     worse by 1 % of the cost: straight on better, turns worse
 
