@@ -132,6 +132,22 @@ def test_commands_become_the_controllers_wheel_speeds():
     assert np.abs(told[0, 190:200] - mean[190:]).max() < 1e-6
 
 
+def test_a_ramp_goes_on_from_window_to_window():
+    """Wheels that lag behind a ramp do not show how far it has come when a window begins; the window before does."""
+    drive = commands.Drive(1.0, 1.0, 9.0, 9.0, 0.2, 1.5, 9.0, 0.1)
+    time = np.arange(2 * logs.SAMPLES) * logs.PERIOD
+    ramp = np.maximum(0.0, time - drive.latency)
+    lagged = drive.mean_acceleration * (ramp - drive.lag * (1 - np.exp(-ramp / drive.lag)))
+    wheels = np.repeat(lagged[:, None], 2, 1).reshape(2, logs.SAMPLES, 2)
+    asked = np.full((2, logs.SAMPLES, 2), 8.0)
+    windows = replace(windows_of(wheels, commands=asked, twist=False), follows=np.array([False, True]))
+    told, turned = commands.targets(drive, windows)
+    step = drive.mean_acceleration * commands.STEP
+    assert told[1, :25] == pytest.approx(told[0, 200:])
+    assert told[1, 0] == pytest.approx(drive.mean_acceleration * 1.8, abs=1.01 * step)
+    assert commands.sampled(turned) == pytest.approx(wheels, abs=step)
+
+
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])
 def test_late_poses_are_those_of_before(late):
     """A robot that speeds up along a straight line, and one that goes on around a circle."""

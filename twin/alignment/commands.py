@@ -98,8 +98,9 @@ def requested(windows: Windows) -> Array:
 def targets(drive: Drive, windows: Windows) -> tuple[Array, Array]:
     """What the servo is told, and the wheel speeds that come of it, from the wheel speeds each window starts with.
 
-    Commands still under way at the start are those of the window before, where this one follows it; else the wheels go
-    on as they are until the first command has arrived.
+    Where a window follows another, commands still under way at its start are that one's, and so is how far the
+    acceleration limits have let the controller come by then, which lagging wheels do not show. Else the wheels go on as
+    they are until the first command has arrived.
 
     Returns:
         Speeds left and right [rad/s], shape (n, (k + AHEAD) · 5, 2), `STEP` [s] apart; and as long the lagged ones.
@@ -107,34 +108,52 @@ def targets(drive: Drive, windows: Windows) -> tuple[Array, Array]:
     gains = np.array([drive.mean_gain, drive.half_gain])
     wanted = requested(windows) * gains
     wanted[..., 1] = np.clip(wanted[..., 1], -drive.half_limit, drive.half_limit)
-    speed = windows.wheels[:, 0].copy()
-    now = np.stack([speed.mean(1), (speed[:, 1] - speed[:, 0]) / 2], -1)
-    before = np.repeat(now[:, None], HISTORY, 1)
+    speed = windows.wheels[:, 0]
+    start = np.stack([speed.mean(1), (speed[:, 1] - speed[:, 0]) / 2], -1)
+    before = np.repeat(start[:, None], HISTORY, 1)
     follows = np.flatnonzero(windows.follows)
     before[follows] = wanted[follows - 1, -HISTORY:]
     wanted = np.concatenate([before, wanted, np.repeat(wanted[:, -1:], AHEAD, 1)], 1).repeat(_PER_SAMPLE, 1)
     delay = min(drive.latency / STEP, HISTORY * _PER_SAMPLE - 1.0)
     whole = int(delay)
     share = delay - whole
+
+    def carried_out(late: int) -> tuple[Array, Array]:
+        arrived = wanted[:, HISTORY * _PER_SAMPLE - late :]
+        begin = start.copy()
+        begin[follows] = _ramped(drive, arrived, start)[follows - 1, SAMPLES * _PER_SAMPLE - 1]
+        return _turned(drive, _ramped(drive, arrived, begin), speed)
+
     # A ramp does not care for the size of what it is told, so the outcome must be blended between two delays instead.
-    one, other = (_carried_out(drive, wanted, now, speed, late) for late in (whole, whole + 1))
+    one, other = carried_out(whole), carried_out(whole + 1)
     return (1 - share) * one[0] + share * other[0], (1 - share) * one[1] + share * other[1]
 
 
-def _carried_out(drive: Drive, wanted: Array, now: Array, speed: Array, late: int) -> tuple[Array, Array]:
-    """`targets` for mean and half speeds wanted since `HISTORY` samples before the start, `late` steps late."""
-    steps = (SAMPLES + AHEAD) * _PER_SAMPLE
-    start = HISTORY * _PER_SAMPLE - late
+def _ramped(drive: Drive, wanted: Array, now: Array) -> Array:
+    """Mean and half speeds that the acceleration limits make of those wanted, after each step, from those now (n, 2).
+
+    Shape (n, (k + AHEAD) · 5, 2).
+    """
     most = np.array([drive.mean_acceleration, drive.half_acceleration]) * STEP
+    out = np.empty((len(wanted), (SAMPLES + AHEAD) * _PER_SAMPLE, 2))
+    for i in range(out.shape[1]):
+        now = now + np.clip(wanted[:, i] - now, -most, most)
+        out[:, i] = now
+    return out
+
+
+def _turned(drive: Drive, ramped: Array, speed: Array) -> tuple[Array, Array]:
+    """What servos are told for these mean and half speeds, and what wheels make of it that lag and begin at `speed`.
+
+    Shapes (n, steps, 2), left and right.
+    """
+    told = np.stack([ramped[..., 0] - ramped[..., 1], ramped[..., 0] + ramped[..., 1]], -1)
+    told /= np.maximum(1.0, np.abs(told).max(-1, keepdims=True) / drive.wheel_limit)
     decay = 1 - np.exp(-STEP / max(drive.lag, 1e-6))
-    told, lagged = np.empty((len(wanted), steps, 2)), np.empty((len(wanted), steps, 2))
-    for i in range(steps):
+    lagged = np.empty_like(told)
+    for i in range(told.shape[1]):
         lagged[:, i] = speed
-        now = now + np.clip(wanted[:, start + i] - now, -most, most)
-        sides = np.stack([now[:, 0] - now[:, 1], now[:, 0] + now[:, 1]], -1)
-        sides = sides / np.maximum(1.0, np.abs(sides).max(1, keepdims=True) / drive.wheel_limit)
-        told[:, i] = sides
-        speed = speed + (sides - speed) * decay
+        speed = speed + (told[:, i] - speed) * decay
     return told, lagged
 
 
