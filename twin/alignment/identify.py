@@ -15,6 +15,7 @@ windows neither pull nor blow them up.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,13 +90,17 @@ def search(
     def named(point: Array) -> dict[str, float]:
         return dict(zip((p.name for p in table), point.tolist(), strict=True))
 
+    @lru_cache(maxsize=1)  # slopes are asked for where residuals just were
+    def at(*point: float) -> Array:
+        return error(named(np.array(point)))
+
     def shifted(z: Array) -> Array:
         point = origin + z * spans
-        return np.append(bend(error(named(point))).ravel(), (point - guess) * sure)
+        return np.append(bend(at(*point)).ravel(), (point - guess) * sure)
 
     def tilted(z: Array) -> Array:
         point = origin + z * spans
-        now = error(named(point))
+        now = at(*point)
         progress(f"  mean log(1 + s) = {_cost(now):.4f}")
         bent = bent_slopes(now, _slopes(table, error, named(point), now)).reshape(-1, len(table))
         return np.concatenate([bent, np.diag(sure)]) * spans
