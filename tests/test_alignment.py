@@ -40,7 +40,7 @@ def test_icr_of_icr_motion_is_found():
     truth = Icr(0.93, 0.97, 0.55, -0.62, -0.08)
     wheels = np.repeat(rng.uniform(-6, 6, (60, 1, 2)), logs.SAMPLES, 1)
     poses = kinematics.predict(truth, windows_of(wheels))[:, : logs.SAMPLES + 1]
-    poses[::7] = 0.0  # the robot stuck in every seventh window
+    poses[::7] = rng.normal(0.0, 1e-3, poses[::7].shape)  # the robot stuck in every seventh window
     found = kinematics.fit_icr(windows_of(wheels, poses))
     for name in truth.__dataclass_fields__:
         assert getattr(found, name) == pytest.approx(getattr(truth, name), abs=2e-3)
@@ -95,13 +95,22 @@ def delivered(period: float) -> tuple[list[list[int]], np.ndarray, np.ndarray]:
     return appeared, np.array(truth), np.array(came)
 
 
-@pytest.mark.parametrize("period", [2.0, 8 / 3, 4.0])
+@pytest.mark.parametrize("period", [2.0, 8 / 3, 4.0, 10.0, 20.0])
 def test_measurements_are_told_from_their_delivery(period):
     appeared, truth, came = delivered(period)
     off = np.abs(held(appeared).elapsed[:, -1] / logs.PERIOD - truth)
     naive = np.abs(came - truth)
     assert np.mean(off < 0.15) > max(0.8, np.mean(naive < 0.15) + 0.05)
     assert off.mean() < naive.mean()
+
+
+def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
+    """One that measures every 0.2 m, at several speeds, and one window of a 10 Hz sensor that came at 20 Hz."""
+    by_distance = [list(range(each, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
+    steady = [list(range(2, 41, 2))] * 5 + [list(range(1, 41))]
+    for appeared in (by_distance, steady):
+        last = [each[-1] for each in appeared]
+        assert held(appeared).elapsed[:, -1] / logs.PERIOD == pytest.approx(last, abs=1e-9)
 
 
 def test_a_sensor_as_fast_as_the_log_is_taken_at_its_word():
@@ -133,18 +142,18 @@ def test_commands_become_the_controllers_wheel_speeds():
 
 
 def test_a_ramp_goes_on_from_window_to_window():
-    """Wheels that lag behind a ramp do not show how far it has come when a window begins; the window before does."""
-    drive = commands.Drive(1.0, 1.0, 9.0, 9.0, 0.2, 1.5, 9.0, 0.1)
-    time = np.arange(2 * logs.SAMPLES) * logs.PERIOD
+    """Wheels that lag behind a ramp do not show how far it has come when a window begins; the windows before do."""
+    drive = commands.Drive(1.0, 1.0, 9.0, 9.0, 0.2, 1.0, 9.0, 0.3)
+    time = np.arange(3 * logs.SAMPLES) * logs.PERIOD
     ramp = np.maximum(0.0, time - drive.latency)
     lagged = drive.mean_acceleration * (ramp - drive.lag * (1 - np.exp(-ramp / drive.lag)))
-    wheels = np.repeat(lagged[:, None], 2, 1).reshape(2, logs.SAMPLES, 2)
-    asked = np.full((2, logs.SAMPLES, 2), 8.0)
-    windows = replace(windows_of(wheels, commands=asked, twist=False), follows=np.array([False, True]))
+    wheels = np.repeat(lagged[:, None], 2, 1).reshape(3, logs.SAMPLES, 2)
+    asked = np.full((3, logs.SAMPLES, 2), 8.0)
+    windows = replace(windows_of(wheels, commands=asked, twist=False), follows=np.arange(3) > 0)
     told, turned = commands.targets(drive, windows)
     step = drive.mean_acceleration * commands.STEP
-    assert told[1, :25] == pytest.approx(told[0, 200:])
-    assert told[1, 0] == pytest.approx(drive.mean_acceleration * 1.8, abs=1.01 * step)
+    assert told[1:, :25] == pytest.approx(told[:-1, 200:])
+    assert told[:, 100, 0] == pytest.approx(drive.mean_acceleration * (2.0 * np.arange(3) + 0.8), abs=1.01 * step)
     assert commands.sampled(turned) == pytest.approx(wheels, abs=step)
 
 
@@ -222,6 +231,27 @@ def test_identified_are_what_residuals_move(guess):
     assert found.values["nothing"] == 7.0
     assert "nothing = 7 m" in found.refused["nothing"]
     assert "another log" in found.refused["nothing"]
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0, 2.0])
+def test_errors_are_how_far_fits_scatter(noise):
+    """However large residuals are beside a good model's miss, and though three windows in a row share some."""
+    table = [Parameter(name, None, 2.0, -50, 50, 0.0, "") for name in "ab"]
+    found, told = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        slopes = np.repeat(rng.normal(size=(150, 1, 3, 2)), 2, 1)
+        off = rng.normal(size=(150, 3)) * 0.85 + np.repeat(rng.normal(size=(50, 3)), 3, 0) * 0.5
+        off = np.repeat(noise * off[:, None], 2, 1)
+
+        def error(values: dict[str, float], slopes=slopes, off=off) -> np.ndarray:
+            return off + slopes @ np.array([values["a"], values["b"]])
+
+        one = fit(table, error, np.arange(150) // 3, {"a": 0.2, "b": 0.2})
+        found.append([one.values[name] for name in "ab"])
+        told.append([one.errors[name] for name in "ab"])
+    ratio = np.sqrt(np.square(found).mean() / np.square(told).mean())
+    assert 0.8 < ratio < 1.25
 
 
 def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():

@@ -54,6 +54,10 @@ BAD = {
     "ms": (lambda t: _bad(t, time=1e3 * t["time"]), r"rows are 50 s apart .*time looks like ms; divide it by 1e3"),
     "slow": (lambda t: {k: v[::12] for k, v in t.items()}, r"rows are 0\.6 s apart .*record at least 2 rows a second"),
     "hours": (lambda t: _bad(t, time=t["time"] / 3600), r"rows are 1\.39e-05 s apart .*; give time in s$"),
+    "rare poses": (
+        lambda t: _bad(t, **{n: t[n][np.arange(len(t[n])) // 50 * 50] for n in logs.POSE}),
+        r"1 new poses in 2 s of driving .*expected at least 2; record them at 1 Hz or more",
+    ),
     "lengths": (lambda t: _bad(t, x=t["x"][:-1]), r"columns of different lengths"),
 }
 
@@ -97,6 +101,20 @@ def test_gaps_are_left_out(drive):
     windows = logs.cut({name: column[keep] for name, column in drive.items()}, "log")
     assert len(windows) == 74 - 3
     assert (~windows.follows).sum() == 2  # the first, and the first after the gap
+
+
+def test_windows_without_poses_are_left_out(drive):
+    """A robot whose wheels turn for seconds in the same place has lost its pose; one that rests has not."""
+    held, resting = (drive["time"] > 20.4) & (drive["time"] < 25.9), drive["time"] > 130.0
+    table = {name: column.copy() for name, column in drive.items()}
+    for name in logs.POSE:
+        table[name][held] = table[name][held][0]
+        table[name][resting] = table[name][resting][0]
+    for name in logs.WHEEL_SPEEDS:
+        table[name][resting] = 0.0
+    windows = logs.cut(table, "log")
+    assert len(windows) == 74 - 3
+    assert np.flatnonzero(~windows.follows).tolist() == [0, 10]
 
 
 def test_a_gap_costs_nothing(drive):

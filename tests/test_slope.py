@@ -116,7 +116,8 @@ def test_readings_without_noise_are_taken(value):
 def test_wheels_do_what_they_did_before_the_window():
     """Through a lagging servo, too; then come the commands."""
     params = replace(SOFT, servo_lag=0.2)
-    before = np.stack([np.linspace(3.0, -1.0, 21), 1.0 + np.sin(np.arange(21) / 4)], -1)[None]
+    count = logs.SAMPLES + 1
+    before = np.stack([np.linspace(6.0, -2.0, count), 1.0 + np.sin(np.arange(count) / 4)], -1)[None]
     told = np.full((1, 225, 2), 2.0)
     model = simulate.plane_model(params)
     lead = simulate._led(before, round(logs.PERIOD / model.opt.timestep), params.servo_lag)
@@ -134,7 +135,7 @@ def test_wheels_do_what_they_did_before_the_window():
     assert out.wheels[0, 0] == pytest.approx(before[0, -1], abs=0.05)
     assert out.wheels[0, -1] == pytest.approx([2.0, 2.0], abs=0.05)
     # The body moves as it had come to, in the samples before time starts as well.
-    held = simulate.drive(params, told, np.repeat(before[:, -1:], 21, 1), level)
+    held = simulate.drive(params, told, np.repeat(before[:, -1:], count, 1), level)
     early = [np.diff(o.poses[0, : simulate.BEFORE + 1, 2]) / logs.PERIOD for o in (out, held)]
     assert np.abs(early[0] - early[1]).max() > 0.05
 
@@ -149,7 +150,9 @@ def test_the_fit_begins_each_window_as_the_log_does(monkeypatch):
 
     def noted(params, told, before, slope, timestep=None):
         seen.append(before)
-        return simulate.Drives(np.zeros((len(told), 49, 3)), np.zeros((len(told), 45, 2)), np.zeros((len(told), 44, 2)))
+        k = logs.SAMPLES + commands.AHEAD
+        shapes = (simulate.BEFORE + k, 3), (k, 2), (k - 1, 2)
+        return simulate.Drives(*(np.zeros((len(told), *shape)) for shape in shapes))
 
     monkeypatch.setattr(ground, "drive", noted)
     params = HuskyParams()

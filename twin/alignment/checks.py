@@ -20,6 +20,12 @@ _DEGREE = np.pi / 180
 
 def check(windows: Windows, where: str) -> None:
     """Raises InputError where a log is too short or too straight to fit anything, or its units cannot be right."""
+    driving = windows.fresh[windows.turning].sum(1)
+    if len(driving) and np.median(driving) < 2:
+        raise InputError(
+            f"{where}: {np.median(driving):g} new poses in {DURATION:.0f} s of driving (median); expected at least 2; "
+            "record them at 1 Hz or more, better at 10 Hz"
+        )
     fitting, scoring = int(windows.fitting.sum()), int((~windows.fitting).sum())
     if fitting < MIN_WINDOWS or scoring < MIN_WINDOWS // 2:
         raise InputError(

@@ -24,6 +24,7 @@ STEP = 0.01  # [s] of the arithmetic
 HISTORY = 20  # samples of the window before that late commands are taken from
 AHEAD = 5  # samples beyond a window's end, for poses that were measured later than the log says
 
+_CHAIN = 3  # windows before one whose commands a ramp is followed through; six seconds reverse the slowest of robots
 _PER_SAMPLE = round(PERIOD / STEP)
 _CURES = {
     "mean_gain": "driving straight at several speeds",
@@ -98,8 +99,8 @@ def requested(windows: Windows) -> Array:
 def targets(drive: Drive, windows: Windows) -> tuple[Array, Array]:
     """What the servo is told, and the wheel speeds that come of it, from the wheel speeds each window starts with.
 
-    Where a window follows another, commands still under way at its start are that one's, and so is how far the
-    acceleration limits have let the controller come by then, which lagging wheels do not show. Else the wheels go on as
+    Where a window follows others, commands still under way at its start are theirs, and so is how far the acceleration
+    limits have let the controller come by then, which lagging wheels do not show. Else the wheels go on as
     they are until the first command has arrived.
 
     Returns:
@@ -120,8 +121,11 @@ def targets(drive: Drive, windows: Windows) -> tuple[Array, Array]:
 
     def carried_out(late: int) -> tuple[Array, Array]:
         arrived = wanted[:, HISTORY * _PER_SAMPLE - late :]
-        begin = start.copy()
-        begin[follows] = _ramped(drive, arrived, start)[follows - 1, SAMPLES * _PER_SAMPLE - 1]
+        begin = start
+        for _ in range(_CHAIN):
+            ended = _ramped(drive, arrived, begin)[:, SAMPLES * _PER_SAMPLE - 1]
+            begin = start.copy()
+            begin[follows] = ended[follows - 1]
         return _turned(drive, _ramped(drive, arrived, begin), speed)
 
     # A ramp does not care for the size of what it is told, so the outcome must be blended between two delays instead.

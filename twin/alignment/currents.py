@@ -102,7 +102,7 @@ def simulated_effort(steady: Steady, params: HuskyParams) -> Effort:
     straight = straight[:: max(1, len(straight) // 20)]
     both = np.concatenate([turning, straight]) / WHEEL_RADIUS
     steps = round((SAMPLES + AHEAD) * PERIOD / STEP)
-    told, before = (np.repeat(both[:, None], count, 1) for count in (steps, 2 * BEFORE + 1))
+    told, before = (np.repeat(both[:, None], count, 1) for count in (steps, BEFORE + 2))
     out = drive(replace(params, servo_lag=0.0), told, before, np.zeros((len(both), 2)), COARSE)
     torque = np.maximum(out.torques[:, SAMPLES // 2 :].mean(1), 0.0)
     return _effort(turning, torque[: len(turning)], torque[len(turning) :])

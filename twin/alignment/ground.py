@@ -17,10 +17,10 @@ that log and scored on its odd ones (median error of the pose after 2 s):
     + poses as of when they were measured              0.12 m, 4.8°: and less of it is noise (`Windows.measured`)
     + rolling resistance                               0.12 m, 4.8°: tyres that roll grip by their slip; drag goes
     + a controller's ramp goes on between windows      0.12 m, 4.6°: wheels lag, so they do not show it (`commands`)
-    the same, drag on all bodies or the chassis alone  worse by 5 % of the cost
-    the same, a part of the weight slides, no drag     worse by 1 % of the cost: straight on better, turns worse
 
-The row with the ramp is what ships; `docs/benchmarks.md` records it. The last two came before rolling resistance.
+The last row is what ships; `docs/benchmarks.md` records it. Before rolling resistance, drag on all bodies or on the
+chassis alone was worse by 5 % of the cost, and a part of the weight that slides, instead of drag, by 1 %: better
+straight on, worse in turns.
 
 Rolling resistance costs power, which servos give without slowing down, but it also softens turns. In MuJoCo's elliptic
 cone (condim 6) sliding, spinning and rolling share one limit: a tyre that rolls at v and slides at u has the share
@@ -52,8 +52,9 @@ from twin.robot import WHEEL_RADIUS, HuskyParams
 
 Array = NDArray[np.float64]
 
-# Guess, span, lowest and highest value, unit, and what would show it; guesses are those of soft ground. Creep is the
-# inverse of slip stiffness, which slip grows with in proportion. The mass may well be as far behind as some publish it.
+# Guess, span, lowest and highest value, unit, and what would show it; guesses are those of soft ground and of the
+# published robot, whatever load it bears. Creep is the inverse of slip stiffness, which slip grows with in proportion.
+# The mass may well be as far behind as some publish it.
 _MANY = 100  # windows
 _NEAR = 0.25  # spans that the search's first step may take which begins near the end
 _SPREAD = "hard turns at several speeds"
@@ -70,7 +71,7 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "center_of_mass_z": (0.062, 0.1, -0.1, 0.45, "m", _BRAKING),
     "radius_left": (WHEEL_RADIUS, 0.012, 0.1, 0.25, "m", "long straight drives"),
     "radius_right": (WHEEL_RADIUS, 0.012, 0.1, 0.25, "m", "long straight drives"),
-    "log10_servo_gain": (np.log10(800.0), 0.3, 1.0, 4.0, "", _TORQUE),
+    "log10_servo_gain": (np.log10(HuskyParams().servo_gain), 0.3, 1.0, 4.0, "", _TORQUE),
     "pose_x": (0.0, 0.2, -1.0, 1.0, "m", "turns on the spot"),
     "pose_y": (0.0, 0.1, -1.0, 1.0, "m", "turns on the spot"),
     "pose_late": (0.0, 0.1, -EARLY * PERIOD, LATE * PERIOD, "s", "turns that begin and end"),
@@ -136,8 +137,8 @@ def simulated(
 
 
 def told_poses(drives: Drives, values: dict[str, float], windows: Windows) -> Array:
-    """Poses of drives as these windows tell them: of the log's own origin, with its own clock, since its first pose was
-    measured. Shape (n, k + OLDEST + 1, 3)."""
+    """Poses of drives as these windows tell them: of the log's own origin, with its own clock, since each one's first
+    pose was measured. Shape (n, k + OLDEST + 1, 3)."""
     seen = retimed(drives.poses, values["pose_late"] - windows.measured[:, 0], BEFORE)
     return moved_origin(seen, values["pose_x"], values["pose_y"])
 

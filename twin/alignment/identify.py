@@ -10,12 +10,12 @@ goes back to its usual value, the rest is judged anew, and what is left is fitte
 
 Standard errors are cluster-robust (Liang and Zeger 1986): residuals of one group of windows may depend on each other in
 any way; where the classical ones are larger, those. Residuals are bent (`kinematics.bend`), so single impossible
-windows neither pull nor blow them up.
+windows neither pull nor blow them up; that their pull falls off with distance makes the valley flatter, and what is
+found less sure, by a third to a half where most residuals are as large as those of a real log.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 SHARE = 0.5  # of its span that a parameter's standard error may be
 _LIKELY = 0.25  # by which (value − guess)² / span² counts beside log(1 + s)
+_FLATTEST = 0.1  # of the curvature that squares would have; where noise rules, differences of the two are noise, too
 _STEP = 0.05  # of its span, for differences
 _EVALUATIONS = 20  # at most, per round of the search; those that lead on take one per free parameter besides
 
@@ -39,6 +40,7 @@ class Parameter:
     guess: float | None
     """None: all that is known of it is what the log says."""
     span: float
+    """How far off the guess may well be; without one, twice the standard error at which it counts as known."""
     low: float
     high: float
     usual: float
@@ -75,14 +77,15 @@ def search(
         table: What is fitted.
         error: Residuals of every window for values by name, in units of a good model's miss, shape (n, looks, ...).
         begin: Values to begin at.
-        reach: How far the search's first step may go, in spans, where no bound is near; less where it begins near the
-            end.
+        reach: Scale of the search's first step, in spans; less where it begins near the end. A step goes as far as
+            the root of it times the distance to the bound.
         progress: Told a line per step of the search.
     """
     # In spans from where the search begins: SciPy's first step is then `reach` of them at most, and its tolerances
     # mean the same for every parameter.
     low, high = (np.array([getattr(p, of) for p in table]) for of in ("low", "high"))
     spans = reach * np.array([p.span for p in table])
+    error = _remembered(error)
     guess = np.array([p.guess or 0.0 for p in table])
     sure = np.array([0.0 if p.guess is None else np.sqrt(_LIKELY) / p.span for p in table])
     origin = np.clip([begin[p.name] for p in table], low + 1e-6 * spans, high - 1e-6 * spans)
@@ -90,17 +93,13 @@ def search(
     def named(point: Array) -> dict[str, float]:
         return dict(zip((p.name for p in table), point.tolist(), strict=True))
 
-    @lru_cache(maxsize=1)  # slopes are asked for where residuals just were
-    def at(*point: float) -> Array:
-        return error(named(np.array(point)))
-
     def shifted(z: Array) -> Array:
         point = origin + z * spans
-        return np.append(bend(at(*point)).ravel(), (point - guess) * sure)
+        return np.append(bend(error(named(point))).ravel(), (point - guess) * sure)
 
     def tilted(z: Array) -> Array:
         point = origin + z * spans
-        now = at(*point)
+        now = error(named(point))
         progress(f"  mean log(1 + s) = {_cost(now):.4f}")
         bent = bent_slopes(now, _slopes(table, error, named(point), now)).reshape(-1, len(table))
         return np.concatenate([bent, np.diag(sure)]) * spans
@@ -110,7 +109,7 @@ def search(
         np.zeros(len(table)),
         jac=tilted,
         bounds=((low - origin) / spans, (high - origin) / spans),
-        ftol=1e-3,
+        ftol=3e-4,
         xtol=3e-3,
         max_nfev=_EVALUATIONS,
     )
@@ -138,6 +137,7 @@ def fit(
     free = list(table)
     values = {p.name: begin[p.name] for p in table}
     refused: dict[str, str] = {}
+    error = _remembered(error)
 
     def at(some: dict[str, float]) -> Array:
         return error(values | some)
@@ -165,6 +165,19 @@ def fit(
         if len(free) == count:
             found = {p.name: float(e) for p, e in zip(free, errors, strict=True)}
             return Fit(values, found, refused, _cost(now))
+
+
+def _remembered(error: Callable[[dict[str, float]], Array]) -> Callable[[dict[str, float]], Array]:
+    """The same, but nothing twice: what is found is judged by residuals and slopes that the search ended with."""
+    seen: dict[tuple[float, ...], Array] = {}
+
+    def at(values: dict[str, float]) -> Array:
+        key = tuple(values.values())
+        if key not in seen:
+            seen[key] = error(values)
+        return seen[key]
+
+    return at
 
 
 def _slopes(
@@ -201,7 +214,7 @@ def _standard_errors(
     told = np.einsum("nmp,nmq->pq", scaled, scaled)
     # A direction that nothing tells of has next to no curvature, hence a huge error rather than a division by zero.
     prior = np.diag(np.where(guessed, _LIKELY, 1e-9 * max(1.0, float(np.trace(told)) / len(told))))
-    inverse = np.linalg.inv(told + prior)
+    inverse = _inverse_curvature(told + prior, score)
     doubt = prior * np.where(guessed, _LIKELY, 1.0)
     robust = np.diag(inverse @ (meat * count / max(1, count - 1) + doubt) @ inverse)
     # Two that do exactly the same have no score where they differ, so only the classical error tells on them.
@@ -210,6 +223,17 @@ def _standard_errors(
     variance = np.maximum(robust, classical)
     flat = np.diag(told) < 1e-6 * max(1.0, float(np.diag(told).max()))
     return np.where(flat, np.inf, np.sqrt(np.maximum(variance, 0.0))) * spans
+
+
+def _inverse_curvature(steep: Array, score: Array) -> Array:
+    """Inverse of the curvature of what is least.
+
+    log(1 + s) has less of it than the squares that stand for it in a step, by twice the squared score of every window.
+    """
+    root = np.linalg.inv(np.linalg.cholesky(steep))
+    less, axes = np.linalg.eigh(2 * root @ score.T @ score @ root.T)
+    half = axes.T @ root
+    return half.T @ (half / np.maximum(1 - less, _FLATTEST)[:, None])
 
 
 def _told(value: float) -> str:

@@ -31,11 +31,14 @@ Array = NDArray[np.float64]
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-OLDEST = 4  # samples that the first pose of a window may have been measured before its start, at most
+OLDEST = 20  # samples that the first pose of a window may have been measured before its start, at most
 MAX_GAP = 0.5  # [s] between two rows of a table; a window that reaches into a longer one is left out
 MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds would show
 
 _FAST = 1.75  # samples; sensors of a shorter period tell more by when their poses appear than by how many did
+_JITTER = 4  # samples, at most, between when a pose was measured and when it appeared, but for what is common to all
+_DROPOUT = 30  # samples without a fresh pose; a window with more of them in which the wheels turn is left out
+_TURNING = 0.5  # [rad/s] mean of both sides' wheels
 _TICK = 1e-6  # [s] instants nearer than this are the same
 _GROUP_WINDOWS = 3  # of a table without groups: six seconds
 _CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change from one window to the next
@@ -97,6 +100,16 @@ class Windows:
             None if self.acceleration is None else self.acceleration[which],
         )
 
+    @property
+    def fresh(self) -> NDArray[np.bool_]:
+        """Which poses but the first are fresh, shape (n, k)."""
+        return np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
+
+    @property
+    def turning(self) -> NDArray[np.bool_]:
+        """In which windows the wheels turn, shape (n,)."""
+        return np.abs(self.wheels).mean((1, 2)) > _TURNING
+
     @cached_property
     def measured(self) -> Array:
         """When each pose was measured [s], but for a lateness common to all; time starts with the first sample.
@@ -105,16 +118,20 @@ class Windows:
         fresh pose to the next a robot moves as far after 0.05 s as after 0.15 s (DRIVE's log: within windows that turn,
         yaw is smooth to 0.3° over the number of fresh poses, to 0.7° over when they appeared). So the n-th measurement
         counts as of n periods after the first one. Where fresh poses are later for good by more than half a period,
-        some were lost. The first one is older than the window, by at most `OLDEST`. Shape (n, k + 1).
+        some were lost. The first one may be older than the window, by at most `OLDEST`. Windows that disagree with
+        their log's period by more than a late delivery explains, and logs of fast sensors, count as they appeared.
+        Shape (n, k + 1).
         """
-        fresh = np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
+        fresh = self.fresh
         appeared = [np.flatnonzero(row).astype(np.float64) + 1 for row in fresh]
         slopes = [theilslopes(each).slope for each in appeared if len(each) > 1]
         period = float(np.median(slopes)) if slopes else 1.0
         out = np.zeros(self.poses.shape[:2])
         for time, new, each in zip(out, fresh, appeared, strict=True):
             if len(each):
-                measured = _measured(each, period) if period > _FAST else np.append(0.0, each)
+                measured = _measured(each, period)
+                if period < _FAST or np.abs(measured[1:] - each).max() > _JITTER:
+                    measured = np.append(0.0, each)
                 time[:] = measured[np.append(0, np.cumsum(new))]
         return out * PERIOD
 
@@ -221,7 +238,7 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
     def sampled(names: tuple[str, ...]) -> Array:
         return np.stack([data[name][rows[:, :-1]] for name in names], -1)
 
-    return Windows(
+    windows = Windows(
         sampled(commands),
         twist,
         sampled(WHEEL_SPEEDS),
@@ -230,6 +247,18 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
         np.diff(order, prepend=-2) == 1,
         sampled(accelerations) if accelerations else None,
     )
+    return _without_dropouts(windows)
+
+
+def _without_dropouts(windows: Windows) -> Windows:
+    """Leaves out windows in which the wheels turn and poses cease: where the robot went, nobody knows."""
+    n = len(windows)
+    edge = np.ones((n, 1), bool)
+    appeared = np.concatenate([edge, windows.fresh, edge], 1)
+    ceased = np.array([np.diff(np.flatnonzero(row)).max() > _DROPOUT for row in appeared], bool)
+    keep = ~(ceased & windows.turning)
+    before = np.concatenate([[False], keep[:-1]])
+    return replace(windows.of(keep), follows=(windows.follows & before)[keep])
 
 
 def _gapless(time: Array, where: str) -> NDArray[np.int64]:
@@ -282,7 +311,7 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
     wheels = np.stack([columns[name] for name in WHEEL_SPEEDS], -1)
     step = columns["calib_step"].astype(np.int64)
     jump = np.abs(wheels[1:, 0] - wheels[:-1, -1]).sum(1)
-    return Windows(
+    windows = Windows(
         np.stack([columns[name] for name in WHEEL_COMMANDS], -1),
         False,
         wheels,
@@ -291,14 +320,16 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
         np.concatenate([[False], (jump < _CONTINUES) & (np.diff(step) <= 1) & (np.diff(step) >= 0)]),
         -np.stack([columns[name] for name in imu], -1),
     )
+    return _without_dropouts(windows)
 
 
 def retimed(poses: Array, late: Array, before: int) -> Array:
-    """Poses of robots from when each was first seen, `late` [s] before time starts; less than nothing: after that.
+    """Poses from when each robot's first one was measured.
 
     Args:
         poses: `PERIOD` [s] apart, shape (n, m, 3).
-        late: At most `before` samples, shape (n,).
+        late: How old the first one is when time starts [s], at most `before` samples; negative where it is yet to come.
+            Shape (n,).
         before: Which of the poses is that at which time starts.
 
     Returns:

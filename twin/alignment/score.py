@@ -39,7 +39,7 @@ class Prediction:
         Args:
             name: For the legend.
             windows: The log.
-            poses: Shape (n, ≥ k + 1, 3).
+            poses: `PERIOD` apart since each window's first was measured, shape (n, k + OLDEST + 1, 3).
             wheels: Shape (n, ≥ k, 2); the measured ones where the model is told them.
         """
         self.name = name
