@@ -16,7 +16,7 @@ that log and scored on its odd ones (median error of the pose after 2 s):
     + wheels and slope as before each window           0.12 m, 4.7°: a body keeps its motion for half a second
     + poses as of when they were measured              0.12 m, 4.8°: and less of it is noise (`Windows.measured`)
     + rolling resistance                               0.12 m, 4.8°: tyres that roll grip by their slip; drag goes
-    + a controller's ramp goes on between windows      0.12 m, 4.6°: wheels lag, so they do not show it (`commands`)
+    + a controller's ramp goes on between windows      0.12 m, 4.5°: wheels lag, so they do not show it (`commands`)
 
 The last row is what ships; `docs/benchmarks.md` records it. Before rolling resistance, drag on all bodies or on the
 chassis alone was worse by 5 % of the cost, and a part of the weight that slides, instead of drag, by 1 %: better
