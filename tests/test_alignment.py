@@ -106,11 +106,27 @@ def test_measurements_are_told_from_their_delivery(period):
 
 def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
     """One that measures every 0.2 m, at several speeds, and one window of a 10 Hz sensor that came at 20 Hz."""
-    by_distance = [list(range(each, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
-    steady = [list(range(2, 41, 2))] * 5 + [list(range(1, 41))]
+    by_distance = [list(range(each // 2, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
+    steady = [list(range(2, 41, 2))] * 10 + [list(range(1, 41))]
     for appeared in (by_distance, steady):
-        last = [each[-1] for each in appeared]
-        assert held(appeared).elapsed[:, -1] / logs.PERIOD == pytest.approx(last, abs=1e-9)
+        measured = held(appeared).measured / logs.PERIOD
+        for window, each in zip(measured, appeared, strict=True):
+            assert window[[each[0], each[-1], 40]] == pytest.approx([each[0], each[-1], each[-1]], abs=1e-9)
+            assert window[0] == pytest.approx(min(0, 2 * each[0] - each[1]), abs=1e-9)
+
+
+def test_kinematics_begin_with_the_wheels_of_before():
+    """Poses of a slow sensor: a window's first one was measured while wheels did what they did in the one before."""
+    n, age = 6, 10
+    time = np.arange(n * logs.SAMPLES) * logs.PERIOD
+    wheels = np.stack([4 + 2 * np.sin(time), 4 - 2 * np.sin(1.7 * time)], -1).reshape(n, logs.SAMPLES, 2)
+    whole = kinematics.integrate(kinematics.NOMINAL.motion(wheels.reshape(1, -1, 2)))[0]
+    seen = [np.maximum(0, i * logs.SAMPLES + np.arange(logs.SAMPLES + 1) + 5) // age * age - 5 for i in range(n)]
+    windows = replace(windows_of(wheels, logs.relative(whole[np.maximum(0, seen)])), follows=np.arange(n) > 0)
+    assert windows.measured[1:, 0] == pytest.approx(-0.25)
+    distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
+    assert distance[1:].max() < 0.005
+    assert angle[1:].max() < 0.2
 
 
 def test_a_sensor_as_fast_as_the_log_is_taken_at_its_word():
@@ -462,7 +478,7 @@ def test_kinematic_baselines_on_the_real_log(real_data: Path):
     distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
     assert np.median(distance[held_out]) == pytest.approx(0.45, abs=0.02)
     assert 65 < np.median(angle[held_out]) < 85
-    model = kinematics.fit_icr(windows.of(windows.fitting))
+    model = kinematics.fit_icr(windows)
     distance, angle = kinematics.end_errors(kinematics.predict(model, windows), windows)
     assert np.median(distance[held_out]) == pytest.approx(0.18, abs=0.01)
     assert np.median(angle[held_out]) == pytest.approx(6.6, abs=0.6)

@@ -55,9 +55,14 @@ BAD = {
     "slow": (lambda t: {k: v[::12] for k, v in t.items()}, r"rows are 0\.6 s apart .*record at least 2 rows a second"),
     "hours": (lambda t: _bad(t, time=t["time"] / 3600), r"rows are 1\.39e-05 s apart .*; give time in s$"),
     "rare poses": (
-        lambda t: _bad(t, **{n: t[n][np.arange(len(t[n])) // 50 * 50] for n in logs.POSE}),
+        lambda t: _bad(t, **{n: t[n][np.arange(len(t[n])) // 30 * 30] for n in logs.POSE}),
         r"1 new poses in 2 s of driving .*expected at least 2; record them at 1 Hz or more",
     ),
+    "rare poses in step with windows": (
+        lambda t: _bad(t, **{n: t[n][np.arange(len(t[n])) // 40 * 40] for n in logs.POSE}),
+        r"no new pose for 1\.5 s in \d+ of \d+ windows in which the wheels turn",
+    ),
+    "no poses": (lambda t: _bad(t, **{n: 0 * t[n] for n in logs.POSE}), r"no new pose for 1\.5 s in "),
     "lengths": (lambda t: _bad(t, x=t["x"][:-1]), r"columns of different lengths"),
 }
 

@@ -154,7 +154,7 @@ def align(
     of it."""
     if not use_slope:
         windows = without_acceleration(windows)
-    icr = fit_icr(windows.of(windows.fitting))
+    icr = fit_icr(windows)
     progress("commands and wheel speeds")
     drive, drive_fit = fit_drive(windows, params)
     tilt = slope.gravity(windows, icr)

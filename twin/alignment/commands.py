@@ -24,7 +24,7 @@ STEP = 0.01  # [s] of the arithmetic
 HISTORY = 20  # samples of the window before that late commands are taken from
 AHEAD = 5  # samples beyond a window's end, for poses that were measured later than the log says
 
-_CHAIN = 3  # windows before one whose commands a ramp is followed through; six seconds reverse the slowest of robots
+_CHAIN = 3  # windows before one whose commands a ramp is followed through: six seconds
 _PER_SAMPLE = round(PERIOD / STEP)
 _CURES = {
     "mean_gain": "driving straight at several speeds",

@@ -56,7 +56,7 @@ Array = NDArray[np.float64]
 # published robot, whatever load it bears. Creep is the inverse of slip stiffness, which slip grows with in proportion.
 # The mass may well be as far behind as some publish it.
 _MANY = 100  # windows
-_NEAR = 0.25  # spans that the search's first step may take which begins near the end
+_NEAR = 0.25  # `reach` of the search that begins near the end
 _SPREAD = "hard turns at several speeds"
 _TORQUE = "motor currents or torques"
 _BRAKING = "hard braking, or slopes"

@@ -81,8 +81,8 @@ def search(
             the root of it times the distance to the bound.
         progress: Told a line per step of the search.
     """
-    # In spans from where the search begins: SciPy's first step is then `reach` of them at most, and its tolerances
-    # mean the same for every parameter.
+    # In `reach` spans from where the search begins: so SciPy scales its first step, and its tolerances mean the same
+    # for every parameter.
     low, high = (np.array([getattr(p, of) for p in table]) for of in ("low", "high"))
     spans = reach * np.array([p.span for p in table])
     error = _remembered(error)
@@ -168,13 +168,18 @@ def fit(
 
 
 def _remembered(error: Callable[[dict[str, float]], Array]) -> Callable[[dict[str, float]], Array]:
-    """The same, but nothing twice: what is found is judged by residuals and slopes that the search ended with."""
+    """The same, but nothing twice: what is found is judged by residuals and slopes that the search ended with.
+
+    Those are among the newest few per parameter; the others are forgotten.
+    """
     seen: dict[tuple[float, ...], Array] = {}
 
     def at(values: dict[str, float]) -> Array:
         key = tuple(values.values())
         if key not in seen:
             seen[key] = error(values)
+            if len(seen) > 4 * (len(values) + 1):
+                del seen[next(iter(seen))]
         return seen[key]
 
     return at

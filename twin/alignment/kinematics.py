@@ -60,19 +60,22 @@ def integrate(motion: Array) -> Array:
 
 
 def predict(model: Icr, windows: Windows) -> Array:
-    """Poses by measured wheel speeds, which are held before and after, since each window's first pose was measured.
+    """Poses by measured wheel speeds, which are held afterwards, since each window's first pose was measured.
     Shape (n, k + OLDEST + 1, 3)."""
-    held = [windows.wheels[:, :1]] * OLDEST, [windows.wheels[:, -1:]] * OLDEST
-    poses = integrate(model.motion(np.concatenate([*held[0], windows.wheels, *held[1]], 1)))
+    before, after = windows.before[:, -1 - OLDEST : -1], np.repeat(windows.wheels[:, -1:], OLDEST, 1)
+    poses = integrate(model.motion(np.concatenate([before, windows.wheels, after], 1)))
     return retimed(poses, -windows.measured[:, 0], OLDEST)
 
 
 def fit_icr(windows: Windows) -> Icr:
-    """The ICR model that fits these windows best."""
+    """The ICR model that fits those of the windows best that are for fitting."""
     start = np.array([1.0, 1.0, 0.5, -0.5, 0.0])
-    found = least_squares(
-        lambda x: bend(residuals(predict(Icr(*x), windows), windows)).ravel(), start, x_scale=(0.1, 0.1, 0.1, 0.1, 0.1)
-    )
+    fitting = windows.fitting
+
+    def error(x: Array) -> Array:
+        return bend(residuals(predict(Icr(*x), windows), windows)[fitting]).ravel()
+
+    found = least_squares(error, start, x_scale=(0.1, 0.1, 0.1, 0.1, 0.1))
     return Icr(*(float(value) for value in found.x))
 
 

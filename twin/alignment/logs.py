@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
+from twin import progress
 from twin.errors import InputError
 
 Array = NDArray[np.float64]
@@ -37,6 +38,7 @@ MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds wo
 
 _FAST = 1.75  # samples; sensors of a shorter period tell more by when their poses appear than by how many did
 _JITTER = 4  # samples, at most, between when a pose was measured and when it appeared, but for what is common to all
+_UNSTEADY = 0.1  # share of windows that disagree with their log's period by more, from which on there is none
 _DROPOUT = 30  # samples without a fresh pose; a window with more of them in which the wheels turn is left out
 _TURNING = 0.5  # [rad/s] mean of both sides' wheels
 _TICK = 1e-6  # [s] instants nearer than this are the same
@@ -119,20 +121,24 @@ class Windows:
         yaw is smooth to 0.3° over the number of fresh poses, to 0.7° over when they appeared). So the n-th measurement
         counts as of n periods after the first one. Where fresh poses are later for good by more than half a period,
         some were lost. The first one may be older than the window, by at most `OLDEST`. Windows that disagree with
-        their log's period by more than a late delivery explains, and logs of fast sensors, count as they appeared.
+        their log's period by more than a late delivery explains count as they appeared, and their first pose as older
+        than the next by as much as those are apart; so do all of a log in which many do, or of a fast sensor.
         Shape (n, k + 1).
         """
         fresh = self.fresh
         appeared = [np.flatnonzero(row).astype(np.float64) + 1 for row in fresh]
         slopes = [theilslopes(each).slope for each in appeared if len(each) > 1]
         period = float(np.median(slopes)) if slopes else 1.0
+        times = [_measured(each, period) for each in appeared]
+        both = zip(times, appeared, strict=True)
+        stray = np.array([np.abs(time[1:] - each).max(initial=0.0) > _JITTER for time, each in both], bool)
+        if period < _FAST or stray.sum() > _UNSTEADY * len(stray):
+            stray[:] = True
         out = np.zeros(self.poses.shape[:2])
-        for time, new, each in zip(out, fresh, appeared, strict=True):
+        for i, each in enumerate(appeared):
             if len(each):
-                measured = _measured(each, period)
-                if period < _FAST or np.abs(measured[1:] - each).max() > _JITTER:
-                    measured = np.append(0.0, each)
-                time[:] = measured[np.append(0, np.cumsum(new))]
+                time = np.append(_first(each, period), each) if stray[i] else times[i]
+                out[i] = time[np.append(0, np.cumsum(fresh[i]))]
         return out * PERIOD
 
     @property
@@ -148,6 +154,8 @@ def _measured(appeared: Array, period: float) -> Array:
         appeared: When fresh poses did [samples].
         period: Of the sensor [samples].
     """
+    if not len(appeared):
+        return np.zeros(1)
     number = np.arange(1.0, len(appeared) + 1)
     lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
     number += np.minimum.accumulate(lost[::-1])[::-1]  # what comes late, but comes, was not lost
@@ -158,6 +166,12 @@ def _measured(appeared: Array, period: float) -> Array:
         first = start = min(start, 0.0)
     first = max(first, -OLDEST)
     return np.append(first, np.maximum(first, start + period * number))
+
+
+def _first(appeared: Array, period: float) -> float:
+    """When the first pose of a window was measured whose fresh ones were as they appeared [samples]."""
+    apart = float(np.median(np.diff(appeared))) if len(appeared) > 1 else period
+    return max(min(float(appeared[0]) - apart, 0.0), -OLDEST)
 
 
 def read_log(path: Path) -> Windows:
@@ -247,16 +261,28 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
         np.diff(order, prepend=-2) == 1,
         sampled(accelerations) if accelerations else None,
     )
-    return _without_dropouts(windows)
+    return _without_dropouts(windows, where)
 
 
-def _without_dropouts(windows: Windows) -> Windows:
-    """Leaves out windows in which the wheels turn and poses cease: where the robot went, nobody knows."""
-    n = len(windows)
-    edge = np.ones((n, 1), bool)
+def _without_dropouts(windows: Windows, where: str) -> Windows:
+    """Leaves out windows in which the wheels turn and poses cease: where the robot went, nobody knows.
+
+    Raises:
+        InputError: those are more than half of the ones in which the wheels turn.
+    """
+    edge = np.ones((len(windows), 1), bool)
     appeared = np.concatenate([edge, windows.fresh, edge], 1)
     ceased = np.array([np.diff(np.flatnonzero(row)).max() > _DROPOUT for row in appeared], bool)
-    keep = ~(ceased & windows.turning)
+    turning = windows.turning
+    lost = int((ceased & turning).sum())
+    if lost > turning.sum() / 2:
+        raise InputError(
+            f"{where}: no new pose for {_DROPOUT * PERIOD:g} s in {lost} of {turning.sum()} windows in which the wheels "
+            "turn; expected at least one a second; record poses at 1 Hz or more, better at 10 Hz"
+        )
+    if lost:
+        progress.say(f"{lost} windows left out: the wheels turn and poses cease")
+    keep = ~(ceased & turning)
     before = np.concatenate([[False], keep[:-1]])
     return replace(windows.of(keep), follows=(windows.follows & before)[keep])
 
@@ -320,7 +346,7 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
         np.concatenate([[False], (jump < _CONTINUES) & (np.diff(step) <= 1) & (np.diff(step) >= 0)]),
         -np.stack([columns[name] for name in imu], -1),
     )
-    return _without_dropouts(windows)
+    return _without_dropouts(windows, where)
 
 
 def retimed(poses: Array, late: Array, before: int) -> Array:
