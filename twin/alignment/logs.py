@@ -277,8 +277,8 @@ def _without_dropouts(windows: Windows, where: str) -> Windows:
     lost = int((ceased & turning).sum())
     if lost > turning.sum() / 2:
         raise InputError(
-            f"{where}: no new pose for {_DROPOUT * PERIOD:g} s in {lost} of {turning.sum()} windows in which the wheels "
-            "turn; expected at least one a second; record poses at 1 Hz or more, better at 10 Hz"
+            f"{where}: no new pose for {_DROPOUT * PERIOD:g} s in {lost} of {turning.sum()} windows in which the "
+            "wheels turn; expected at least one a second; record poses at 1 Hz or more, better at 10 Hz"
         )
     if lost:
         progress.say(f"{lost} windows left out: the wheels turn and poses cease")
