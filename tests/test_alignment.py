@@ -12,7 +12,7 @@ from drive_logs import SOFT, columns, windows_of
 from twin.align import main, summary
 from twin.alignment import commands, currents, kinematics, logs, simulate
 from twin.alignment.aligned import Alignment, align, robot_toml
-from twin.alignment.identify import Fit, Parameter, bend, fit
+from twin.alignment.identify import Fit
 from twin.alignment.kinematics import Icr
 from twin.alignment.score import Prediction
 from twin.config_file import parse, read_robot
@@ -46,75 +46,6 @@ def test_icr_of_icr_motion_is_found():
         assert getattr(found, name) == pytest.approx(getattr(truth, name), abs=2e-3)
 
 
-def test_bent_residuals_count_as_logarithms():
-    error = np.random.default_rng(0).normal(size=(5, 2, 3)) * np.logspace(-6, 3, 5)[:, None, None]
-    mean_square = (error**2).sum((1, 2)) / 2
-    assert (bend(error) ** 2).sum((1, 2)) == pytest.approx(np.log1p(mean_square), rel=1e-6)
-
-
-def held(appeared: list[list[float]]) -> logs.Windows:
-    """Windows whose pose moves on by 1 m at these samples and stays in between."""
-    poses = np.zeros((len(appeared), logs.SAMPLES + 1, 3))
-    for window, samples in zip(poses, appeared, strict=True):
-        for sample in samples:
-            window[sample:, 0] += 1.0
-    return windows_of(np.zeros((len(appeared), logs.SAMPLES, 2)), poses)
-
-
-def test_stale_poses_were_measured_when_their_sensor_measured():
-    """At 10 Hz: every second sample. In samples from the window's start; negative: before it."""
-    regular, old = list(range(2, 41, 2)), list(range(1, 41, 2))
-    late = [2, 4, 6, 11, 12, 13, *range(14, 41, 2)]  # two came late, none was lost
-    lost = [2, 4, 6, 12, *range(14, 41, 2)]
-    early = [*range(1, 38, 2), 38, 40]  # 21 of them: on the edge between two samples
-    resting = list(range(11, 41, 2))  # at first: it was last measured less than a period before
-    measured = held([regular, old, late, lost, early, resting, []]).measured / logs.PERIOD
-    np.testing.assert_allclose(measured[0], np.arange(41) // 2 * 2, atol=1e-9)
-    np.testing.assert_allclose(measured[1], (np.arange(41) + 1) // 2 * 2 - 1, atol=1e-9)
-    np.testing.assert_allclose(measured[2, [0, 6, 10, 11, 12, 13, 40]], [0, 6, 6, 8, 10, 12, 40], atol=1e-9)
-    np.testing.assert_allclose(measured[3, [0, 6, 11, 12, 14, 40]], [0, 6, 6, 12, 14, 40], atol=1e-9)
-    assert measured[4, -1] - measured[4, 0] == pytest.approx(42)
-    np.testing.assert_allclose(measured[5, [0, 10, 11, 39]], [-1, -1, 11, 39], atol=1e-9)
-    assert np.all(measured[6] == measured[6, 0])
-
-
-def delivered(period: float) -> tuple[list[list[int]], np.ndarray, np.ndarray]:
-    """When measurements came into the log of 200 windows, and how long after its first one a window's last was made: in
-    truth, and by when they came. Each comes within a sample, one in twenty much later, one in a hundred never."""
-    rng = np.random.default_rng(0)
-    appeared, truth, came = [], [], []
-    for _ in range(200):
-        made = rng.uniform(-3 * period, -2 * period) - 1.0 + period * np.arange(70)
-        late = rng.uniform(0.0, 0.9, 70) + np.where(rng.random(70) < 0.05, rng.uniform(0.0, 2.5, 70), 0.0)
-        at = np.ceil(np.maximum.accumulate(made + late))
-        at[rng.random(70) < 0.01] = np.inf
-        newest = [int(np.flatnonzero(at <= sample)[-1]) for sample in range(logs.SAMPLES + 1)]
-        appeared.append((np.flatnonzero(np.diff(newest)) + 1).tolist())
-        truth.append(made[newest[-1]] - made[newest[0]])
-        came.append(at[newest[-1]] - at[newest[0]])
-    return appeared, np.array(truth), np.array(came)
-
-
-@pytest.mark.parametrize("period", [2.0, 8 / 3, 4.0, 10.0, 20.0])
-def test_measurements_are_told_from_their_delivery(period):
-    appeared, truth, came = delivered(period)
-    off = np.abs(held(appeared).elapsed[:, -1] / logs.PERIOD - truth)
-    naive = np.abs(came - truth)
-    assert np.mean(off < 0.15) > max(0.8, np.mean(naive < 0.15) + 0.05)
-    assert off.mean() < naive.mean()
-
-
-def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
-    """One that measures every 0.2 m, at several speeds, and one window of a 10 Hz sensor that came at 20 Hz."""
-    by_distance = [list(range(each // 2, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
-    steady = [list(range(2, 41, 2))] * 10 + [list(range(1, 41))]
-    for appeared in (by_distance, steady):
-        measured = held(appeared).measured / logs.PERIOD
-        for window, each in zip(measured, appeared, strict=True):
-            assert window[[each[0], each[-1], 40]] == pytest.approx([each[0], each[-1], each[-1]], abs=1e-9)
-            assert window[0] == pytest.approx(min(0, 2 * each[0] - each[1]), abs=1e-9)
-
-
 def test_kinematics_begin_with_the_wheels_of_before():
     """Poses of a slow sensor: a window's first one was measured while wheels did what they did in the one before."""
     n, age = 6, 10
@@ -127,13 +58,6 @@ def test_kinematics_begin_with_the_wheels_of_before():
     distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
     assert distance[1:].max() < 0.005
     assert angle[1:].max() < 0.2
-
-
-def test_a_sensor_as_fast_as_the_log_is_taken_at_its_word():
-    appeared, truth, _ = delivered(1.0)
-    windows = held(appeared)
-    assert windows.measured[:, -1] / logs.PERIOD == pytest.approx([each[-1] for each in appeared])
-    assert np.abs(windows.elapsed[:, -1] / logs.PERIOD - truth).mean() < 0.5
 
 
 def test_commands_become_the_controllers_wheel_speeds():
@@ -222,105 +146,6 @@ def test_grip_grows_with_slip_over_rolling_speed(speed, share):
             slip.append(data.qvel[:3] @ across / np.hypot(data.qvel[0], data.qvel[1]))
     tangent = params.rolling_resistance / params.friction * share / np.sqrt(1 - share**2)
     assert np.mean(slip) == pytest.approx(np.sin(np.arctan(tangent)), rel=0.04)
-
-
-@pytest.mark.parametrize("guess", [None, 0.0])
-def test_identified_are_what_residuals_move(guess):
-    """A line through noise: slope and offset come out with their textbook errors; what does nothing is refused."""
-    rng = np.random.default_rng(3)
-    x = np.linspace(-1, 1, 400)
-    y = 2.0 * x + 0.5 + rng.normal(0, 0.1, 400)
-    table = [
-        Parameter("slope", guess, 1.0, -10, 10, 1.0, ""),
-        Parameter("offset", guess, 1.0, -10, 10, 0.0, ""),
-        Parameter("nothing", guess, 1.0, -10, 10, 7.0, "m", "another log"),
-    ]
-
-    def error(v: dict[str, float]) -> np.ndarray:
-        return (v["slope"] * x + v["offset"] + 0 * v["nothing"] - y)[:, None, None]
-
-    found = fit(table, error, np.arange(400), {p.name: 0.0 for p in table})
-    assert found.values["slope"] == pytest.approx(2.0, abs=0.03)
-    for name, shown in {"slope": (x**2).sum(), "offset": 400}.items():
-        prior = 0.0 if guess is None else 0.25
-        assert found.errors[name] == pytest.approx(np.sqrt(0.1**2 * shown + prior**2) / (shown + prior), rel=0.2)
-    assert found.values["nothing"] == 7.0
-    assert "nothing = 7 m" in found.refused["nothing"]
-    assert "another log" in found.refused["nothing"]
-
-
-@pytest.mark.parametrize("noise", [0.1, 1.0, 2.0])
-def test_errors_are_how_far_fits_scatter(noise):
-    """However large residuals are beside a good model's miss, and though three windows in a row share some."""
-    table = [Parameter(name, None, 2.0, -50, 50, 0.0, "") for name in "ab"]
-    found, told = [], []
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        slopes = np.repeat(rng.normal(size=(150, 1, 3, 2)), 2, 1)
-        off = rng.normal(size=(150, 3)) * 0.85 + np.repeat(rng.normal(size=(50, 3)), 3, 0) * 0.5
-        off = np.repeat(noise * off[:, None], 2, 1)
-
-        def error(values: dict[str, float], slopes=slopes, off=off) -> np.ndarray:
-            return off + slopes @ np.array([values["a"], values["b"]])
-
-        one = fit(table, error, np.arange(150) // 3, {"a": 0.2, "b": 0.2})
-        found.append([one.values[name] for name in "ab"])
-        told.append([one.errors[name] for name in "ab"])
-    ratio = np.sqrt(np.square(found).mean() / np.square(told).mean())
-    assert 0.8 < ratio < 1.25
-
-
-def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():
-    """One that says 1 and has three times the weight of the guess that says 0."""
-    table = [Parameter("a", 0.0, 1.0, -10, 10, 7.0, ""), Parameter("b", None, 1.0, -10, 10, 7.0, "")]
-    shown = np.sqrt(0.75 / 100) * np.repeat(np.eye(2), 100, 0)
-    found = fit(
-        table, lambda v: (shown @ [v["a"] - 1, v["b"] - 1])[:, None, None], np.arange(200), {"a": 5.0, "b": 5.0}
-    )
-    assert found.values == pytest.approx({"a": 0.75, "b": 1.0}, abs=0.01)
-    assert found.errors["a"] == pytest.approx(1 / 4, rel=0.02)
-
-
-@pytest.mark.parametrize("guess", [None, 3.0])
-def test_nothing_identified_is_a_fit_too(guess):
-    table = [Parameter(name, guess, 1.0, -10, 10, 7.0, "") for name in ("a", "b")]
-    noise = np.random.default_rng(0).normal(size=(50, 1, 1))
-    found = fit(table, lambda v: noise + 0 * (v["a"] + v["b"]), np.arange(50), {"a": 3.0, "b": 3.0})
-    assert found.values == {"a": 7.0, "b": 7.0}
-    assert not found.errors and set(found.refused) == {"a", "b"}
-    assert found.cost == pytest.approx(np.log1p(noise**2).mean())
-
-
-@pytest.mark.parametrize("kept", [0, 1])
-def test_parameters_may_go_one_by_one(kept):
-    """Each shows only as long as the next one is not at its usual value, and the last one hardly shows."""
-    rng = np.random.default_rng(1)
-    names = list("abcdefg")
-    x, noise = rng.normal(size=(7, 400)), 0.1 * rng.normal(size=400)
-    table = [Parameter(name, 1.0, 1.0, -10, 10, 0.0, "") for name in names]
-
-    def error(v: dict[str, float]) -> np.ndarray:
-        shown = [*(float(v[after] != 0.0) for after in names[1:]), 0.005]
-        shown[0] = shown[0] or float(kept)
-        off = (np.array([v[name] for name in names]) - 1.0) * shown
-        return (off @ x + noise)[:, None, None]
-
-    found = fit(table, error, np.arange(400), dict.fromkeys(names, 1.0))
-    assert set(found.errors) == set(names[:kept]) and set(found.refused) == set(names[kept:])
-    if kept:
-        assert found.values["a"] == pytest.approx(1.0, abs=0.03)
-        assert found.errors["a"] == pytest.approx(np.sqrt(0.1**2 * 400 + 0.25**2) / 400.25, rel=0.2)
-
-
-@pytest.mark.parametrize("guess", [None, 0.0])
-def test_two_that_do_the_same_are_not_both_identified(guess):
-    rng = np.random.default_rng(0)
-    x, noise = rng.normal(size=200), 0.1 * rng.normal(size=200)
-    table = [Parameter(name, guess, 1.0, -10, 10, 0.0, "") for name in ("a", "b")]
-    begin = {"a": 0.0, "b": 0.0}
-    found = fit(table, lambda v: ((v["a"] + v["b"] - 1.0) * x + noise)[:, None, None], np.arange(200), begin)
-    assert len(found.errors) == 1
-    assert sum(found.values.values()) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ that log and scored on its odd ones (median error of the pose after 2 s):
     + slope, from the log's accelerometer              0.13 m, 5.2°: scrubbing tyres slide downhill
     + the lateness of poses against wheel speeds       0.13 m, 4.8°
     + wheels and slope as before each window           0.12 m, 4.7°: a body keeps its motion for half a second
-    + poses as of when they were measured              0.12 m, 4.8°: and less of it is noise (`Windows.measured`)
+    + poses as of when they were measured              0.12 m, 4.8°: and less of it is noise (`timing`)
     + rolling resistance                               0.12 m, 4.8°: tyres that roll grip by their slip; drag goes
     + a controller's ramp goes on between windows      0.12 m, 4.5°: wheels lag, so they do not show it (`commands`)
 

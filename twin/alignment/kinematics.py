@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from twin.alignment.logs import OLDEST, PERIOD, SAMPLES, Windows, retimed, wrapped
+from twin.alignment.logs import PERIOD, SAMPLES, Windows, retimed, wrapped
+from twin.alignment.timing import OLDEST
 from twin.robot import TRACK, WHEEL_RADIUS
 
 Array = NDArray[np.float64]

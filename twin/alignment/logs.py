@@ -22,9 +22,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import theilslopes
 
 from twin import progress
+from twin.alignment.timing import OLDEST, measured
 from twin.errors import InputError
 
 Array = NDArray[np.float64]
@@ -32,13 +32,9 @@ Array = NDArray[np.float64]
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-OLDEST = 20  # samples that the first pose of a window may have been measured before its start, at most
 MAX_GAP = 0.5  # [s] between two rows of a table; a window that reaches into a longer one is left out
 MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds would show
 
-_FAST = 1.75  # samples; sensors of a shorter period tell more by when their poses appear than by how many did
-_JITTER = 4  # samples, at most, between when a pose was measured and when it appeared, but for what is common to all
-_UNSTEADY = 0.1  # share of windows that disagree with their log's period by more, from which on there is none
 _DROPOUT = 30  # samples without a fresh pose; a window with more of them in which the wheels turn is left out
 _TURNING = 0.5  # [rad/s] mean of both sides' wheels
 _TICK = 1e-6  # [s] instants nearer than this are the same
@@ -116,62 +112,14 @@ class Windows:
     def measured(self) -> Array:
         """When each pose was measured [s], but for a lateness common to all; time starts with the first sample.
 
-        A sensor of poses measures at a steady rate, but what it measures gets into the log sooner or later: from a
-        fresh pose to the next a robot moves as far after 0.05 s as after 0.15 s (DRIVE's log: within windows that turn,
-        yaw is smooth to 0.3° over the number of fresh poses, to 0.7° over when they appeared). So the n-th measurement
-        counts as of n periods after the first one. Where fresh poses are later for good by more than half a period,
-        some were lost. The first one may be older than the window, by at most `OLDEST`. Windows that disagree with
-        their log's period by more than a late delivery explains count as they appeared, and their first pose as older
-        than the next by as much as those are apart; so do all of a log in which many do, or of a fast sensor.
-        Shape (n, k + 1).
+        See `timing`. Shape (n, k + 1).
         """
-        fresh = self.fresh
-        appeared = [np.flatnonzero(row).astype(np.float64) + 1 for row in fresh]
-        slopes = [theilslopes(each).slope for each in appeared if len(each) > 1]
-        period = float(np.median(slopes)) if slopes else 1.0
-        times = [_measured(each, period) for each in appeared]
-        both = zip(times, appeared, strict=True)
-        stray = np.array([np.abs(time[1:] - each).max(initial=0.0) > _JITTER for time, each in both], bool)
-        if period < _FAST or stray.sum() > _UNSTEADY * len(stray):
-            stray[:] = True
-        out = np.zeros(self.poses.shape[:2])
-        for i, each in enumerate(appeared):
-            if len(each):
-                time = np.append(_first(each, period), each) if stray[i] else times[i]
-                out[i] = time[np.append(0, np.cumsum(fresh[i]))]
-        return out * PERIOD
+        return measured(self.fresh) * PERIOD
 
     @property
     def elapsed(self) -> Array:
         """Time from the measurement of the first pose to that of each [s], shape (n, k + 1)."""
         return self.measured - self.measured[:, :1]
-
-
-def _measured(appeared: Array, period: float) -> Array:
-    """When a window's first pose and its fresh ones were measured; see `Windows.measured`.
-
-    Args:
-        appeared: When fresh poses did [samples].
-        period: Of the sensor [samples].
-    """
-    if not len(appeared):
-        return np.zeros(1)
-    number = np.arange(1.0, len(appeared) + 1)
-    lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
-    number += np.minimum.accumulate(lost[::-1])[::-1]  # what comes late, but comes, was not lost
-    start = float(np.median(appeared - period * number))
-    if start > period / 2:  # the robot rested, or as many were lost at first
-        first = start - period * np.ceil(start / period)
-    else:  # there was a pose when the window began
-        first = start = min(start, 0.0)
-    first = max(first, -OLDEST)
-    return np.append(first, np.maximum(first, start + period * number))
-
-
-def _first(appeared: Array, period: float) -> float:
-    """When the first pose of a window was measured whose fresh ones were as they appeared [samples]."""
-    apart = float(np.median(np.diff(appeared))) if len(appeared) > 1 else period
-    return max(min(float(appeared[0]) - apart, 0.0), -OLDEST)
 
 
 def read_log(path: Path) -> Windows:

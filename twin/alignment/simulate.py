@@ -15,8 +15,9 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from twin.alignment.commands import AHEAD, STEP
-from twin.alignment.logs import OLDEST, PERIOD, SAMPLES
+from twin.alignment.logs import PERIOD, SAMPLES
 from twin.alignment.slope import GRAVITY
+from twin.alignment.timing import OLDEST
 from twin.cores import cores
 from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.husky_look import LOOK_GROUP

@@ -1,0 +1,77 @@
+"""When poses were measured, told from when they got into the log; truth is a sensor that is made up."""
+
+import numpy as np
+import pytest
+from drive_logs import windows_of
+
+from twin.alignment import logs
+
+
+def held(appeared: list[list[float]]) -> logs.Windows:
+    """Windows whose pose moves on by 1 m at these samples and stays in between."""
+    poses = np.zeros((len(appeared), logs.SAMPLES + 1, 3))
+    for window, samples in zip(poses, appeared, strict=True):
+        for sample in samples:
+            window[sample:, 0] += 1.0
+    return windows_of(np.zeros((len(appeared), logs.SAMPLES, 2)), poses)
+
+
+def test_stale_poses_were_measured_when_their_sensor_measured():
+    """At 10 Hz: every second sample. In samples from the window's start; negative: before it."""
+    regular, old = list(range(2, 41, 2)), list(range(1, 41, 2))
+    late = [2, 4, 6, 11, 12, 13, *range(14, 41, 2)]  # two came late, none was lost
+    lost = [2, 4, 6, 12, *range(14, 41, 2)]
+    early = [*range(1, 38, 2), 38, 40]  # 21 of them: on the edge between two samples
+    resting = list(range(11, 41, 2))  # at first: it was last measured less than a period before
+    measured = held([regular, old, late, lost, early, resting, []]).measured / logs.PERIOD
+    np.testing.assert_allclose(measured[0], np.arange(41) // 2 * 2, atol=1e-9)
+    np.testing.assert_allclose(measured[1], (np.arange(41) + 1) // 2 * 2 - 1, atol=1e-9)
+    np.testing.assert_allclose(measured[2, [0, 6, 10, 11, 12, 13, 40]], [0, 6, 6, 8, 10, 12, 40], atol=1e-9)
+    np.testing.assert_allclose(measured[3, [0, 6, 11, 12, 14, 40]], [0, 6, 6, 12, 14, 40], atol=1e-9)
+    assert measured[4, -1] - measured[4, 0] == pytest.approx(42)
+    np.testing.assert_allclose(measured[5, [0, 10, 11, 39]], [-1, -1, 11, 39], atol=1e-9)
+    assert np.all(measured[6] == measured[6, 0])
+
+
+def delivered(period: float) -> tuple[list[list[int]], np.ndarray, np.ndarray]:
+    """When measurements came into the log of 200 windows, and how long after its first one a window's last was made: in
+    truth, and by when they came. Each comes within a sample, one in twenty much later, one in a hundred never."""
+    rng = np.random.default_rng(0)
+    appeared, truth, came = [], [], []
+    for _ in range(200):
+        made = rng.uniform(-3 * period, -2 * period) - 1.0 + period * np.arange(70)
+        late = rng.uniform(0.0, 0.9, 70) + np.where(rng.random(70) < 0.05, rng.uniform(0.0, 2.5, 70), 0.0)
+        at = np.ceil(np.maximum.accumulate(made + late))
+        at[rng.random(70) < 0.01] = np.inf
+        newest = [int(np.flatnonzero(at <= sample)[-1]) for sample in range(logs.SAMPLES + 1)]
+        appeared.append((np.flatnonzero(np.diff(newest)) + 1).tolist())
+        truth.append(made[newest[-1]] - made[newest[0]])
+        came.append(at[newest[-1]] - at[newest[0]])
+    return appeared, np.array(truth), np.array(came)
+
+
+@pytest.mark.parametrize("period", [2.0, 8 / 3, 4.0, 10.0, 20.0])
+def test_measurements_are_told_from_their_delivery(period):
+    appeared, truth, came = delivered(period)
+    off = np.abs(held(appeared).elapsed[:, -1] / logs.PERIOD - truth)
+    naive = np.abs(came - truth)
+    assert np.mean(off < 0.15) > max(0.8, np.mean(naive < 0.15) + 0.05)
+    assert off.mean() < naive.mean()
+
+
+def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
+    """One that measures every 0.2 m, at several speeds, and one window of a 10 Hz sensor that came at 20 Hz."""
+    by_distance = [list(range(each // 2, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
+    steady = [list(range(2, 41, 2))] * 10 + [list(range(1, 41))]
+    for appeared in (by_distance, steady):
+        measured = held(appeared).measured / logs.PERIOD
+        for window, each in zip(measured, appeared, strict=True):
+            assert window[[each[0], each[-1], 40]] == pytest.approx([each[0], each[-1], each[-1]], abs=1e-9)
+            assert window[0] == pytest.approx(min(0, 2 * each[0] - each[1]), abs=1e-9)
+
+
+def test_a_sensor_as_fast_as_the_log_is_taken_at_its_word():
+    appeared, truth, _ = delivered(1.0)
+    windows = held(appeared)
+    assert windows.measured[:, -1] / logs.PERIOD == pytest.approx([each[-1] for each in appeared])
+    assert np.abs(windows.elapsed[:, -1] / logs.PERIOD - truth).mean() < 0.5
