@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.alignment.identify import Fit, Parameter, fit
-from twin.alignment.kinematics import bend
 from twin.alignment.logs import PERIOD, SAMPLES, Windows
+from twin.alignment.robust import Kinds, unlikelihood
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ _CURES = {
     "half_acceleration": "sudden turns at full command",
     "lag": "sudden changes of command",
 }
-_SCALE = 0.3  # [rad/s] what a good model misses a wheel speed by
+_SIDES: Kinds = (0, 0)  # of the misses of the left and of the right wheels [rad/s]
 
 
 @dataclass(frozen=True)
@@ -190,13 +190,13 @@ def fit_drive(windows: Windows, params: HuskyParams) -> tuple[Drive, Fit]:
         "lag": 0.1,
     }
 
-    def error(values: dict[str, float]) -> Array:
+    def missed(values: dict[str, float]) -> Array:
         drive = Drive(**(_asdict(given) | values))
-        return (sampled(targets(drive, windows)[1]) - windows.wheels)[fitting] / _SCALE
+        return (sampled(targets(drive, windows)[1]) - windows.wheels)[fitting]
 
     # Far from its latency a log hardly shows its accelerations, so the search begins at the best of a few.
     tries = [start | {"latency": t, "half_acceleration": a} for t in (0.05, 0.15, 0.25, 0.4) for a in (3.0, 8.0, 30.0)]
-    start = min(tries, key=lambda values: float((bend(error(values)) ** 2).sum()))
+    start = min(tries, key=lambda values: unlikelihood(missed(values), _SIDES))
     spans = {  # span, lowest, highest value, unit
         "mean_gain": (0.05 * start["mean_gain"], 0.05, 20.0, ""),
         "half_gain": (0.1 * start["half_gain"], 0.02, 20.0, ""),
@@ -214,7 +214,7 @@ def fit_drive(windows: Windows, params: HuskyParams) -> tuple[Drive, Fit]:
         Parameter(name, None, span, low, high, usual[name], unit, _CURES[name])
         for name, (span, low, high, unit) in spans.items()
     ]
-    found = fit(table, error, windows.groups[fitting], start)
+    found = fit(table, missed, _SIDES, windows.groups[fitting], start)
     return Drive(**(usual | found.values)), found
 
 

@@ -2,8 +2,8 @@
 
 *Nominal*: a differential drive whose wheels roll freely. *ICR model*: each side's tread meets the ground where it does
 not slip at a lateral offset of its own, the instantaneous centre of rotation of that side (Mandow et al. 2007); with a
-factor of slip per side and a common forward offset it is the usual baseline, five numbers. Residuals are *bent*, so
-that a window in which the robot was stuck counts little: a window's squared residuals s count as log(1 + s).
+factor of slip per side and a common forward offset it is the usual baseline, five numbers, fitted as the MJCF is
+(`robust`).
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from twin.alignment.logs import PERIOD, SAMPLES, Windows, retimed, wrapped
+from twin.alignment.robust import Kinds, bent, in_turns
 from twin.alignment.timing import OLDEST
 from twin.robot import TRACK, WHEEL_RADIUS
 
 Array = NDArray[np.float64]
 
-POSITION_SCALE, YAW_SCALE = 0.08, 0.07  # [m], [rad] what a good model misses by in 2 s
+POSE: Kinds = (0, 0, 1)
+"""Of the misses of x, y [m] and yaw [rad]."""
 LOOKS = (SAMPLES // 2, SAMPLES)
 """Samples of a window at which a model is held against the poses."""
 
@@ -73,11 +75,13 @@ def fit_icr(windows: Windows) -> Icr:
     start = np.array([1.0, 1.0, 0.5, -0.5, 0.0])
     fitting = windows.fitting
 
-    def error(x: Array) -> Array:
-        return bend(residuals(predict(Icr(*x), windows), windows)[fitting]).ravel()
+    def missed(x: Array) -> Array:
+        return misses(predict(Icr(*x), windows), windows)[fitting]
 
-    found = least_squares(error, start, x_scale=(0.1, 0.1, 0.1, 0.1, 0.1))
-    return Icr(*(float(value) for value in found.x))
+    def solve(x: Array, unit: Array) -> Array:
+        return least_squares(lambda x: bent(missed(x) / unit).ravel(), x, x_scale=0.1).x
+
+    return Icr(*in_turns(start, missed, POSE, solve).tolist())
 
 
 def at(poses: Array, time: Array) -> Array:
@@ -89,49 +93,12 @@ def at(poses: Array, time: Array) -> Array:
     return poses[row, before] * (1 - share) + poses[row, before + 1] * share
 
 
-def residuals(predicted: Array, windows: Windows) -> Array:
-    """Predicted minus measured in units of what a good model misses by, at `LOOKS`. Shape (n, looks, 3)."""
+def misses(predicted: Array, windows: Windows) -> Array:
+    """Predicted minus measured x, y [m] and yaw [rad] at `LOOKS`. Shape (n, looks, 3)."""
     elapsed = windows.elapsed
     error = np.stack([at(predicted, elapsed[:, i]) - windows.poses[:, i] for i in LOOKS], 1)
     error[..., 2] = wrapped(error[..., 2])
-    return error / (POSITION_SCALE, POSITION_SCALE, YAW_SCALE)
-
-
-def bend(error: Array) -> Array:
-    """Residuals (n, looks, ...) scaled per window so that their squares sum to log(1 + s), s their mean over looks."""
-    return error * _per_window(_bent(_size(error)) / np.sqrt(error.shape[1]), error)
-
-
-def bent_slopes(error: Array, slopes: Array) -> Array:
-    """What a least-squares solver may take for the slopes of `bend(error)`: with them its gradient is exact.
-
-    The true ones turn with the residuals, over which differences stumble; Gauss and Newton do not need that part.
-
-    Args:
-        error: Shape (n, looks, ...).
-        slopes: Of `error`, one more axis.
-    """
-    size = _size(error)
-    factor = 1 / (1 + size) / _bent(size) / np.sqrt(error.shape[1])
-    return slopes * _per_window(factor, slopes)
-
-
-def weighted(error: Array, values: Array) -> Array:
-    """Values (n, ...) times the root of their window's weight 1 / (1 + s), as iterated least squares would have it."""
-    return values * _per_window(1 / np.sqrt((1 + _size(error)) * error.shape[1]), values)
-
-
-def _size(error: Array) -> Array:
-    return (error**2).sum(tuple(range(1, error.ndim))) / error.shape[1]
-
-
-def _bent(size: Array) -> Array:
-    """√(log(1 + s) / s), which tends to 1 at 0."""
-    return np.where(size < 1e-9, 1.0, np.sqrt(np.log1p(size) / np.maximum(size, 1e-12)))
-
-
-def _per_window(factor: Array, like: Array) -> Array:
-    return factor.reshape(-1, *[1] * (like.ndim - 1))
+    return error
 
 
 def end_errors(predicted: Array, windows: Windows) -> tuple[Array, Array]:

@@ -1,0 +1,84 @@
+"""Misses of heavy tails: scales, what they weigh, and models found with them."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import multivariate_t
+
+from twin.alignment.robust import FREEDOM, bent, bent_slopes, in_turns, unit, unlikelihood
+
+POSE = (0, 0, 1)
+
+
+def drawn(scales: tuple[float, ...], count: int, seed: int = 0) -> np.ndarray:
+    """Misses (count, 1, c) of a t distribution of these scales."""
+    shape = np.diag(np.square(scales))
+    return multivariate_t(shape=shape, df=FREEDOM, seed=seed).rvs(count).reshape(count, 1, -1)
+
+
+def test_scales_are_those_of_the_distribution():
+    found = unit(drawn((0.06, 0.06, 0.1), 20_000), POSE)
+    assert found == pytest.approx(np.sqrt(FREEDOM) * np.array([0.06, 0.06, 0.1]), rel=0.02)
+
+
+def test_no_other_scales_are_likelier():
+    """The likelihood by SciPy's own distribution, which unlikelihood is minus of, but for a constant."""
+    misses = drawn((0.02, 0.02, 0.3), 300)
+
+    def unlikely(position: float, yaw: float, some: np.ndarray) -> float:
+        shape = np.diag(np.square([position, position, yaw]) / FREEDOM)
+        return -multivariate_t(shape=shape, df=FREEDOM).logpdf(some[:, 0]).mean()
+
+    _, position, yaw = unit(misses, POSE)
+    least = unlikely(position, yaw, misses)
+    for k, m in ((0.97, 1), (1.03, 1), (1, 0.97), (1, 1.03)):
+        assert unlikely(k * position, m * yaw, misses) > least
+    other = 3 * misses
+    _, position, yaw = unit(other, POSE)
+    more = unlikely(position, yaw, other) - least
+    assert unlikelihood(other, POSE) - unlikelihood(misses, POSE) == pytest.approx(more) == pytest.approx(3 * np.log(3))
+
+
+def test_scales_hardly_care_for_impossible_windows():
+    misses = drawn((0.05, 0.05, 0.1), 500)
+    usual = unit(misses, POSE)
+    misses[::25] = 1e4
+    assert unit(misses, POSE) == pytest.approx(usual, rel=0.2)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_misses_without_noise_have_a_scale(share):
+    misses = np.zeros((100, 2, 3))
+    misses[: round(share * 100)] = 0.7
+    assert unit(misses, POSE) == pytest.approx(np.full(3, 1e-3 * np.sqrt(FREEDOM)))
+
+
+def test_bent_misses_count_as_logarithms():
+    scaled = np.random.default_rng(0).normal(size=(5, 2, 3)) * np.logspace(-6, 3, 5)[:, None, None]
+    assert (bent(scaled) ** 2).sum((1, 2)) == pytest.approx(np.log1p((scaled**2).sum((1, 2)) / 2), rel=1e-6)
+
+
+def test_gradients_by_bent_slopes_are_exact():
+    rng = np.random.default_rng(1)
+    at, slopes = rng.normal(size=(20, 2, 3)), rng.normal(size=(20, 2, 3, 4))
+    gradient = bent_slopes(at, slopes).reshape(-1, 4).T @ bent(at).ravel()
+
+    def half(x: np.ndarray) -> float:
+        return (bent(at + slopes @ x) ** 2).sum() / 2
+
+    steps = 1e-6 * np.eye(4)
+    assert gradient == pytest.approx([(half(step) - half(-step)) / 2e-6 for step in steps], rel=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.01, 1.0, 30.0])
+def test_model_and_scales_are_found_in_turns(noise):
+    """From far away, in any unit, with a tenth of the windows impossible."""
+    misses = noise * drawn((1.0,), 300)
+    misses[::10] = -80.0 * noise
+    found = in_turns(
+        np.array([500.0 * noise]),
+        lambda x: misses + x,
+        (0,),
+        lambda x, scale: least_squares(lambda x: bent((misses + x) / scale).ravel(), x).x,
+    )
+    assert found == pytest.approx(0.0, abs=0.2 * noise)
