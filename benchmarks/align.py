@@ -68,7 +68,7 @@ def main() -> int:
     print(summary(result))
     rows = judged(figures)
     for name, value, target, met in rows:
-        print(f"{name:28} {value:8.3f}   wanted {target:.3f}   {'met' if met else 'missed'}")
+        print(f"{name:28} {value:8.4f}   wanted {target:.4f}   {'met' if met else 'missed'}")
     progress.say("currents on asphalt")
     asphalt = efforts(options.data)
     print(f"\n{'a turn against driving straight':64} outer  inner   mean")
