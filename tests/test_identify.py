@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from twin.alignment.identify import Parameter, fit
+from twin.alignment.identify import Fit, Parameter, fit, search
 from twin.alignment.robust import unlikelihood
 
 ONE = (0,)
 
 
 @pytest.mark.parametrize("guess", [None, 0.0])
-def test_identified_are_what_residuals_move(guess):
+def test_identified_are_what_misses_move(guess):
     """A line through noise: slope and offset come out with their textbook errors; what does nothing is refused.
 
-    A t distribution's fit to normal noise scatters 7 % more than the textbook's.
+    A t distribution's fit to normal noise scatters 8 % more than the textbook's.
     """
     rng = np.random.default_rng(3)
     x = np.linspace(-1, 1, 400)
@@ -31,7 +31,7 @@ def test_identified_are_what_residuals_move(guess):
     found = fit(table, misses, ONE, np.arange(400), {p.name: 0.0 for p in table})
     assert found.values["slope"] == pytest.approx(2.0, abs=0.03)
     for name, shown in {"slope": (x**2).sum(), "offset": 400}.items():
-        assert found.errors[name] == pytest.approx(1.07 * 0.1 / np.sqrt(shown), rel=0.1)
+        assert found.errors[name] == pytest.approx(1.08 * 0.1 / np.sqrt(shown), rel=0.1)
     assert found.values["nothing"] == 7.0
     assert "nothing = 7 m" in found.refused["nothing"]
     assert "another log" in found.refused["nothing"]
@@ -39,40 +39,96 @@ def test_identified_are_what_residuals_move(guess):
 
 @pytest.mark.parametrize(("noise", "freedom"), [(0.02, np.inf), (1.0, np.inf), (50.0, np.inf), (1.0, 3), (1.0, 1)])
 def test_errors_are_how_far_fits_scatter(noise, freedom):
-    """However large misses are, however heavy their tails, and though three windows in a row share some."""
+    """However large misses are, and however heavy their tails; three windows in a row share some, and those of the last
+    component are of another size."""
     table = [Parameter(name, None, 2.0 * noise, -50 * noise, 50 * noise, 0.0, "") for name in "ab"]
     found, told = [], []
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        slopes = np.repeat(rng.normal(size=(150, 1, 3, 2)), 2, 1)
+        sizes = np.array([1.0, 1.0, 100.0])
+        slopes = np.repeat(rng.normal(size=(150, 1, 3, 2)), 2, 1) * sizes[:, None]
         off = rng.normal(size=(150, 3)) * 0.85 + np.repeat(rng.normal(size=(50, 3)), 3, 0) * 0.5
-        off = np.repeat(noise * off[:, None], 2, 1)
+        off = np.repeat(noise * off[:, None], 2, 1) * sizes
         if freedom < np.inf:
             off /= np.sqrt(rng.chisquare(freedom, (150, 1, 1)) / freedom)
 
         def misses(values: dict[str, float], slopes=slopes, off=off) -> np.ndarray:
             return off + slopes @ np.array([values["a"], values["b"]])
 
-        one = fit(table, misses, (0, 0, 0), np.arange(150) // 3, {"a": 0.2 * noise, "b": 0.2 * noise})
+        one = fit(table, misses, (0, 0, 1), np.arange(150) // 3, {"a": 0.2 * noise, "b": 0.2 * noise})
         found.append([one.values[name] for name in "ab"])
         told.append([one.errors[name] for name in "ab"])
     ratio = np.sqrt(np.square(found).mean() / np.square(told).mean())
     assert 0.8 < ratio < 1.25
 
 
-def test_few_groups_do_not_make_sure():
+def slope_through(y: np.ndarray, x: np.ndarray, groups: np.ndarray, looks: int = 1) -> Fit:
+    """A line's slope fitted to values that are looked at several times."""
+
+    def misses(v: dict[str, float]) -> np.ndarray:
+        return np.repeat((v["slope"] * x - y)[:, None, None], looks, 1)
+
+    return fit([Parameter("slope", None, 1.0, -10, 10, 1.0, "")], misses, ONE, groups, {"slope": 0.0})
+
+
+@pytest.mark.parametrize("looks", [1, 40])
+def test_few_groups_do_not_make_sure(looks):
     """Of two groups the scores may nearly cancel by chance; windows do scatter."""
     x = np.linspace(-1, 1, 200)
     for seed in range(20):
         y = 2.0 * x + np.random.default_rng(seed).normal(0, 0.1, 200)
-        found = fit(
-            [Parameter("slope", None, 1.0, -10, 10, 1.0, "")],
-            lambda v, y=y: (v["slope"] * x - y)[:, None, None],
-            ONE,
-            np.arange(200) % 2,
-            {"slope": 0.0},
-        )
+        found = slope_through(y, x, np.arange(200) % 2, looks)
         assert found.errors["slope"] > 0.9 * 0.1 / np.linalg.norm(x)
+
+
+def test_errors_hold_where_windows_that_tell_most_miss_most():
+    """A fifth of the windows is stuck, and would tell five times as much."""
+    found, told = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        stuck = np.arange(300) % 5 == 0
+        x = np.where(stuck, 5.0, 1.0) * rng.normal(size=300)
+        one = slope_through(2.0 * x + np.where(stuck, 5.0, 0.5) * rng.normal(size=300), x, np.arange(300))
+        found.append(one.values["slope"] - 2.0)
+        told.append(one.errors["slope"])
+    assert 0.75 < np.sqrt(np.square(found).mean() / np.square(told).mean()) < 1.25
+
+
+def test_impossible_windows_do_not_decide_from_far_away():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(200, 1, 1))
+    noise = 0.01 * rng.normal(size=(200, 1, 1))
+    noise[::8] = -40.0
+    table = [Parameter("a", None, 1.0, -1e3, 1e3, 0.0, "")]
+    found = fit(table, lambda v: (v["a"] - 3.0) * x + noise, ONE, np.arange(200), {"a": 600.0})
+    assert found.values["a"] == pytest.approx(3.0, abs=0.005)
+
+
+def test_nothing_is_asked_twice():
+    rng = np.random.default_rng(0)
+    x, noise = rng.normal(size=(2, 100)), rng.normal(size=100)
+    asked = []
+
+    def misses(v: dict[str, float]) -> np.ndarray:
+        asked.append((v["a"], v["b"]))
+        return (x[0] * v["a"] + x[1] * v["b"] - noise)[:, None, None]
+
+    table = [Parameter(name, 0.0, 1.0, -10, 10, 0.0, "") for name in "ab"]
+    fit(table, misses, ONE, np.arange(100), {"a": 1.0, "b": 1.0})
+    assert len(set(asked)) == len(asked) > 6
+
+
+@pytest.mark.parametrize("reach", [0.01, 1.0])
+def test_reach_is_the_scale_of_the_first_step(reach):
+    x = np.random.default_rng(0).normal(size=(100, 1, 1))
+    asked: list[float] = []
+
+    def misses(v: dict[str, float]) -> np.ndarray:
+        asked.append(v["a"])
+        return (v["a"] - 500.0) * x + 0.1 * x**2
+
+    search([Parameter("a", None, 1.0, -1e3, 1e3, 0.0, "")], misses, ONE, {"a": 0.0}, reach)
+    assert asked[2] == pytest.approx(reach * np.sqrt(1e3 / reach), rel=0.1)  # after the beginning, and the slope there
 
 
 def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():

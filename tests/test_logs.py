@@ -122,6 +122,22 @@ def test_windows_without_poses_are_left_out(drive):
     assert np.flatnonzero(~windows.follows).tolist() == [0, 10]
 
 
+def test_windows_in_which_the_robot_stands_are_left_out(drive):
+    """However long it is parked, told to stay: what is fitted and what is said would be of that. Stuck it is kept."""
+    parked = {name: np.concatenate([column, np.repeat(column[-1:], 8000)]) for name, column in drive.items()}
+    begins = len(drive["time"])
+    parked["time"] = np.arange(len(parked["time"])) * 0.05
+    for name in (*logs.TWIST, *logs.WHEEL_SPEEDS):
+        parked[name][begins:] = 0.0
+    whole = logs.cut(drive, "log")
+    windows = logs.cut(parked, "log")
+    assert len(windows) in (len(whole), len(whole) + 1)  # the last one may have begun before
+    np.testing.assert_array_equal(windows.wheels[: len(whole)], whole.wheels)
+    assert windows.follows[: len(whole)].tolist() == whole.follows.tolist()
+    parked["cmd_v"][begins:] = 0.5
+    assert len(logs.cut(parked, "log")) >= len(whole) + 199
+
+
 def test_a_gap_costs_nothing(drive):
     """One row before the clock was set: two seconds of the log are lost to the grid at most, and no memory."""
     late = {name: np.concatenate([column[:1], column]) for name, column in drive.items()}

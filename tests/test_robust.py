@@ -21,6 +21,12 @@ def test_scales_are_those_of_the_distribution():
     assert found == pytest.approx(np.sqrt(FREEDOM) * np.array([0.06, 0.06, 0.1]), rel=0.02)
 
 
+def test_looks_of_a_window_count_as_one():
+    misses = drawn((0.06, 0.06, 0.1), 100)
+    assert unit(np.repeat(misses, 3, 1), POSE) == pytest.approx(unit(misses, POSE))
+    assert unlikelihood(np.repeat(misses, 3, 1), POSE) == pytest.approx(unlikelihood(misses, POSE))
+
+
 def test_no_other_scales_are_likelier():
     """The likelihood by SciPy's own distribution, which unlikelihood is minus of, but for a constant."""
     misses = drawn((0.02, 0.02, 0.3), 300)

@@ -9,9 +9,9 @@ are not, the least certain one goes back to its usual value, the rest is judged 
 until a fit leaves none to go.
 
 Standard errors are cluster-robust (Liang and Zeger 1986): misses of one group of windows may depend on each other in
-any way; where the classical ones are larger, those. Bent as misses are, single impossible windows neither pull nor blow
-them up; that their pull falls off with distance makes the valley flatter than squares would, and what is found less
-sure.
+any way; where those of windows by themselves are larger, as they may be of few groups, those. Bent as misses are,
+single impossible windows neither pull nor blow them up; that their pull falls off with distance makes the valley
+flatter than squares would, and what is found less sure.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ SHARE = 0.5  # of its span that a parameter's standard error may be
 _FLATTEST = 0.1  # of the curvature that squares would have; where noise rules, differences of the two are noise, too
 _STEP = 0.05  # of its span, for differences
 _NATS = 0.02  # of likelihood; a search ends where a step brings less: a fifth of a standard error off in one direction
-_EVALUATIONS = 20  # at most, per round of the search; those that lead on take one per free parameter besides
+_EVALUATIONS = 50  # at most, per round of the search; those that lead on take one per free parameter besides
 
 
 @dataclass(frozen=True)
@@ -95,22 +95,23 @@ def search(
     def at(z: Array) -> dict[str, float]:
         return dict(zip((p.name for p in table), (origin + z * spans).tolist(), strict=True))
 
-    def solve(z: Array, scale: Array) -> Array:
+    def solve(begin: Array, scale: Array) -> Array:
         def shifted(z: Array) -> Array:
-            off = (origin + z * spans - guess) * sure
-            return np.append(bent(misses(at(z)) / scale).ravel(), off)
+            off = (origin + (begin + z) * spans - guess) * sure
+            return np.append(bent(misses(at(begin + z)) / scale).ravel(), off)
 
         def tilted(z: Array) -> Array:
-            now = misses(at(z))
+            now = misses(at(begin + z))
             progress(f"  −log likelihood of a window's misses: {unlikelihood(now, kinds):.4f}")
-            slopes = _slopes(table, misses, at(z), now) / scale[:, None]
+            slopes = _slopes(table, misses, at(begin + z), now) / scale[:, None]
             slopes = bent_slopes(now / scale, slopes).reshape(-1, len(table))
             return np.concatenate([slopes, np.diag(sure)]) * spans
 
-        bounds = (low - origin) / spans, (high - origin) / spans
+        bounds = (low - origin) / spans - begin, (high - origin) / spans - begin
+        z = np.zeros(len(table))  # from elsewhere SciPy's first step would be as long as that is far
         half = float((shifted(z) ** 2).sum()) / 2  # what SciPy makes less
         enough = min(1e-3, _NATS / ((FREEDOM + len(kinds)) * max(half, 1e-9)))
-        return least_squares(shifted, z, tilted, bounds, ftol=enough, xtol=1e-3, max_nfev=_EVALUATIONS).x
+        return begin + least_squares(shifted, z, tilted, bounds, ftol=enough, xtol=1e-3, max_nfev=_EVALUATIONS).x
 
     return at(in_turns(np.zeros(len(table)), lambda z: misses(at(z)), kinds, solve))
 
@@ -226,10 +227,9 @@ def _standard_errors(slopes: Array, scaled: Array, groups: NDArray[np.int64], sp
     inverse = _inverse_curvature(told + prior, score)
     doubt = prior * np.where(likely > 0, likely, 1.0)
     robust = np.diag(inverse @ (meat * count / max(1, count - 1) + doubt) @ inverse)
-    # Of few groups scores may be small by chance.
-    noise = (pull**2).sum() / max(1, pull.size - len(told))
-    classical = np.diag(inverse @ (np.einsum("nmp,nmq->pq", rows, rows) * noise + doubt) @ inverse)
-    variance = np.maximum(robust, classical)
+    own = score.T @ score * len(score) / max(1, len(score) - len(told))
+    alone = np.diag(inverse @ (own + doubt) @ inverse)
+    variance = np.maximum(robust, alone)
     flat = np.diag(told) < 1e-6 * max(1.0, float(np.diag(told).max()))
     return np.where(flat, np.inf, np.sqrt(np.maximum(variance, 0.0))) * spans
 

@@ -37,6 +37,7 @@ MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds wo
 
 _DROPOUT = 30  # samples without a fresh pose; a window with more of them in which the wheels turn is left out
 _TURNING = 0.5  # [rad/s] mean of both sides' wheels
+_STANDS = 0.05  # [rad/s], [m/s]; a window in which neither wheels nor commands ever are faster is left out
 _TICK = 1e-6  # [s] instants nearer than this are the same
 _GROUP_WINDOWS = 3  # of a table without groups: six seconds
 _CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change from one window to the next
@@ -209,11 +210,13 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
         np.diff(order, prepend=-2) == 1,
         sampled(accelerations) if accelerations else None,
     )
-    return _without_dropouts(windows, where)
+    return _telling(windows, where)
 
 
-def _without_dropouts(windows: Windows, where: str) -> Windows:
-    """Leaves out windows in which the wheels turn and poses cease: where the robot went, nobody knows.
+def _telling(windows: Windows, where: str) -> Windows:
+    """Leaves out windows that tell nothing of a model.
+
+    Where the wheels turn and poses cease, nobody knows where the robot went; to stand where told to, any model can.
 
     Raises:
         InputError: those are more than half of the ones in which the wheels turn.
@@ -230,7 +233,10 @@ def _without_dropouts(windows: Windows, where: str) -> Windows:
         )
     if lost:
         progress.say(f"{lost} windows left out: the wheels turn and poses cease")
-    keep = ~(ceased & turning)
+    stands = np.maximum(np.abs(windows.wheels), np.abs(windows.commands)).max((1, 2), initial=0.0) < _STANDS
+    if stands.any():
+        progress.say(f"{stands.sum()} windows left out: the robot stands")
+    keep = ~(ceased & turning) & ~stands
     before = np.concatenate([[False], keep[:-1]])
     return replace(windows.of(keep), follows=(windows.follows & before)[keep])
 
@@ -294,7 +300,7 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
         np.concatenate([[False], (jump < _CONTINUES) & (np.diff(step) <= 1) & (np.diff(step) >= 0)]),
         -np.stack([columns[name] for name in imu], -1),
     )
-    return _without_dropouts(windows, where)
+    return _telling(windows, where)
 
 
 def retimed(poses: Array, late: Array, before: int) -> Array:

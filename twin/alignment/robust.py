@@ -6,10 +6,11 @@ Little and Taylor 1989), whose −2 log likelihood for c components of scale σ 
 
     2 Σ log σ + (ν + c) log(1 + s),    s = Σ (miss / σ)² / ν    (the mean over the instants that are looked at)
 
-with ν = `FREEDOM`; where ν was left to a log as well, DRIVE's, it came to 2.6 to 3.2. Components of one *kind*, such as
-x and y, share their scale. Nobody knows beforehand how well a model can do on some ground, so scales are the likeliest
-for the misses there are; they and the model are found in turns, which makes both likelier every time. *Scaled* misses
-are in units of σ √ν; *bent*, the squares of a window's sum to log(1 + s), as least-squares solvers would have it.
+with ν = `FREEDOM`; where ν was left to a log as well, DRIVE's, it came to 2.6 to 3.2. The instants of a window count as
+one. Components of one *kind*, such as x and y, share their scale. Nobody knows beforehand how well a model can do on
+some ground, so scales are the likeliest for the misses there are; they and the model are found in turns, which makes
+both likelier every time. *Scaled* misses are in units of σ √ν; *bent*, the squares of a window's sum to log(1 + s), as
+least-squares solvers would have it.
 """
 
 from collections.abc import Callable
@@ -23,13 +24,16 @@ Kinds = tuple[int, ...]
 
 FREEDOM = 3.0  # degrees of
 
-_FINEST = 1e-3  # the least scale, in units of the misses: no log tells millimetres or milliradians
+_FINEST = 1e-3  # the least scale, in units of the misses: no log tells millimetres, milliradians, or as much a second
 _ROUNDS, _SETTLED = 10, 0.05  # at most, of scales and model in turns; share by which scales that have settled change
 _ITERATIONS, _CLOSE = 500, 1e-4
 
 
 def unit(misses: Array, kinds: Kinds) -> Array:
-    """σ √ν of each component, shape (c,), that makes misses (n, looks, c) likeliest."""
+    """σ √ν of each component, shape (c,), that makes misses (n, looks, c) likeliest, where no kind is without noise.
+
+    Where more than ν / (ν + c) of the windows have next to no misses, those alone decide.
+    """
     kind = np.asarray(kinds)
     of_kind = [misses[..., kind == k] for k in range(kind.max() + 1)]
     scale = np.array([max(float(np.median(np.abs(m))), _FINEST) for m in of_kind])
@@ -37,15 +41,15 @@ def unit(misses: Array, kinds: Kinds) -> Array:
         weight = 1 / (1 + _size(misses / (scale[kind] * np.sqrt(FREEDOM))))
         square = [(weight * (m**2).mean((1, 2))).sum() / weight.sum() for m in of_kind]
         before, scale = scale, np.maximum(np.sqrt(square), _FINEST)
-        if np.abs(scale / before - 1).max() < _CLOSE:
+        if not np.abs(scale / before - 1).max() >= _CLOSE:  # as it never is without numbers
             break
     return scale[kind] * np.sqrt(FREEDOM)
 
 
 def unlikelihood(misses: Array, kinds: Kinds) -> float:
     """Minus the log likelihood of misses (n, looks, c), of likeliest scales; per window, and but for a constant."""
-    scaled = unit(misses, kinds)
-    return float(np.log(scaled).sum() + (FREEDOM + len(kinds)) / 2 * np.log1p(_size(misses / scaled)).mean())
+    units = unit(misses, kinds)
+    return float(np.log(units).sum() + (FREEDOM + len(kinds)) / 2 * np.log1p(_size(misses / units)).mean())
 
 
 def in_turns(
