@@ -95,23 +95,23 @@ def search(
     def at(z: Array) -> dict[str, float]:
         return dict(zip((p.name for p in table), (origin + z * spans).tolist(), strict=True))
 
-    def solve(begin: Array, scale: Array) -> Array:
+    def solve(start: Array, scale: Array) -> Array:
         def shifted(z: Array) -> Array:
-            off = (origin + (begin + z) * spans - guess) * sure
-            return np.append(bent(misses(at(begin + z)) / scale).ravel(), off)
+            off = (origin + (start + z) * spans - guess) * sure
+            return np.append(bent(misses(at(start + z)) / scale).ravel(), off)
 
         def tilted(z: Array) -> Array:
-            now = misses(at(begin + z))
+            now = misses(at(start + z))
             progress(f"  −log likelihood of a window's misses: {unlikelihood(now, kinds):.4f}")
-            slopes = _slopes(table, misses, at(begin + z), now) / scale[:, None]
+            slopes = _slopes(table, misses, at(start + z), now) / scale[:, None]
             slopes = bent_slopes(now / scale, slopes).reshape(-1, len(table))
             return np.concatenate([slopes, np.diag(sure)]) * spans
 
-        bounds = (low - origin) / spans - begin, (high - origin) / spans - begin
+        bounds = (low - origin) / spans - start, (high - origin) / spans - start
         z = np.zeros(len(table))  # from elsewhere SciPy's first step would be as long as that is far
         half = float((shifted(z) ** 2).sum()) / 2  # what SciPy makes less
         enough = min(1e-3, _NATS / ((FREEDOM + len(kinds)) * max(half, 1e-9)))
-        return begin + least_squares(shifted, z, tilted, bounds, ftol=enough, xtol=1e-3, max_nfev=_EVALUATIONS).x
+        return start + least_squares(shifted, z, tilted, bounds, ftol=enough, xtol=1e-3, max_nfev=_EVALUATIONS).x
 
     return at(in_turns(np.zeros(len(table)), lambda z: misses(at(z)), kinds, solve))
 

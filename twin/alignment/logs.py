@@ -3,7 +3,8 @@
 A *window* is two seconds of a log, sampled evenly: commands, wheel speeds, poses relative to the first one, and, where
 there was an IMU, accelerations. Windows of one *group* share an experiment; groups of even number are for fitting, odd
 ones for scoring. A window *follows* the one before it where it begins when that one ends. A pose is *fresh* when it
-differs from the one before, *stale* when it repeats it.
+differs from the one before, *stale* when it repeats it. Windows in which the robot stands, as it was told to, or in
+which poses cease while the wheels turn, are left out.
 
 `read_log` takes
 
