@@ -10,12 +10,13 @@ the rest.
 """
 
 import argparse
-import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from record import add_record_options, save
 
 from twin.env.obstacle_view import camera_intrinsics
 from twin.env.randomisation import ANOTHER_DAY, UNTOLD, Draw
@@ -84,14 +85,14 @@ def ratios(gaps: list[NDArray], moved: list[NDArray], rng: np.random.Generator |
     return np.exp(np.mean(each, 0))
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument(
         "--days", nargs="+", choices=WEATHER, default=list(WEATHER), metavar="NAME", help="default: all"
     )
     parser.add_argument("--policies", nargs="*", default=[], help="runs of the scene, named after their task")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    add_record_options(parser)
     parser.add_argument("--pictures", type=Path, help="folder for pictures: day, twin, twin with weather drawn")
     given = parser.parse_args()
     twin = load_scene(given.scene)
@@ -156,9 +157,8 @@ def main() -> None:
             tell(name, ratios(gaps, moved)[k])
             tell(f"{name}.low", low[k])
             tell(f"{name}.high", high[k])
-    if given.json:
-        given.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return save(given.json, figures, given.replace_record)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

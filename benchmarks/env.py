@@ -8,13 +8,14 @@ the best of several short runs in processes that have the cores they are said to
 """
 
 import argparse
-import json
 import platform
+import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from field import shown
+from record import add_record_options, save, write_so_far
 
 TARGETS: dict[str, tuple[str, float]] = {
     "single.steps_per_s": ("≥", 60.0),
@@ -43,16 +44,17 @@ def judge(name: str, value: Any) -> tuple[str, str]:
     return f"{sense} {wanted:,.4g}" if wanted < 1e6 else f"{sense} {wanted:,.0f}", "yes" if met else "no"
 
 
-def main() -> None:
+def main() -> int:
     from env_sections import SECTIONS
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene, such as scenes/demo")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    add_record_options(parser)
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean little")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
+    record: dict[str, Any] = {}
     print(f"{'figure':36} {'value':>16} {'target':>14}  met")
     for section in options.only or list(SECTIONS):
         found = SECTIONS[section](options.scene, options.quick)
@@ -61,12 +63,16 @@ def main() -> None:
             wanted, met = judge(name, value)
             print(f"{name:36} {shown(value):>16} {wanted:>14}  {met}".rstrip(), flush=True)
         if options.json:  # after every section, as a run is long
-            versions = {
-                name: metadata.version(name) for name in ("twin", "mujoco", "mujoco-warp", "warp-lang", "numpy")
-            }
-            about = {"machine": platform.machine(), "versions": versions, "quick": options.quick}
-            options.json.write_text(json.dumps(figures | {"about": about}, indent=1) + "\n", "utf-8")
+            record = figures | {"about": about(options)}
+            write_so_far(options.json, record)
+    return save(options.json, record, options.replace_record)
+
+
+def about(options: argparse.Namespace) -> dict[str, Any]:
+    """What the figures were measured with."""
+    versions = {name: metadata.version(name) for name in ("twin", "mujoco", "mujoco-warp", "warp-lang", "numpy")}
+    return {"machine": platform.machine(), "versions": versions, "quick": options.quick}
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -8,15 +8,16 @@ the machine the whole takes some 35 minutes. What each figure is, is said where 
 """
 
 import argparse
-import json
 import os
 import platform
+import sys
 import tempfile
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from field_common import Bench
+from record import add_record_options, save, write_so_far
 
 TARGETS: dict[str, tuple[str, float]] = {
     "fox.psnr_60s": ("≥", 24.0),
@@ -64,14 +65,14 @@ def shown(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def main() -> None:
+def main() -> int:
     from field_sections import NEED_SCENE, SECTIONS
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene, such as scenes/demo")
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared/data")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    add_record_options(parser)
     parser.add_argument("--budgets", nargs="+", type=int, default=[60, 300, 1200], metavar="S", help="of the fox [s]")
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean nothing")
     options = parser.parse_args()
@@ -84,6 +85,7 @@ def main() -> None:
     # All sections but `gpu` are about the processor.
     os.environ["TWIN_DEVICE"] = "cpu"
     figures: dict[str, Any] = {}
+    record: dict[str, Any] = {}
     print(f"{'figure':32} {'value':>16} {'target':>12}  met")
     with tempfile.TemporaryDirectory() as work:
         bench = Bench(options.scene, options.data, Path(work), tuple(options.budgets), options.quick)
@@ -94,7 +96,9 @@ def main() -> None:
                 wanted, met = judge(name, figures)
                 print(f"{name:32} {shown(figures[name]):>16} {wanted:>12}  {met}".rstrip(), flush=True)
             if options.json:  # after every section, as a run is long
-                options.json.write_text(json.dumps(figures | {"about": about(options)}, indent=1) + "\n", "utf-8")
+                record = figures | {"about": about(options)}
+                write_so_far(options.json, record)
+    return save(options.json, record, options.replace_record)
 
 
 def about(options: argparse.Namespace) -> dict[str, Any]:
@@ -106,4 +110,4 @@ def about(options: argparse.Namespace) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

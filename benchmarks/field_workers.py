@@ -142,12 +142,13 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     import numpy as np
 
     from twin.config_file import load_config
+    from twin.files import read_json
     from twin.geometry.cameras import Cameras
     from twin.geometry.points import SparsePoints
     from twin.nerf.fit import fit
     from twin.nerf.stage import constant_height
     from twin.progress import set_quiet
-    from twin.scene import SceneDir, read_json
+    from twin.scene import SceneDir
 
     set_quiet(True)
     paths = SceneDir(Path(scene))

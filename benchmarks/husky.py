@@ -8,7 +8,6 @@ should pass, or a control passes that should fail.
 """
 
 import argparse
-import json
 import math
 import platform
 import sys
@@ -20,6 +19,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from record import add_record_options, save
 
 from twin.assets.ground import Ground
 from twin.env.acceptance import grounds
@@ -85,7 +85,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene")
     parser.add_argument("--only", nargs="+", metavar="ID", help="rows such as B6, or: controls, speed")
-    parser.add_argument("--json", type=Path, help="file to write")
+    add_record_options(parser)
     arguments = parser.parse_args()
 
     def wanted(*names: str) -> bool:
@@ -114,6 +114,7 @@ def main() -> int:
         controls[control.name] = {"fails": failed, "caught": caught, "rows": [asdict(row) for row in measured]}
         worst = ", ".join(f"{row.quantity} {row.value:.3g}" for row in measured if not row.passed and row.id != "A1")
         print(f"control: {control.name}: {'fails ' + ', '.join(failed) if caught else 'PASSES'} ({worst})", flush=True)
+    status = 0
     if arguments.json:
         report = {
             "rows": [asdict(row) | {"passed": row.passed} for row in rows],
@@ -125,8 +126,8 @@ def main() -> int:
         open_limits = {math.inf: None, -math.inf: None}
         for row in [*report["rows"], *(row for control in controls.values() for row in control["rows"])]:
             row |= {k: open_limits.get(row[k], row[k]) for k in ("value", "low", "high")}
-        arguments.json.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return int(not all(row.passed for row in rows) or not all(c["caught"] for c in controls.values()))
+        status = save(arguments.json, report, arguments.replace_record)
+    return status or int(not all(row.passed for row in rows) or not all(c["caught"] for c in controls.values()))
 
 
 if __name__ == "__main__":

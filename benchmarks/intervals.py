@@ -1,16 +1,23 @@
 """How often the forecast's 90 % intervals hold what they aim at, in simulated worlds where that is known.
 
     python benchmarks/intervals.py [--experiments 300]
+    python benchmarks/intervals.py --record benchmarks/table1/results.json
 
 Policies of varied quality drive under two lightings, in a twin that promises too much and misjudges each by some noise.
-Prints a table: a world per row, a statistic per column.
+Prints a table: a world per row, a statistic per column. With `--record`, worlds are resampled from an experiment's
+record instead: many days of few trials, most of them all or none. See `RECORDED`.
 """
 
 import argparse
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from scipy.special import expit
 
+from twin.config import RANDOMISED
+from twin.files import read_json
 from twin.report.bootstrap import Paired, Rates, interval, resample, seen
 from twin.report.correction import Correction, left_out_predictions, powered_mean
 from twin.report.statistics import mmrv_rows, pearson_rows, spearman_rows, winner_rows
@@ -39,6 +46,41 @@ def world(rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, 
     return Paired(trials[0], won[0], of, trials[1], won[1], np.ones((n, 2)), (np.arange(n),))
 
 
+RECORDED = {
+    "policies drawn anew, the same days": False,
+    "policies and days drawn anew": True,
+}
+"""Worlds of a record: each policy's trials are driven again at the rates seen, on its days or on days drawn of them."""
+
+
+def recorded(path: Path) -> Paired:
+    """An experiment as `benchmarks/table1` records it, by a photo of each day; policies by task."""
+    read: list[tuple[str, list[list[int]]]] = []
+    for run in read_json(path)["runs"]:
+        for policy in run["policies"]:
+            twin, real = policy["validate_by_photo"]["by_lighting"], policy["real"]["by_lighting"]
+            sides = [[twin[f"{day}{RANDOMISED}"], real[day]] for day in real]
+            read.append((run["task"], [[c["trials"] for c in s] + [c["successes"] for c in s] for s in sides]))
+    counts = np.array([cells for _, cells in read])
+    task = np.array([name for name, _ in read])
+    of = np.broadcast_to(np.arange(counts.shape[1]), counts.shape[:2])
+    strata = tuple(np.flatnonzero(task == name) for name in dict.fromkeys(task))
+    weight = np.ones(counts.shape[:2])
+    return Paired(counts[..., 0], counts[..., 2], of, counts[..., 1], counts[..., 3], weight, strata)
+
+
+def again(rng: np.random.Generator, record: Paired, days_anew: bool) -> Paired:
+    """One experiment with policies drawn with replacement from the record's, task by task, and maybe with its days."""
+    policies = np.concatenate([rng.choice(members, len(members)) for members in record.strata])
+    strata = tuple(np.split(np.arange(len(policies)), np.cumsum([len(m) for m in record.strata])[:-1]))
+    days = np.arange(record.weight.shape[1])
+    chosen = np.ix_(policies, rng.choice(days, len(days)) if days_anew else days)
+    twin_trials, real_trials = record.twin_trials[chosen], record.real_trials[chosen]
+    twin = rng.binomial(twin_trials, record.twin_successes[chosen] / twin_trials)
+    real = rng.binomial(real_trials, record.real_successes[chosen] / real_trials)
+    return Paired(twin_trials, twin, record.twin_of, real_trials, real, record.weight, strata)
+
+
 def statistics(rates: Rates) -> dict[str, np.ndarray]:
     """Those with a bootstrap interval."""
     agreement, regret = winner_rows(twin=rates.twin, real=rates.real)
@@ -56,17 +98,13 @@ def statistics(rates: Rates) -> dict[str, np.ndarray]:
 def coverage(settings: tuple[int, int, int, float, float], experiments: int, seed: int = 0) -> dict[str, float]:
     """Share of the experiments in which each interval held what it aims at."""
     rng = np.random.default_rng(seed)
-    many = [statistics(seen(world(rng, *settings))) for _ in range(_MEAN_OVER)]
-    aims = {name: float(np.nanmean([one[name] for one in many])) for name in many[0]}
+    aims = aimed_at(lambda: world(rng, *settings))
     held: dict[str, list[float]] = {name: [] for name in (*aims, "predicted", "left out", "mean on the road")}
     n = settings[0]
     for _ in range(experiments):
         data = world(rng, *settings)
-        own, again = statistics(seen(data)), statistics(resample(data, rng, _DRAWS))
-        for name, aim in aims.items():
-            ends = interval(float(own[name]), again[name])
-            if ends:
-                held[name].append(ends[0] - 1e-9 <= aim <= ends[1] + 1e-9)
+        for name, hit in hits(data, rng, aims).items():
+            held[name].append(hit)
         further = seen(world(rng, 2 * n, *settings[1:]))
         driven, others = slice(0, n), slice(n, 2 * n)
         f, y = further.twin, further.real
@@ -77,15 +115,43 @@ def coverage(settings: tuple[int, int, int, float, float], experiments: int, see
             held["left out"].append(float(np.mean((low <= y[driven]) & (y[driven] <= high))))
         mean = powered_mean(twin=f[driven], real=y[driven], twin_only=f[others])
         held["mean on the road"].append(mean.low <= 0.5 <= mean.high)  # one half, by symmetry
-    return {name: float(np.mean(hits)) if hits else float("nan") for name, hits in held.items()}
+    return {name: float(np.mean(each)) if each else float("nan") for name, each in held.items()}
+
+
+def aimed_at(experiment: Callable[[], Paired]) -> dict[str, float]:
+    """Mean of each statistic over many experiments."""
+    many = [statistics(seen(experiment())) for _ in range(_MEAN_OVER)]
+    return {name: float(np.nanmean([one[name] for one in many])) for name in many[0]}
+
+
+def hits(data: Paired, rng: np.random.Generator, aims: dict[str, float]) -> dict[str, bool]:
+    """Whether one experiment's bootstrap intervals hold what they aim at, where there are intervals."""
+    own, repeated = statistics(seen(data)), statistics(resample(data, rng, _DRAWS))
+    ends = {name: interval(float(own[name]), repeated[name]) for name in aims}
+    return {name: end[0] - 1e-9 <= aims[name] <= end[1] + 1e-9 for name, end in ends.items() if end}
+
+
+def recorded_coverage(record: Paired, days_anew: bool, experiments: int, seed: int = 0) -> dict[str, float]:
+    """`coverage` in worlds resampled from a record."""
+    rng = np.random.default_rng(seed)
+    aims = aimed_at(lambda: again(rng, record, days_anew))
+    held = [hits(again(rng, record, days_anew), rng, aims) for _ in range(experiments)]
+    return {name: float(np.mean([one[name] for one in held if name in one])) for name in aims}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--experiments", type=int, default=300)
-    experiments = parser.parse_args().experiments
-    for i, (name, settings) in enumerate(WORLDS.items()):
-        row = coverage(settings, experiments)
+    parser.add_argument("--record", type=Path, metavar="FILE", help="results.json of benchmarks/table1")
+    given = parser.parse_args()
+    worlds: dict[str, Callable[[], dict[str, float]]] = {
+        name: partial(coverage, settings, given.experiments) for name, settings in WORLDS.items()
+    }
+    if given.record:
+        record = recorded(given.record)
+        worlds = {name: partial(recorded_coverage, record, anew, given.experiments) for name, anew in RECORDED.items()}
+    for i, (name, measure) in enumerate(worlds.items()):
+        row = measure()
         if i == 0:
             print(f"| world | {' | '.join(row)} |\n|---|{'---|' * len(row)}")
         print(f"| {name} | {' | '.join(f'{x:.2f}' if x == x else '–' for x in row.values())} |", flush=True)

@@ -10,7 +10,7 @@ measured along a drive, see `twin/report/seen_touched.py`.
 """
 
 import argparse
-import json
+import sys
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import warp as wp
+from record import add_record_options, save
 
 from twin.config import ObstacleConfig
 from twin.env.obstacle_shapes import Shape, add_shape
@@ -267,10 +268,10 @@ def save_pictures(folder: Path, lighting: str, rows: list[tuple[str, np.ndarray,
         cv2.imwrite(str(folder / f"{lighting}_{kind}.jpg"), big[..., ::-1])
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene with its truth, such as scenes/demo")
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    add_record_options(parser)
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="where pictures to judge by go")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     options = parser.parse_args()
@@ -278,9 +279,8 @@ def main() -> None:
     for name, value in figures.items():
         sense, wanted = TARGETS.get(name, ("", 0.0))
         print(f"{name:40} {value:10.4g}  {f'{sense} {wanted:g}' if sense else ''}".rstrip())
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
+    return save(options.json, figures, options.replace_record)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

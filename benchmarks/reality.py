@@ -8,7 +8,7 @@ scene, its route is laid on the true one.
 """
 
 import argparse
-import json
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,6 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from record import add_record_options, save
 
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import psnr, write_image
@@ -73,10 +74,10 @@ def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
     yield "reality.route_begins_later_m", float(station[0])
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene with truth")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    add_record_options(parser)
     parser.add_argument("--pictures", type=Path, help="folder for pictures: rasterised, film, difference")
     options = parser.parse_args()
     if options.pictures:
@@ -86,9 +87,8 @@ def main() -> None:
         for name, value in part:
             figures[name] = value
             print(f"{name:44} {value:8.3f}", flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    return save(options.json, figures, options.replace_record)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.files import write_json
 from twin.geometry.cameras import Cameras, Posed, pixel_grid, resized, unproject
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
-from twin.scene import write_json
 
 Array = NDArray[np.float64]
 

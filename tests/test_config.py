@@ -4,7 +4,7 @@ import math
 import pytest
 
 from twin import build
-from twin.config import SceneConfig
+from twin.config import CAMERA_MODELS, MARKER_FAMILIES, SceneConfig
 from twin.config_file import _RANGES, load_config
 from twin.errors import InputError
 
@@ -26,9 +26,9 @@ def test_defaults_and_name_from_folder(tmp_path):
 
 
 def test_nested_table_and_integer_for_float(tmp_path):
-    text = _MINIMAL + 'camera = {model="PINHOLE", params=[1, 2.5], width=4, height=3}\ncamera_height=2\n'
+    text = _MINIMAL + 'camera = {model="PINHOLE", params=[1, 2.5, 3, 4], width=4, height=3}\ncamera_height=2\n'
     config = load_config(_write(tmp_path, text))
-    assert config.source[0].camera.params == (1.0, 2.5)
+    assert config.source[0].camera.params == (1.0, 2.5, 3.0, 4.0)
     assert config.source[0].camera_height == 2.0 and isinstance(config.source[0].camera_height, float)
 
 
@@ -47,7 +47,38 @@ def test_nested_table_and_integer_for_float(tmp_path):
         (f"seed = {2**31}\n" + _MINIMAL, "seed = 2,147,483,648; expected"),
         (_SOURCE, "no scale"),
         (_SOURCE + "[metric]\ncamera_height = 1.0\ngps = true\n", "camera_height and gps"),
+        (_MINIMAL + "[capture]\nkeep = [[5, 3]]\n", "capture.keep = [[5.0, 3.0]]; expected pairs [from, to]"),
+        (_MINIMAL + "keep = [[-1.0, 3]]\n", "keep of [[source]] 'a.mp4' = [[-1.0, 3.0]]; expected pairs"),
+        (_MINIMAL + "keep = [[0, 3], [2, 4]]\n", "in order and apart"),
+        (_MINIMAL + "keep = [[0, 3, 4]]\n", "expected pairs"),
+        (_MINIMAL + "keep = [0, 3]\n", "keep: expected a list, got 0"),
+        (_MINIMAL + "keep = [[0, inf]]\n", "expected a finite number"),
         (_MINIMAL + 'kind = "film"\n', "expected auto, video"),
+        (_MINIMAL + 'kind = "vidoe"\n', "did you mean 'video'"),
+        (_MINIMAL + 'path = "a\\u0000.mp4"\n'.replace("path", "mask"), "no NUL"),
+        (_MINIMAL + '[cameras]\nmapper = "incremntal"\n', "cameras.mapper = 'incremntal'; did you mean 'incremental'"),
+        (_SOURCE + '[metric]\ncamera_height = 1\nup = ""\n', "metric.up = ''; expected ground, cameras or poses"),
+        (_MINIMAL + 'lighting = "training"\n', "a light drawn at random"),
+        (_MINIMAL + 'lighting = "a/b"\n', "choose a plain name"),
+        (_MINIMAL + f'lighting = "{"x" * 90}"\n', "at most 80 characters"),
+        (_MINIMAL + 'lighting = ".."\n', "no dot to begin with"),
+        (_MINIMAL + 'camera = {model = "PINHOL", params = [1, 2, 3, 4]}\n', "did you mean 'PINHOLE'"),
+        (_MINIMAL + 'camera = {model = "OPENCV", params = [1, 2, 3, 4]}\n', "has 4 numbers; OPENCV has 8"),
+        (_MINIMAL + "camera = {params = [1, 2, 3, 4], width = 9}\n", "is for 9x0 px"),
+        ('metric.marker = {family = "DICT_4x4_5O", size = 1}\n' + _SOURCE, "did you mean 'DICT_4X4_50'"),
+        ('metric.marker = {family = "DICT_4X4_50", id = 50, size = 1}\n' + _SOURCE, "id = 50; expected 0 to 49"),
+        ('metric.marker = {family = "DICT_4X4_50", id = 1}\n' + _SOURCE, "size = 0; expected the side"),
+        ("metric.distance = {a = [1, 2], b = [3, 4]}\n" + _SOURCE, "metres = 0; expected the metres"),
+        ("metric.distance = {metres = 1, a = [1], b = [3, 4]}\n" + _SOURCE, "a = [1.0]; expected [u, v]"),
+        ("metric.distance = {metres = 1, a = [1, 2], b = [3, 4]}\n" + _SOURCE, "frame_a = ''; expected a frame"),
+        ('name = "a\\nb"\n' + _MINIMAL, "without control characters"),
+        *(
+            (_MINIMAL + f'[[task]]\nname = "{name}"\nlength = 5\n', "files are named after it")
+            for name in ("a/b", "..", ".x", "a\\u0000", "x" * 81, " ", "\u6f22" * 60)
+        ),
+        (_MINIMAL + 2 * '[[task]]\nname = "a"\nlength = 5\n', "two [[task]] are named 'a'"),
+        (_MINIMAL + '[[obstacle]]\nkind = "cone"\nname = "a/b"\n', "files are named after it"),
+        (_MINIMAL + '[[obstacle]]\nkind = "cone"\n[[obstacle]]\nkind = "box"\nname = "cone_0"\n', "named 'cone_0'"),
         ("[[source]]\n", "no path"),
         ("seed = 1\n", "no [[source]]"),
         ("seed = \n", "not valid TOML"),
@@ -63,6 +94,25 @@ def test_bad_input_is_one_line_with_a_cure(tmp_path, text, message):
 def test_missing_file_names_the_verb_that_writes_one(tmp_path):
     with pytest.raises(InputError, match=r"twin\.new"):
         load_config(tmp_path / "scene.toml")
+
+
+def test_parts_of_films(tmp_path):
+    config = load_config(_write(tmp_path, _MINIMAL + "keep = [[0, 3], [4.5, 6]]\n"), ("capture.keep=[[1, 2]]",))
+    assert config.source[0].keep == ((0.0, 3.0), (4.5, 6.0)) and config.capture.keep == ((1.0, 2.0),)
+
+
+def test_what_may_be_chosen_is_what_the_libraries_have():
+    cv2, lens = (pytest.importorskip(n) for n in ("cv2", "twin.capture.lens"))
+    models = set(lens.pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
+    assert set(CAMERA_MODELS) == models
+    for name, count in CAMERA_MODELS.items():
+        assert len(lens.pycolmap.Camera.create_from_model_name(0, name, 1.0, 10, 10).params) == count
+    families = {name for name in dir(cv2.aruco) if name.startswith("DICT_")}
+    assert set(MARKER_FAMILIES) <= families and {name.upper() for name in MARKER_FAMILIES} == {
+        n.upper() for n in families
+    }
+    for name, count in MARKER_FAMILIES.items():
+        assert len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList) == count
 
 
 def test_overrides(tmp_path):

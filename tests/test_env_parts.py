@@ -14,9 +14,11 @@ import twin
 from twin import progress
 from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.audit import EVENTS, Findings, Seen, audit
+from twin.env.batch import worlds_of
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
 from twin.env.lightings import Light, LightSets, draw_light
+from twin.env.options import parse_options
 from twin.env.physics import HuskyPhysics
 from twin.env.randomisation import ANOTHER_DAY, Draw, Nominal, Ranges
 from twin.env.scene_model import episode_spec
@@ -383,3 +385,75 @@ def test_the_examiner_knows_tunnelling_climbing_and_sliding(scene):
     robot.data.qvel[0] = 0.5
     mujoco.mj_forward(robot.model, robot.data)
     assert {"tunnelling", "wall_sliding"} <= set(examiner.events())
+
+
+_NO_ACTIONS = [
+    *(np.ones(1), np.ones(3), np.ones((1, 2)), np.ones((0,)), 1.0, None, "ab", [[1.0], [1.0, 2.0]]),
+    *(np.ones(2, complex), np.ones(2, bool), np.array([np.nan, 0.0]), np.array([0.0, np.inf]), [10**400, 0]),
+]
+
+
+@pytest.mark.parametrize("action", _NO_ACTIONS, ids=str)
+def test_what_is_no_action_is_a_clear_error_and_the_episode_goes_on(scene, action):
+    environments = []
+    for _ in range(2):
+        environments.append(twin.load(scene, "ahead", seed=3, pixels=False))
+        environments[-1].reset()
+    tried, other = environments
+    with pytest.raises(ValueError, match=r"^action .*; expected finite numbers of shape \(2,\)$"):
+        tried.step(action)
+    good = [tried.step(np.array([0.5, 0.1])), other.step([0.5, 0.1])]
+    assert good[0].reward == good[1].reward and not good[0].last()
+    for name, value in good[0].observation.items():
+        np.testing.assert_array_equal(value, good[1].observation[name])
+
+
+def test_what_is_no_action_of_many_worlds(scene):
+    worlds = worlds_of(scene, "ahead", {"pixels": False, "action": "steering"}, [1, 2], 1)
+    worlds.begin([0, 1])
+    for actions in (np.zeros((2, 2)), np.zeros(2), np.zeros((1, 1)), np.full((2, 1), np.nan), np.zeros((2, 1), bool)):
+        with pytest.raises(ValueError, match=r"expected finite numbers of shape \(2, 1\)"):
+            worlds.step(actions)
+    assert np.isfinite(worlds.step(np.zeros((2, 1), int)).reward).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[
+            ("size", (10**9, 10**9)),
+            ("size", 5),
+            ("size", "ab"),
+            ("size", (90.5, 90)),
+            ("stack", 10**9),
+            ("stack", 2.5),
+        ],
+        *[("speed", "fast"), ("speed", float("nan")), ("speed", 10**400), ("time_limit", [1]), ("start_along", "x")],
+        *[("half_width", float("inf")), ("start_offset", True), ("rewards", {"step": "much"}), ("rewards", None)],
+        *[
+            ("obstacles", -1),
+            ("obstacles", 10**9),
+            ("obstacles", [5]),
+            ("lighting", 5),
+            ("lighting", ()),
+            ("device", 7),
+        ],
+        *[
+            ("camera", "shaky"),
+            ("randomise", "much"),
+            ("pixels", "yes"),
+            ("action", 3),
+            ("observe", None),
+            ("device", 7),
+        ],
+    ],
+)
+def test_options_of_another_kind_are_refused(name, value):
+    with pytest.raises(InputError, match=name):
+        parse_options({name: value})
+
+
+@pytest.mark.parametrize("pair", [5, "ab", (1,), (1, 2, 3), (0.0, float("inf")), (0, 10**400), None])
+def test_a_range_is_two_numbers(pair):
+    with pytest.raises(InputError, match="friction"):
+        Ranges(friction=pair)

@@ -9,6 +9,7 @@ import torch
 
 from twin.config import NerfConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
+from twin.files import write_json
 from twin.geometry.cameras import Cameras, Viewpoints, project
 from twin.geometry.images import psnr, write_image
 from twin.geometry.points import SparsePoints
@@ -26,7 +27,7 @@ from twin.nerf.losses import bending
 from twin.nerf.stage import constant_height, run
 from twin.nerf.workspace import CameraArrays
 from twin.progress import set_quiet
-from twin.scene import SceneDir, write_json
+from twin.scene import SceneDir
 
 WIDTH, HEIGHT = 32, 24
 K = np.array([24.0, 24.0, 16.0, 12.0])

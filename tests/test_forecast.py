@@ -16,7 +16,16 @@ from twin.report import forecast_figures
 from twin.report.forecast import ALL_TASKS, Estimate, Forecast
 from twin.report.forecast_figures import columns_of
 from twin.report.forecast_page import forecast_page
-from twin.report.forecast_words import CSV_COLUMNS, STATISTICS, candidates_csv, show, summary, unknowns, verdicts
+from twin.report.forecast_words import (
+    CSV_COLUMNS,
+    NOMINAL,
+    STATISTICS,
+    candidates_csv,
+    show,
+    summary,
+    unknowns,
+    verdicts,
+)
 from twin.report.forecasting import make_forecast
 from twin.report.markup import LONG
 from twin.report.statistics import mmrv, pearson, spearman, wilson
@@ -375,6 +384,19 @@ def test_names_from_files_are_text() -> None:
     real = [Cell(evil if c.policy == "p0" else c.policy, *c.key[1:], 20, c.successes, c.twin_lighting) for c in real]
     page = Text(forecast_page(make_forecast(evil, twin, real)))
     assert "script" not in page.tags and evil in page.text
+
+
+def test_the_intervals_coverage_stands_beside_them() -> None:
+    twin, real = cells()
+    made = make_forecast("road", twin, real)
+    assert all(word in NOMINAL for word in ("nominal", "60% (Spearman)", "70% (Pearson)", "50% (MMRV)", "days"))
+    page = forecast_page(made)
+    road = page[page.index('<section id="road"') : page.index('<section id="stages"')]
+    assert NOMINAL in Text(road).text and NOMINAL in " ".join(summary(made).split())
+    told = page + summary(made)
+    assert "drive more policies" not in told and "in a repetition" not in told
+    for alone in (make_forecast("road", twin, []), make_forecast("road", *cells(driven=4))):  # no intervals there
+        assert NOMINAL not in " ".join((forecast_page(alone) + summary(alone)).split())
 
 
 def test_numbers_are_shown_with_their_interval() -> None:

@@ -210,7 +210,7 @@ def _spoil(table: dict[str, Any], what: str) -> None:
 @pytest.mark.parametrize(
     ("what", "words"),
     [
-        ("nan", "im1.png.*not finite"),
+        ("nan", "transforms.json.*NaN where a finite number"),
         ("scaled", "im1.png.*not rigid"),
         ("mirrored", "im1.png.*not rigid"),
         ("ragged", "im1.png.*not 4x4"),

@@ -161,7 +161,7 @@ def test_masks_in_a_folder_are_named_like_the_frames(tmp_path: Path) -> None:
     [
         (np.zeros((HEIGHT, WIDTH), np.uint8), "ignores the whole"),
         (np.ones((WIDTH, WIDTH), np.uint8), "aspect"),
-        (None, "no such mask"),
+        (None, "No such file.*give as mask"),
     ],
 )
 def test_a_wrong_mask_is_refused(tmp_path: Path, mask: np.ndarray | None, words: str) -> None:
@@ -301,3 +301,29 @@ def test_the_paper_films_keep_all_their_frames(tmp_path: Path, real_data: Path) 
     capture, _, _ = captured(tmp_path, sources, frames=80, min_motion=0.0, max_size=160)
     assert len(capture.names) == 160
     assert [n.split("/")[1] for n in capture.names[:80]] == [n.split("/")[1] for n in capture.names[80:]]
+
+
+def test_only_the_parts_of_a_film_that_are_kept_are_read(tmp_path: Path) -> None:
+    film(tmp_path / "a.mp4", views([4 * i for i in range(60)]))  # 4 s
+    film(tmp_path / "b.mp4", views([4 * i for i in range(60)]))
+    sources = [SourceConfig(path="a.mp4"), SourceConfig(path="b.mp4", keep=((3.0, 9.0),))]
+    capture, metrics, _ = captured(tmp_path, sources, fps=5.0, keep=((0.0, 1.0), (2.0, 2.6)))
+    times = capture.times[capture.source_index == 0]
+    assert len(times) in (8, 9) and np.all((times <= 1.001) | ((times >= 1.999) & (times <= 2.601)))
+    assert (times < 1.5).sum() in (5, 6)
+    assert capture.names[0].startswith("a/0000") and capture.names[len(times) - 1] == f"a/{times[-1] * 15:06.0f}"
+    times = capture.times[capture.source_index == 1]
+    assert len(times) == 5 and times.min() >= 2.999
+    facts = metrics["sources"]["b"]
+    assert facts["decoded"] == facts["promised"] == 15 and facts["duration_s"] == 1.0
+
+
+def test_as_many_slots_as_frames_keeps_every_frame_of_a_part(tmp_path: Path) -> None:
+    film(tmp_path / "a.mp4", views([4 * i for i in range(30)]))
+    capture, _, _ = captured(tmp_path, [SourceConfig(path="a.mp4")], frames=30, keep=((1.0, 1.4),))
+    assert capture.names == tuple(f"a/{i:06d}" for i in range(15, 22))
+
+
+def test_parts_that_hold_nothing_are_refused(tmp_path: Path) -> None:
+    film(tmp_path / "a.mp4", views([4 * i for i in range(30)]))
+    refused(tmp_path, SourceConfig(path="a.mp4", keep=((5.0, 9.0),)), r"leaves 0 of 30 frames.*0 to 1\.93 s")

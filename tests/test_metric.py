@@ -13,11 +13,12 @@ from twin.capture.scale import local_east_north_up
 from twin.capture.types import Capture, SourceInfo
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig, SceneConfig
 from twin.errors import InputError
+from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, project, unproject
 from twin.geometry.images import write_image
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import Similarity, inverse_pose, look_at, umeyama
-from twin.scene import SceneDir, read_json
+from twin.scene import SceneDir
 
 SIZE = (320, 240)
 INTRINSICS = np.array([260.0, 260.0, 160.0, 120.0])

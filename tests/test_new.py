@@ -1,6 +1,7 @@
 """The verb that starts a scene: what it writes can be loaded and built."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from twin.build import build
 from twin.config_file import load_config
 from twin.geometry.images import write_image
 from twin.new import main as new_main
+from twin.new import new_scene
 
 
 def test_new_writes_a_scene_that_loads_and_never_overwrites(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -126,3 +128,20 @@ def test_a_lighting_s_name_means_no_other_light(tmp_path: Path, name: str) -> No
     day = film(tmp_path / f"{name}.mp4", views([5 * i for i in range(4)]))
     assert new_main([str(tmp_path / "scene"), str(day), "--camera-height", "1.2"]) == 0
     assert build(tmp_path / "scene", until="capture")["capture"]["frames"] >= 2
+
+
+def test_a_folder_is_copied_without_what_is_no_file(tmp_path):
+    photos = tmp_path / "photos"
+    write_image(photos / "a.png", np.zeros((8, 8, 3), np.uint8))
+    os.mkfifo(photos / "b.png")
+    for name, target in (("c.png", "/dev/zero"), ("d.png", "nowhere"), ("e", ".")):
+        (photos / name).symlink_to(target)
+    new_scene(tmp_path / "scene", [photos], 1.2)
+    assert [path.name for path in (tmp_path / "scene/input/photos").iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize("name", ["x" * 200, "\u6f22" * 60, ".hidden", "a\nb", "a\\b"])
+def test_a_film_of_any_name_becomes_a_lighting_that_is_taken(tmp_path, name):
+    write_image(tmp_path / name / "a.png", np.zeros((8, 8, 3), np.uint8))
+    config = load_config(new_scene(tmp_path / "scene", [tmp_path / name], 1.2))
+    assert 1 <= len(config.source[0].lighting) <= 80

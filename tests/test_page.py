@@ -1,21 +1,32 @@
 """The report page: what it says follows from the numbers, nothing is made up, and no name can break it."""
 
+import ast
 import copy
+import inspect
 import re
+import sys
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from twin.build import summary
+from twin.files import write_json
 from twin.geometry.images import write_image
+from twin.report import against_truth, crosslight, reconstruction, seen_section
+from twin.report import page as report_page
+from twin.report import sections as section_words
 from twin.report.against_truth import truth_section
 from twin.report.markup import Html, element, table
 from twin.report.page import page, write_page
-from twin.report.sections import SECTIONS
-from twin.report.words import NOT_MEASURED, duration, flat, follower_verdict, listing, number, pick, verdicts
-from twin.scene import STAGES, SceneDir, write_json
+from twin.report.sections import SECTIONS, cautions, sections, summed_up
+from twin.report.words import NOT_MEASURED, Caution, duration, flat, follower_verdict, listing, number, pick
+from twin.scene import STAGES, SceneDir
 
 REPORT: dict[str, Any] = {
     "scene": "road",
@@ -51,11 +62,12 @@ REPORT: dict[str, Any] = {
 }
 
 
-def changed(path: str, value: Any) -> dict[str, Any]:
-    report = copy.deepcopy(REPORT)
+def changed(path: str, value: Any, of: dict[str, Any] = REPORT) -> dict[str, Any]:
+    report = copy.deepcopy(of)
     *folders, last = path.split(".")
     inner = report
     for key in folders:
+        inner[key] = inner.get(key) or {}
         inner = inner[key]
     inner[last] = value
     return report
@@ -141,9 +153,9 @@ def test_every_missing_key_is_tolerated(scene: SceneDir) -> None:
         for key in REPORT[stage]:
             report = copy.deepcopy(REPORT)
             del report[stage][key]
-            SECTIONS[stage](report), verdicts(report)
+            SECTIONS[stage](report), summed_up(report)
             report[stage][key] = None
-            SECTIONS[stage](report), verdicts(report)
+            SECTIONS[stage](report), summed_up(report)
     for key in REPORT:
         read(page(scene, {k: v for k, v in REPORT.items() if k != key}))
 
@@ -212,33 +224,149 @@ def test_no_drive_says_why(scene: SceneDir) -> None:
     assert "Does not apply here: this is no drive." in read(page(scene, report)).text
 
 
-@pytest.mark.parametrize(
-    ("stage", "key", "value", "what"),
-    [
-        ("cameras", "registered", 100, "60 of 160 frames could not be placed"),
-        ("cameras", "reprojection_error_px", 2.5, "2.50 px"),
-        ("cameras", "outliers", ["day/000001"], "day/000001"),
-        ("metric", "scale_uncertainty", 0.1, "10.0%"),
-        ("field", "psnr", {"day": 12.0}, "12.0 dB"),
-        ("field", "n", {"day": 1}, "Only 1 frame"),
-        ("field", "cross_lighting", {"colour_follows": {"day": 0.4}}, "Only 40% of the places"),
-        ("field", "cross_lighting", {"colour_follows": {"day": 1.0}, "depth_moves_m": 0.2}, "moves by up to 0.200 m"),
-        ("mesh", "parts", 0, "Nothing solid"),
-        ("mesh", "parts_beyond_bound", 2, "2 solid part(s) stick out"),
-        ("mesh", "ground", {"corridor_coverage": 0.2}, "Only 20%"),
-        ("mesh", "coacd_failed", 1, "1 piece(s)"),
-        ("mjcf", "spawn_touched", ["part_0003"], "part_0003"),
-        ("metric", "gravity_uncertainty_deg", 3.0, "3.0°"),
-        ("metric", "road_reliable", False, "Too few points"),
-        ("capture", "frames", 5, "Only 5 frames"),
-        ("capture", "sources", {"day": {"damaged": 4}}, "4 frame(s)"),
-    ],
+CAUTIONS: list[tuple[str, str, Any, str]] = [
+    ("capture", "capture.frames", 5, "Only 5 frames"),
+    ("capture", "capture.sources", {"day": {"damaged": 4}}, "4 frame(s)"),
+    ("cameras", "cameras.registered", 100, "60 of 160 frames could not be placed"),
+    ("cameras", "cameras.reprojection_error_px", 2.5, "2.50 px"),
+    ("cameras", "cameras.outliers", ["day/000001"], "day/000001"),
+    ("cameras", "cameras.note", "the given poses did not fit", "The given poses did not fit."),
+    ("metric", "metric.scale_uncertainty", 0.1, "10.0%"),
+    ("metric", "metric.gravity_uncertainty_deg", 3.0, "3.0°"),
+    ("metric", "metric.road_reliable", False, "Too few points"),
+    ("field", "field.psnr", {"day": 12.0}, "12.0 dB"),
+    ("field", "field.n", {"day": 1}, "Only 1 frame"),
+    ("field", "field.cross_lighting", {"colour_follows": {"day": 0.4}}, "Only 40% of the places"),
+    (
+        "field",
+        "field.cross_lighting",
+        {"colour_follows": {"day": 1.0}, "depth_moves_m": 0.2},
+        "moves by up to 0.200 m",
+    ),
+    ("mesh", "mesh.parts", 0, "Nothing solid"),
+    ("mesh", "mesh.parts_left_out", 3, "3 solid part(s) were left out"),
+    ("mesh", "mesh.parts_beyond_bound", 2, "2 solid part(s) stick out"),
+    ("mesh", "mesh.coacd_failed", 1, "1 piece(s)"),
+    ("mesh", "mesh.ground", {"corridor_coverage": 0.2}, "Only 20%"),
+    ("mjcf", "mjcf.spawn_touched", ["part_0003"], "part_0003"),
+    ("review", "review.follower.reached_goal", False, "did not reach the goal"),
+    ("review", "review.follower.touched", ["part_0001"], "It touched part_0001."),
+    ("seen_touched", "seen_touched.median_m", 0.052, "differ: 0.052 m"),
+    ("seen_touched", "seen_touched.corridor_leak_m", 0.3, "seen but not solid: 0.300 m"),
+    ("seen_touched", "seen_touched.corridor_ghost_m", 0.23, "Solid things in the corridor are not seen: 0.230 m"),
+    ("seen_touched", "seen_touched.unfilmed_ghost_m", 1.53, "1.530 m"),
+    ("truth", "truth.ate_m", 0.2, "The camera path: 0.200 m off"),
+    ("truth", "truth.scale_error", -0.05, "The scale: 5.0% off"),
+    ("truth", "truth.ground_median_m", 0.2, "The ground: 0.200 m off"),
+    ("truth", "truth.obstacle_median_m", 0.2, "Solid parts: 0.200 m off"),
+    ("truth", "truth.corridor_intrusions", 2, "2 solid part(s) reach into the true corridor"),
+    ("costs", "peak_memory_bytes", 6 * 2**30, "6.0 GiB of memory."),
+]
+"""Every kind of caution: its section, the number that causes it, and what is said of it."""
+
+
+@pytest.fixture
+def no_charts() -> Iterator[None]:
+    """Charts take a second a page and give no caution."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report_page, "charts", lambda scene, report: [])
+        yield
+
+
+def header_of(html: str) -> str:
+    return read(html[html.index("<header") : html.index("</header>")] + "</header>").text
+
+
+def test_nothing_wrong_gives_no_caution() -> None:
+    assert cautions(REPORT) == [] and cautions({}) == []
+    assert {section.headline.mood for section in summed_up(REPORT) if section.headline} == {"good"}
+    assert "caution" not in summary(REPORT)
+
+
+@pytest.mark.usefixtures("no_charts")
+@pytest.mark.parametrize(("section", "path", "value", "what"), CAUTIONS)
+def test_what_is_wrong_is_said_with_a_cure_below_and_above(
+    scene: SceneDir, section: str, path: str, value: Any, what: str
+) -> None:
+    report = changed(path, value)
+    (below,) = [s for s in sections(report) if s.cautions]
+    (caution,) = below.cautions
+    assert below.name == section and what in caution.what and caution.cure
+    assert below.headline is not None and below.headline.mood in ("mixed", "bad")
+    assert cautions(report) == [{"section": section, "title": below.title, "what": caution.what, "cure": caution.cure}]
+    html = page(scene, report)
+    above = header_of(html)
+    assert f"{below.headline.word}:" in above and caution.what in above
+    assert f'href="#{section}"' in html and f'id="{section}"' in html
+    assert read(html).text.count(caution.what) == 2  # above, and with its cure below
+    printed = [line for line in summary(report).splitlines() if line.startswith("caution")]
+    assert len(printed) == 1 and caution.what in printed[0] and caution.cure in printed[0]
+
+
+def test_every_kind_of_caution_is_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A caution that the code can give and the list above lacks would not be tested."""
+    modules = (against_truth, crosslight, reconstruction, section_words, seen_section)
+    given: set[tuple[str, int]] = set()
+
+    def recording(*args: str) -> Caution:
+        caller = sys._getframe(1)
+        given.add((caller.f_globals["__name__"], caller.f_lineno))
+        return Caution(*args)
+
+    for module in modules:
+        monkeypatch.setattr(module, "Caution", recording)
+    for _, path, value, _ in CAUTIONS:
+        sections(changed(path, value))
+    written = {
+        (module.__name__, node.lineno)
+        for module in modules
+        for node in ast.walk(ast.parse(inspect.getsource(module)))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Caution"
+    }
+    assert len(written) > 20 and given == written
+    elsewhere = {
+        path.stem
+        for path in Path(section_words.__file__).parent.glob("*.py")
+        if "Caution(" in path.read_text(encoding="utf-8").replace("class Caution", "")
+    }
+    # The pages of a validation and of a forecast have their own.
+    apart = {path for path in elsewhere if path.startswith(("validation", "forecast"))}
+    assert elsewhere - apart == {module.__name__.rsplit(".", 1)[1] for module in modules}
+
+
+@pytest.mark.usefixtures("no_charts")
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    wrong=st.lists(st.sampled_from(CAUTIONS), unique_by=lambda case: case[1], max_size=12),
+    numbers=st.dictionaries(
+        st.sampled_from([path for _, path, value, _ in CAUTIONS if isinstance(value, int | float)]),
+        st.one_of(st.none(), st.booleans(), st.integers(-9, 999), st.floats(-2.0, 40.0)),
+        max_size=8,
+    ),
+    missing=st.sets(st.sampled_from(list(REPORT)), max_size=3),
 )
-def test_what_is_wrong_is_said_with_a_cure(stage: str, key: str, value: Any, what: str) -> None:
-    assert SECTIONS[stage](REPORT).cautions == []
-    cautions = SECTIONS[stage](changed(f"{stage}.{key}", value)).cautions
-    assert len(cautions) == 1
-    assert what in cautions[0].what and cautions[0].cure
+def test_no_summary_is_greener_than_its_sections(
+    wrong: list[tuple[str, str, Any, str]], numbers: dict[str, Any], missing: set[str]
+) -> None:
+    report = {key: value for key, value in REPORT.items() if key not in missing or key in ("stages", "seconds")}
+    report.setdefault("peak_memory_bytes", 2**30)
+    for _, path, value, _ in wrong:
+        report = changed(path, value, report)
+    for path, value in numbers.items():
+        if path != "peak_memory_bytes":
+            report = changed(path, value, report)
+    below = [(section, caution) for section in sections(report) for caution in section.cautions]
+    above = {section.name: section for section in summed_up(report)}
+    for section, _ in below:
+        headline = above[section.name].headline
+        assert headline is not None and headline.mood in ("mixed", "bad") and headline.word in ("caution", "bad")
+    html = page(SceneDir(Path("nowhere")), report)
+    header, printed = header_of(html), summary(report)
+    text = read(html[html.index("</header>") + len("</header>") :].removesuffix("</html>").rsplit("</main>", 1)[0]).text
+    for _, caution in below:
+        assert caution.what in header and caution.what in text and caution.what in printed
+    assert [it["what"] for it in cautions(report)] == [caution.what for _, caution in below]
+    assert text.count("What helps:") == len(below) == printed.count("What helps:")
 
 
 def test_a_failed_drive_says_what_to_try() -> None:
@@ -255,7 +383,7 @@ def test_truth_is_told_where_it_is_known(scene: SceneDir) -> None:
     values = {fact.name: fact.value for fact in section.facts}
     assert values["camera positions"] == "0.042 m" and values["scale"] == NOT_MEASURED
     assert len(section.cautions) == 2
-    assert any("4.2 cm" in verdict.text for verdict in verdicts(known))
+    assert section.headline is not None and "4.2 cm" in section.headline.text and section.headline.mood == "mixed"
 
 
 def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:

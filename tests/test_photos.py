@@ -119,3 +119,20 @@ def test_photos_with_gps_and_a_posed_set(tmp_path: Path, real_data: Path) -> Non
     source = next(iter(metrics["sources"].values()))
     assert (source["kept"], source["missing"], source["width"]) == (50, 17, 540) and capture.intrinsics is not None
     np.testing.assert_allclose(capture.intrinsics[0], (687.76, 687.245, 277.279, 482.634))
+
+
+def _clocked(path: Path, image: np.ndarray, second: int) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x9003] = f"2024:05:01 10:00:{second:02d}"
+    Image.fromarray(image).save(path, exif=exif)
+
+
+def test_photos_with_a_clock_are_kept_by_it_and_those_without_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "clocked").mkdir()
+    for i, view in enumerate(views([9 * i for i in range(8)])):
+        _clocked(tmp_path / f"clocked/{i}.jpg", view, 3 * i)
+        write_image(tmp_path / f"bare/{i}.png", view)
+    capture, _, _ = captured(tmp_path, [SourceConfig(path="clocked")], keep=((3.0, 12.0),))
+    assert capture.names == tuple(f"clocked/{i:06d}" for i in range(1, 5))
+    refused(tmp_path, SourceConfig(path="bare", keep=((0.0, 3.0),)), "no clock.*folder of their own")
+    refused(tmp_path, SourceConfig(path="clocked", keep=((40.0, 50.0),)), r"leaves 0 of 8 photos.*0 to 21\.00 s")

@@ -148,8 +148,8 @@ DAMAGE = {
     "weights changed": (lambda f: flip(f / WEIGHTS, -5), "is not the file"),
     "weights cut": (lambda f: (f / WEIGHTS).write_bytes((f / WEIGHTS).read_bytes()[:500]), "is not the file"),
     "weights gone": (lambda f: (f / WEIGHTS).unlink(), "is missing"),
-    "json cut": (lambda f: (f / JSON).write_text((f / JSON).read_text()[:90]), "is no JSON"),
-    "json binary": (lambda f: (f / JSON).write_bytes(b"\xff\xfe\x00"), "is no JSON"),
+    "json cut": (lambda f: (f / JSON).write_text((f / JSON).read_text()[:90]), "no valid JSON|no UTF-8"),
+    "json binary": (lambda f: (f / JSON).write_bytes(b"\xff\xfe\x00"), "no valid JSON|no UTF-8"),
     "json gone": (lambda f: (f / JSON).unlink(), "holds no policy.json"),
     "json of others": (lambda f: (f / JSON).write_text("[1, 2]"), "not a policy of twin"),
     "later version": (lambda f: edit(f, version=3), "version 3"),
@@ -286,3 +286,73 @@ def test_pictures_that_do_not_fit_are_refused(folder):
         policy(np.zeros((12, 45, 80), np.uint8))
     with pytest.raises(InputError, match="float64"):
         policy(np.zeros((12, 90, 160)))
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "def act(pixels): raise KeyError('x')",
+        "def act(pixels): raise SystemExit(3)",
+        "def act(pixels): return 'left'",
+        "def act(pixels): return [1, 2, 3]",
+        "act = 5",
+        "raise OSError('no such robot')",
+        "import sys; sys.exit(4)",
+        "def act(",
+    ],
+)
+def test_a_callable_that_is_no_policy_is_refused_in_one_line(tmp_path, monkeypatch, code):
+    name = f"theirs_{abs(hash(code))}"
+    (tmp_path / f"{name}.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(InputError, match=name) as refused:
+        load_policy(f"{name}:act")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["subprocess:run", "os:abort_", "..:..", "a b:c", ":x", "x:"])
+def test_what_names_no_policy_is_refused(name):
+    with pytest.raises(InputError):
+        load_policy(name)
+
+
+def test_a_callable_that_raises_on_the_way_is_said_to(tmp_path, monkeypatch):
+    code = "left = [1]\ndef act(pixels):\n    left.pop()\n    return [0.0]\n"
+    (tmp_path / "tired_policy.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    policy = load_policy("tired_policy:act")
+    with pytest.raises(InputError, match="tired_policy:act: raised IndexError"):
+        policy(np.zeros((12, 90, 160), np.uint8))
+
+
+def _hidden_tensors():
+    """Models with a tensor in another file, each at another place."""
+    outside = helper.make_tensor("w", TensorProto.FLOAT, [1], [0.0])
+    outside.data_location = TensorProto.EXTERNAL
+    outside.external_data.add(key="location", value="elsewhere")
+    constant = helper.make_node("Constant", [], ["y"], value=outside)
+    function = helper.make_function("own", "f", [], ["y"], [constant], [helper.make_opsetid("", 17)])
+    sparse = onnx.SparseTensorProto(values=outside, indices=outside, dims=[1])
+    return {
+        "function": lambda model: model.functions.append(function),
+        "sparse": lambda model: model.graph.sparse_initializer.append(sparse),
+        "training": lambda model: model.training_info.add().algorithm.initializer.append(outside),
+    }
+
+
+@pytest.mark.parametrize("place", _hidden_tensors())
+def test_weights_in_other_files_are_found_wherever_they_are_named(tmp_path, place):
+    model = onnx.load(foreign(tmp_path / "a.onnx"))
+    _hidden_tensors()[place](model)
+    (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match="keeps its weights in other files"):
+        load_policy(tmp_path / "a.onnx")
+
+
+def test_an_onnx_file_that_asks_for_huge_pictures_is_refused(tmp_path):
+    model = onnx.load(foreign(tmp_path / "a.onnx"))
+    for axis in (2, 3):
+        model.graph.input[0].type.tensor_type.shape.dim[axis].dim_value = 100_000
+    (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match=r"100000 × 100000 px|is no ONNX file"):
+        load_policy(tmp_path / "a.onnx")

@@ -14,14 +14,15 @@ from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
-from twin.nerf.added import AddedLighting, added_lightings, check_name
+from twin.nerf.added import AddedLighting, added_lightings, check_name, field_result
 from twin.nerf.air import Air, mixed
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.field import RadianceField, untrained
 from twin.nerf.lightings import Lightings
 from twin.nerf.workspace import Layout
 from twin.relight import fit_photo, main
-from twin.scene import SceneDir, write_json
+from twin.scene import SceneDir
+from twin.stamp import seal
 
 
 def small_field(seed: int = 0) -> RadianceField:
@@ -38,8 +39,8 @@ def scene(tmp_path_factory) -> SceneDir:
     scene = filmed_corridor(tmp_path_factory.mktemp("relight") / "scene")
     scene.stage("field").mkdir()
     small_field().save(scene.stage("field"))
-    write_json(scene.stamp("field"), {"result": "first"})
-    write_json(scene.stage("metric") / "stamp.json", {"result": "x"})
+    for stage in ("capture", "cameras", "metric", "field"):
+        seal(scene.stage(stage), stage)
     write_image(scene.root / "photo.png", picture(pose_at(2.4, 0.2), tint=(0.9, 0.6, 0.4)))
     return scene
 
@@ -138,9 +139,11 @@ def _without_gaps(picture: np.ndarray) -> np.ndarray:
 
 
 def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
-    AddedLighting("old", [0.0] * 8, Air(), "first", "photo.png", {}).save(scene)
+    AddedLighting("old", [0.0] * 8, Air(), field_result(scene), "photo.png", {}).save(scene)
     assert "old" in added_lightings(scene)[0]
-    write_json(scene.stamp("field"), {"result": "second"})
+    another = scene.stage("field") / "another"
+    another.touch()
+    seal(scene.stage("field"), "field")
     try:
         field = twin.load_scene(scene.root).radiance_field()
         assert "old" not in field.lightings
@@ -150,7 +153,8 @@ def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
             ):
                 field.embedding(asked)
     finally:
-        write_json(scene.stamp("field"), {"result": "first"})
+        another.unlink()
+        seal(scene.stage("field"), "field")
     assert "old" in twin.load_scene(scene.root).radiance_field().lightings
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
+from twin.files import read_json
 from twin.geometry.cameras import Cameras, Posed, Viewpoints, nearest_frame, pixel_grid, resized, unproject
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
@@ -21,7 +22,7 @@ from twin.report.review import film
 from twin.report.rows import error_colours, judged_row, scale_bar
 from twin.report.studio import Studio, frames_to_compare, greyed, light_of_frame, side_by_side, spread
 from twin.report.video import describe, read_frames
-from twin.scene import SceneDir, read_json
+from twin.scene import SceneDir
 
 
 class ChequeredField:

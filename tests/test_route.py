@@ -12,6 +12,8 @@ from twin.assets.route import (
     distance_to_route,
     filmed_route,
     path_inliers,
+    path_jumps,
+    refuse_jumps,
     route_length,
     smooth_route,
     without_rocking,
@@ -83,3 +85,67 @@ def test_a_camera_that_stands_still_is_refused(tmp_path: Path):
     still = replace(cameras, camera_to_world=np.repeat(cameras.camera_to_world[:1], len(cameras), 0))
     with pytest.raises(InputError, match=r"0\.00 m long.*mjcf\.route = false"):
         filmed_route(still)
+
+
+def _filmed(tmp_path: Path, xy: np.ndarray, times: np.ndarray | None = None):
+    """Cameras of one film along a path (n, 2)."""
+    cameras = drive(street(), right_turn(), tmp_path / "2_metric", points=100)
+    pose = np.repeat(cameras.camera_to_world[:1], len(xy), 0)
+    pose[:, :2, 3] = xy
+    cameras = cameras.select(np.zeros(len(xy), int))
+    names = tuple(f"film/{i:06d}" for i in range(len(xy)))
+    return replace(
+        cameras, names=names, camera_to_world=pose, times=0.5 * np.arange(len(xy)) if times is None else times
+    )
+
+
+def _bend(length: float = 45.0, count: int = 70) -> np.ndarray:
+    s = np.linspace(0.0, length, count)
+    return np.stack([s, 3.0 * np.sin(s / 10.0)], -1)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.2), (12.0, 30.0)])
+def test_two_passes_in_one_film_are_refused_by_the_names_of_their_frames(tmp_path: Path, shift):
+    rng = np.random.default_rng(0)
+    twice = np.concatenate([_bend(), _bend(count=60) + shift]) + 0.03 * rng.standard_normal((130, 2))
+    cameras = _filmed(tmp_path, twice)
+    for check in (refuse_jumps, filmed_route):
+        with pytest.raises(InputError, match=r"film/000069 to film/000070.*keep = \[\[") as error:
+            check(cameras)
+    assert "keep = [[0, 34.5]]" in str(error.value) or "keep = [[35, 64.5]]" in str(error.value)
+    assert list(path_jumps(cameras.positions, cameras.times)) == [69]
+    for one_pass in (cameras.select(cameras.times <= 34.5), cameras.select(cameras.times >= 35.0)):
+        refuse_jumps(one_pass)
+        assert 40.0 < route_length(filmed_route(one_pass)) < 55.0
+
+
+def _driven(speeds: list[float]) -> np.ndarray:
+    """A path whose steps are these [m], turning slowly."""
+    x = np.concatenate([[0.0], np.cumsum(speeds)])
+    return np.stack([60.0 * np.sin(x / 60.0), 60.0 - 60.0 * np.cos(x / 60.0)], -1)
+
+
+@pytest.mark.parametrize(
+    "xy",
+    [
+        _driven([0.5] * 80),
+        _driven([0.02] * 60 + [7.0] * 12),  # stands long, then goes fast at once
+        _driven([7.0] * 8 + [0.3] * 60),  # and the reverse
+        _driven([0.1 * 1.15**i for i in range(32)]),
+        _driven([0.2, 1.8] * 40),  # the sharpest frame of each slot, at the slots' ends
+        _driven([0.6] * 30 + [4.5] + [0.6] * 30),  # some frames did not register
+        np.concatenate([_driven([0.6] * 40), _driven([0.6] * 40)[::-1]]),  # there and back
+        np.concatenate([[[0.6 * i, 0.0] for i in range(40)], [[23.4, -0.6 * i] for i in range(1, 40)]]),  # a corner
+    ],
+)
+def test_turns_stops_and_changes_of_speed_are_no_jumps(tmp_path: Path, xy):
+    refuse_jumps(_filmed(tmp_path, xy))
+
+
+def test_lost_frames_are_no_jump_unless_the_gap_in_time_is_too_short(tmp_path: Path):
+    steps = [0.6] * 40 + [9.0] + [0.6] * 40
+    times = 0.5 * np.arange(82)
+    with pytest.raises(InputError, match=r"jumps 9\.0 m"):
+        refuse_jumps(_filmed(tmp_path, _driven(steps), times))
+    times[41:] += 7.0  # 14 frames between them
+    refuse_jumps(_filmed(tmp_path, _driven(steps), times))

@@ -29,6 +29,7 @@ from twin.mjcf.export import rest_pose
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
 from twin.robot import BASE_HEIGHT, HuskyParams
+from twin.stamp import seal
 
 ASKEW = HuskyParams(camera_height=0.75, camera_yaw=1.4, camera_pitch=7.0, camera_roll=-2.0, camera_offset=(0.3, 0.05))
 GIVEN = Lens("PINHOLE", tuple(K), 320, 240)
@@ -172,8 +173,8 @@ def scene(tmp_path_factory):
     flat = np.zeros((80, 240))
     Ground(flat, np.array([-4.0, -4.0]), 0.1, flat == 0.0, np.zeros((*flat.shape, 3), np.uint8)).save(mesh)
     scene.stage("field").mkdir()
-    for stage in ("metric", "field", "mesh"):
-        (scene.stage(stage) / "stamp.json").write_text("{}")
+    for stage in ("capture", "cameras", "metric", "field", "mesh"):
+        seal(scene.stage(stage), stage)
     return scene
 
 

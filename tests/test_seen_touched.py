@@ -52,11 +52,12 @@ def place(tmp_path_factory):
     eyes = np.array([point_at(world.route, s) + np.array([0.0, 0.013, 0.6]) for s in STATIONS])
     poses = np.array([look_at(eye, eye + np.array([1.0, 0.007, -0.1])) for eye in eyes])
     looks = look(SolidField(world.model()), world, poses, "day")
-    above = look_at(np.array([3.0, 0.0, 12.0]), np.array([3.01, 0.0, 0.0]))
+    above = [look_at(np.array([3.0 + x, 0.0, 12.0]), np.array([3.01, 0.0, 0.0])) for x in (0.0, 1.0)]
     cameras = replace(
-        Cameras.load(SceneDir(root).stage("metric")).select(np.array([1])),
-        camera_to_world=above[None],
-        intrinsics=np.array([[300.0, 300.0, 320.0, 180.0]]),
+        Cameras.load(SceneDir(root).stage("metric")).select(np.array([1, 1])),
+        camera_to_world=np.stack(above),
+        intrinsics=np.tile([300.0, 300.0, 320.0, 180.0], (2, 1)),
+        held_out=np.zeros(2, bool),
     )
     return world, looks, cameras, Ground.load(mesh), Parts.load(mesh / "parts.npz")
 
@@ -102,6 +103,50 @@ def test_what_is_solid_but_seen_through_is_a_ghost_and_unfilmed_ones_are_told_ap
     assert unfilmed["corridor_ghost_m"] == 0.0 and unfilmed["unfilmed_ghost_m"] == pytest.approx(0.28, abs=0.06)
 
 
+@pytest.fixture
+def sunk(place):
+    """Looks through a hole of 0.28 m in the ground before the robot."""
+    world, looks, *_ = place
+    points = looks.points(looks.solid, world.intrinsics)
+    hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
+    eye = looks.camera_to_world[:, None, None, 2, 3]
+    share = (eye - points[..., 2] + 0.28) / (eye - points[..., 2])
+    return replace(looks, seen=np.where(hole, looks.seen * share, looks.seen))
+
+
+@pytest.mark.parametrize(
+    ("what", "two_directions"),
+    [
+        ("both", True),
+        ("one frame", False),
+        ("one of two is held out", False),
+        ("standing still", False),
+        ("a frame per film from the same place", False),
+        ("a frame per film", False),
+        ("three frames, two of them from one place", True),
+    ],
+)
+def test_only_two_directions_of_one_film_determine_a_depth(place, sunk, what, two_directions):
+    world, _, cameras, ground, parts = place
+    still = cameras.camera_to_world[[0, 0]]
+    films = ("a", "b")
+    given = {
+        "both": cameras,
+        "one frame": cameras.select(np.array([0])),
+        "one of two is held out": replace(cameras, held_out=np.array([False, True])),
+        "standing still": replace(cameras, camera_to_world=still),
+        "a frame per film from the same place": replace(cameras, camera_to_world=still, sources=films),
+        "a frame per film": replace(cameras, sources=films),
+        "three frames, two of them from one place": cameras.select(np.array([0, 0, 1])),
+    }[what]
+    found = compare(sunk, world, given, ground, parts)
+    # A ghost is in one of the two figures, so one of the two cautions is always given.
+    ghost, other = ("corridor_ghost_m", "unfilmed_ghost_m")[:: 1 if two_directions else -1]
+    assert found[ghost] == pytest.approx(0.28, abs=0.06) and found[other] < 0.02
+    cautions = [caution.what for caution in seen_section({"seen_touched": found}).cautions]
+    assert len(cautions) == 1 and ("from build to build" in cautions[0]) != two_directions
+
+
 def test_a_part_that_is_not_seen_is_a_ghost_and_one_that_is_not_solid_a_leak(place):
     world, looks, cameras, ground, parts = place
     part = ~looks.is_ground & (looks.solid < 8.0)
@@ -131,6 +176,8 @@ def test_the_page_tells_it(place, tmp_path):
     assert "Seen and touched" in told and "Seen but not solid" in told
     large = seen_section({"seen_touched": found | {"corridor_leak_m": 0.4, "unfilmed_ghost_m": 0.9}})
     assert large.cautions[0].what.startswith("Something in the corridor") and len(large.cautions) == 2
+    just_over = seen_section({"seen_touched": found | {"median_m": 0.0521}}).cautions
+    assert [it.what for it in just_over] == ["What is seen and what is solid differ: 0.052 m, more than 0.05 m."]
     assert seen_section({}).not_applicable
     assert seen_row(looks, 0).shape[1] > 4 * 300
     assert isinstance(looks, Looks)

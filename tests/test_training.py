@@ -22,6 +22,7 @@ from twin import progress, train
 from twin.alone import alone
 from twin.env.randomisation import Ranges
 from twin.errors import InputError
+from twin.files import write_json
 from twin.learn.choosing import FRESH
 from twin.learn.policy import load_policy
 from twin.learn.train_config import TrainConfig
@@ -29,7 +30,6 @@ from twin.learn.training import EPISODE_COLUMNS, _check_same, _keep_rows
 from twin.learn.vectors import DriveVecEnv
 from twin.report.training import read_episodes
 from twin.report.trials import csv_text
-from twin.scene import write_json
 
 
 @pytest.fixture(scope="module")
@@ -198,8 +198,20 @@ def test_a_changed_road_is_another_run(scene, tmp_path):
         toml.write_text(text)
 
 
+_WRONG: list[tuple[str, object]] = [
+    *[("seed", -1), ("seed", 2**64), ("steps", 0), ("steps", 10**30), ("worlds", 0), ("worlds", 99_999_999)],
+    *[("updates", 0.0), ("updates", float("nan")), ("entropy", float("inf")), ("steering", float("nan"))],
+    *[("colours", -1.0), ("colours", float("nan")), ("batch", 0), ("buffer", 10**12), ("hidden", (10**9,))],
+    *[("convolutions", ((0, 5, 3),)), ("worlds", True), ("gamma", "high"), ("observe", "eyes"), ("device", "tpu")],
+]
+
+
 @pytest.mark.parametrize(
-    "wrong", [{"seed": -1}, {"steps": 0}, {"worlds": 0}, {"updates": 0.0}, {"colours": -1.0}, {"lighting": "held-out"}]
+    "wrong",
+    [
+        *({name: value} for name, value in _WRONG),
+        {"lighting": "held-out"},
+    ],
 )
 def test_what_no_training_can_be_is_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):

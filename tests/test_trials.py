@@ -128,7 +128,7 @@ def test_wrong_results_are_told(tmp_path: Path, text: str, told: str) -> None:
 def test_what_is_no_text_is_told(tmp_path: Path) -> None:
     path = tmp_path / "results.csv"
     path.write_bytes(b"policy,lighting\xff\xfe\n")
-    with pytest.raises(InputError, match="not UTF-8"):
+    with pytest.raises(InputError, match="no UTF-8"):
         read_results(path, TWIN)
     with pytest.raises(InputError, match="does not exist"):
         read_results(tmp_path / "none.csv", TWIN)

@@ -16,6 +16,7 @@ from tiny_twin import tiny_twin
 
 from twin import film, progress, validate
 from twin.errors import InputError
+from twin.files import digest_file, write_json
 from twin.report.figures import SERIES
 from twin.report.training import RECENT, binned, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
@@ -24,7 +25,6 @@ from twin.report.validation_figures import FEW, better, rate_tiles, rates
 from twin.report.validation_page import Curve, validation_page
 from twin.report.validation_words import FAILURES, chance_words, pair_words, percent, unknowns, verdicts, why
 from twin.report.video import describe
-from twin.scene import digest_file, write_json
 
 TRAINED = {"run": "ahead", "task": "ahead", "observe": "nerf", "lighting": "training", "step": 300}
 EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: step, success

@@ -13,7 +13,7 @@ from twin.nerf.baked import BakedField
 from twin.nerf.layout import BrickLayout, leaps
 from twin.nerf.lightings import Lightings
 from twin.robot import HuskyParams
-from twin.scene import write_json
+from twin.stamp import seal
 
 LAYOUT = BrickLayout((4.5, -2.5, 1.0), (8.0, 6.0, 2.0), 0.1, 0.5, (12, 9, 5), (8, 8, 4))
 
@@ -45,7 +45,7 @@ def tiny_twin(
     scene.stage("field").mkdir()
     tiny_field(boxes).save(scene.stage("field"))
     for stage in ("metric", "mesh", "mjcf", "field"):
-        write_json(scene.stage(stage) / "stamp.json", {"result": "made up"})
+        seal(scene.stage(stage), stage)
     return root
 
 

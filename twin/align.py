@@ -23,14 +23,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from twin import progress
+from twin import progress, verb
 from twin.alignment.aligned import Alignment, align, robot_toml, told_error, toml_text
 from twin.alignment.checks import check
 from twin.alignment.logs import read_log
 from twin.config_file import ROBOT_TOML, load_config, overruled, parse, read_robot
-from twin.errors import InputError, refuse
+from twin.errors import InputError
+from twin.files import digest_file, read_toml, write_json, write_text
 from twin.robot import HuskyParams
-from twin.scene import SceneDir, digest_file, write_json, write_text
+from twin.scene import SceneDir
 
 if TYPE_CHECKING:
     from twin.alignment.camera import CameraAlignment
@@ -146,10 +147,7 @@ def _by_hand(folder: Path) -> dict[str, Any]:
     path = SceneDir(folder).config_file
     if not path.exists():
         return {}
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8")).get("robot", {})
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    return read_toml(path).get("robot", {})
 
 
 def summary(result: Alignment) -> str:
@@ -181,8 +179,8 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
-    parser = argparse.ArgumentParser(
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(
         prog="python -m twin.align",
         description="Fit the Husky's parameters to a log of a real one driving, scored on windows not fitted to; "
         "or how its camera sits to a film by that camera.",
@@ -197,26 +195,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help=f"folder for robot.toml and {FOLDER}/; by default the scene's")
     parser.add_argument("--level", action="store_true", help="take the ground for level, whatever the log's IMU says")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    options = parser.parse_args(arguments)
-    progress.set_quiet(options.quiet)
-    try:
-        if options.log.suffix.lower() in FILMS:
-            if options.out or options.level:
-                raise InputError(f"{options.log} is a film; --out and --level belong to a log")
-            camera, folder = run_camera(options.robot, options.log)
-            identified, lines = camera.identified, "\n".join([camera.in_words, "fitted:", *_fitted(camera.identified)])
-        else:
-            result, folder = run(options.robot, options.log, options.out, not options.level)
-            identified, lines = result.identified, summary(result)
-        overruled = hidden(folder, identified)
-    except (InputError, OSError) as error:
-        return refuse(error)
+    return verb.run(parser, _main, arguments)
+
+
+def _main(options: argparse.Namespace) -> None:
+    if options.log.suffix.lower() in FILMS:
+        if options.out or options.level:
+            raise InputError(f"{options.log} is a film; --out and --level belong to a log")
+        camera, folder = run_camera(options.robot, options.log)
+        identified, lines = camera.identified, "\n".join([camera.in_words, "fitted:", *_fitted(camera.identified)])
+    else:
+        result, folder = run(options.robot, options.log, options.out, not options.level)
+        identified, lines = result.identified, summary(result)
+    overruled = hidden(folder, identified)
     if not options.quiet:
         print(lines)
         if overruled:
             print(f"scene.toml's [robot] overrules what was fitted: {', '.join(overruled)}; remove it there to use it")
         print(f"wrote {folder / ROBOT_TOML}; look at {folder / FOLDER}")
-    return 0
 
 
 if __name__ == "__main__":

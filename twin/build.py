@@ -7,7 +7,6 @@ A stage runs in `build/<folder>.partial`, which is renamed when it is complete. 
 
 import argparse
 import dataclasses
-import errno
 import importlib
 import os
 import sys
@@ -16,14 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from twin import progress
+from twin import progress, verb
 from twin.alone import alone
 from twin.config import SceneConfig
 from twin.config_file import load_config
-from twin.errors import InputError, refuse
+from twin.errors import InputError
+from twin.files import digest_file, path_is_link, remove, write_json
 from twin.memory import PeakMemory
-from twin.scene import STAGES, SceneDir, digest_file, write_json
-from twin.stamp import Stamp, commit, digest_folder, key_of, package_versions, recover, replace_file
+from twin.scene import STAGES, SceneDir
+from twin.stamp import Stamp, commit, key_of, package_versions, recover, replace_file, seal
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,15 @@ _MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the
 PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
-    Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
+    Stage("metric", "twin.capture.metric", 1, ("metric", "mjcf.route"), ("capture", "cameras")),
     Stage("field", "twin.nerf.stage", 3, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 2, ("mesh", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.export", 3, ("mjcf", "robot"), ("metric", "mesh")),
-    Stage("review", "twin.report.review", 3, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
+    Stage("review", "twin.report.review", 4, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
 )
+
+_WRITTEN = ("build", "runs", "validation", "forecast", "lightings")
+"""Folders of a scene that twin writes: never an input."""
 
 
 def build(
@@ -74,6 +77,7 @@ def build(
     scene = SceneDir(root)
     config = load_config(scene.config_file, overrides)
     inputs = input_digests(scene, config)
+    _check_folder(scene.build)
     scene.build.mkdir(exist_ok=True)
     with alone(scene.build / ".lock", f"{scene.root} is being built"):
         recover(scene)
@@ -93,24 +97,63 @@ def build(
     return report
 
 
-def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
-    """SHA-256 of every file the sources name, by path relative to the scene. Raises InputError if one is absent."""
-    from twin.capture.formats import files_named
+def _check_folder(folder: Path) -> None:
+    if (path_is_link(folder) and not folder.exists()) or (folder.exists() and not folder.is_dir()):
+        raise InputError(f"{folder} is no folder; move it away: what is built goes there")
 
-    digests: dict[str, str] = {}
+
+def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
+    """SHA-256 of every file that the sources are read from, by path relative to the scene.
+
+    A folder of the scene counts with all that is in it, except for what twin writes; of a folder around the scene, and
+    of a posed image set elsewhere, only what is read of it does.
+
+    Raises:
+        InputError: one is absent, or neither a file nor a folder.
+    """
+    from twin.capture.formats import files_read, is_image
+    from twin.capture.paths import is_folder
+
+    files: set[Path] = set()
     for source in config.source:
         for name in filter(None, (source.path, source.images, source.mask)):
             path = scene.root / name
-            if not path.exists():
-                raise InputError(f"{scene.config_file}: {name!r} does not exist; put it there or correct the path")
-            # A transforms.json or a COLMAP model names images elsewhere below input/, which are input as well.
-            posed = path.suffix == ".json" or any(path.glob("cameras.*"))
-            folder = scene.root / Path(name).parts[0] if posed and not Path(name).is_absolute() else path
-            files = sorted(p for p in folder.rglob("*") if p.is_file()) if folder.is_dir() else [path]
-            if path.suffix == ".json":
-                files += files_named(path, scene.root / source.images if source.images else None)
-            digests |= {os.path.relpath(file, scene.root): digest_file(file) for file in files}
-    return digests
+            is_folder(path, f"put {name!r} of {scene.config_file} there or correct the path")
+        path = scene.root / source.path
+        images = scene.root / source.images if source.images else None
+        read = files_read(path, source.kind, images)
+        files.update(read)
+        posed = path.suffix == ".json" or (path.is_dir() and any(path.glob("cameras.*")))
+        # Beside a posed set lies what else belongs to it, all below one folder of the scene.
+        parts = Path(os.path.normpath(source.path)).parts
+        for folder in (
+            scene.root.joinpath(*parts[:1]) if posed and not Path(source.path).is_absolute() else path,
+            images,
+        ):
+            if folder is not None:
+                files.update(_files_below(folder, scene))
+        if source.mask:
+            mask = scene.root / source.mask
+            files.update(
+                [mask]
+                if not mask.is_dir()
+                else _files_below(mask, scene) or [file for file in mask.iterdir() if is_image(file)]
+            )
+    return {os.path.relpath(file, scene.root): digest_file(file) for file in sorted(files)}
+
+
+def _files_below(folder: Path, scene: SceneDir) -> list[Path]:
+    """The regular files below a folder; none of a folder around the scene, and none of what twin writes."""
+    root, top = scene.root.resolve(), folder.resolve()
+    written = {(root / name) for name in _WRITTEN}
+    if not folder.is_dir() or root.is_relative_to(top) or top in written:
+        return []
+    found = []
+    for place, folders, names in os.walk(folder):
+        here = Path(place)
+        folders[:] = [name for name in folders if (here / name).resolve() not in written]
+        found += [here / name for name in names if (here / name).is_file()]
+    return found
 
 
 def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: dict[str, Stamp]) -> dict[str, Any]:
@@ -119,8 +162,14 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for name in stage.config:
         section, _, key = name.partition(".")
         settings[name] = table[section][key] if key else table[section]
+    # What came later and is not used: without it a result is what it was before.
+    for one in (settings.get("capture", {}), *settings.get("source", ())):
+        if "keep" in one and not one["keep"]:
+            del one["keep"]
+    if stage.name == "metric" and settings["mjcf.route"]:  # read only to refuse a path that jumps
+        del settings["mjcf.route"]
     if not settings.get("nerf", {}).get("refine_cameras", True):
-        del settings["nerf"]["refine_cameras"]  # came later: without it a field is what it was before
+        del settings["nerf"]["refine_cameras"]
     return {
         "stage": stage.name,
         "version": stage.version,
@@ -136,15 +185,15 @@ def _run(stage: Stage, scene: SceneDir, config: SceneConfig, depends: dict[str, 
     out = scene.partial(stage.name)
     out.mkdir()
     start = time.perf_counter()
-    with PeakMemory() as peak:
-        metrics = importlib.import_module(stage.module).run(scene, config, out)
-    seconds = time.perf_counter() - start
-    result, files = digest_folder(out)
-    device = os.environ.get("TWIN_DEVICE", "auto")
-    stamp = Stamp(
-        stage.name, key_of(depends), result, depends, files, metrics, seconds, peak.bytes, device, package_versions()
-    )
-    commit(scene, stage.name, stamp)
+    try:
+        with PeakMemory() as peak:
+            metrics = importlib.import_module(stage.module).run(scene, config, out)
+        about = {"metrics": metrics, "seconds": time.perf_counter() - start, "peak_memory_bytes": peak.bytes}
+        stamp = seal(out, stage.name, depends, device=os.environ.get("TWIN_DEVICE", "auto"), **about)
+    except BaseException:
+        remove(out)
+        raise
+    commit(scene, stage.name)
     return stamp
 
 
@@ -176,6 +225,9 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
         from twin.report.truth import compare
 
         report["truth"] = compare(scene)
+    from twin.report.sections import cautions
+
+    report["cautions"] = cautions(report)
     return report
 
 
@@ -200,7 +252,8 @@ def _select_device(device: str | None) -> None:
 
 
 def summary(report: dict[str, Any]) -> str:
-    """The table printed at the end of a build."""
+    """What is printed at the end of a build: a row per stage, then every caution of the report, a line each."""
+    from twin.report.sections import cautions
 
     def pick(*path: str) -> Any:
         value: Any = report
@@ -232,6 +285,8 @@ def summary(report: dict[str, Any]) -> str:
         note = " (up to date)" if stage["skipped"] else ""
         lines.append(f"{name:<9} {stage['seconds']:>8.1f}  {figures[name]}{note}")
     lines.append(f"{'total':<9} {report['seconds']:>8.1f}  peak memory {report['peak_memory_bytes'] / 2**30:.2f} GiB")
+    told = cautions(report)
+    lines += [f"{'caution':<9} {it['title']}: {it['what']} What helps: {it['cure']}" for it in told]
     return "\n".join(lines)
 
 
@@ -256,7 +311,8 @@ python -m twin.new SCENE VIDEO... writes such a folder.
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(
         prog="python -m twin.build",
         description="Turn a filmed place into a drivable MuJoCo twin.",
         epilog=_EPILOG,
@@ -268,33 +324,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    arguments = parser.parse_args(argv)
-    progress.set_quiet(arguments.quiet)
-    try:
-        _select_device(arguments.device)
-        report = build(arguments.scene, arguments.until, tuple(arguments.force), tuple(arguments.set))
-    except InputError as error:
-        return refuse(error)
-    except OSError as error:
-        # Only what the user's machine refuses; any other OSError is a bug and keeps its traceback.
-        cures = {
-            errno.ENOSPC: "free some space",
-            errno.EDQUOT: "free some space",
-            errno.EROFS: "make the folder writable",
-            errno.EACCES: "make the folder writable",
-            errno.EPERM: "make the folder writable",
-        }
-        if error.errno not in cures:
-            raise
-        return refuse(f"{error.filename or arguments.scene}: {error.strerror}; {cures[error.errno]} and run again")
-    except KeyboardInterrupt:
-        print("stopped; run the same command to resume", file=sys.stderr)
-        return 130
-    if not arguments.quiet:
+    return verb.run(parser, _main, argv)
+
+
+def _main(options: argparse.Namespace) -> None:
+    _select_device(options.device)
+    report = build(options.scene, options.until, tuple(options.force), tuple(options.set))
+    if not options.quiet:
         print(summary(report))
-        if arguments.until is None:
-            print(f"look at {SceneDir(arguments.scene).report_html} and {SceneDir(arguments.scene).review_mp4}")
-    return 0
+        if options.until is None:
+            print(f"look at {SceneDir(options.scene).report_html} and {SceneDir(options.scene).review_mp4}")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,40 @@ RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 RANDOMISED = "+randomised"
 """Ends the name of a lighting in tables: driven in that light, and all else drawn for every episode, too."""
 
+KINDS = ("auto", "video", "images", "colmap", "transforms")
+MAPPERS = ("auto", "global", "incremental")
+UPS = ("ground", "cameras", "poses")
+CAMERA_MODELS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL": 5,
+    "RADIAL_FISHEYE": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+}
+"""COLMAP's camera models and how many parameters each has."""
+MARKER_FAMILIES = {
+    **{f"DICT_{n}X{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "DICT_ARUCO_ORIGINAL": 1024,
+    **{f"DICT_ARUCO_MIP_36{h}12": 250 for h in "hH"},
+    **{f"DICT_APRILTAG_16{h}5": 30 for h in "hH"},
+    **{f"DICT_APRILTAG_25{h}9": 35 for h in "hH"},
+    **{f"DICT_APRILTAG_36{h}10": 2320 for h in "hH"},
+    **{f"DICT_APRILTAG_36{h}11": 587 for h in "hH"},
+}
+"""OpenCV's dictionaries of markers and how many markers each has."""
+
 
 @dataclass(frozen=True)
 class CalibrationConfig:
@@ -46,6 +80,8 @@ class SourceConfig:
     """Known intrinsics, held fixed. A calibrated camera pays: forward driving bends a self-calibrated one."""
     camera_height: float = 0.0
     """Height of this source's lens above the ground [m], where sources differ; 0 = `metric.camera_height`."""
+    keep: tuple[tuple[float, ...], ...] = ()
+    """Which parts of this film are used, as `capture.keep`, which it replaces."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +98,9 @@ class CaptureConfig:
     """Longer side of a kept frame [px]; larger input is scaled down (intrinsics with it)."""
     held_out_every: int = 8
     """Every n-th frame along each source is never trained on."""
+    keep: tuple[tuple[float, ...], ...] = ()
+    """Parts of every film that are used, [[from, to], ...] in seconds from its first frame, both ends included; in
+    order and apart; empty = all of it. A route is one pass: of a film of two, keep one. Photos need a clock for it."""
     min_motion: float = 1.0
     """Frames that moved less than this from the last kept one [px, median optical flow at 320 px width] are dropped."""
 

@@ -15,12 +15,14 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from twin import progress
+from twin import verb
 from twin.assets.gaussians import gaussians_of_views
 from twin.assets.views import Views, render_views
-from twin.errors import InputError, refuse
+from twin.errors import InputError
+from twin.files import load_arrays, write_bytes
 from twin.geometry.cameras import project
 from twin.loading import load_scene
+from twin.stamp import finished
 
 _VIEWS, _WIDTH = 60, 320
 _FAR = 100.0  # [m] what is further becomes background
@@ -69,35 +71,25 @@ def export(scene: Path, lighting: str | None, glb: Path | None, ply: Path | None
     views = render_views(field, twin.cameras(), _VIEWS, _WIDTH, _FAR, lighting)
     lines = []
     if glb is not None:
-        file = twin.scene.stage("mesh") / "visual.npz"
-        if not file.exists():
-            raise InputError(f"{file} is missing; run python -m twin.build {scene}")
-        with np.load(file, allow_pickle=False) as mesh:
-            vertices, faces = mesh["vertices"], mesh["faces"]
+        mesh = load_arrays(finished(twin.scene, "mesh") / "visual.npz")
+        vertices, faces = mesh["vertices"], mesh["faces"]
         colours = vertex_colours(views, vertices.astype(np.float64))
         solid = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
         solid.apply_transform(_Z_UP_TO_Y_UP)  # as glTF has it
         content = solid.export(file_type="glb")
         assert isinstance(content, bytes)
-        written(glb, content)
+        write_bytes(glb, content)
         lines.append(f"{glb}: {len(faces)} faces under {lighting}, y up [m]")
     if ply is not None:
         splats = gaussians_of_views(views, _BACKGROUND)
-        written(ply, splats.to_ply())
+        write_bytes(ply, splats.to_ply())
         lines.append(f"{ply}: {len(splats.rgb)} gaussians under {lighting}, z up [m]")
     return lines
 
 
-def written(path: Path, content: bytes) -> None:
-    """Writes aside and renames, so that a full disk leaves no half a file under that name."""
-    aside = path.with_name(path.name + ".partial")
-    aside.write_bytes(content)
-    aside.replace(path)
-
-
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
-    parser = argparse.ArgumentParser(
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(
         prog="python -m twin.export",
         description="Write a built place for other programs: its mesh as glTF, its field as Gaussian splats.",
     )
@@ -106,17 +98,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--ply", type=Path, help="write gaussians as 3DGS viewers read them (z up)")
     parser.add_argument("--lighting", help="name, or two and a share as sun:night:0.5; by default the first filmed one")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    options = parser.parse_args(arguments)
-    progress.set_quiet(options.quiet)
-    try:
-        if options.glb is None and options.ply is None:
-            raise InputError("nothing to write; give --glb FILE, --ply FILE or both")
-        lines = export(options.scene, options.lighting, options.glb, options.ply)
-    except (InputError, OSError) as error:
-        return refuse(error)
+    return verb.run(parser, _main, arguments)
+
+
+def _main(options: argparse.Namespace) -> None:
+    if options.glb is None and options.ply is None:
+        raise InputError("nothing to write; give --glb FILE, --ply FILE or both")
+    lines = export(options.scene, options.lighting, options.glb, options.ply)
     if not options.quiet:
         print("\n".join(lines))
-    return 0
 
 
 if __name__ == "__main__":

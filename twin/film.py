@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Any
 import dm_env
 import numpy as np
 
-from twin import progress
-from twin.errors import InputError, refuse
+from twin import progress, verb
+from twin.errors import InputError
 from twin.loading import load, load_scene
+
+_MOST_DIGITS = 6  # of a number of obstacles
 
 if TYPE_CHECKING:
     from twin.env.episode import Episode
@@ -99,8 +101,8 @@ def film_name(task: str, lighting: str, seed: int) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
-    parser = argparse.ArgumentParser(
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(
         prog="python -m twin.film",
         description="Film a drive in a built scene: robot view, chase view, map, speed and reward.",
     )
@@ -119,30 +121,28 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; by default in SCENE/films")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    given = parser.parse_args(arguments)
-    progress.set_quiet(given.quiet)
-    try:
-        options = {
-            "lighting_drift": given.drift,
-            "randomise": given.randomise,
-            "obstacles": _obstacles(given.obstacles),
-        }
-        if given.lighting:
-            from twin.env.randomisation import asked
+    return verb.run(parser, _main, arguments)
 
-            options |= {name: value for name, value in asked(given.lighting).items() if value}
-        path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
-    except (InputError, OSError) as error:
-        return refuse(error)
+
+def _main(given: argparse.Namespace) -> None:
+    options = {
+        "lighting_drift": given.drift,
+        "randomise": given.randomise,
+        "obstacles": _obstacles(given.obstacles),
+    }
+    if given.lighting:
+        from twin.env.randomisation import asked
+
+        options |= {name: value for name, value in asked(given.lighting).items() if value}
+    path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
     if not given.quiet:
         print(f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}")
-    return 0
 
 
 def _obstacles(text: str) -> str | int:
     if text == "scene":
         return text
-    if not text.isdecimal():  # "²" is a digit, too
+    if not text.isdecimal() or len(text) > _MOST_DIGITS:  # "²" is a digit, too
         raise InputError(f"--obstacles {text!r}: expected a number, or 'scene' for those of scene.toml")
     return int(text)
 

@@ -11,10 +11,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from twin.errors import InputError, refuse
+from twin import verb
+from twin.errors import InputError
+from twin.files import write_text
 from twin.report.forecast import Estimate, Forecast
 from twin.report.trials import RESULT_COLUMNS, read_results, read_trials, tally
-from twin.scene import SceneDir, write_text
+from twin.scene import SceneDir
 
 
 def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
@@ -64,8 +66,8 @@ held-out+randomised.
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
-    parser = argparse.ArgumentParser(
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(
         prog="python -m twin.forecast",
         description="What success in the twin says about success on the road.",
         epilog=_EPILOG,
@@ -75,19 +77,18 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--real", type=Path, metavar="CSV", help="trials on the road; see below")
     parser.add_argument("--seed", type=int, default=0, help="of the resampling (default 0)")
     parser.add_argument("--quiet", action="store_true", help="no summary")
-    arguments = parser.parse_args(argv)
-    try:
-        if arguments.seed < 0:
-            raise InputError(f"--seed {arguments.seed}: expected 0 or more")
-        out = forecast(arguments.scene, arguments.real, arguments.seed)
-    except (InputError, OSError) as error:
-        return refuse(error)
-    if not arguments.quiet:
+    return verb.run(parser, _main, argv)
+
+
+def _main(options: argparse.Namespace) -> None:
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: expected 0 or more")
+    out = forecast(options.scene, options.real, options.seed)
+    if not options.quiet:
         from twin.report.forecast_words import summary
 
         print(summary(out))
-        print(f"look at {SceneDir(arguments.scene).forecast / 'forecast.html'}")
-    return 0
+        print(f"look at {SceneDir(options.scene).forecast / 'forecast.html'}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from twin.errors import InputError
-from twin.scene import STAGES, SceneDir, read_json
+from twin.files import read_json
+from twin.scene import SceneDir
+from twin.stamp import finished
 
 if TYPE_CHECKING:
     from dm_control.rl.control import Environment
@@ -63,15 +65,12 @@ class Twin:
 
     def report(self) -> dict[str, Any]:
         """Every number of the last build."""
+        if not self.scene.report_json.exists():
+            raise InputError(f"{self.scene.report_json} is missing; run python -m twin.build {self.scene.root}")
         return read_json(self.scene.report_json)
 
     def _folder(self, stage: str) -> Path:
-        folder = self.scene.stage(stage)
-        if not (folder / "stamp.json").exists():
-            raise InputError(
-                f"{self.scene.root} has no {STAGES[stage]} yet; run python -m twin.build {self.scene.root}"
-            )
-        return folder
+        return finished(self.scene, stage)
 
 
 def load_scene(path: str | Path) -> Twin:

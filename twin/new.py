@@ -10,18 +10,21 @@ nearest folder that has all of it below; from there the files it needs are copie
 """
 
 import argparse
-import json
 import os
 import shutil
 import sys
 from pathlib import Path
 
+from twin import verb
 from twin.capture.colmap import find_model
 from twin.capture.formats import ImageSet, detect_kind, files_named, read_colmap, read_transforms
+from twin.capture.paths import is_file
 from twin.capture.video import probe
 from twin.config import RANDOMISED, RESERVED_LIGHTINGS
-from twin.errors import InputError, refuse
-from twin.scene import SceneDir, digest_file, write_text
+from twin.config_file import LONGEST_NAME
+from twin.errors import InputError
+from twin.files import digest_file, toml_string, write_text
+from twin.scene import SceneDir
 
 _POSED = ("colmap", "transforms")
 
@@ -43,6 +46,7 @@ _REST = """
 [capture]
 fps = 2.0                      # frames kept per second of film, the sharpest of each time slot
 # frames = 80                  # or: so many per film
+# keep = [[0, 62.5]]           # only these parts of a film [s]: a route is one pass; in a [[source]] for that one
 
 [metric]                       # where the metres come from; exactly one way
 {camera_height}
@@ -87,11 +91,11 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
             _image_set(film)
     inputs = root / "input"
     inputs.mkdir(parents=True, exist_ok=True)
-    text = _HEAD.format(name=_quoted(root.resolve().name))
+    text = _HEAD.format(name=toml_string(root.resolve().name))
     for film in films:
         path = _brought(film, inputs)
         lighting = _lighting(path, detect_kind(film))
-        text += _SOURCE.format(path=_quoted(("input" / path).as_posix()), lighting=_quoted(lighting))
+        text += _SOURCE.format(path=toml_string(("input" / path).as_posix()), lighting=toml_string(lighting))
     given = f"{camera_height:<14g}" if camera_height is not None else None
     line = f"camera_height = {given} # lens above the ground [m], carried at a constant height"
     if given is None:
@@ -117,11 +121,17 @@ def _copied(film: Path, inputs: Path) -> Path:
         aside = copy.with_name(copy.name + ".partial")  # an interrupted copy never passes for a film
         if film.is_dir():
             shutil.rmtree(aside, ignore_errors=True)
-            shutil.copytree(film, aside)
+            shutil.copytree(film, aside, ignore=_no_files)
         else:
             shutil.copyfile(film, aside)
         aside.replace(copy)
     return copy.relative_to(inputs)
+
+
+def _no_files(folder: str, names: list[str]) -> list[str]:
+    """What of a folder is not copied: pipes, devices, and links that lead nowhere or to folders, perhaps this one."""
+    paths = [Path(folder) / name for name in names]
+    return [path.name for path in paths if not is_file(path) and (path.is_symlink() or not path.is_dir())]
 
 
 def _is_same(film: Path, copy: Path) -> bool:
@@ -178,30 +188,28 @@ def _posed_files(film: Path) -> tuple[Path, list[Path]]:
 def _lighting(path: Path, kind: str) -> str:
     """A lighting's name for a path under `input/`: that of the film, or of the root of a posed image set."""
     name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
-    name = name.replace(":", "_").replace("/", "_").replace(RANDOMISED, RANDOMISED.replace("+", "_"))
+    name = "".join(c if c.isprintable() and c not in ":/\\" else "_" for c in name).lstrip(".") or "film"
+    name = name.replace(RANDOMISED, RANDOMISED.replace("+", "_"))
+    while len(name) > LONGEST_NAME or len(name.encode()) > 2 * LONGEST_NAME:
+        name = name[:-1]
     return f"{name}_light" if name in RESERVED_LIGHTINGS else name
 
 
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)  # a JSON string is a TOML basic string
-
-
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
-    parser = argparse.ArgumentParser(prog="python -m twin.new", description="Start a scene folder from films.")
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(prog="python -m twin.new", description="Start a scene folder from films.")
     parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
     parser.add_argument("films", type=Path, nargs="+", metavar="VIDEO", help="films or image folders, one per lighting")
     parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
-    options = parser.parse_args(arguments)
-    try:
-        config = new_scene(options.scene, options.films, options.camera_height)
-    except (InputError, OSError) as error:
-        return refuse(error)
+    return verb.run(parser, _main, arguments)
+
+
+def _main(options: argparse.Namespace) -> None:
+    config = new_scene(options.scene, options.films, options.camera_height)
     print(f"wrote {config}")
     if options.camera_height is None:
         print("fill in [metric] there: without a scale nothing is metric")
     print(f"next: python -m twin.build {options.scene}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import progress
-from twin.errors import InputError, refuse
+from twin import verb
+from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.nerf.added import AddedLighting, check_name, field_result
 from twin.nerf.air import Air
 from twin.scene import SceneDir
+from twin.stamp import finished
 
 _CLEAR = Air()
 _MAX_WIDTH = 480  # [px] longer side of the picture fitted, as that of the frames trained on
@@ -132,6 +133,8 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
     from twin.geometry.cameras import Cameras
     from twin.nerf.field import RadianceField
 
+    for stage in ("capture", "cameras", "metric"):
+        finished(scene, stage)
     field = RadianceField.load(scene.stage("field"))
     check_name(name, field.lightings)
     image, facts = load_photo(photo, None)
@@ -184,8 +187,8 @@ def summary(lighting: AddedLighting) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, or 2 with one line on standard error."""
-    parser = argparse.ArgumentParser(
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(
         prog="python -m twin.relight",
         description="Learn one more lighting of a built place from a single photo of it: find where it was taken, then "
         "fit the field's appearance and the air to it. What it looks like this afternoon, the twin then looks like, "
@@ -195,16 +198,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
     parser.add_argument("--name", required=True, help="what the lighting is to be called; an added one is replaced")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    options = parser.parse_args(arguments)
-    progress.set_quiet(options.quiet)
-    try:
-        lighting = relight(options.scene, options.photo, options.name)
-    except (InputError, OSError) as error:
-        return refuse(error)
+    return verb.run(parser, _main, arguments)
+
+
+def _main(options: argparse.Namespace) -> None:
+    lighting = relight(options.scene, options.photo, options.name)
     if not options.quiet:
         print(summary(lighting))
         print(f"look at {SceneDir(options.scene).lightings / f'{options.name}.png'}")
-    return 0
 
 
 if __name__ == "__main__":

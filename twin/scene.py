@@ -12,11 +12,11 @@ scenes/<name>/
   forecast/             forecast.json .csv .html: what that says about the real runs
 """
 
-import hashlib
-import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+from twin.errors import InputError
 
 STAGES: dict[str, str] = {
     "capture": "1_capture",
@@ -100,28 +100,27 @@ class SceneDir:
         return (self.stage("mjcf") / "world.json").exists()
 
 
-def digest_file(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+_NAME = re.compile(r"\w[\w.-]*")
+_LONGEST_NAME = 80  # characters; with what is added to it, a file system takes 255 bytes
 
 
-def digest_json(value: Any) -> str:
-    """SHA-256 of a JSON value in canonical form."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+def check_name(name: str, what: str) -> str:
+    """A name that becomes that of a file or folder.
+
+    Args:
+        name: Letters, digits and `_ . -`, the first a letter, a digit or `_`; at most 80 characters.
+        what: What it is the name of, such as `--run`, to open the message.
+
+    Raises:
+        InputError: it is something else, such as a path.
+    """
+    if not _NAME.fullmatch(name):
+        raise InputError(f"{what} {name!r}: expected a name of letters, digits and _ . - only, no path")
+    if len(name) > _LONGEST_NAME or len(name.encode()) > 2 * _LONGEST_NAME:
+        raise InputError(f"{what} {name!r}: {len(name)} characters; expected at most {_LONGEST_NAME}")
+    return name
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text aside and renames it, so that a reader never sees half a file."""
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(text, encoding="utf-8")
-    aside.replace(path)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes JSON as `write_text` does. NaN is refused."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
-
-
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
+def run_folder(scene: SceneDir, name: str) -> Path:
+    """The folder of a training run. Raises InputError where the name is none; see `check_name`."""
+    return scene.root / "runs" / check_name(name, "--run")

@@ -2,18 +2,24 @@
 
 A stage's *key* is the hash of everything its result depends on: its config sections, the digests of its input files,
 the *results* (content digests) of its upstream stages, its version and the seed. A stage folder whose stamp carries
-the present key, and whose files are all there, is up to date. Package versions are recorded, but are not in the key.
+the present key, and whose files are all as they were written, is up to date. Package versions are recorded, but are
+not in the key.
 """
 
 import os
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from twin.scene import STAGES, SceneDir, digest_file, digest_json, read_json, write_json
+from twin.errors import InputError
+from twin.files import aside, damaged, digest_file, digest_json, read_json, regular, remove, write_json
+from twin.scene import STAGES, SceneDir
 
+_CURE = "build the scene again"
+_MOST_READ = 256 << 20  # [bytes] of a file that is compared when a scene is opened
 _PACKAGES = ("twin", "numpy", "torch", "warp-lang", "mujoco", "mujoco-warp", "pycolmap", "coacd", "av", "scipy")
 
 
@@ -36,31 +42,122 @@ class Stamp:
     peak_memory_bytes: int
     device: str
     packages: dict[str, str]
+    sha256: dict[str, str] = field(default_factory=dict)
+    """Digest of every file; empty in stamps of before, whose folders are compared with `result` as a whole."""
+    itself: str = ""
+    """Digest of all of the above; empty in stamps of before."""
 
     def save(self, folder: Path) -> None:
-        write_json(folder / "stamp.json", asdict(self))
+        stamp = replace(self, itself=self._digest())
+        write_json(folder / "stamp.json", asdict(stamp))
 
     @staticmethod
     def load(folder: Path) -> "Stamp | None":
-        """The stamp of a finished stage folder, or None where it is missing, damaged, or does not fit its files."""
+        """The stamp of a finished stage folder, or None where it is missing, damaged, or does not fit its files.
+
+        Every file is read.
+        """
         try:
-            stamp = Stamp(**read_json(folder / "stamp.json"))
-            complete = all((folder / name).stat().st_size == size for name, size in stamp.files.items())
-        except (OSError, ValueError, TypeError):
+            return Stamp.checked(folder)
+        except InputError:
             return None
-        return stamp if complete else None
+
+    @staticmethod
+    def checked(folder: Path, most: int | None = None) -> "Stamp":
+        """The stamp of a finished stage folder, which fits its files.
+
+        Args:
+            folder: Of the stage.
+            most: Of files larger than this only the size is compared [bytes]; None: all are read.
+
+        Raises:
+            InputError: names the file that is damaged or missing.
+        """
+        path = folder / "stamp.json"
+        with damaged(path, _CURE):
+            read = read_json(path)
+            stamp = Stamp(**read)
+            if stamp.itself and stamp.itself != stamp._digest():
+                raise ValueError("it is not as it was written")
+            for name, size in stamp.files.items():
+                stamp._check(folder / name, name, int(size), most)
+            if not stamp.sha256 and digest_folder(folder)[0] != stamp.result:
+                raise InputError(f"{folder} is damaged (its files are not as they were written); {_CURE}")
+        return stamp
+
+    def _check(self, file: Path, name: str, size: int, most: int | None) -> None:
+        if not file.is_file():
+            raise InputError(f"{file} is missing; {_CURE}")
+        small = most is None or size <= most
+        if file.stat().st_size != size or (name in self.sha256 and small and digest_file(file) != self.sha256[name]):
+            raise InputError(f"{file} is damaged (it is not as it was written); {_CURE}")
+
+    def _digest(self) -> str:
+        return digest_json({name: value for name, value in asdict(self).items() if name != "itself"})
 
 
 def key_of(depends: dict[str, Any]) -> str:
     return digest_json(depends)
 
 
-def digest_folder(folder: Path) -> tuple[str, dict[str, int]]:
-    """Content digest of a folder, and its files with their sizes."""
+def digest_folder(folder: Path) -> tuple[str, dict[str, int], dict[str, str]]:
+    """Content digest of a folder, and its files with their sizes [bytes] and with their digests."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "stamp.json")
     names = [path.relative_to(folder).as_posix() for path in files]
     digests = [digest_file(path) for path in files]
-    return digest_json([names, digests]), dict(zip(names, (path.stat().st_size for path in files), strict=True))
+    sizes = [path.stat().st_size for path in files]
+    return (
+        digest_json([names, digests]),
+        dict(zip(names, sizes, strict=True)),
+        dict(zip(names, digests, strict=True)),
+    )
+
+
+def seal(folder: Path, stage: str, depends: dict[str, Any] | None = None, **more: Any) -> Stamp:
+    """Stamps a stage folder with what is in it now.
+
+    Args:
+        folder: Of the stage.
+        stage: Its name.
+        depends: What went into the key.
+        more: Fields of `Stamp`: metrics, seconds, peak_memory_bytes, device.
+    """
+    depends = depends or {}
+    result, files, sha256 = digest_folder(folder)
+    about = {"metrics": {}, "seconds": 0.0, "peak_memory_bytes": 0, "device": "auto", **more}
+    stamp = Stamp(stage, key_of(depends), result, depends, files, packages=package_versions(), sha256=sha256, **about)
+    stamp.save(folder)
+    return stamp
+
+
+@lru_cache(maxsize=64)
+def _finished(folder: Path, _stamped: tuple[int, int]) -> Stamp:
+    return Stamp.checked(folder, _MOST_READ)
+
+
+def finished(scene: SceneDir, stage: str) -> Path:
+    """The folder of a stage that has been built and is as it was written.
+
+    A process compares the files of a stage once. Files above 256 MiB are compared by size alone: a change that keeps
+    their size is found by the next build, which reads everything.
+
+    Raises:
+        InputError: the stage has not been built, or a file of it is damaged.
+    """
+    folder = scene.stage(stage).resolve()
+    path = folder / "stamp.json"
+    if not path.exists():
+        raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run python -m twin.build {scene.root}")
+    facts = regular(path).stat()
+    _finished(folder, (facts.st_mtime_ns, facts.st_size))
+    return scene.stage(stage)
+
+
+def result_of(scene: SceneDir, stage: str) -> str:
+    """What the result of a built stage is known by. Raises InputError: see `finished`."""
+    finished(scene, stage)
+    facts = scene.stamp(stage).stat()
+    return _finished(scene.stage(stage).resolve(), (facts.st_mtime_ns, facts.st_size)).result
 
 
 def package_versions() -> dict[str, str]:
@@ -68,19 +165,18 @@ def package_versions() -> dict[str, str]:
     return {name: metadata.version(name) for name in _PACKAGES}
 
 
-def commit(scene: SceneDir, stage: str, stamp: Stamp) -> None:
-    """Stamps the partial folder of a stage and puts it in the place of the former one.
+def commit(scene: SceneDir, stage: str) -> None:
+    """Puts the partial folder of a stage, stamped, in the place of the former one.
 
     A kill between the two renames leaves the former folder as `<folder>.old`; `recover` puts it back.
     """
     partial, final = scene.partial(stage), scene.stage(stage)
     old = final.with_name(final.name + ".old")
-    stamp.save(partial)
-    shutil.rmtree(old, ignore_errors=True)
+    remove(old)
     if final.exists():
         final.rename(old)
     partial.rename(final)
-    shutil.rmtree(old, ignore_errors=True)
+    remove(old)
 
 
 def recover(scene: SceneDir) -> None:
@@ -90,16 +186,17 @@ def recover(scene: SceneDir) -> None:
         old = final.with_name(final.name + ".old")
         if old.exists() and not final.exists():
             old.rename(final)
-        shutil.rmtree(old, ignore_errors=True)
-        shutil.rmtree(scene.partial(stage), ignore_errors=True)
+        remove(old)
+        remove(scene.partial(stage))
+        if final.is_symlink() or final.is_file():
+            remove(final)
 
 
 def replace_file(source: Path, target: Path) -> None:
     """Puts a copy of `source` at `target` in one step (a hard link where the file system has them)."""
-    aside = target.with_name(target.name + ".partial")
-    aside.unlink(missing_ok=True)
-    try:
-        os.link(source, aside)
-    except OSError:
-        shutil.copyfile(source, aside)
-    aside.replace(target)
+    with aside(target) as partial:
+        partial.unlink(missing_ok=True)
+        try:
+            os.link(source, partial)
+        except OSError:
+            shutil.copyfile(source, partial)

@@ -9,41 +9,38 @@ The same command goes on with a run that was stopped or killed. The policy is in
 
 import argparse
 import dataclasses
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from twin import progress
+from twin import progress, verb
 from twin.alone import alone
-from twin.errors import InputError, refuse
+from twin.errors import InputError
 from twin.loading import Twin, load_scene
 from twin.report.statistics import wilson
+from twin.scene import SceneDir, run_folder
 
 if TYPE_CHECKING:
     from twin.learn.train_config import TrainConfig
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, 2 with one line on standard error, or 130 when interrupted."""
-    given = _parser().parse_args(arguments)
-    progress.set_quiet(given.quiet)
-    try:
-        from twin.learn.train_config import PRESETS, TrainConfig
-        from twin.report.training import success_curve
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    return verb.run(_parser(), _main, arguments)
 
-        names = {field.name for field in dataclasses.fields(TrainConfig)}
-        asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
-        config = TrainConfig(**{**PRESETS[given.preset], **asked})
-        twin, folder = load_scene(given.scene), given.scene / "runs" / given.run
-        with alone(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
-            chosen = _trained(twin, folder, config, given.processes)
-        picture = success_curve(folder)
-    except (InputError, OSError) as error:
-        return refuse(error)
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
+
+def _main(given: argparse.Namespace) -> None:
+    from twin.learn.train_config import PRESETS, TrainConfig
+    from twin.report.training import success_curve
+
+    names = {field.name for field in dataclasses.fields(TrainConfig)}
+    asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
+    config = TrainConfig(**{**PRESETS[given.preset], **asked})
+    folder = run_folder(SceneDir(given.scene), given.run)
+    twin = load_scene(given.scene)
+    with alone(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
+        chosen = _trained(twin, folder, config, given.processes)
+    picture = success_curve(folder)
     if not given.quiet:
         won, trials = chosen["successes"], chosen["trials"]
         low, high = wilson(won, trials)
@@ -51,7 +48,6 @@ def main(arguments: list[str] | None = None) -> int:
             f"{folder}: the policy of step {chosen['step']}, which without exploring arrives in {won} of {trials} "
             f"episodes like those of the training ({low:.2f} to {high:.2f}); success along it: {picture}"
         )
-    return 0
 
 
 def _trained(twin: Twin, folder: Path, config: "TrainConfig", processes: int | None) -> dict[str, Any]:
@@ -75,15 +71,11 @@ def _trained(twin: Twin, folder: Path, config: "TrainConfig", processes: int | N
                 )
 
         training.train(twin, folder, config, watch, processes)
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        return choose(twin, folder, config, processes)["chosen"]
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    return choose(twin, folder, config, processes)["chosen"]
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m twin.train", description="Train a policy by SAC from pixels.")
+    parser = verb.Parser(prog="python -m twin.train", description="Train a policy by SAC from pixels.")
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     parser.add_argument("--run", required=True, help="name of the run, a folder in SCENE/runs")

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from twin import progress
+from twin import progress, verb
 from twin.alone import alone
 from twin.config import HELD_OUT, RANDOMISED
 from twin.env.randomisation import asked, known_of
 from twin.env.suite import fingerprint
-from twin.errors import InputError, refuse
+from twin.errors import InputError
+from twin.files import damaged, digest_file, digest_json, read_json, write_bytes, write_json, write_text
 from twin.learn.judging import CHUNK, Chunk, Driven, campaign
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.loading import Twin, load_scene
@@ -28,13 +29,14 @@ from twin.report.training import read_episodes, trainings
 from twin.report.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
 from twin.report.validation import failure_map, lines, summary, typical_episode, worst_episode
 from twin.report.validation_page import Curve, write_validation_page
-from twin.scene import SceneDir, digest_file, digest_json, read_json, write_json, write_text
+from twin.scene import SceneDir
 
 DEFAULT_LIGHTINGS = (HELD_OUT, HELD_OUT + RANDOMISED)
 """As the place was filmed but for its light; and nearer to what a road does."""
 
 _FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # of validation; see `seeds_of`
 _SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
+_MOST_PROCESSES = 1024
 _LIGHTS, _LOOKS, _FINALISTS = 16, 4, 4  # lights drawn, episodes in each, and how many are looked at more closely
 
 Key = tuple[str, str, str, int]
@@ -163,7 +165,7 @@ def _write(twin: Twin) -> dict:
     said["worst"] = _worst_lights(folder / "worst.csv")
     said["robot_known"] = known_of(twin.world().robot)
     films = folder / "films" / "films.json"
-    said["films"] = read_json(films) if films.exists() else []
+    said["films"] = _filmed(films)
     write_json(folder / "summary.json", said)
     _draw_maps(twin, folder, trials)
     runs = dict.fromkeys(trained["run"] for trained in said["training"].values())
@@ -187,7 +189,7 @@ def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[T
     from twin.report.video import last_frame
 
     noted = folder / "films" / "films.json"
-    before: list[dict] = read_json(noted) if noted.exists() else []
+    before = _filmed(noted)
     chosen: dict[Trial, list[str]] = {}
     for kind, trial in (("typical", typical_episode(trials)), ("worst", worst_episode(trials))):
         chosen.setdefault(trial, []).append(kind)
@@ -205,13 +207,25 @@ def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[T
                     f"{trial.steps}, as in {folder / 'episodes.csv'}: the policy's code changed, or another kind of "
                     f"machine drove it; move {folder} away to validate anew"
                 )
-            poster.write_bytes(last_frame(path))
+            write_bytes(poster, last_frame(path))
         told = {"policy": trial.policy, "task": trial.task, "lighting": trial.lighting, "seed": trial.seed}
         told |= {"which": which, "cause": trial.cause, "progress_m": trial.progress, "of": len(trials)}
         files = {"file": path.relative_to(folder).as_posix(), "poster": poster.relative_to(folder).as_posix()}
         mine.append(told | files)
     key = trials[0].policy, trials[0].task
     write_json(noted, [one for one in before if (one["policy"], one["task"]) != key] + mine)
+
+
+def _filmed(path: Path) -> list[dict]:
+    """What `films.json` has; nothing where there is none. Raises InputError: not one that `_film` wrote."""
+    if not path.exists():
+        return []
+    with damaged(path, "delete it, and the films are noted again"):
+        films = [dict(one) for one in read_json(path)]
+        for one in films:
+            _ = [one[name] + "" for name in ("policy", "task", "lighting", "cause", "file", "poster")]
+            _ = int(one["seed"]), int(one["of"]), float(one["progress_m"]), [name + "" for name in one["which"]]
+    return films
 
 
 def seeds_of(lighting: str, episodes: int) -> range:
@@ -265,7 +279,10 @@ def _check_same(
 ) -> None:
     """Notes which policies the tables are of, and which roads (a task under a lighting); refuses others so named."""
     path = folder / "validated.json"
-    noted: dict[str, Any] = {"roads": {}, "policies": {}} | (read_json(path) if path.exists() else {})
+    noted: dict[str, Any] = {"roads": {}, "policies": {}}
+    if path.exists():
+        with damaged(path, f"move {folder} away to validate anew"):
+            noted |= {name: dict(value) for name, value in read_json(path).items()}
     tables = [folder / "episodes.csv", folder / "worst.csv"]
     trials = [trial for table in tables if table.exists() and _has_rows(table) for trial in read_trials(table)]
     driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}
@@ -330,8 +347,8 @@ def _has_rows(path: Path) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status: 0, 2 with one line on standard error, or 130 when interrupted."""
-    parser = argparse.ArgumentParser(prog="python -m twin.validate", description="How often policies succeed.")
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(prog="python -m twin.validate", description="How often policies succeed.")
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
@@ -348,31 +365,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
     parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
     parser.add_argument("--quiet", action="store_true", help="no progress, no table")
-    given = parser.parse_args(arguments)
-    progress.set_quiet(given.quiet)
-    try:
-        if min(given.episodes, given.processes) < 1:
-            raise InputError(f"--episodes {given.episodes}, --processes {given.processes}; expected at least 1")
-        run = (
-            given.task,
-            given.lightings,
-            given.episodes,
-            given.worst,
-            given.trust,
-            given.processes,
-            given.ray,
-            given.films,
-        )
-        said = validate(given.scene, given.policy, *run)
-    except (InputError, OSError) as error:
-        return refuse(error)
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
+    return verb.run(parser, _main, arguments)
+
+
+def _main(given: argparse.Namespace) -> None:
+    for name, most in (("episodes", _PER_LIGHTING), ("processes", _MOST_PROCESSES)):
+        if not 1 <= getattr(given, name) <= most:
+            raise InputError(f"--{name} {getattr(given, name)}; expected 1 to {most}")
+    how = (given.worst, given.trust, given.processes, given.ray, given.films)
+    said = validate(given.scene, given.policy, given.task, given.lightings, given.episodes, *how)
     if not given.quiet:
         print("\n".join(lines(said)))
         print(f"look at {SceneDir(given.scene).validation / 'validation.html'}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -4,11 +4,12 @@
 
 films reality and builds the twin in SCENE (unless that is done), aligns its robot to a drive log of reality's Husky and
 to a film by that one's camera, trains the three setups on both tasks, validates every policy in the twin under held-out
-lightings, as filmed and with all else drawn anew, drives them in reality under weather that neither has seen, and
+lightings, as filmed and with all else drawn anew, drives them in reality under weather that was not filmed, and
 forecasts: once from held-out lightings, by who knows nothing of the weather, and once, after all training, from a photo
 of each day of the test. Every step is a command of `twin`, goes on where it was cut off, and adds to what is there: the
-same call with more seeds keeps all runs. `results.json` beside this file holds every run. Setups, sizes, checkpoints:
-`plan.py`.
+same call with more seeds keeps all runs. `results.json` beside this file holds every run, and is not replaced by one
+that has less unless `--replace-record` is given. Setups, sizes, checkpoints: `plan.py`. What is printed first, scores
+on days that no choice had seen, `scores.py` recounts from `results.json` alone.
 """
 
 import argparse
@@ -24,11 +25,15 @@ from pathlib import Path
 
 from plan import EPISODES, LIGHTINGS, PHOTO_EPISODES, PHOTOS, SETUPS, STEPS, TASKS, TRIALS, Run, runs
 from results import HELD_OUT_FORECAST, collect, table
+from scores import RESULTS, tables
 
 from twin.config import RANDOMISED
 from twin.nerf.added import added_lightings
 from twin.reality.weather import WEATHER
 from twin.scene import SceneDir
+
+sys.path.append(str(Path(__file__).parents[1]))
+from record import add_replace_option, save
 
 STAGES = ("train", "validate", "photos", "real", "forecast")
 
@@ -115,7 +120,7 @@ def _policies(scene: Path, run: Run) -> list[Path]:
     return [run.folder(scene), *run.checkpoints(scene)]
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
@@ -123,6 +128,8 @@ def main() -> None:
     parser.add_argument("--setups", nargs="+", choices=SETUPS, default=list(SETUPS))
     parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="none: the table alone")
     parser.add_argument("--jobs", type=int, default=2, help="runs at once, one core each")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: results.json beside this)")
+    add_replace_option(parser)
     given = parser.parse_args()
     asked = runs(given.seeds, given.tasks, given.setups)
     if given.steps:
@@ -144,13 +151,17 @@ def main() -> None:
     folders = [path for path in (given.scene / "runs").glob("*_*_[0-9]*") if path.is_dir()]
     seeds = sorted({int(path.name.rsplit("_", 1)[1]) for path in folders})
     results = collect(given.scene, runs(seeds, list(TASKS), list(SETUPS)))
-    out = Path(__file__).with_name("results.json")
-    out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    print(table(results))
+    status = save(given.results, results, given.replace_record)
+    if status:
+        return status
+    print(tables(results))
+    print(f"\nThe paper's table, over all {len(WEATHER)} weathers\n\n{table(results)}")
+    print("\nForecasts over all of them; their 90 % intervals are nominal, see benchmarks/intervals.py --record")
     for kind in ("forecast", "forecast_by_photo"):
         for task, group in results[kind].items():
             print(kind, task, json.dumps(group))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -5,14 +5,16 @@ from pathlib import Path
 from typing import Any
 
 from plan import PAPER, PHOTOS, SETUPS, TASKS, Run
+from scores import counts, over_days
 
 from twin.config import HELD_OUT, RANDOMISED
+from twin.files import read_json
 from twin.report.statistics import wilson
 from twin.report.training import CHOICE, read_episodes
 from twin.report.trials import RECENT, Trial, read_trials
-from twin.scene import read_json
 
 _JUDGED = ("validate", "validate_randomised", "validate_by_photo", "real")
+_BY_DAY = ("validate_by_photo", "real")
 HELD_OUT_FORECAST = "forecast_held_out"
 """Folder beside `forecast`, which then is of photos."""
 FORECAST = (
@@ -46,7 +48,10 @@ def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
 
 
 def table(results: dict[str, Any]) -> str:
-    """The paper's table with ours beside it, in Markdown; finished policies of all seeds together."""
+    """The paper's table with ours beside it, in Markdown; finished policies of all seeds together.
+
+    Where trials come by days (by photo, real), rates are means over all the days, with intervals over days.
+    """
     told = "train / validate / (ours: another day / a photo of each day of the test) / real"
     lines = [f"| | | straight: {told} | right turn: {told} |", "|---|---|---|---|"]
     for setup in SETUPS:
@@ -54,8 +59,9 @@ def table(results: dict[str, Any]) -> str:
         ours = []
         for task in TASKS:
             some = [r for r in results["runs"] if r["finished"] and (r["setup"], r["task"]) == (setup, TASKS[task])]
-            parts = [[r["train"] for r in some], *([r["policies"][0][k] for r in some] for k in _JUDGED)]
-            ours.append(" / ".join(_together(part) for part in parts) + f" ({len(some)} runs)")
+            parts = {"train": [r["train"] for r in some]} | {k: [r["policies"][0][k] for r in some] for k in _JUDGED}
+            cells = [_over_days(part) if name in _BY_DAY else _together(part) for name, part in parts.items()]
+            ours.append(" / ".join(cells) + f" ({len(some)} runs)")
         lines.append(f"| ours | {setup} | " + " | ".join(ours) + " |")
     return "\n".join(lines)
 
@@ -70,6 +76,10 @@ def _together(parts: list[dict[str, Any]]) -> str:
         return "–"
     low, high = wilson(won, trials)
     return f"{won / trials:.2f} [{low:.2f}, {high:.2f}], {won}/{trials}"
+
+
+def _over_days(parts: list[dict[str, Any]]) -> str:
+    return over_days([counts(part) for part in parts])
 
 
 def _training(folder: Path) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from twin.alignment.kinematics import NOMINAL, Icr, fit_icr, predict
 from twin.alignment.logs import Windows, without_acceleration
 from twin.alignment.plots import steady, track_ratios
 from twin.alignment.score import Prediction
+from twin.files import toml_string
 from twin.robot import HuskyParams
 
 Array = NDArray[np.float64]
@@ -224,7 +225,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, tuple | list):
         return "[" + ", ".join(_toml(item) for item in value) + "]"
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return toml_string(value)
     if isinstance(value, int):
         return str(value)
     text = f"{value:.6g}"

@@ -25,6 +25,7 @@ from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
 from twin.robot import HuskyParams, PixelCamera
 from twin.scene import SceneDir
+from twin.stamp import finished
 
 _CHOICE = CaptureConfig(fps=2.0, max_frames=90)
 _WORST_TURN, _WORST_HEIGHT = 0.3, 0.03  # [°], [m] standard errors beyond which a seat is not believed
@@ -134,10 +135,9 @@ def pictures(
 
 
 def _ground(scene: SceneDir) -> Ground:
-    """Of a scene that is built as far as is needed here."""
+    """Of a scene that is built as far as is needed here. Raises InputError."""
     for stage in ("metric", "field", "mesh"):
-        if not (scene.stage(stage) / "stamp.json").exists():
-            raise InputError(f"{scene.root} is not built; run python -m twin.build {scene.root} and align then")
+        finished(scene, stage)
     return Ground.load(scene.stage("mesh"))
 
 

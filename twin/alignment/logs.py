@@ -17,6 +17,7 @@ which poses cease while the wheels turn, are left out.
 """
 
 import csv
+import io
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from twin import progress
 from twin.alignment.timing import OLDEST, measured
 from twin.errors import InputError
+from twin.files import damaged, exists, load_arrays, read_text
 
 Array = NDArray[np.float64]
 
@@ -39,6 +41,7 @@ MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds wo
 _DROPOUT = 30  # samples without a fresh pose; a window with more of them in which the wheels turn is left out
 _TURNING = 0.5  # [rad/s] mean of both sides' wheels
 _STANDS = 0.05  # [rad/s], [m/s]; a window in which neither wheels nor commands ever are faster is left out
+_MOST_LOG = 512 << 20  # [bytes], unpacked
 _TICK = 1e-6  # [s] instants nearer than this are the same
 _GROUP_WINDOWS = 3  # of a table without groups: six seconds
 _CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change from one window to the next
@@ -126,7 +129,7 @@ class Windows:
 
 def read_log(path: Path) -> Windows:
     """Reads any kind of log. Raises InputError: unreadable, columns missing, times or values impossible, too short."""
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{path}: no such log; expected a .csv, an .npz or the folder of a ROS 2 bag")
     if path.is_dir() or path.suffix in (".db3", ".mcap", ".bag"):
         from twin.alignment.bags import read_bag
@@ -143,11 +146,11 @@ def read_log(path: Path) -> Windows:
 
 
 def _read_csv(path: Path) -> dict[str, Array]:
+    text = read_text(path, _MOST_LOG)
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            head, *rows = [row for row in csv.reader(file) if row]
-            values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
-    except (ValueError, UnicodeDecodeError) as error:
+        head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row]
+        values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
+    except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
     if values.ndim != 2 or values.shape[1] != len(head):
         raise InputError(f"{path}: {len(head)} names over rows of another length; export it anew")
@@ -155,11 +158,9 @@ def _read_csv(path: Path) -> dict[str, Array]:
 
 
 def _read_npz(path: Path) -> dict[str, Array]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: np.asarray(file[name], np.float64) for name in file.files}
-    except Exception as error:  # numpy raises whatever the zip or the array inside happens to be wrong with
-        raise InputError(f"{path}: not an .npz of plain arrays: {error}; save it anew with numpy.savez") from None
+    arrays = load_arrays(path, _MOST_LOG)
+    with damaged(path, "expected plain arrays of numbers; save it anew with numpy.savez"):
+        return {name: np.asarray(values, np.float64) for name, values in arrays.items()}
 
 
 def cut(columns: dict[str, Array], where: str) -> Windows:

@@ -11,9 +11,9 @@ checked, and what fails is cut in halves until it passes.
 
 import argparse
 import hashlib
-import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from twin import progress
-from twin.child import die_with_parent
-from twin.scene import digest_json
+from twin.child import die_with_parent, environment
+from twin.files import digest_json
 
 Array = NDArray[np.float64]
 
@@ -251,7 +251,11 @@ def _coacd(pieces: list[Piece], bound: float, cache: Path, seed: int) -> tuple[l
     with progress.bar("convex parts", len(open_), "piece") as bar, ThreadPoolExecutor(_CHILDREN) as pool:
         # Alternate pieces, so that both children have large and small ones.
         shares = [[(job[0], job[1]) for job in open_[k::_CHILDREN]] for k in range(_CHILDREN)]
-        list(pool.map(lambda share: _work_off(share, bar), shares))
+        stopped = threading.Event()
+        try:
+            list(pool.map(lambda share: _work_off(share, bar, stopped), shares))
+        finally:
+            stopped.set()
     answers: list[list[Part] | None] = []
     for source, target, _ in jobs:
         source.unlink(missing_ok=True)
@@ -259,15 +263,21 @@ def _coacd(pieces: list[Piece], bound: float, cache: Path, seed: int) -> tuple[l
     return answers, len(jobs) - len(open_)
 
 
-def _work_off(jobs: list[tuple[Path, Path]], bar: progress.tqdm) -> None:
-    """Runs children until every job is done or has killed one; a job that does is given up."""
+def _work_off(jobs: list[tuple[Path, Path]], bar: progress.tqdm, stopped: threading.Event) -> None:
+    """Runs children until every job is done or has killed one; a job that does is given up. Ends early once stopped."""
     todo = list(jobs)
     while todo:
         command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in todo for path in job)]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+        child = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            process_group=0,  # a signal to all of a terminal's is for us
+            env=environment(OMP_NUM_THREADS="1"),
+        )
         done, since = 0, time.monotonic()
-        while child.poll() is None and time.monotonic() - since < _TIME_LIMIT:
+        while child.poll() is None and time.monotonic() - since < _TIME_LIMIT and not stopped.is_set():
             if todo[done:] and todo[done][1].exists():
                 done, since = done + 1, time.monotonic()
                 bar.update()
@@ -275,6 +285,8 @@ def _work_off(jobs: list[tuple[Path, Path]], bar: progress.tqdm) -> None:
                 time.sleep(0.05)
         child.kill()
         child.wait()
+        if stopped.is_set():
+            return
         finished = sum(target.exists() for _, target in todo)
         bar.update(finished - done)
         # Jobs are done in order: the first without an answer is the one that crashed or hung.

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from twin.files import check_shapes, damaged, load_arrays
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -43,5 +45,20 @@ class Ground:
 
     @staticmethod
     def load(folder: Path) -> "Ground":
-        with np.load(folder / "ground.npz", allow_pickle=False) as data:
-            return Ground(data["height"], data["origin"], float(data["cell"]), data["measured"], data["rgb"])
+        """Raises InputError: no such file, or not one that `save` wrote."""
+        path = folder / "ground.npz"
+        with damaged(path, "build the scene again"):
+            data = load_arrays(path)
+            ground = Ground(data["height"], data["origin"], float(data["cell"]), data["measured"], data["rgb"])
+            rows, columns = ground.height.shape
+            check_shapes(
+                {
+                    "height": (ground.height, (rows, columns), "f"),
+                    "origin": (ground.origin, (2,), "f"),
+                    "measured": (ground.measured, (rows, columns), "b"),
+                    "rgb": (ground.rgb, (rows, columns, 3), "u"),
+                }
+            )
+            if not (0.0 < ground.cell < np.inf and np.isfinite(ground.height).all() and rows * columns):
+                raise ValueError(f"cell = {ground.cell}, or heights that are not finite")
+        return ground

@@ -6,6 +6,7 @@ length along it. The *corridor* is what lies within a half width of the route: t
 free.
 """
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -23,15 +24,20 @@ _SMOOTHING = 0.5  # [m] standard deviation; moves a 5 m turn by 0.5²/(2·5) = 2
 _ROCKING = 0.4  # [m] returns within this are standing or rocking, not driving
 _LEFT = 1.6  # [m] further away than this it has left for good: a round trip passes here again
 _MIN_LENGTH = 2.0  # [m]
+_JUMP = 8.0  # usual steps; frames of uneven slots and sudden starts stay below 4
+_MIN_JUMP = 5.0  # [m]
+_BESIDE = 4  # steps before and after that say what is usual
+_MOST_LOST = 20.0  # frames in a row; a longer gap in time explains no longer step
 
 
 def filmed_route(cameras: Cameras) -> Array:
     """The route of the longest source (the first of those within 2 % of it), shape (m, 2) [m].
 
     Raises:
-        InputError: the cameras hardly moved.
+        InputError: the cameras hardly moved, or the path jumps.
     """
-    routes = [smooth_route(cameras.positions[index]) for index in source_frames(cameras)]
+    frames = source_frames(cameras)
+    routes = [smooth_route(cameras.positions[index]) for index in frames]
     lengths = np.array([route_length(route) for route in routes])
     if not len(lengths) or lengths.max() < _MIN_LENGTH:
         longest = lengths.max() if len(lengths) else 0.0
@@ -39,7 +45,69 @@ def filmed_route(cameras: Cameras) -> Array:
             f"the filmed path is {longest:.2f} m long, expected at least {_MIN_LENGTH:g} m; "
             "film a drive, correct [metric], or set mjcf.route = false"
         )
-    return routes[int(np.argmax(lengths >= 0.98 * lengths.max()))]
+    chosen = int(np.argmax(lengths >= 0.98 * lengths.max()))
+    _refuse_jumps(cameras, frames[chosen])
+    return routes[chosen]
+
+
+def refuse_jumps(cameras: Cameras) -> None:
+    """Refuses a film of several passes as early as its cameras are metric; a path too short for a route is let pass.
+
+    Raises:
+        InputError: the path that makes the route jumps, see `path_jumps`; names the frames.
+    """
+    frames = source_frames(cameras)
+    lengths = np.array([route_length(smooth_route(cameras.positions[index])) for index in frames])
+    if len(lengths) and lengths.max() >= _MIN_LENGTH:
+        _refuse_jumps(cameras, frames[int(np.argmax(lengths >= 0.98 * lengths.max()))])
+
+
+def path_jumps(positions: Array, times: Array) -> NDArray[np.int64]:
+    """Where a path steps much further than it usually does: between two passes that were filmed one after the other.
+
+    A step is usual where it is at most 8 of those before and after it, or less than 5 m. Frames that are missing in
+    between lengthen it.
+
+    Args:
+        positions: Camera centres in order of time, shape (n, 3) [m].
+        times: Of these [s], or the place of photos without a clock, shape (n,).
+
+    Returns:
+        Indices i such that the path jumps from i to i + 1, shape (k,).
+    """
+    if len(positions) < 3:
+        return np.zeros(0, np.int64)
+    step = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    wait = np.diff(times)
+    lost = np.clip(wait / max(float(np.median(wait)), 1e-9), 1.0, _MOST_LOST)  # intervals that a step spans
+    pace = step / lost
+    usual = np.full(len(step), np.median(pace))
+    for i in range(len(step)):
+        beside = np.concatenate([pace[max(i - _BESIDE, 0) : i], pace[i + 1 : i + 1 + _BESIDE]])
+        # An upper quartile, since a film may start, stop and speed up at any frame.
+        usual[i] = max(usual[i], float(np.quantile(beside, 0.75)))
+    return np.flatnonzero((step > _MIN_JUMP) & (step > usual * np.maximum(_JUMP, 2.0 * lost)))
+
+
+def _refuse_jumps(cameras: Cameras, index: NDArray[np.int64]) -> None:
+    """Refuses a source, given its frames in order of time, whose path jumps."""
+    index = index[path_inliers(cameras.positions[index])]
+    xy, times = cameras.positions[index, :2], cameras.times[index]
+    jumps = path_jumps(cameras.positions[index], times)
+    if not len(jumps):
+        return
+    first = int(jumps[0])
+    metres = float(np.linalg.norm(xy[first + 1] - xy[first]))
+    starts, ends = [0, *(int(k) + 1 for k in jumps)], [*(int(k) for k in jumps), len(index) - 1]
+    passes = list(zip(starts, ends, strict=True))
+    a, b = max(passes, key=lambda ends: route_length(xy[ends[0] : ends[1] + 1]))
+    keep = f"[[{math.floor(100 * times[a]) / 100:g}, {math.ceil(100 * times[b]) / 100:g}]]"
+    raise InputError(
+        f"the filmed path jumps {metres:.1f} m from frame {cameras.names[index[first]]} to "
+        f"{cameras.names[index[first + 1]]}: a route is one pass without cuts; choose a pass, for the longest write "
+        f"keep = {keep} [s] under [capture], or under its [[source]] where there are several; put photos of one pass "
+        "into a folder of their own; or set mjcf.route = false"
+    )
 
 
 def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:

@@ -5,17 +5,23 @@ Only the cameras and the images are needed; points are found anew. A *model* is 
 """
 
 import struct
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from twin.capture.lens import Lens, checked_lens
+from twin.capture.paths import is_file
+from twin.capture.pycolmap_import import pycolmap
+from twin.config import CAMERA_MODELS
 from twin.errors import InputError
+from twin.files import damaged, read_bytes
 from twin.geometry.poses import inverse_pose
 
 _MODEL_PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
+_MODEL_NAMES = {int(pycolmap.CameraModelId.__members__[name]): name for name in CAMERA_MODELS}
+_LARGEST = 1e9  # number in a pose
+_CURE = "export the model again"
 
 Array = NDArray[np.float64]
 
@@ -24,9 +30,13 @@ def find_model(folder: Path) -> Path | None:
     """The COLMAP model in a folder or at its usual places below it, or None."""
     for place in _MODEL_PLACES:
         model = folder / place
-        if any((model / f"cameras{kind}").exists() and (model / f"images{kind}").exists() for kind in (".bin", ".txt")):
+        if any(_both(model, kind) for kind in (".bin", ".txt")):
             return model
     return None
+
+
+def _both(model: Path, kind: str) -> bool:
+    return is_file(model / f"cameras{kind}") and is_file(model / f"images{kind}")
 
 
 def read_model(model: Path) -> list[tuple[str, Lens, Array]]:
@@ -35,23 +45,21 @@ def read_model(model: Path) -> list[tuple[str, Lens, Array]]:
     Raises:
         InputError: damaged or inconsistent files, or a pose that is not finite.
     """
-    kind = ".bin" if (model / "images.bin").exists() and (model / "cameras.bin").exists() else ".txt"
+    kind = ".bin" if _both(model, ".bin") else ".txt"
     read_cameras, read_images = (_cameras_bin, _images_bin) if kind == ".bin" else (_cameras_txt, _images_txt)
     cameras_path, images_path = model / f"cameras{kind}", model / f"images{kind}"
-    try:
+    with damaged(cameras_path, _CURE):
         lenses = read_cameras(cameras_path)
-    except (ValueError, IndexError, struct.error) as error:
-        raise _damaged(cameras_path, error) from None
-    try:
+    with damaged(images_path, _CURE):
         images = read_images(images_path)
-    except (ValueError, IndexError, struct.error) as error:
-        raise _damaged(images_path, error) from None
     posed = []
     for name, camera_id, values in images:
         if camera_id not in lenses:
             raise InputError(f"{images_path}: {name} uses camera {camera_id}, which {cameras_path.name} does not list")
-        length = float(np.linalg.norm(values[:4]))
-        if not np.isfinite(values).all() or length < 1e-6:
+        place = PurePosixPath(name.replace("\\", "/"))
+        if not place.name or place.is_absolute() or ".." in place.parts or "\0" in name:
+            raise InputError(f"{images_path}: an image is named {name!r}; expected a path below the image folder")
+        if not np.abs(values).max() < _LARGEST or (length := float(np.linalg.norm(values[:4]))) < 1e-6:
             raise InputError(f"{images_path}: the pose of {name} is not finite; remove that image or export again")
         pose = np.eye(4)
         pose[:3, :3] = rotation_from_quaternion(values[:4] / length)
@@ -65,12 +73,6 @@ def rotation_from_quaternion(q: Array) -> Array:
     w, v = q[0], q[1:]
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     return (w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) + 2.0 * w * cross
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    if isinstance(error, InputError):
-        return error
-    return InputError(f"{path}: damaged or no COLMAP file ({error}); export the model again")
 
 
 def _cameras_txt(path: Path) -> dict[int, Lens]:
@@ -107,16 +109,16 @@ def _images_txt(path: Path) -> list[tuple[str, int, Array]]:
 
 def _text(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return read_bytes(path).decode("utf-8").splitlines()
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; export the model again") from None
+        raise InputError(f"{path}: not a text file; {_CURE}") from None
 
 
 class _Reader:
     """Reads packed little-endian values from bytes, front to back."""
 
     def __init__(self, path: Path) -> None:
-        self.data, self.at = path.read_bytes(), 0
+        self.data, self.at = read_bytes(path), 0
 
     def take(self, layout: str) -> tuple:
         values = struct.unpack_from("<" + layout, self.data, self.at)
@@ -138,12 +140,11 @@ def _cameras_bin(path: Path) -> dict[int, Lens]:
     reader, lenses = _Reader(path), {}
     for _ in range(reader.take("Q")[0]):
         key, model_id, width, height = reader.take("iiQQ")
-        try:
-            camera = pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model_id), 1.0, width, height)
-        except (TypeError, ValueError, RuntimeError):
-            raise ValueError(f"camera model number {model_id}") from None
-        params = reader.take(f"{len(camera.params)}d")
-        lenses[key] = checked_lens(camera.model_name, params, width, height, f"{path}: camera {key}")
+        model = _MODEL_NAMES.get(model_id)
+        if model is None:
+            raise ValueError(f"camera model number {model_id}")
+        params = reader.take(f"{CAMERA_MODELS[model]}d")
+        lenses[key] = checked_lens(model, params, width, height, f"{path}: camera {key}")
     return lenses
 
 

@@ -10,8 +10,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags
+
+from twin.capture.pycolmap_import import pycolmap
+from twin.geometry.images import BROKEN, opened
 
 _FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
@@ -35,13 +37,16 @@ def photo_facts(path: Path) -> PhotoFacts:
     """Reads a photo's header; whatever is absent or malformed is unknown, never an error."""
     nothing = PhotoFacts(None, (math.nan, math.nan, math.nan), None, 1)
     try:
-        with Image.open(path) as image:
+        found = opened(path)
+        if found is None:
+            return nothing
+        with found as image:
             width, height = image.size
             exif = image.getexif()
             if not exif:
                 return nothing
             photo, gps = exif.get_ifd(ExifTags.IFD.Exif), exif.get_ifd(ExifTags.IFD.GPSInfo)
-    except (OSError, ValueError, SyntaxError, UnidentifiedImageError):
+    except BROKEN:
         return nothing
     orientation = exif.get(ExifTags.Base.Orientation, 1)
     return PhotoFacts(

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from twin.capture.lens import Lens
 from twin.capture.pairs import Pair, ordered
+from twin.capture.pycolmap_import import pycolmap
 from twin.capture.types import Capture, SourceInfo
 from twin.capture.worker import tell
 from twin.errors import InputError

@@ -6,7 +6,6 @@ camera axes (y up, looking along −z); here poses are OpenCV's. What a dialect 
 sources posed by one reconstruction share its world.
 """
 
-import json
 import math
 import re
 from dataclasses import dataclass
@@ -15,15 +14,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from twin.capture.colmap import find_model, read_model
 from twin.capture.lens import Lens, checked_lens
-from twin.errors import InputError
+from twin.capture.paths import is_file, is_folder
+from twin.errors import InputError, shown
+from twin.files import damaged, read_json
 from twin.geometry.cameras import opencv_to_mujoco
+from twin.geometry.images import image_size
 from twin.geometry.poses import inverse_pose
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
+_LARGEST = 1e12  # number that a camera may have
+_FAR = 1e9  # units from the origin that no camera is
 _RIGID_TOLERANCE = 1e-2  # entries of RᵀR − 1; files with rounded numbers stay below
 
 Array = NDArray[np.float64]
@@ -51,13 +54,11 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
 
 def detect_kind(path: Path) -> str:
     """What a source is, from what lies at its path: video, images, colmap or transforms. Raises InputError."""
-    if not path.exists():
-        raise InputError(f"{path}: no such source; check path = in scene.toml (it is relative to the scene folder)")
-    if path.is_file():
+    if not is_folder(path, "check path = in scene.toml (it is relative to the scene folder)"):
         return "transforms" if path.suffix.lower() == ".json" else "video"
     if find_model(path):
         return "colmap"
-    if (path / "transforms.json").exists():
+    if is_file(path / "transforms.json"):
         return "transforms"
     if _image_files(path):
         return "images"
@@ -91,13 +92,13 @@ def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
     if not posed:
         raise InputError(f"{model}: the COLMAP model has no registered image; reconstruct again")
     roots = [images] if images else [r for up in (folder, model, *list(model.parents)[:3]) for r in (up / "images", up)]
-    root = next((r for r in roots if any((r / name).exists() for name, _, _ in posed)), None)
+    root = next((r for r in roots if any(is_file(r / name) for name, _, _ in posed)), None)
     if root is None:
         raise InputError(
             f"{model}: none of its {len(posed)} images (such as {posed[0][0]}) found in {roots[0]}; "
             "set images = in scene.toml"
         )
-    found = [(root / name, lens, pose) for name, lens, pose in posed if (root / name).exists()]
+    found = [(root / name, lens, pose) for name, lens, pose in posed if is_file(root / name)]
     return ImageSet(
         tuple(path for path, _, _ in found),
         tuple(lens for _, lens, _ in found),
@@ -117,7 +118,11 @@ def read_transforms(path: Path, images: Path | None = None) -> ImageSet:
         InputError: wrong JSON, a missing or impossible entry, a pose that is not rigid, no image found.
     """
     path = path / "transforms.json" if path.is_dir() else path
-    table = _json(path)
+    with damaged(path, "export the file again"), np.errstate(all="ignore"):
+        return _image_set(path, _json(path), images)
+
+
+def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageSet:
     frames = table.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: no frames in it; expected a nerfstudio or instant-ngp transforms.json")
@@ -136,8 +141,12 @@ def read_transforms(path: Path, images: Path | None = None) -> ImageSet:
             continue
         world = opencv_to_mujoco(undo @ pose)  # the flip between OpenGL and OpenCV axes is its own inverse
         world[:3, 3] /= scale
+        if not np.abs(world[:3, 3]).max() < _FAR:
+            raise InputError(f"{where}: transform_matrix lies too far away; export the file again")
         mask = frame.get("mask_path")
-        mask_path = path.parent / mask if isinstance(mask, str) and (path.parent / mask).exists() else None
+        if not isinstance(mask, str | None):
+            raise InputError(f"{where}: mask_path = {shown(mask)}; expected a path")
+        mask_path = path.parent / mask if mask and is_file(path.parent / mask) else None
         entries.setdefault(file, (lens_from_transforms({**table, **frame}, file, where), world, mask_path))
     if not entries:
         raise InputError(
@@ -166,9 +175,33 @@ def files_named(path: Path, images: Path | None = None) -> list[Path]:
         if isinstance(frame, dict):
             if isinstance(frame.get("file_path"), str):
                 found.add(_find_image(path.parent, images, frame["file_path"]))
-            if isinstance(frame.get("mask_path"), str) and (path.parent / frame["mask_path"]).is_file():
+            if isinstance(frame.get("mask_path"), str) and is_file(path.parent / frame["mask_path"]):
                 found.add(path.parent / frame["mask_path"])
     return sorted(file for file in found if file is not None)
+
+
+def files_read(path: Path, kind: str, images: Path | None = None) -> list[Path]:
+    """Every file that reading a source takes, masks of `scene.toml` left out; of a damaged one, what is known.
+
+    Args:
+        path: The source.
+        kind: auto, or what it is taken for.
+        images: Image folder of a posed set that has one elsewhere.
+
+    Raises:
+        InputError: nothing there that could be a source.
+    """
+    kind = detect_kind(path) if kind == "auto" else kind
+    if kind == "transforms":
+        table = path / "transforms.json" if path.is_dir() else path
+        return [table, *files_named(table, images)]
+    if kind == "colmap" and path.is_dir() and (model := find_model(path)) is not None:
+        files = [file for file in model.iterdir() if is_file(file)]
+        try:
+            return [*files, *read_colmap(path, images).paths]
+        except InputError:
+            return files  # reading it for good will say what is wrong
+    return _image_files(path) if kind == "images" and path.is_dir() else [path]
 
 
 def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
@@ -180,8 +213,9 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
 
     def number(key: str, default: float | None = None) -> float | None:
         value = table.get(key, default)
-        if value is not None and (not isinstance(value, int | float) or not math.isfinite(value)):
-            raise InputError(f"{where}: {key} = {value!r}; expected a finite number")
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is not None and not (number and abs(value) < _LARGEST):
+            raise InputError(f"{where}: {key} = {shown(value)}; expected a finite number")
         return value
 
     if "w" in table and "h" in table:
@@ -199,7 +233,9 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
         raise InputError(f"{where}: neither fl_x nor camera_angle_x; add the focal length [px]")
     core = (fx, fy, number("cx", 0.5 * width) or 0.0, number("cy", 0.5 * height) or 0.0)
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    name = str(table.get("camera_model", ""))
+    name = table.get("camera_model") or ""
+    if not isinstance(name, str):
+        raise InputError(f"{where}: camera_model = {shown(name)}; expected OPENCV, OPENCV_FISHEYE or PINHOLE")
     if name == "OPENCV_FISHEYE" or (not name and table.get("is_fisheye")):
         return checked_lens("OPENCV_FISHEYE", (*core, k1, k2, k3, k4), width, height, where)
     if name not in ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
@@ -213,27 +249,20 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
     return checked_lens("PINHOLE", core, width, height, where)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file as stored [px], from its header. Raises InputError."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, UnidentifiedImageError):
-        raise InputError(f"{path}: not a readable image ({path.stat().st_size} bytes); replace or remove it") from None
+def is_image(path: Path) -> bool:
+    """Whether a file is there and is called like an image."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and is_file(path)
 
 
 def _image_files(folder: Path) -> list[Path]:
-    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
-    return sorted((p for p in files if p.is_file()), key=lambda p: natural_key(p.name))
+    return sorted(filter(is_image, folder.iterdir()), key=lambda p: natural_key(p.name))
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give a transforms.json or the folder that holds it") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not valid JSON: {error}; export the file again") from None
+        table = read_json(path)
+    except InputError as error:
+        raise InputError(f"{error}; give a transforms.json or the folder that holds it") from None
     if not isinstance(table, dict):
         raise InputError(f"{path}: expected a JSON object with frames, got {type(table).__name__}")
     return table
@@ -250,7 +279,7 @@ def _rigid(value: Any, where: str) -> Array:
         raise InputError(f"{where}: transform_matrix is not finite; remove this frame or export the file again")
     rotation = matrix[:3, :3]
     wrong = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if wrong > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0.0:
+    if not wrong <= _RIGID_TOLERANCE or np.linalg.det(rotation) < 0.0:
         raise InputError(
             f"{where}: transform_matrix is not rigid (RᵀR is off by {wrong:.2g}, det {np.linalg.det(rotation):.2g}); "
             "expected a rotation and a translation"
@@ -267,8 +296,8 @@ def _world_of(table: dict[str, Any], path: Path) -> tuple[Array, float]:
     if "applied_transform" in table:
         undo = inverse_pose(_rigid(table["applied_transform"], f"{path}: applied_transform"))
     scale = table.get("applied_scale", 1.0)
-    if not isinstance(scale, int | float) or not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"{path}: applied_scale = {scale!r}; expected a positive number")
+    if not isinstance(scale, int | float) or isinstance(scale, bool) or not 1 / _LARGEST < scale < _LARGEST:
+        raise InputError(f"{path}: applied_scale = {shown(scale)}; expected a positive number")
     # nerfstudio scales after it moves, x' = s (R x + t), so t of the undone transform is scaled as well.
     undo[:3, 3] *= scale
     return undo, float(scale)
@@ -278,12 +307,12 @@ def _find_image(base: Path, images: Path | None, name: str) -> Path | None:
     name = name.replace("\\", "/")
     places = [images / name, images / Path(name).name] if images else [base / name]
     for place in places:
-        if place.is_file():
+        if is_file(place):
             return place
         # instant-ngp writes names without a suffix.
-        if place.suffix.lower() not in IMAGE_SUFFIXES:
+        if place.name and place.suffix.lower() not in IMAGE_SUFFIXES:
             for suffix in IMAGE_SUFFIXES:
                 for candidate in (place.with_name(place.name + suffix), place.with_name(place.name + suffix.upper())):
-                    if candidate.is_file():
+                    if is_file(candidate):
                         return candidate
     return None

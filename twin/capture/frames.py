@@ -15,10 +15,12 @@ from twin import progress
 from twin.capture.formats import detect_kind, read_colmap, read_image_folder, read_transforms
 from twin.capture.keep import NO_GPS, FrameWriter, Image, Kept, Task
 from twin.capture.masks import Masks, read_mask
+from twin.capture.paths import folder
 from twin.capture.photos import read_photos
 from twin.capture.types import Capture
 from twin.capture.video import FilmCount, damage_note, read_film
-from twin.config import RANDOMISED, RESERVED_LIGHTINGS, CaptureConfig, SceneConfig, SourceConfig
+from twin.config import CaptureConfig, SceneConfig, SourceConfig
+from twin.config_file import LONGEST_NAME, check_lighting
 from twin.errors import InputError
 from twin.scene import SceneDir
 
@@ -84,16 +86,8 @@ def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
 
 
 def _lighting(source: SourceConfig) -> str:
-    lighting = source.lighting or _stem(source.path)
-    if set(lighting) & set(":/") or lighting.endswith(RANDOMISED):
-        raise InputError(
-            f"lighting = {lighting!r}: ':', '/' and '{RANDOMISED}' have a meaning of their own; choose a plain name"
-        )
-    if lighting in RESERVED_LIGHTINGS:
-        raise InputError(
-            f"{source.path}: lighting = {lighting!r} has a meaning of its own, a light drawn at random; choose another "
-            "name, such as morning"
-        )
+    lighting = source.lighting or _stem(source.path)[:LONGEST_NAME]
+    check_lighting(lighting, f"{source.path}: lighting")
     return lighting
 
 
@@ -101,12 +95,12 @@ def _read_source(
     root: Path, name: str, lighting: str, source: SourceConfig, config: CaptureConfig, writer: FrameWriter
 ) -> Kept:
     path = root / source.path
-    kind = detect_kind(path) if source.kind == "auto" or not path.exists() else source.kind
+    kind = detect_kind(path) if source.kind == "auto" else source.kind
     masks = Masks(root / source.mask) if source.mask else None
     task = Task(path, name, lighting, kind, source, config, masks, writer)
     images = root / source.images if source.images else None
-    if images and not images.is_dir():
-        raise InputError(f"{images}: no such folder; check images = in scene.toml")
+    if images:
+        folder(images, "check images = in scene.toml, a folder")
     if kind == "video":
         return _read_video(task)
     if kind == "images":
@@ -122,7 +116,7 @@ def _read_video(task: Task) -> Kept:
     kept, count, unmasked = Kept(task.info((0, 0), None, False)), FilmCount(), 0
     size = (0, 0)
     with progress.bar(f"reading {task.name}", 0, "frame") as bar:
-        for frame in read_film(task.path, task.config, count, mask_of):
+        for frame in read_film(task.path, task.config, count, mask_of, task.parts):
             size = (frame.image.shape[1], frame.image.shape[0])
             task.writer.put(frame.index, frame.image, frame.mask)
             unmasked += frame.mask is None

@@ -43,6 +43,11 @@ class Task:
     masks: Masks | None
     writer: "FrameWriter"
 
+    @property
+    def parts(self) -> tuple[tuple[float, ...], ...]:
+        """The parts of the source that are used, [from, to] each [s]; empty = all of it."""
+        return self.source.keep or self.config.keep
+
     def given_lens(self, native: tuple[int, int]) -> Lens | None:
         """The calibration of `scene.toml`, or None; `native` is the upright size of the input [px].
 

@@ -10,14 +10,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from twin.capture.pycolmap_import import pycolmap
 from twin.capture.undistort import pinhole_of, undistortion_map
+from twin.config import CAMERA_MODELS
 from twin.errors import InputError
 
-_MODELS = tuple(name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR"))
+_MODELS = tuple(CAMERA_MODELS)
 _MAX_ASPECT_ERROR = 0.01
+_MOST_SIDE = 1_000_000  # [px]
 
 Image = NDArray[np.uint8]
 
@@ -87,7 +89,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
         near = difflib.get_close_matches(model.upper(), _MODELS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(_MODELS)}"
         raise InputError(f"{where}: unknown camera model {model!r}; {hint}")
-    if width <= 0 or height <= 0:
+    if not (0 < width < _MOST_SIDE and 0 < height < _MOST_SIDE):
         raise InputError(f"{where}: image size {width}x{height}; give the width and height the calibration is for [px]")
     camera = pycolmap.Camera.create_from_model_name(0, model, 1.0, width, height)
     if len(params) != len(camera.params):

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from twin.capture import pairs as pairing
 from twin.capture.features import Matcher, open_database
 from twin.capture.outliers import path_outliers
+from twin.capture.pycolmap_import import pycolmap
 from twin.capture.types import Capture
 from twin.capture.worker import tell
 from twin.errors import InputError
+from twin.files import write_json
 from twin.geometry.poses import Array, inverse_pose
-from twin.scene import write_json
 
 _MIN_FRAMES = 3
 _PROBE_INLIERS = 25

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.capture.lens import same_aspect
+from twin.capture.paths import is_file, is_folder
 from twin.errors import InputError
+from twin.geometry.images import decoded
 
 _LOSSY_THRESHOLD = 63  # a JPEG's zero is not quite zero
 
@@ -22,9 +24,8 @@ class Masks:
     path: Path
 
     def __post_init__(self) -> None:
-        if not self.path.exists():
-            raise InputError(f"{self.path}: no such mask; give an image or a folder of images, 0 = ignore")
-        if self.path.is_dir() and not any(self.path.iterdir()):
+        cure = "give as mask an image or a folder of images, 0 = ignore"
+        if is_folder(self.path, cure) and not any(self.path.iterdir()):
             raise InputError(f"{self.path}: this mask folder is empty; put one image per frame in it, 0 = ignore")
 
     def find(self, keys: tuple[str, ...]) -> Path | None:
@@ -32,7 +33,7 @@ class Masks:
         if not self.path.is_dir():
             return self.path
         candidates = (self.path / f"{key}{suffix}" for key in keys for suffix in (".png", ".jpg", ".PNG", ".JPG"))
-        return next((path for path in candidates if path.exists()), None)
+        return next((path for path in candidates if is_file(path)), None)
 
 
 def read_mask(path: Path, width: int, height: int) -> Image:
@@ -41,10 +42,7 @@ def read_mask(path: Path, width: int, height: int) -> Image:
     Raises:
         InputError: unreadable, of another aspect than the frame, or nothing left to use.
     """
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    if mask is None:
-        raise InputError(f"{path}: not a readable mask ({len(data)} bytes); write it again as an 8-bit PNG")
+    mask = decoded(path, cv2.IMREAD_GRAYSCALE, "write the mask again as an 8-bit PNG")
     if not same_aspect((mask.shape[1], mask.shape[0]), (width, height)):
         raise InputError(
             f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its frame has the aspect of {width}x{height}; "

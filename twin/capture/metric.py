@@ -10,16 +10,18 @@ from typing import Any
 
 import numpy as np
 
+from twin.assets.route import refuse_jumps
 from twin.capture.gravity import Road, Up, camera_up, find_road, heights_above_road, up_from_ground
 from twin.capture.markers import scale_from_marker
 from twin.capture.scale import Scale, chosen_way, scale_from_distance, scale_from_gps, scale_from_height
 from twin.capture.types import Capture
 from twin.config import SceneConfig
 from twin.errors import InputError
+from twin.files import write_json
 from twin.geometry.cameras import Cameras
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import Array, Similarity
-from twin.scene import SceneDir, write_json
+from twin.scene import SceneDir
 
 _START = 0.08
 """The way driven first is the first part of the first source's path [share of its length]."""
@@ -38,7 +40,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         similarity from the reconstruction, and notes of the scale's own.
 
     Raises:
-        InputError: no scale or several given, or the chosen evidence is not in the data.
+        InputError: no scale or several given, the chosen evidence is not in the data, or the path of a drive jumps.
     """
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
@@ -71,6 +73,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         scale = Scale(1.0, 0.0)
     similarity = _level_frame(cameras, up.direction, level, scale.value, east, keep=config.metric.up == "poses")
     placed, moved = cameras.transformed(similarity), points.transformed(similarity)
+    if config.mjcf.route:
+        refuse_jumps(placed)
     placed.save(out)
     moved.save(out)
     metrics = _metrics(placed, moved, way, scale, up, road, floor_source, similarity)

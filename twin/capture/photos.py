@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as PillowImage
 
 from twin import progress
 from twin.capture.exif import PhotoFacts, photo_facts
@@ -20,9 +19,9 @@ from twin.capture.formats import ImageSet
 from twin.capture.keep import BLANK, Image, Kept, Task, ahead
 from twin.capture.lens import Lens, flattened, same_aspect
 from twin.capture.masks import read_mask
-from twin.capture.video import fitted_size
+from twin.capture.video import fitted_size, within
 from twin.errors import InputError
-from twin.geometry.images import resize
+from twin.geometry.images import BROKEN, decoded, opened, resize
 
 _MAX_FOCAL_SPREAD = 0.05  # relative; photos of one source that differ more were zoomed
 
@@ -40,7 +39,8 @@ def read_photos(task: Task, images: ImageSet) -> Kept:
         lenses = (given,) * len(lenses)
     flatten = lenses is not None and _differ(lenses)
     limit = min(task.config.frames or task.config.max_frames, task.config.max_frames)
-    chosen = [int(i) for i in regular_choice(len(images.paths), limit)]
+    there = _in_parts(task, images)
+    chosen = [int(there[i]) for i in regular_choice(len(there), limit)]
 
     def load(i: int) -> tuple[int, Image, PhotoFacts]:
         return i, *load_photo(images.paths[i], lenses[i] if lenses else None)
@@ -114,6 +114,31 @@ def read_photos(task: Task, images: ImageSet) -> Kept:
     return kept
 
 
+def _in_parts(task: Task, images: ImageSet) -> NDArray[np.int64]:
+    """Indices of the photos that lie in the parts of the source that are used.
+
+    Raises:
+        InputError: parts are given and the photos have no clock that rises, or fewer than two photos are in the parts.
+    """
+    count = len(images.paths)
+    if not task.parts:
+        return np.arange(count)
+    clock = [photo_facts(path).time for path in images.paths]
+    if not rises(clock):
+        raise InputError(
+            f"{task.path}: keep is in seconds, but these photos have no clock (EXIF) that rises with their names; put "
+            "the photos that are to be used into a folder of their own, and give keep to the films only"
+        )
+    times = np.array(photo_times(clock, list(range(count))))
+    used = np.flatnonzero(within(times, task.parts))
+    if len(used) < 2:
+        raise InputError(
+            f"{task.path}: keep = {[list(part) for part in task.parts]} leaves {len(used)} of {count} photos (need 2); "
+            f"they were taken from 0 to {times[-1]:.2f} s"
+        )
+    return used
+
+
 def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoFacts]:
     """An image file as RGB, shape (h, w, 3), and what its header says.
 
@@ -122,18 +147,11 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoFacts]:
     Raises:
         InputError: missing, empty, cut off or undecodable, or of another shape than its lens is for.
     """
-    data = path.read_bytes() if path.exists() else b""
-    unreadable = InputError(f"{path}: not a readable image ({len(data)} bytes); replace or remove it")
-    if not data:
-        raise unreadable
+    stored = _stored_size(path)
     facts = photo_facts(path)
-    stored = _stored_size(path, len(data))
     as_stored = lens is not None and (facts.orientation < 5 or stored is None or lens.fits(*stored))
     flags = cv2.IMREAD_COLOR | (cv2.IMREAD_IGNORE_ORIENTATION if as_stored else 0)
-    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if decoded is None:
-        raise unreadable
-    image = np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
+    image = np.asarray(cv2.cvtColor(decoded(path, flags), cv2.COLOR_BGR2RGB), np.uint8)
     if lens is not None and not lens.fits(image.shape[1], image.shape[0]):
         raise InputError(
             f"{path}: {image.shape[1]}x{image.shape[0]}, but its camera is for {lens.width}x{lens.height}; "
@@ -144,10 +162,16 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoFacts]:
 
 def photo_times(clock: list[float | None], index: list[int]) -> list[float]:
     """Times from the first photo on [s] where every photo has a clock and they rise strictly; else the index."""
-    known = [t for t in clock if t is not None]
-    if len(known) == len(clock) and len(known) > 1 and all(b > a for a, b in itertools.pairwise(known)):
+    if rises(clock):
+        known = [t for t in clock if t is not None]
         return [t - known[0] for t in known]
     return [float(i) for i in index]
+
+
+def rises(clock: list[float | None]) -> bool:
+    """Whether two photos or more have a clock each, [s] or None, and it rises strictly."""
+    known = [t for t in clock if t is not None]
+    return len(known) == len(clock) and len(known) > 1 and all(b > a for a, b in itertools.pairwise(known))
 
 
 def regular_choice(count: int, limit: int) -> NDArray[np.int64]:
@@ -171,14 +195,13 @@ def _differ(lenses: tuple[Lens, ...]) -> bool:
     return several and any(lens.is_distorted for lens in lenses)
 
 
-def _stored_size(path: Path, count: int) -> tuple[int, int] | None:
+def _stored_size(path: Path) -> tuple[int, int] | None:
     """Width and height as stored [px]; None where Pillow does not know the format.
 
     OpenCV fills the rest of a JPEG that is cut off with grey and says nothing; Pillow reads to the end and objects.
     """
-    try:
-        photo = PillowImage.open(path)
-    except (OSError, SyntaxError, ValueError):
+    photo = opened(path)
+    if photo is None:
         return None
     with photo:
         stored = photo.size
@@ -187,7 +210,8 @@ def _stored_size(path: Path, count: int) -> tuple[int, int] | None:
         try:
             photo.draft("L", (stored[0] // 8, stored[1] // 8))  # cheap, yet reads to the end
             photo.load()
-        except (OSError, SyntaxError, ValueError):
+        except BROKEN:
+            count = path.stat().st_size
             raise InputError(f"{path}: the image is cut off ({count} bytes); copy it again or remove it") from None
     return stored
 

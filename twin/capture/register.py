@@ -13,22 +13,23 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from twin.capture.exif import PhotoFacts
 from twin.capture.lens import Lens, same_aspect
 from twin.capture.photos import regular_choice
+from twin.capture.pycolmap_import import pycolmap
 from twin.capture.types import Capture
 from twin.capture.video import fitted_size
 from twin.capture.worker import run_worker, tell
 from twin.errors import InputError
+from twin.files import read_json, write_json
 from twin.geometry.cameras import Cameras, project
-from twin.geometry.images import resize, write_image
+from twin.geometry.images import decoded, resize, write_image
 from twin.geometry.points import SparsePoints
 from twin.geometry.poses import Array, inverse_pose
-from twin.scene import SceneDir, read_json, write_json
+from twin.scene import SceneDir
 
 MIN_INLIERS = 25
 MAX_SIZE = 1280  # [px] longer side the photo's features are looked for at
@@ -128,9 +129,7 @@ class Place:
 
     def features(self, path: Path) -> tuple[Array, NDArray[np.float32]]:
         """Places [px] (n, 2) and unit descriptors (n, 128) of an image file's SIFT features."""
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise InputError(f"{path}: not a readable image; delete the build folder and build again")
+        image = decoded(path, cv2.IMREAD_GRAYSCALE, "delete the build folder and build again")
         keypoints, descriptors = self._extractor.extract_from_uint8_array(np.ascontiguousarray(image))
         places = np.array([(k.x, k.y) for k in keypoints], np.float64).reshape(-1, 2)
         values = np.asarray(descriptors.data, np.float32).reshape(-1, 128)

@@ -13,17 +13,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from twin.capture.lens import Lens
+from twin.capture.pycolmap_import import pycolmap
 from twin.capture.register import GUESSED_FOCAL, MAX_SIZE, MIN_INLIERS, Place, camera_of, estimation, matched_frames
 from twin.capture.video import fitted_size
 from twin.capture.worker import run_worker, tell
 from twin.errors import InputError
+from twin.files import read_json, write_json
 from twin.geometry.images import resize, write_image
 from twin.geometry.poses import Array, inverse_pose
-from twin.scene import SceneDir, read_json, write_json
+from twin.scene import SceneDir
 
 _NEIGHBOURS = 12  # frames that the next one is compared with
 _USUAL = 0.0015  # an inlier's error, from which on it counts less [longer sides]

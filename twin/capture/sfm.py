@@ -11,18 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from twin import progress
+from twin.capture.pycolmap_import import pycolmap
 from twin.capture.types import Capture
 from twin.capture.undistort import pinhole_of, undistortion_map, write_pinhole_image
 from twin.capture.worker import run_worker
 from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
+from twin.files import read_json
 from twin.geometry.cameras import Cameras
 from twin.geometry.points import SparsePoints
-from twin.scene import SceneDir, read_json
+from twin.scene import SceneDir
 
 _MAX_THREADS = 16
 _MAX_POINT_ERROR = 20.0  # [px]

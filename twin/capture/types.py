@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.scene import read_json, write_json
+from twin.files import check_shapes, checked_text, damaged, load_arrays, read_json, write_json
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,23 @@ class Capture:
 
     @staticmethod
     def load(folder: Path) -> "Capture":
-        head = read_json(folder / "capture.json")
-        sources = tuple(SourceInfo(**{**s, "camera_params": tuple(s["camera_params"])}) for s in head["sources"])
-        with np.load(folder / "capture.npz", allow_pickle=False) as data:
-            return Capture(sources, tuple(head["names"]), **{key: data[key] for key in data.files})
+        """Raises InputError: no such files, or not those that `save` wrote."""
+        head, data = read_json(folder / "capture.json"), load_arrays(folder / "capture.npz")
+        with damaged(folder / "capture.json", "build the scene again"):
+            sources = tuple(SourceInfo(**{**s, "camera_params": tuple(s["camera_params"])}) for s in head["sources"])
+            names = tuple(map(checked_text, head["names"]))
+        with damaged(folder / "capture.npz", "build the scene again"):
+            capture, n = Capture(sources, names, **data), len(names)
+            shapes: dict[str, tuple[NDArray, tuple[int, ...], str]] = {
+                "source_index": (capture.source_index, (n,), "i"),
+                "times": (capture.times, (n,), "f"),
+                "held_out": (capture.held_out, (n,), "b"),
+                "gps": (capture.gps, (n, 3), "f"),
+            }
+            if capture.camera_to_world is not None and capture.intrinsics is not None:
+                shapes["camera_to_world"] = capture.camera_to_world, (n, 4, 4), "f"
+                shapes["intrinsics"] = capture.intrinsics, (n, 4), "f"
+            check_shapes(shapes)
+            if n and not (capture.source_index.min() >= 0 and capture.source_index.max() < len(sources)):
+                raise ValueError(f"frames of sources that are not among the {len(sources)}")
+        return capture

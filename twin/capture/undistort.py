@@ -10,12 +10,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from twin.capture.pycolmap_import import pycolmap
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid
-from twin.geometry.images import write_image
+from twin.geometry.images import decoded, write_image
 from twin.geometry.poses import Array
 
 _NEGLIGIBLE = 0.1  # [px] distortion below this is left alone
@@ -72,9 +72,8 @@ def write_pinhole_image(raw: Path, target: Path, mapping: NDArray[np.float32] | 
         except OSError:
             shutil.copyfile(raw, target)
         return
-    image = cv2.imread(str(raw), cv2.IMREAD_GRAYSCALE if mask else cv2.IMREAD_ANYCOLOR)
-    if image is None:
-        raise InputError(f"{raw}: not a readable image; delete the build folder and build again")
+    flags = cv2.IMREAD_GRAYSCALE if mask else cv2.IMREAD_ANYCOLOR
+    image = decoded(raw, flags, "delete the build folder and build again")
     method = cv2.INTER_NEAREST if mask else cv2.INTER_CUBIC
     flat = cv2.remap(image, mapping[..., 0], mapping[..., 1], method, borderMode=cv2.BORDER_REPLICATE)
     write_image(target, flat if flat.ndim == 2 else cv2.cvtColor(flat, cv2.COLOR_BGR2RGB))

@@ -2,7 +2,8 @@
 
 A *slot* is one of n equal spans of a film's duration; of each slot the sharpest frame is a *candidate*. A candidate
 that hardly moved from the last kept frame is a *duplicate* of a standing camera and is dropped. A frame's *index* is
-its place in the film, counted from 0 in order of presentation; its *time* runs from the first frame [s].
+its place in the film, counted from 0 in order of presentation; its *time* runs from the first frame [s]. Where only
+*parts* of a film are used, slots divide these, as if the rest were cut out; indices and times stay those of the film.
 """
 
 import contextlib
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from twin.capture.motion import FLOW_WIDTH, SHARPNESS_WIDTH, sharpness, stands_still
 from twin.config import CaptureConfig
 from twin.errors import InputError
+from twin.files import regular
 from twin.geometry.images import resize
 
 _BLANK = 2.0  # [grey levels], a frame whose brightness varies less than this shows nothing
@@ -86,6 +88,7 @@ def probe(path: Path) -> FilmFacts:
         InputError: not a video, or so damaged that it has no readable packet.
     """
     times: list[float] = []
+    regular(path)
     try:
         with av.open(str(path)) as container:
             stream = _video_stream(container, path)
@@ -184,8 +187,40 @@ def slot_count(facts: FilmFacts, config: CaptureConfig) -> int:
     return min(wanted, config.max_frames, len(facts.times))
 
 
+def within(times: NDArray[np.float64], parts: tuple[tuple[float, ...], ...]) -> NDArray[np.bool_]:
+    """Which times (n,) [s] lie in one of some parts, [from, to] each; all of them where there are no parts."""
+    if not parts:
+        return np.ones(len(times), bool)
+    # Half a millisecond, to which Matroska rounds its clock.
+    return np.any([(times >= start - 5e-4) & (times <= end + 5e-4) for start, end in parts], axis=0)
+
+
+def _cut(facts: FilmFacts, parts: tuple[tuple[float, ...], ...], path: Path) -> tuple[FilmFacts, NDArray[np.int64]]:
+    """A film's facts as if only some parts were there, and by frame of the film its place among those, −1 if cut out.
+
+    Raises:
+        InputError: fewer than two frames are in these parts.
+    """
+    used = within(facts.times, parts)
+    if parts and used.sum() < 2:
+        raise InputError(
+            f"{path}: keep = {[list(part) for part in parts]} leaves {used.sum()} of {len(used)} frames (need 2); the "
+            f"film runs from 0 to {facts.times[-1]:.2f} s"
+        )
+    place = np.where(used, np.cumsum(used) - 1, -1)
+    if used.all():
+        return facts, place
+    # The clock stops where a part ends: its last frame lasts one interval more.
+    step = np.where(np.diff(np.flatnonzero(used)) > 1, facts.interval, np.diff(facts.times[used]))
+    return FilmFacts(np.concatenate([[0.0], np.cumsum(step)]), facts.start, int(used.sum())), place
+
+
 def read_film(
-    path: Path, config: CaptureConfig, count: FilmCount, mask_of: Callable[[int, int, int], Image | None]
+    path: Path,
+    config: CaptureConfig,
+    count: FilmCount,
+    mask_of: Callable[[int, int, int], Image | None],
+    parts: tuple[tuple[float, ...], ...] = (),
 ) -> Iterator[FilmFrame]:
     """Yields a film's chosen frames in order: the sharpest of each slot, less the duplicates of a standing camera.
 
@@ -194,13 +229,17 @@ def read_film(
         config: Slots, size and smallest motion.
         count: Filled with what became of the frames.
         mask_of: From a frame's index, kept width and kept height to its mask (0 = ignore), or None.
+        parts: Of the film that are used, [from, to] each [s]; empty = all of it.
 
     Raises:
         InputError: nothing readable, fewer than two frames, or nothing but blank frames.
     """
     facts = probe(path)
-    slots = slot_count(facts, config)
-    count.promised, count.duration = max(facts.promised, len(facts.times)), facts.duration
+    shown, place = _cut(facts, parts, path)
+    last = int(np.flatnonzero(place >= 0)[-1])
+    slots = slot_count(shown, config)
+    count.promised = max(facts.promised, len(facts.times)) if not parts else len(shown.times)
+    count.duration = shown.duration
     kept_small: Image | None = None
     kept_any = False
 
@@ -225,8 +264,12 @@ def read_film(
     index = -1
     size: tuple[int, int] | None = None
     for stamp, frame in decode(path, count):
-        count.decoded += 1
         index = index_of(None if stamp is None else stamp - facts.start, facts, index)
+        if parts and index > last:
+            break
+        if parts and place[index] < 0:
+            continue
+        count.decoded += 1
         time = float(facts.times[index]) if index < len(facts.times) else index * facts.interval
         if size is not None and size != (frame.width, frame.height):
             raise InputError(
@@ -238,7 +281,8 @@ def read_film(
         if float(grey[::2, ::2].std()) < _BLANK:
             count.blank += 1
             continue
-        candidate = _Candidate(slot_of(index, time, facts, slots), index, time, sharpness(grey), frame)
+        order, at = (int(place[index]), float(shown.times[place[index]])) if parts else (index, time)
+        candidate = _Candidate(slot_of(order, at, shown, slots), index, time, sharpness(grey), frame)
         if best is not None and candidate.slot != best.slot:
             if (kept := keep(best)) is not None:
                 yield kept

@@ -16,10 +16,12 @@ import subprocess
 import sys
 import threading
 import traceback
+from collections import deque
 from pathlib import Path
 from typing import IO, Any
 
 from twin import progress
+from twin.child import die_with_parent, environment
 from twin.errors import InputError
 
 _LOG = "colmap.log"
@@ -67,10 +69,13 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
         errors="replace",
+        process_group=0,  # a signal to all of a terminal's is for us
+        env=environment(),
     )
     assert process.stdout and process.stderr
     bars = _Bars()
-    reader = threading.Thread(target=_keep_log, args=(process.stderr, log_file, bars), daemon=True)
+    last: deque[str] = deque(maxlen=30)
+    reader = threading.Thread(target=_keep_log, args=(process.stderr, log_file, bars, last), daemon=True)
     reader.start()
     error: str | None = None
     try:
@@ -86,7 +91,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
         bars.close()
     if code == 0:
         return
-    tail = " | ".join(log_file.read_text(encoding="utf-8", errors="replace").split("\n")[-30:])[-1500:]
+    tail = " | ".join(last)[-1500:]
     if code == _BAD_INPUT and error:
         raise InputError(error)
     if any(words in tail.lower() for words in _DISK_FULL):
@@ -94,8 +99,8 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     if code < 0:
         name = signal.Signals(-code).name
         cure = _CURES.get(name, _CURES["SIGABRT"])
-        last = next((part for part in reversed(tail.split(" | ")) if part.strip()), "no log")[-160:]
-        raise InputError(f"structure from motion died ({name}; {last}); {cure}")
+        words = next((part for part in reversed(tail.split(" | ")) if part.strip()), "no log")[-160:]
+        raise InputError(f"structure from motion died ({name}; {words}); {cure}")
     raise RuntimeError(f"structure from motion failed with exit status {code}: {tail}")
 
 
@@ -141,12 +146,13 @@ class _Bars:
             self._bar = None
 
 
-def _keep_log(stream: IO[str], path: Path, bars: _Bars) -> None:
-    with path.open("w", encoding="utf-8") as log:
+def _keep_log(stream: IO[str], path: Path, bars: _Bars, last: deque[str]) -> None:
+    with path.open("wb", buffering=0) as log:
         for line in stream:
-            log.write(line)
-            log.flush()
+            last.append(line.rstrip("\n"))
             bars.log(line)
+            with contextlib.suppress(OSError):  # a full disk, on which the worker fails by itself
+                log.write(line.encode())
 
 
 def _end_with_parent() -> None:
@@ -159,6 +165,7 @@ def _end_with_parent() -> None:
 
 def main(argv: list[str]) -> int:
     """The worker. Exit status: 0 done, 2 bad input (said in the news), 1 anything else."""
+    die_with_parent()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Loaded here only: the parent needs no COLMAP to start a worker.
     from twin.capture import mapping, register, register_film

@@ -25,7 +25,7 @@ from twin.env.dm import control
 from twin.env.dm_physics import DrivePhysics
 from twin.env.options import CPU, parse_options
 from twin.env.suite import Stage
-from twin.env.tasks import Drive
+from twin.env.tasks import Drive, checked_actions
 from twin.errors import InputError
 from twin.loading import Twin
 
@@ -112,10 +112,14 @@ class Worlds:
         Args:
             actions: Of each, every number in [-1, 1], which spans what `action_spec` allows; shape (k, actions).
             which: Of which worlds; all unless given. The outcome has their order.
+
+        Raises:
+            ValueError: no such actions; the episodes are as they were.
         """
         which = range(len(self)) if which is None else which
         # In float64, as a driver of one environment does it.
-        wanted = self._low + (np.clip(np.asarray(actions, float), -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
+        given = checked_actions(actions, (len(which), self.actions))
+        wanted = self._low + (np.clip(given, -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
         out = self._advance(wanted, which)
         if self.pixels:
             self.pixels.look(which)

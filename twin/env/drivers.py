@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from twin.env.dm import control
 from twin.env.follower import Pursuit
 from twin.env.options import STEERING
-from twin.errors import InputError
+from twin.env.tasks import checked_actions
+from twin.errors import InputError, shown
 
 Array = NDArray[np.float64]
 Policy = Callable[[NDArray[np.uint8]], NDArray]
@@ -60,10 +61,14 @@ class PolicyDriver:
     def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
         pixels = step.observation["pixels"]
         stack, height, width, three = pixels.shape
-        action = np.asarray(self._policy(pixels.transpose(0, 3, 1, 2).reshape(stack * three, height, width)), float)
+        answer = self._policy(pixels.transpose(0, 3, 1, 2).reshape(stack * three, height, width))
         spec = environment.action_spec()
-        if action.shape != spec.shape or not np.isfinite(action).all():
-            raise InputError(f"the policy answered {action!r}; expected {spec.shape[0]} numbers in [-1, 1]")
+        try:
+            action = checked_actions(answer, spec.shape)
+        except ValueError:
+            raise InputError(
+                f"the policy answered {shown(answer)}; expected {spec.shape[0]} numbers in [-1, 1]"
+            ) from None
         return spec.minimum + (np.clip(action, -1.0, 1.0) + 1.0) / 2.0 * (spec.maximum - spec.minimum)
 
 
@@ -80,8 +85,8 @@ def find_callable(name: str) -> Policy:
         sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), function)
-    except (ModuleNotFoundError, AttributeError) as error:
-        raise InputError(f"policy {name!r}: {error}") from None
+    except (Exception, SystemExit) as error:  # whatever the user's own code raises when it is imported
+        raise InputError(f"policy {name!r}: {type(error).__name__}: {error}") from error
     if not callable(found):
         raise InputError(f"policy {name!r}: {found!r} cannot be called; expected a function of pixels")
     return found

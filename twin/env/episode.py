@@ -13,7 +13,7 @@ from twin.config import ObstacleConfig
 from twin.config_file import parse
 from twin.env.dm import control
 from twin.env.drivers import Driver
-from twin.scene import read_json, write_json
+from twin.files import read_json, write_json
 
 Array = NDArray[np.float64]
 

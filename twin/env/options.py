@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from twin.config import TRAINING, ObstacleConfig
 from twin.env.camera_effects import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.randomisation import Ranges
-from twin.errors import InputError
+from twin.errors import InputError, shown
 
 CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
 """Why an episode ends."""
@@ -108,6 +109,7 @@ def parse_options(given: dict[str, Any]) -> Options:
     if isinstance(given.get("rewards"), dict):
         given["rewards"] = _rewards(given["rewards"])
     options = Options(**given)
+    _check_kinds(options)
     if options.action not in (TWIST, STEERING):
         raise InputError(f"action = {options.action!r}; expected {TWIST!r} or {STEERING!r}")
     if options.observe not in (NERF, SIMULATOR):
@@ -138,6 +140,58 @@ def parse_options(given: dict[str, Any]) -> Options:
     if len(options.size) != 2 or min(options.size) < 8:
         raise InputError(f"size = {options.size}; expected (width, height) of at least 8 px")
     return options
+
+
+_MOST_STACK, _MOST_SIDE, _MOST_OBSTACLES, _MOST_NUMBER = 64, 4096, 1000, 1e6
+_NUMBERS = ("control_timestep", "speed", "yaw_rate", "start_offset", "start_heading", "start_along")
+_NUMBERS_OR_NONE = ("half_width", "time_limit")
+
+
+def _check_kinds(options: Options) -> None:
+    """Raises InputError where a value is of another kind than its option, not finite, or beyond all reason."""
+    numbers: dict[str, Any] = {name: getattr(options, name) for name in _NUMBERS}
+    numbers |= {name: value for name in _NUMBERS_OR_NONE if (value := getattr(options, name)) is not None}
+    for name, kind in (("rewards", Rewards), ("camera", CameraOptions), ("randomise", Ranges)):
+        value = getattr(options, name)
+        if not isinstance(value, kind) and (value is not None or name == "rewards"):
+            raise InputError(f"{name} = {shown(value)}; expected {kind.__name__}")
+        if name != "randomise" and value is not None:
+            numbers |= {f"{name}.{part}": part_value for part, part_value in vars(value).items()}
+    for name, value in numbers.items():
+        if not _is_number(value):
+            raise InputError(f"{name} = {shown(value)}; expected a number, at most {_MOST_NUMBER:,.0f} in size")
+    for name in ("pixels", "lighting_drift"):
+        if not isinstance(getattr(options, name), bool | np.bool_):
+            raise InputError(f"{name} = {shown(getattr(options, name))}; expected True or False")
+    _check_whole("stack", options.stack, 1, _MOST_STACK)
+    if not isinstance(options.size, Sequence) or isinstance(options.size, str) or len(options.size) != 2:
+        raise InputError(f"size = {shown(options.size)}; expected (width, height) of at least 8 px")
+    for side in options.size:
+        _check_whole("size", side, 8, _MOST_SIDE)
+    for name in ("action", "observe", "device"):
+        if not isinstance(getattr(options, name), str):
+            raise InputError(f"{name} = {shown(getattr(options, name))}; expected a word")
+    light = options.lighting
+    names = [light] if isinstance(light, str) else list(light) if isinstance(light, Sequence) else []
+    if not names or not all(isinstance(name, str) for name in names):
+        raise InputError(f"lighting = {shown(light)}; expected a name, or several")
+    if isinstance(options.obstacles, str):
+        return
+    if isinstance(options.obstacles, Sequence):
+        if not all(isinstance(one, ObstacleConfig) for one in options.obstacles):
+            raise InputError(f"obstacles = {shown(options.obstacles)}; expected 'scene', a number, or ObstacleConfigs")
+    else:
+        _check_whole("obstacles", options.obstacles, 0, _MOST_OBSTACLES)
+
+
+def _is_number(value: Any) -> bool:
+    real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    return real and -_MOST_NUMBER <= value <= _MOST_NUMBER
+
+
+def _check_whole(name: str, value: Any, low: int, high: int) -> None:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not low <= value <= high:
+        raise InputError(f"{name} = {shown(value)}; expected a whole number from {low} to {high}")
 
 
 def _rewards(given: dict[str, float]) -> Rewards:

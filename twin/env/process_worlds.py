@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from twin import cores, progress
 from twin.env.batch import Outcome, stacked
 from twin.env.options import parse_options
+from twin.env.tasks import checked_actions
 from twin.errors import InputError
 from twin.loading import Twin
 
@@ -110,7 +111,7 @@ class ProcessWorlds:
 
     def step(self, actions: NDArray, which: Sequence[int] | None = None) -> Outcome:
         some = np.arange(len(self)) if which is None else np.asarray(which, int)
-        actions = np.asarray(actions, float)
+        actions = checked_actions(actions, (len(some), self.actions))
         parts = list(self._split(some))
         news = self._ask({c: ("step", actions[at], local) for c, at, local in parts})
         out = Outcome(np.zeros(len(some)), np.zeros(len(some), bool), np.zeros(len(some), bool))

@@ -33,10 +33,11 @@ from twin.env.stretches import Stretch, find_task
 from twin.env.tasks import Drive
 from twin.env.trust import Trust
 from twin.errors import InputError
+from twin.files import digest_file, digest_json
 from twin.loading import Twin, load_scene
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
-from twin.scene import digest_file, digest_json, read_json
+from twin.stamp import finished, result_of
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Stage:
         """Reads a built scene. Raises InputError: not built, no route, no such task, or unknown options."""
         parsed = parse_options(options)
         twin = scene if isinstance(scene, Twin) else load_scene(scene)
+        finished(twin.scene, "mjcf")
         if not twin.scene.has_route:
             raise InputError(f"{twin.scene.root}: nothing to drive, as its build has no route (mjcf.route)")
         world = twin.world()
@@ -126,7 +128,7 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
     photos = [path for name in plain.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()]
     return digest_json(
         {
-            "stages": [read_json(twin.scene.stamp(stage))["result"] for stage in ("field", "mjcf")],
+            "stages": [result_of(twin.scene, stage) for stage in ("field", "mjcf")],
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
             **({"randomise": drawn} if drawn else {}),

@@ -26,7 +26,7 @@ from twin.env.judge import CAUSES, STATE, Judge, Motion
 from twin.env.options import STEERING, Options
 from twin.env.randomisation import Draw, Nominal
 from twin.env.stretches import Stretch
-from twin.errors import InputError
+from twin.errors import InputError, shown
 from twin.mjcf.world import World, heading_at, point_at
 
 Array = NDArray[np.float64]
@@ -35,6 +35,22 @@ START, ROBOT, LIGHT, OBSTACLES, CAMERA, WEATHER = range(6)
 """Streams of an episode's randomness: `numpy.random.default_rng([seed, stream])`."""
 
 _START_TRIES = 50
+
+
+def checked_actions(actions: Any, shape: tuple[int, ...]) -> Array:
+    """Actions as float64.
+
+    Raises:
+        ValueError: of another shape, no real numbers (booleans are none), or not finite.
+    """
+    try:
+        given = np.asarray(actions)
+    except (TypeError, ValueError):  # ragged lists
+        given = np.empty(0, object)
+    if given.dtype.kind not in "iuf" or given.shape != shape or not np.isfinite(given).all():
+        kind = f"{given.dtype} of shape {given.shape}"
+        raise ValueError(f"action {shown(actions)} ({kind}); expected finite numbers of shape {shape}")
+    return given.astype(np.float64, copy=False)
 
 
 class Drive(control.Task):
@@ -112,7 +128,9 @@ class Drive(control.Task):
         self._judge.begin(self._me, np.array([self._began]), physics.planar_pose[None, :2])
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
-        commands = self.commands(np.asarray(action, float)[None])
+        """Raises ValueError: no action; the episode is as it was."""
+        width = 1 if self.options.action == STEERING else 2
+        commands = self.commands(checked_actions(action, (width,))[None])
         self._judge.act(self._me, commands[:, 1])
         physics.robot.command(*commands[0].tolist())
 

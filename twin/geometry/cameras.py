@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import InputError
+from twin.files import check_shapes, checked_text, damaged, load_arrays, read_json, write_json
 from twin.geometry.poses import Similarity, inverse_pose
-from twin.scene import read_json, write_json
 
 Array = NDArray[np.float64]
 
@@ -112,21 +112,39 @@ class Cameras:
 
     @staticmethod
     def load(folder: Path) -> "Cameras":
-        head = read_json(folder / "cameras.json")
+        """Raises InputError: no such files, or not those that `save` wrote."""
+        head, data = read_json(folder / "cameras.json"), load_arrays(folder / "cameras.npz")
         base = folder.resolve().parent
-        with np.load(folder / "cameras.npz", allow_pickle=False) as data:
-            return Cameras(
-                names=tuple(head["names"]),
+        missing = {"camera_to_world", "intrinsics", "sizes", "times", "held_out"} - data.keys()
+        if missing:
+            raise InputError(f"{folder / 'cameras.npz'}: no {', '.join(sorted(missing))}; build the scene again")
+        with damaged(folder / "cameras.json", "build the scene again"):
+            cameras = Cameras(
+                names=tuple(map(checked_text, head["names"])),
                 camera_to_world=data["camera_to_world"],
                 intrinsics=data["intrinsics"],
                 sizes=data["sizes"],
-                lightings=tuple(head["lightings"]),
-                sources=tuple(head["sources"]),
+                lightings=tuple(map(checked_text, head["lightings"])),
+                sources=tuple(map(checked_text, head["sources"])),
                 times=data["times"],
                 held_out=data["held_out"],
                 images=base / head["images"],
                 masks=base / head["masks"] if head["masks"] else None,
             )
+            n = len(cameras.names)
+            if not len(cameras.lightings) == len(cameras.sources) == n:
+                raise ValueError(f"{n} names, {len(cameras.lightings)} lightings, {len(cameras.sources)} sources")
+        with damaged(folder / "cameras.npz", "build the scene again"):
+            check_shapes(
+                {
+                    "camera_to_world": (cameras.camera_to_world, (n, 4, 4), "f"),
+                    "intrinsics": (cameras.intrinsics, (n, 4), "f"),
+                    "sizes": (cameras.sizes, (n, 2), "i"),
+                    "times": (cameras.times, (n,), "f"),
+                    "held_out": (cameras.held_out, (n,), "b"),
+                }
+            )
+        return cameras
 
 
 def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:

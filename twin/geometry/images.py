@@ -1,26 +1,106 @@
 """Images as arrays, and how alike two are. RGB order, shape (height, width, 3), float in [0, 1] unless uint8."""
 
+import re
+import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
 from skimage.metrics import structural_similarity
 
 from twin.errors import InputError
+from twin.files import read_bytes, regular, write_bytes
+
+MOST_PIXELS = 2 * 89_478_485
+"""Of an image, by its header; beyond it Pillow takes the file for an attack."""
+BROKEN = (
+    *(ArithmeticError, AttributeError, EOFError, LookupError, OSError, SyntaxError, TypeError, ValueError),
+    *(AssertionError, MemoryError, NotImplementedError, RuntimeError, struct.error, zlib.error, cv2.error),
+)
+"""What Pillow and OpenCV raise upon a damaged file."""
+_MOST_BYTES = 2 << 30  # of an image file
+_CURE = "replace or remove it"
+warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # half of what is refused here
+warnings.filterwarnings("ignore", module="PIL")  # headers with a flaw, which are unknown then
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
     """An image file as RGB uint8; grey becomes RGB, alpha is dropped, EXIF rotation is applied.
 
     Raises:
-        InputError: missing, empty or undecodable file.
+        InputError: missing, empty, too large or undecodable file.
     """
-    data = np.frombuffer(path.read_bytes(), np.uint8) if path.exists() else np.zeros(0, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    return cv2.cvtColor(decoded(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def decoded(path: Path, flags: int, cure: str = _CURE) -> NDArray[np.uint8]:
+    """An image file as OpenCV decodes it: shape (h, w), or (h, w, 3) in the order blue, green, red.
+
+    Args:
+        path: The file.
+        flags: OpenCV's `IMREAD_...`.
+        cure: Ends the message where the file is not readable.
+
+    Raises:
+        InputError: missing, empty, too large or undecodable file.
+    """
+    if (header := opened(path, cure)) is not None:
+        header.close()
+    data = read_bytes(path, _MOST_BYTES)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except BROKEN:
+        image = None
     if image is None:
-        raise InputError(f"{path}: not a readable image ({len(data)} bytes); replace or remove it")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+        raise unreadable(path, cure)
+    return np.asarray(image, np.uint8)
+
+
+def opened(path: Path, cure: str = _CURE) -> PillowImage.Image | None:
+    """An image file opened by Pillow, of which only the header is read; None where Pillow does not know the format.
+
+    Raises:
+        InputError: no file, or more than `MOST_PIXELS`.
+    """
+    try:
+        if not regular(path).stat().st_size:
+            raise unreadable(path, cure)
+        image = PillowImage.open(path)
+    except PillowImage.DecompressionBombError as error:
+        count = re.search(r"\d+", str(error))
+        raise _too_large(path, f"{int(count[0]) / 1e6:,.0f} megapixels" if count else "too many pixels") from None
+    except InputError:
+        raise
+    except BROKEN:
+        return None
+    width, height = image.size
+    if width * height > MOST_PIXELS:
+        image.close()
+        raise _too_large(path, f"{width}x{height}, {width * height / 1e6:,.0f} megapixels")
+    return image
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file as stored [px], from its header. Raises InputError: see `decoded`."""
+    image = opened(path)
+    if image is None:
+        raise unreadable(path)
+    with image:
+        return image.size
+
+
+def unreadable(path: Path, cure: str = _CURE) -> InputError:
+    """What is said of an image that cannot be decoded."""
+    return InputError(f"{path}: not a readable image ({path.stat().st_size} bytes); {cure}")
+
+
+def _too_large(path: Path, size: str) -> InputError:
+    most = MOST_PIXELS / 1e6
+    return InputError(f"{path}: the image has {size}; expected at most {most:.0f} megapixels: scale it down")
 
 
 def write_image(path: Path, image: NDArray) -> None:
@@ -34,7 +114,7 @@ def write_image(path: Path, image: NDArray) -> None:
     ok, data = cv2.imencode(path.suffix, image, fast)
     if not ok:
         raise OSError(f"could not encode {path}")
-    path.write_bytes(data.tobytes())
+    write_bytes(path, data.tobytes())
 
 
 def resize(image: NDArray, width: int, height: int) -> NDArray:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.files import check_shapes, damaged, load_arrays
 from twin.geometry.poses import Similarity
 
 
@@ -46,5 +47,20 @@ class SparsePoints:
 
     @staticmethod
     def load(folder: Path) -> "SparsePoints":
-        with np.load(folder / "points.npz", allow_pickle=False) as data:
-            return SparsePoints(**{key: data[key] for key in data.files})
+        """Raises InputError: no such file, or not one that `save` wrote."""
+        path = folder / "points.npz"
+        with damaged(path, "build the scene again"):
+            points = SparsePoints(**load_arrays(path))
+            m, k = len(points.xyz), len(points.point)
+            check_shapes(
+                {
+                    "xyz": (points.xyz, (m, 3), "f"),
+                    "rgb": (points.rgb, (m, 3), "u"),
+                    "error": (points.error, (m,), "f"),
+                    "point": (points.point, (k,), "i"),
+                    "frame": (points.frame, (k,), "i"),
+                }
+            )
+            if k and not (points.point.min() >= 0 and points.point.max() < m and points.frame.min() >= 0):
+                raise ValueError(f"observations of points that are not among the {m}")
+        return points

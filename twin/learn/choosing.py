@@ -14,13 +14,13 @@ import numpy as np
 
 from twin import progress
 from twin.env.batch import worlds_of
+from twin.files import damaged, read_json, write_json
 from twin.learn.judging import Driven, episodes
 from twin.learn.policy import copy_policy, load_policy
 from twin.learn.state import saved_steps
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
 from twin.report.training import CHOICE
-from twin.scene import read_json, write_json
 
 FRESH = 20
 """Episodes that the chosen one drives at the end."""
@@ -43,8 +43,12 @@ def choose(twin: Twin, folder: Path, config: TrainConfig, processes: int | None 
         reward; step, trials and successes of the chosen one, of fresh episodes.
     """
     trained = saved_steps(folder / "state")
-    if (folder / CHOICE).exists() and read_json(folder / CHOICE)["steps"] == trained:
-        return read_json(folder / CHOICE)
+    if (folder / CHOICE).exists():
+        with damaged(folder / CHOICE, "delete it, and the best policy is chosen again"):
+            before = read_json(folder / CHOICE)
+            if before["steps"] == trained:
+                _ = [before["chosen"][name] + 0 for name in ("step", "trials", "successes")]
+                return before
     candidates = _candidates(folder / "checkpoints", trained)
     drawn = np.random.SeedSequence([config.seed, _STREAM]).generate_state(config.trials + FRESH)
     seeds = tuple(int(seed) for seed in drawn)

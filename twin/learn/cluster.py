@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 from twin.errors import InputError
 from twin.learn.judging import Chunk, Driven, drive
+from twin.verb import signals_kept
 
 _CORES = 2  # that driving a chunk keeps busy
 _PATIENCE = 5.0  # [s]
@@ -30,7 +31,8 @@ def campaign_on_ray(chunks: Sequence[Chunk], address: str) -> Iterator[list[Driv
         if address != "auto":  # Ray itself would try for minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), _PATIENCE).close()
-        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+        with signals_kept():  # Ray takes SIGTERM for itself
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         first = str(error).splitlines()[0]
         raise InputError(f"--ray {address}: no cluster there ({first}); start one with `ray start --head`") from None

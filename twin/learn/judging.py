@@ -6,21 +6,27 @@ meets the same start, robot and light. So policies are compared on the same epis
 """
 
 import dataclasses
+import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 
 import numpy as np
 
+from twin.child import die_with_parent, ignore_stops
 from twin.env.batch import Worlds
 from twin.env.process_worlds import ProcessWorlds
 from twin.env.randomisation import Ranges, asked
 from twin.env.suite import Stage
+from twin.errors import InputError
 from twin.learn.policy import Policy, load_policy
 from twin.loading import load_scene
+from twin.verb import signals_held
 
 CHUNK = 16
 """Episodes at most that are driven by one process in one go."""
@@ -114,17 +120,29 @@ def campaign(chunks: Sequence[Chunk], processes: int = 1) -> Iterator[list[Drive
 
     Args:
         chunks: What to drive.
-        processes: How many on this machine.
+        processes: How many on this machine. They end when this one does, however it does.
+
+    Raises:
+        InputError: as `drive`, or a process ended, for want of memory most likely.
     """
     if processes == 1:
         yield from map(drive, chunks)
     else:
         # Warp and MuJoCo have threads, which a fork would not survive.
-        with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-            try:
-                yield from pool.map(drive, chunks)
-            finally:
-                pool.shutdown(cancel_futures=True)
+        pool = ProcessPoolExecutor(min(processes, max(1, len(chunks))), get_context("spawn"), _begin, (os.getpid(),))
+        try:
+            with signals_held():  # the workers are started here; a signal to all of a terminal's is for us
+                driven = pool.map(drive, chunks)
+            yield from driven
+        except BrokenProcessPool:
+            raise InputError(
+                f"one of {processes} processes ended; if memory ran out, take fewer (--processes 1: none)"
+            ) from None
+        finally:
+            if sys.exc_info()[0] is not None:  # no waiting for chunks that nobody wants
+                for worker in active_children():
+                    worker.kill()
+            pool.shutdown(cancel_futures=True)
 
 
 def drawn_light(stage: Stage, number: int) -> Stage:
@@ -136,6 +154,12 @@ def drawn_light(stage: Stage, number: int) -> Stage:
         filmed = stage.field.lightings_by_name.filmed()
         stage.field.add_lightings({name: filmed.sample(np.random.default_rng(number))})
     return stage
+
+
+def _begin(parent: int) -> None:
+    """In a worker, before its first chunk."""
+    ignore_stops()
+    die_with_parent(parent)
 
 
 @lru_cache(maxsize=4)

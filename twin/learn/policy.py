@@ -14,9 +14,10 @@ The first two are what is loaded; the network runs in ONNX Runtime. Files of oth
 of these files can run code, except where the user says that a file is to be trusted.
 """
 
+import contextlib
 import dataclasses
+import hashlib
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,9 +31,9 @@ from safetensors.numpy import save as safetensors_save
 
 from twin.env.drivers import find_callable
 from twin.env.options import STEERING, TWIST
-from twin.errors import InputError
+from twin.errors import InputError, shown
+from twin.files import aside, digest_file, json_bytes, parse_json, read_bytes, read_json
 from twin.learn.architecture import Architecture, Floats, onnx_bytes
-from twin.scene import digest_file, write_json, write_text
 
 Pictures = NDArray[np.uint8]
 Act = Callable[[Pictures], Floats]
@@ -41,6 +42,7 @@ Act = Callable[[Pictures], Floats]
 JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
 FORMAT, VERSION = "twin policy", 2
 
+_MOST_SIDE, _MOST_STACK = 4096, 64  # [px] of a picture, and pictures, that a policy may ask for
 _LARGEST = 256 << 20  # [bytes] of a file that is read
 _NOTE = "twin"  # key of our metadata in an ONNX file
 
@@ -138,20 +140,26 @@ def save_policy(
     folder.mkdir(parents=True, exist_ok=True)
     weights = {name: np.ascontiguousarray(weights[name], np.float32) for name in architecture.shapes()}
     head = {"control": dataclasses.asdict(control), "network": dataclasses.asdict(architecture)}
-    (folder / JSON).unlink(missing_ok=True)
-    (folder / WEIGHTS).write_bytes(safetensors_save(weights))
+    blob = safetensors_save(weights)
     note = json.dumps({"format": FORMAT, "version": VERSION, **head, "trained": trained})
-    (folder / ONNX).write_bytes(onnx_bytes(architecture, weights, {_NOTE: note}))
-    sums = {"weights_sha256": digest_file(folder / WEIGHTS)}
-    write_json(folder / JSON, {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained})
+    sums = {"weights_sha256": hashlib.sha256(blob).hexdigest()}
+    about = {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained}
+    files = {WEIGHTS: blob, ONNX: onnx_bytes(architecture, weights, {_NOTE: note}), JSON: json_bytes(about)}
+    _replace_policy(folder, files)
 
 
 def copy_policy(source: Path, folder: Path) -> None:
     """Puts a policy folder's files in the place of another's; policy.json comes last, as in `save_policy`."""
-    (folder / JSON).unlink(missing_ok=True)
-    for name in (WEIGHTS, ONNX):
-        shutil.copyfile(source / name, folder / name)
-    write_text(folder / JSON, (source / JSON).read_text(encoding="utf-8"))
+    _replace_policy(folder, {name: read_bytes(source / name) for name in (WEIGHTS, ONNX, JSON)})
+
+
+def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
+    """Writes all files aside before the first takes its place: on a full disk the policy before stays whole."""
+    with contextlib.ExitStack() as asides:
+        written = {name: asides.enter_context(aside(folder / name)) for name in reversed(files)}
+        for name, content in files.items():
+            written[name].write_bytes(content)
+        (folder / JSON).unlink(missing_ok=True)  # or it would be of other weights for a moment
 
 
 def find_policy(root: Path, source: str) -> str:
@@ -219,15 +227,17 @@ def _from_folder(folder: Path) -> Policy:
 
 def _from_onnx(path: Path) -> Policy:
     import onnx
-    from google.protobuf.message import DecodeError
 
     try:
         model = onnx.load_model_from_string(_read(path))
-        if any(one.data_location == onnx.TensorProto.EXTERNAL for one in _tensors(model.graph)):
+        # Before the checker, which would look for the files.
+        if any(one.data_location == onnx.TensorProto.EXTERNAL for one in _tensors(model)):
             raise InputError(f"{path} keeps its weights in other files; save it with its weights inside")
         onnx.checker.check_model(model)
-    except (DecodeError, onnx.checker.ValidationError) as error:
-        raise InputError(f"{path} is no ONNX file: {error}") from None
+    except InputError:
+        raise
+    except Exception as error:  # of protobuf, of the checker, and of Python where it is nested deep
+        raise InputError(f"{path} is no ONNX file: {type(error).__name__}: {error}") from None
     names = {one.name for one in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in names]
     shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
@@ -239,36 +249,55 @@ def _from_onnx(path: Path) -> Policy:
             "(n, 1 or 2), n open or 1"
         )
     _, channels, height, width = shapes[0]
+    if channels > 3 * _MOST_STACK or max(height, width) > _MOST_SIDE:
+        raise InputError(
+            f"{path}: takes pictures of {width} × {height} px in {channels} channels; expected at most {_MOST_SIDE} px "
+            f"a side and {_MOST_STACK} pictures of 3"
+        )
     notes = {one.key: one.value for one in model.metadata_props}
     control, trained = Control(STEERING if shapes[1][1] == 1 else TWIST), {}
     if _NOTE in notes:
         try:
-            head = _head(json.loads(notes[_NOTE]), path)
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}: its metadata are no JSON: {error}") from None
+            head = _head(parse_json(notes[_NOTE], f"{path}: its metadata"), path)
+        except UnicodeError as error:
+            raise InputError(f"{path}: its metadata are no text: {error}") from None
         control, trained = _parts(head, path)[1], head.get("trained", {})
     act = _session(model.SerializeToString(), path)
     return Policy(path.stem, act, control, (width, height), channels // 3, trained)
 
 
-def _tensors(graph: Any) -> Iterator[Any]:
-    """Every constant of an ONNX graph and of the graphs within it."""
-    yield from graph.initializer
-    for attribute in (a for node in graph.node for a in node.attribute):
-        yield from (attribute.t, *attribute.tensors)
-        for inner in (attribute.g, *attribute.graphs):
-            yield from _tensors(inner) if inner.node or inner.initializer else ()
+def _tensors(model: Any) -> Iterator[Any]:
+    """Every tensor of an ONNX model, wherever it is: initialisers, sparse ones too, attributes, functions, training."""
+    waiting = [model]
+    while waiting:
+        message = waiting.pop()
+        if message.DESCRIPTOR.name == "TensorProto":
+            yield message
+        for field, value in message.ListFields():
+            if field.type == field.TYPE_MESSAGE:
+                waiting += [value] if hasattr(value, "ListFields") else list(value)
 
 
 def _from_callable(name: str) -> Policy:
     function = find_callable(name)
 
-    def act(stacks: Pictures) -> Floats:
-        return np.stack([np.asarray(function(stack), np.float32) for stack in stacks])
+    def answered(stack: Pictures) -> Floats:
+        try:
+            return np.asarray(function(stack), np.float32)
+        except (Exception, SystemExit) as error:  # whatever the user's own code raises
+            raise InputError(f"policy {name}: raised {type(error).__name__}: {error}") from error
 
-    answer = np.asarray(function(np.zeros((12, 90, 160), np.uint8)), float)
+    def act(stacks: Pictures) -> Floats:
+        each = [answered(stack) for stack in stacks]
+        if any(one.shape != answer.shape for one in each):
+            raise InputError(f"policy {name}: answered {shown(each)}; expected {answer.shape[0]} number(s) as before")
+        return np.stack(each)
+
+    answer = answered(np.zeros((12, 90, 160), np.uint8))
     if answer.shape not in ((1,), (2,)):
-        raise InputError(f"policy {name}: answered {answer!r}; expected 1 number in [-1, 1] (steering) or 2 (twist)")
+        raise InputError(
+            f"policy {name}: answered {shown(answer)}; expected 1 number in [-1, 1] (steering) or 2 (twist)"
+        )
     return Policy(name, act, Control(STEERING if answer.shape == (1,) else TWIST))
 
 
@@ -330,8 +359,8 @@ def _parts(head: dict[str, Any], path: Path) -> tuple[Architecture, Control]:
         network["size"], network["hidden"] = tuple(network["size"]), tuple(network["hidden"])
         network["convolutions"] = tuple(tuple(one) for one in network["convolutions"])
         architecture, control = Architecture(**network), Control(**head["control"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: {error}") from None
+    except (ArithmeticError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: {type(error).__name__}: {error}") from None
     if architecture.actions != control.actions:
         raise InputError(f"{path}: {architecture.actions} actions; expected {control.actions} ({control.action})")
     return architecture, control
@@ -340,18 +369,13 @@ def _parts(head: dict[str, Any], path: Path) -> tuple[Architecture, Control]:
 def _json_of(path: Path) -> Any:
     if not path.exists():
         raise InputError(f"{path.parent} holds no {JSON}: not a policy folder, or a run that has not come to one yet")
-    try:
-        return json.loads(_read(path).decode("utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is no JSON: {error}") from None
+    return read_json(path)
 
 
 def _read(path: Path) -> bytes:
     if not path.is_file():
         raise InputError(f"{path} is missing; copy the whole run")
-    if path.stat().st_size > _LARGEST:
-        raise InputError(f"{path} has {path.stat().st_size >> 20} MiB; expected at most {_LARGEST >> 20}")
-    return path.read_bytes()
+    return read_bytes(path, _LARGEST)
 
 
 def _name(folder: Path) -> str:

@@ -21,6 +21,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from twin.errors import InputError
+from twin.files import allocate
 from twin.learn.colours import recoloured
 
 _SHORT = 8  # mean steps of an episode; shorter ones leave less than the whole buffer to draw from
@@ -74,6 +75,7 @@ class FrameReplayBuffer(ReplayBuffer):
 
         Raises:
             InputError: a file of another size.
+            OSError: the disk has no room for the whole file.
         """
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = max(buffer_size // n_envs, 1)
@@ -97,7 +99,8 @@ class FrameReplayBuffer(ReplayBuffer):
             there = file.exists()
             if there and file.stat().st_size != int(np.prod(shape)):
                 raise InputError(f"{file} has {file.stat().st_size} bytes; expected {int(np.prod(shape))}: damaged")
-            self.tapes = np.memmap(file, np.uint8, "r+" if there else "w+", shape=shape)
+            allocate(file, int(np.prod(shape)))  # now: a full disk is an error at the start, not a SIGBUS hours later
+            self.tapes = np.memmap(file, np.uint8, "r+", shape=shape)
         self._reach = self.length - -(-2 * slack // n_envs)
         self.written = np.zeros(n_envs, np.int64)
         """Pictures ever written on each tape."""

@@ -4,20 +4,17 @@
 one complete state is there. Tensors are safetensors, the rest of the replay buffer npz, all else JSON.
 """
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as tensor_bytes
 
-from twin.errors import InputError
+from twin.files import damaged, load_arrays, read_json, regular, remove, save_arrays, write_bytes, write_json
 from twin.learn.replay import FrameReplayBuffer
 from twin.learn.sac import PixelSAC
-from twin.scene import read_json, write_json
 
 _JSON, _TENSORS, _REPLAY = "state.json", "tensors.safetensors", "replay.npz"
 
@@ -29,14 +26,21 @@ def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
         folder: Of the states.
         model: With a `FrameReplayBuffer`.
         more: JSON-able, given back by `load_state`.
+
+    Raises:
+        OSError: the disk is full; the state before is whole.
     """
     assert isinstance(model.replay_buffer, FrameReplayBuffer)
     name = f"state_{model.num_timesteps:09d}"
-    shutil.rmtree(folder / name, ignore_errors=True)
+    remove(folder / name)
     (folder / name).mkdir(parents=True)
-    save_file(_tensors(model), folder / name / _TENSORS)
-    arrays, replay = model.replay_buffer.state()
-    np.savez(folder / name / _REPLAY, **arrays)  # type: ignore[arg-type]
+    try:
+        write_bytes(folder / name / _TENSORS, tensor_bytes(_tensors(model)))
+        arrays, replay = model.replay_buffer.state()
+        save_arrays(folder / name / _REPLAY, arrays)
+    except OSError:  # the disk is full: make room for those who want to say so
+        remove(folder / name)
+        raise
     counts = {"steps": model.num_timesteps, "updates": model._n_updates, "episodes": model._episode_num}
     chance = {"action_space": model.action_space.np_random.bit_generator.state}
     write_json(folder / _JSON, {"folder": name, **counts, "replay": replay, "rng": chance, "more": more})
@@ -51,7 +55,8 @@ def has_state(folder: Path) -> bool:
 
 def saved_steps(folder: Path) -> int:
     """Of the state that is there."""
-    return int(read_json(folder / _JSON)["steps"])
+    with damaged(folder / _JSON, "train anew under another name"):
+        return int(read_json(folder / _JSON)["steps"])
 
 
 def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
@@ -61,18 +66,15 @@ def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
         InputError: files that are missing, damaged, or of another network.
     """
     assert isinstance(model.replay_buffer, FrameReplayBuffer)
-    try:
+    with damaged(folder, "train anew under another name"):
         head = read_json(folder / _JSON)
-        tensors = load_file(folder / head["folder"] / _TENSORS)
-        with np.load(folder / head["folder"] / _REPLAY, allow_pickle=False) as data:
-            model.replay_buffer.set_state(dict(data), head["replay"])
+        where = folder / Path(head["folder"]).name
+        tensors = load_file(regular(where / _TENSORS))
+        model.replay_buffer.set_state(load_arrays(where / _REPLAY), head["replay"])
         _set_tensors(model, tensors)
-    except (OSError, KeyError, ValueError, RuntimeError, json.JSONDecodeError, SafetensorError) as error:
-        raise InputError(
-            f"{folder}: the saved training is damaged ({' '.join(str(error).split())}); train anew under another name"
-        ) from None
+        int(head["steps"]), int(head["updates"]), int(head["episodes"]), dict(head["more"])
+        model.action_space.np_random.bit_generator.state = head["rng"]["action_space"]
     model.num_timesteps, model._n_updates, model._episode_num = head["steps"], head["updates"], head["episodes"]
-    model.action_space.np_random.bit_generator.state = head["rng"]["action_space"]
     return head["more"]
 
 

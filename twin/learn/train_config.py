@@ -8,17 +8,53 @@ from dataclasses import dataclass
 from typing import Any
 
 from twin.config import ANY, HELD_OUT, TRAINING
-from twin.env.options import NERF, STEERING, Rewards
+from twin.env.options import CPU, CUDA, NERF, SIMULATOR, STEERING, TWIST, Rewards
 from twin.env.randomisation import Ranges
-from twin.errors import InputError
+from twin.errors import InputError, shown
 from twin.learn.architecture import Architecture
 from twin.learn.policy import Control
 
 _STATES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
 """Speed [m/s], yaw rate [rad/s], cross-track [m], heading error and turns 1, 2 and 4 m ahead [rad]."""
 
+_RANGES: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**63 - 1),
+    "steps": (1, 10**10),
+    "worlds": (1, 4096),
+    "speed": (0.01, 10),
+    "yaw_rate": (0.01, 10),
+    "centring": (0, 1e3),
+    "steering": (0, 1e3),
+    "entropy": (-1e3, 1e3),
+    "start_along": (0, 0.999),
+    "pool": (1, 16),
+    "convolutions": (1, 4096),
+    "features": (1, 65_536),
+    "hidden": (1, 65_536),
+    "batch": (1, 65_536),
+    "buffer": (1, 10**8),
+    "starts": (0, 10**10),
+    "updates": (1e-6, 1e3),
+    "gamma": (0, 0.999999),
+    "learning_rate": (1e-9, 1),
+    "tau": (1e-9, 1),
+    "shift": (0, 64),
+    "colours": (0, 100),
+    "checkpoints": (1, 10**6),
+    "trials": (1, 10**6),
+    "save_every": (1, 10**10),
+}
+"""What each number may be. Beyond these a training ends in an error of arithmetic, for want of memory, or never."""
+_WORDS = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
+
 _CLEAR = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
 """The place as filmed; only the robot differs."""
+
+
+def _numbers(value: Any) -> list[Any]:
+    """What is in a number, in several, or in groups of several."""
+    groups = value if isinstance(value, tuple | list) else (value,)
+    return [number for group in groups for number in (group if isinstance(group, tuple | list) else (group,))]
 
 
 @dataclass(frozen=True)
@@ -85,11 +121,13 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Raises InputError: a number out of range, or lights that are kept for validation."""
-        for name, least in (("seed", 0), ("steps", 1), ("worlds", 1), ("trials", 1), ("colours", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} = {getattr(self, name)}; expected {least} or more")
-        if self.updates <= 0:
-            raise InputError(f"updates = {self.updates}; expected more than 0 per step")
+        for name, (low, high) in _RANGES.items():
+            for value in _numbers(getattr(self, name)):
+                if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                    raise InputError(f"{name} = {shown(getattr(self, name))}; expected {low:,.10g} to {high:,.10g}")
+        for name, valid in _WORDS.items():
+            if getattr(self, name) not in valid:
+                raise InputError(f"{name} = {shown(getattr(self, name))}; expected {' or '.join(map(repr, valid))}")
         if self.lighting in (HELD_OUT, ANY):
             raise InputError(
                 f"lighting = {self.lighting!r}: held-out lights are kept for python -m twin.validate; "

@@ -17,7 +17,6 @@ import csv
 import dataclasses
 import json
 import shutil
-import signal
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +35,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from twin.config import RANDOMISED
 from twin.env.suite import fingerprint
 from twin.errors import InputError
+from twin.files import damaged, read_json, write_json, write_text
 from twin.learn.architecture import prepared
 from twin.learn.policy import save_policy
 from twin.learn.replay import FrameReplayBuffer
@@ -47,7 +47,7 @@ from twin.loading import Twin
 from twin.memory import resident
 from twin.report.training import CHOICE
 from twin.report.trials import RECENT, csv_text
-from twin.scene import read_json, write_json, write_text
+from twin.verb import Stop, Stopped, stop_noted
 
 EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m")
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
@@ -106,10 +106,12 @@ def train(
         watch: Is told at every step of the worlds.
         processes: That step the worlds; see `worlds_of`. What is learnt is the same.
 
-    SIGINT and SIGTERM save, and then raise KeyboardInterrupt.
+    SIGINT, SIGTERM and SIGHUP save, and then raise `Stopped`, a KeyboardInterrupt. Nothing is deleted in a folder that
+    is not a run: a run has a folder `state`, which is the first thing that a training makes in it.
 
     Raises:
-        InputError: the run is another, or damaged; or what `twin.load` raises.
+        InputError: the run is another, or damaged, or the folder is no run; or what `twin.load` raises.
+        OSError: the disk is full; what was saved before is whole.
     """
     road = fingerprint(twin, config.task, config.lighting + (RANDOMISED if config.randomise else ""))
     said = _as_json({**dataclasses.asdict(config), "road": road})
@@ -117,11 +119,11 @@ def train(
     if go_on:
         _check_same(folder, said)
     else:
-        folder.mkdir(parents=True, exist_ok=True)
+        _check_run(folder)
+        (folder / "state").mkdir(parents=True, exist_ok=True)
         for stale in ("episodes.csv", "log.csv", "state/pictures.bin"):
             (folder / stale).unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-        (folder / "state").mkdir(exist_ok=True)
     if go_on and not (folder / "state" / "pictures.bin").exists():
         raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
     vectors = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, **config.options())
@@ -137,19 +139,15 @@ def train(
                 model.train(updates, config.batch)
 
         worlds.meanwhile = learn
-        keeper = _Keeper(folder, config, said, twin, before["wall"], resumed, watch)
-        before_us = {one: signal.signal(one, keeper.stop) for one in (signal.SIGINT, signal.SIGTERM)}
-        try:
+        with stop_noted() as stop:
+            keeper = _Keeper(folder, config, said, twin, before["wall"], resumed, watch, stop)
             left = config.steps - model.num_timesteps
             if left > 0:
                 (folder / CHOICE).unlink(missing_ok=True)  # what it says will not be so
                 model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
                 keeper.end()
-                if keeper.stopped:
-                    raise KeyboardInterrupt
-        finally:
-            for one, handler in before_us.items():
-                signal.signal(one, handler)
+                if stop.number:
+                    raise Stopped(stop.number)
 
 
 def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
@@ -192,6 +190,14 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
     return model
 
 
+def _check_run(folder: Path) -> None:
+    """Raises InputError where a folder has something in it and is no run: a training would delete and replace there."""
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise InputError(f"{folder} is no folder; move it away, or give another --run")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "state").is_dir():
+        raise InputError(f"{folder} is no training run (it has no folder state); move it away, or give another --run")
+
+
 def _as_json(said: dict[str, Any]) -> dict[str, Any]:
     """As it is once it has been written and read."""
     return json.loads(json.dumps(said))
@@ -199,7 +205,9 @@ def _as_json(said: dict[str, Any]) -> dict[str, Any]:
 
 def _check_same(folder: Path, said: dict[str, Any]) -> None:
     """Refuses another config for a run that is there."""
-    there = read_json(folder / "config.json")
+    with damaged(folder / "config.json", "train anew under another name"):
+        there = dict(read_json(folder / "config.json"))
+        there["road"]
     new = [name for name in said if name not in there]
     if new:
         raise InputError(f"{folder} was trained by an earlier version, which had no {new[0]}; give another --run")
@@ -228,17 +236,14 @@ class _Keeper(BaseCallback):
         wall: float,
         resumed: int,
         watch: Callable[[Progress], None] | None,
+        stop: Stop,
     ) -> None:
         super().__init__()
         self.model: PixelSAC
         self._folder, self._config, self._scene, self._watch = folder, config, twin.scene.root.resolve().name, watch
         self._said = said
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
-        self.stopped = False
-
-    def stop(self, *_: Any) -> None:
-        """A signal handler: before the next step, all is saved, and KeyboardInterrupt raised."""
-        self.stopped = True
+        self._stop = stop
 
     @property
     def wall(self) -> float:
@@ -255,10 +260,10 @@ class _Keeper(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # Here, and not in _on_step, all that was collected is in the buffer.
-        if self.stopped or self.model.num_timesteps - self._saved >= self._config.save_every:
+        if self._stop.number or self.model.num_timesteps - self._saved >= self._config.save_every:
             self.save()
-        if self.stopped:
-            raise KeyboardInterrupt
+        if self._stop.number:
+            raise Stopped(self._stop.number)
         self._checkpoint()
 
     def _on_step(self) -> bool:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.config_file import parse
+from twin.files import check_shapes, checked_text, damaged, read_json, write_json
 from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
-from twin.scene import read_json, write_json
 
 Array = NDArray[np.float64]
 
@@ -84,18 +84,29 @@ class World:
 
     @staticmethod
     def load(folder: Path) -> "World":
-        head = read_json(folder / "world.json")
-        x, y, z, yaw = head["spawn"]
-        (fx, fy, cx, cy), (width, height) = head["camera"]["native_intrinsics"], head["camera"]["native_size"]
-        return World(
-            route=np.array(head["route"]),
-            half_width=float(head["half_width"]),
-            spawn=(x, y, z, yaw),
-            camera=PixelCamera((fx, fy, cx, cy), (width, height)),
-            robot=parse(HuskyParams, head["robot"], str(folder / "world.json")),
-            folder=folder,
-            names=head["names"],
-        )
+        """Raises InputError: no such file, or not one that `save` wrote."""
+        path = folder / "world.json"
+        head = read_json(path)
+        with damaged(path, "build the scene again"):
+            x, y, z, yaw = map(float, head["spawn"])
+            (fx, fy, cx, cy), (width, height) = head["camera"]["native_intrinsics"], head["camera"]["native_size"]
+            world = World(
+                route=np.array(head["route"], np.float64),
+                half_width=float(head["half_width"]),
+                spawn=(x, y, z, yaw),
+                camera=PixelCamera((float(fx), float(fy), float(cx), float(cy)), (int(width), int(height))),
+                robot=parse(HuskyParams, head["robot"], str(path)),
+                folder=folder,
+                names={checked_text(key): checked_text(name) for key, name in head["names"].items()},
+            )
+            m = len(world.route)
+            check_shapes({"route": (world.route, (m, 3), "f")})
+            if m < 2 or not world.half_width > 0.0 or min(fx, fy, width, height) <= 0:
+                raise ValueError(f"a route of {m} points {world.half_width} m to a side, filmed at {width} × {height}")
+            missing = {"body", "camera", "ground", "keyframe"} - world.names.keys()
+            if missing:
+                raise ValueError(f"no name of {', '.join(sorted(missing))}")
+        return world
 
 
 def arc_lengths(route: Array) -> Array:

@@ -4,7 +4,6 @@ They lie outside `build/`, which may be deleted at any time. An embedding means 
 tied to the content digest of the field stage it was fitted with; beside another build of the field it is *stale*.
 """
 
-import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,11 +12,13 @@ from numpy.typing import NDArray
 
 from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
+from twin.files import damaged, read_json, write_json
 from twin.nerf.air import Air
-from twin.scene import SceneDir, read_json, write_json
+from twin.scene import SceneDir
+from twin.scene import check_name as check_scene_name
+from twin.stamp import result_of
 
 _FORMAT = 2  # which has the air
-_NAME = re.compile(r"\w[\w.-]*")
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,7 @@ class AddedLighting:
 
 def check_name(name: str, filmed: tuple[str, ...]) -> None:
     """Raises InputError where a name cannot be that of an added lighting: it names a file, and a part of a mixture."""
-    if not _NAME.fullmatch(name):
-        raise InputError(f"--name {name!r}: expected letters, digits and _ . - only, such as afternoon")
+    check_scene_name(name, "--name")
     if name in RESERVED_LIGHTINGS:
         raise InputError(
             f"--name {name!r}: has a meaning of its own, a light drawn at random; choose another, such as afternoon"
@@ -56,10 +56,7 @@ def check_name(name: str, filmed: tuple[str, ...]) -> None:
 
 def field_result(scene: SceneDir) -> str:
     """What the field of a scene is known by. Raises InputError where it has not been built."""
-    path = scene.stamp("field")
-    if not path.exists():
-        raise InputError(f"{scene.root} has no {path.parent.name} yet; run python -m twin.build {scene.root}")
-    return str(read_json(path)["result"])
+    return result_of(scene, "field")
 
 
 def added_lightings(
@@ -76,7 +73,7 @@ def added_lightings(
     airs: dict[str, Air] = {}
     stale = []
     for path in sorted(scene.lightings.glob("*.json")):
-        try:
+        with damaged(path, "fit it again or delete it"):
             head = read_json(path)
             if head["format"] == 1:  # without its air
                 stale.append(path.stem)
@@ -88,12 +85,8 @@ def added_lightings(
             air = Air(float(head["air"]["extinction"]), (red, green, blue))
             if not (0.0 <= air.extinction < np.inf and all(0.0 <= share <= 1.0 for share in air.airlight)):
                 raise ValueError(f"air {air.extinction}, {air.airlight}")
-        except InputError:
-            raise
-        except (ValueError, TypeError, KeyError) as error:
-            raise InputError(
-                f"{path}: no lighting ({type(error).__name__}: {error}); fit it again or delete it"
-            ) from None
+            if vector.ndim != 1 or not np.isfinite(vector).all():
+                raise ValueError(f"embedding of shape {vector.shape}, or not finite")
         if made_by == result:
             fresh[path.stem], airs[path.stem] = vector, air
         else:

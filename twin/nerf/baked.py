@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from safetensors.numpy import load_file
 from safetensors.numpy import save as to_bytes
 
 from twin.cores import cores
-from twin.errors import InputError
+from twin.errors import InputError, shown
+from twin.files import check_shapes, checked_text, damaged, load_tensors, read_json, write_json
 from twin.geometry.cameras import Posed, resized
 from twin.nerf.air import Air
 from twin.nerf.kernels import march as kernels
@@ -35,7 +35,6 @@ from twin.nerf.lightings import Lightings
 from twin.nerf.plausible import Probes
 from twin.nerf.rendering import Rendering
 from twin.progress import bar
-from twin.scene import read_json, write_json
 
 wp.config.log_level = wp.LOG_ERROR
 
@@ -259,20 +258,28 @@ class BakedField:
         Raises:
             InputError: none there, or one of another format.
         """
-        if not (folder / "baked.json").exists():
+        path = folder / "baked.json"
+        if not path.exists():
             raise InputError(f"{folder}: holds no baked.json; build the scene (again)")
-        head = read_json(folder / "baked.json")
-        if head.get("format") != _FORMAT:
-            raise InputError(f"{folder}/baked.json: format {head.get('format')}, expected {_FORMAT}; build it anew")
-        arrays = load_file(str(folder / "baked.safetensors"))
-        lightings = Lightings(
-            tuple(head["lightings"]),
-            arrays.pop("lightings.vectors"),
-            tuple(head["frames"]),
-            arrays.pop("lightings.frames"),
-        )
-        layout: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in head["layout"].items()}
-        return BakedField(BrickLayout(**layout), lightings, arrays, where, head["about"])
+        head = read_json(path)
+        with damaged(path, "build the scene again"):
+            if head.get("format") != _FORMAT:
+                raise InputError(f"{path}: format {shown(head.get('format'))}, expected {_FORMAT}; build it anew")
+            layout: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in head["layout"].items()}
+            bricks = BrickLayout(**layout)
+            names, frames = tuple(map(checked_text, head["lightings"])), tuple(map(checked_text, head["frames"]))
+            about = dict(head["about"])
+        arrays = load_tensors(folder / "baked.safetensors")
+        with damaged(folder / "baked.safetensors", "build the scene again"):
+            vectors, frame_vectors = arrays.pop("lightings.vectors"), arrays.pop("lightings.frames")
+            dim = vectors.shape[1]
+            check_shapes(
+                {
+                    "lightings.vectors": (vectors, (len(names), dim), "f"),
+                    "lightings.frames": (frame_vectors, (len(frames), dim), "f"),
+                }
+            )
+            return BakedField(bricks, Lightings(names, vectors, frames, frame_vectors), arrays, where, about)
 
 
 class _Picture:

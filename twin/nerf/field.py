@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
-from twin.errors import InputError
+from twin.errors import InputError, shown
+from twin.files import checked_text, damaged, read_json, regular, write_json
 from twin.geometry.cameras import Posed, resized
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
@@ -27,7 +28,6 @@ from twin.nerf.kernels import hashgrid, sampler, space
 from twin.nerf.rendering import FAR, Rendering
 from twin.nerf.sampling import level_cells, level_shapes, stop_grids
 from twin.nerf.workspace import CameraArrays, Layout, Workspace
-from twin.scene import read_json, write_json
 
 _FORMAT = 1
 _RENDER_RAYS = 4096  # per batch
@@ -285,21 +285,23 @@ class RadianceField:
         where = where or device()
         if not (folder / "field.json").exists():
             raise InputError(f"{folder}: holds no field.json; build the scene's field first")
-        head = read_json(folder / "field.json")
-        if head.get("format") != _FORMAT:
-            raise InputError(f"{folder}/field.json: format {head.get('format')}, expected {_FORMAT}; build it anew")
-        tensors = load_file(str(folder / "field.safetensors"), device=where)
-        layout = head["layout"] | {key: tuple(head["layout"][key]) for key in ("centre", "half")}
-        appearance = Appearance(
-            tuple(head["lightings"]),
-            tuple(head["frames"]),
-            np.array(head["frame_lighting"], np.int64),
-            tensors["appearance.vectors"],
-            tensors["appearance.residuals"],
-        )
-        parameters = {k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")}
-        grids = tensors["grid.near"], tensors["grid.far"]
-        return RadianceField(Layout(**layout), appearance, tensors["table"], parameters, grids, head["about"])
+        path = folder / "field.json"
+        head = read_json(path)
+        with damaged(path, "build the scene again"):
+            if head.get("format") != _FORMAT:
+                raise InputError(f"{path}: format {shown(head.get('format'))}, expected {_FORMAT}; build it anew")
+            layout = Layout(**(head["layout"] | {key: tuple(head["layout"][key]) for key in ("centre", "half")}))
+            names, frames = tuple(map(checked_text, head["lightings"])), tuple(map(checked_text, head["frames"]))
+            frame_lighting, about = np.array(head["frame_lighting"], np.int64), dict(head["about"])
+        path = regular(folder / "field.safetensors")
+        with damaged(path, "build the scene again"):
+            tensors = load_file(str(path), device=where)
+            appearance = Appearance(
+                names, frames, frame_lighting, tensors["appearance.vectors"], tensors["appearance.residuals"]
+            )
+            parameters = {k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")}
+            grids = tensors["grid.near"], tensors["grid.far"]
+            return RadianceField(layout, appearance, tensors["table"], parameters, grids, about)
 
 
 def untrained(layout: Layout, appearance: Appearance, seed: int, where: str) -> RadianceField:

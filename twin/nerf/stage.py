@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from twin.config import SceneConfig
+from twin.files import read_json
 from twin.geometry.cameras import Cameras
 from twin.geometry.points import SparsePoints
 from twin.nerf.bake import bake
@@ -13,7 +14,7 @@ from twin.nerf.crosslight import cross_lighting
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.evaluate import evaluate
 from twin.nerf.fit import fit
-from twin.scene import SceneDir, read_json
+from twin.scene import SceneDir
 
 _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 

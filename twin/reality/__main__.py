@@ -17,8 +17,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from twin import verb
 from twin.config import HELD_OUT, RANDOMISED
-from twin.errors import InputError, refuse
+from twin.errors import InputError
+from twin.files import toml_string, write_text
 from twin.reality import drive, log, onboard
 from twin.reality import place as places
 from twin.reality.drive import TASKS
@@ -36,7 +38,15 @@ TINY = Plan(
 
 
 def film(plan: Plan, out: Path) -> Truth:
-    """Films every lighting of a plan into a scene folder, with its truth."""
+    """Films every lighting of a plan into a scene folder, with its truth.
+
+    Raises:
+        InputError: another's folder.
+    """
+    if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
+        raise InputError(
+            f"{out} has something in it and no truth/, so it is no scene of this world; give another --out"
+        )
     (out / "input").mkdir(parents=True, exist_ok=True)
     place = places.build()
     films = {}
@@ -45,7 +55,7 @@ def film(plan: Plan, out: Path) -> Truth:
         films[lighting] = Film(times, poses, *depths(lighting, place, plan, poses))
     truth = Truth(place.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (plan.width, plan.height), films)
     truth.save(out / "truth")
-    (out / "scene.toml").write_text(scene_toml(plan, out.resolve().name), encoding="utf-8")
+    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name))
     return truth
 
 
@@ -53,7 +63,14 @@ def scene_toml(plan: Plan, name: str) -> str:
     """The scene's description, as a user would write it."""
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     lines = ["# A drive through the known-truth world, filmed by python -m twin.reality film --out THIS_FOLDER"]
-    lines += [f'name = "{name}"', "seed = 0", "", "[metric]", f"camera_height = {CAMERA_HEIGHT}  # metres", ""]
+    lines += [
+        f"name = {toml_string(name)}",
+        "seed = 0",
+        "",
+        "[metric]",
+        f"camera_height = {CAMERA_HEIGHT}  # metres",
+        "",
+    ]
     for lighting in plan.lightings:
         lines += ["[[source]]", f'path = "input/{lighting}.mp4"', f'lighting = "{lighting}"']
         lines += ["[source.camera]", 'model = "PINHOLE"', f"params = [{fx}, {fy}, {cx}, {cy}]"]
@@ -62,8 +79,8 @@ def scene_toml(plan: Plan, name: str) -> str:
 
 
 def main(given: list[str] | None = None) -> int:
-    """Runs a command; returns the exit status: 0, or 2 with one line on standard error."""
-    parser = argparse.ArgumentParser(prog="python -m twin.reality", description="The known-truth world.")
+    """Runs the verb; returns the exit status, see `twin.verb`."""
+    parser = verb.Parser(prog="python -m twin.reality", description="The known-truth world.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("film", help="film the world into a scene folder")
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
@@ -99,31 +116,30 @@ def main(given: list[str] | None = None) -> int:
     command = commands.add_parser("photo", help="a photo by that camera in the weather of a trial, for twin.relight")
     command.add_argument("--lighting", required=True, choices=WEATHER, metavar="NAME", help=among)
     command.add_argument("--out", type=Path, required=True, help="photo.png")
-    options = parser.parse_args(given)
-    try:
-        if options.command == "film":
-            plan = TINY if options.tiny else Plan()
-            film(replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan, options.out)
-        elif options.command == "log":
-            log.write(options.out, log.record(options.duration))
-        elif options.command == "onboard":
-            onboard.write(options.out)
-        elif options.command == "photo":
-            onboard.photograph(options.lighting, options.out)
-        else:
-            trials = drive.run(
-                options.policy,
-                options.task,
-                options.lightings,
-                options.trials,
-                options.out,
-                options.twin_lighting,
-                options.films,
-            )
-            print(cells_text(tally(trials)), end="")
-    except (InputError, OSError) as error:
-        return refuse(error)
-    return 0
+    return verb.run(parser, _main, given)
+
+
+def _main(options: argparse.Namespace) -> None:
+    if options.command == "film":
+        plan = TINY if options.tiny else Plan()
+        film(replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan, options.out)
+    elif options.command == "log":
+        log.write(options.out, log.record(options.duration))
+    elif options.command == "onboard":
+        onboard.write(options.out)
+    elif options.command == "photo":
+        onboard.photograph(options.lighting, options.out)
+    else:
+        trials = drive.run(
+            options.policy,
+            options.task,
+            options.lightings,
+            options.trials,
+            options.out,
+            options.twin_lighting,
+            options.films,
+        )
+        print(cells_text(tally(trials)), end="")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,16 @@
 """The real test: a policy file drives reality's Husky on reality's road, in weather that nobody filmed.
 
-A policy is told nothing but pictures. Its file is all that comes in from the training side; rows of trials are all that
-goes back. Trials have seeds: the k-th trial in a weather starts from the same place with the same shaking camera for
-every policy, so that policies can be compared pair by pair.
+A policy gets nothing but pictures; its file is all that a test takes from the training side. A test returns rows of
+trials, and films of them where asked. The model of the robot, its controller, the effects of the camera and the judge
+are those of the twin. Two of the twin's constants were set with this world's pictures in view
+(`twin.env.randomisation.UNTOLD`, `twin.env.light.GROUND_ALBEDO`).
+
+Trials have seeds: the k-th trial in a weather starts from the same place with the same shaking camera for every policy,
+so that policies can be compared pair by pair.
 """
 
 import csv
+import io
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -19,6 +24,7 @@ from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
 from twin.env.tasks import CAMERA
 from twin.errors import InputError
+from twin.files import damaged, digest_file, read_json, read_text, write_json, write_text
 from twin.learn.policy import JSON, Policy, load_policy
 from twin.progress import bar
 from twin.reality import world as worlds
@@ -37,7 +43,6 @@ from twin.report.trials import (
     read_trials,
     tally,
 )
-from twin.scene import digest_file, read_json, write_json, write_text
 
 TASKS = ("straight", "right_turn")
 
@@ -192,8 +197,8 @@ def _key(trial: Trial) -> tuple[str, str, str]:
 def _write(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) -> None:
     compared: dict[tuple[str, str, str], str] = {}  # what a cell was compared with before, it still is
     if out.exists():
-        with out.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
+        with damaged(out, "give another --out"):
+            for row in csv.DictReader(io.StringIO(read_text(out), newline="")):
                 compared[row["policy"], row["task"], row["lighting"]] = row["twin_lighting"]
     rows = [
         (c.policy, c.lighting, str(c.trials), str(c.successes), c.task, compared.get(c.key, twin_lighting))
@@ -209,7 +214,10 @@ def _write(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) 
 
 def _remember(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -> None:
     """Notes which file drove under which name."""
-    sums: dict[str, str] = read_json(record) if record.exists() else {}
+    sums: dict[str, str] = {}
+    if record.exists():
+        with damaged(record, "give another --out"):
+            sums = dict(read_json(record))
     for policy, path in zip(policies, paths, strict=True):
         folder = path.parent if path.name == JSON else path
         digest = digest_file(folder / JSON if folder.is_dir() else folder)  # which has the digest of the weights

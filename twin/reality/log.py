@@ -1,4 +1,4 @@
-"""A drive log of reality's Husky, as `twin.align` reads it: the other thing besides the film that leaves reality.
+"""A drive log of reality's Husky, as `twin.align` reads it.
 
 Someone drives it by joystick on the straight part of the road: commands that change every second or two, forwards,
 backwards and turning, never off the asphalt. Logged are commands, wheel encoders, an IMU and a surveyor's pose, with

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
+from twin.files import read_json, write_json
 from twin.reality import place as places
 from twin.reality import route as roads
 from twin.reality import shapes
 from twin.reality.route import Route
 from twin.reality.things import SEED, Place
-from twin.scene import read_json, write_json
 
 Array = NDArray[np.float64]
 

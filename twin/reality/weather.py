@@ -1,4 +1,7 @@
-"""The lightings of the real test. None of them is ever filmed; a twin knows of them by a photo at most.
+"""The lightings of the real test. None of them is ever filmed; a build of the twin gets a photo of them at most.
+
+The five stated ones were driven while training was developed, and a constant of the twin was measured on pictures of
+these and of days 1 to 5 (`twin.env.randomisation.UNTOLD`): only days 6 to 15 were no part of any choice.
 
 The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Five are
 stated here, fifteen more are *days*, drawn once with a fixed seed as a calendar would: sun, clouds and air are whatever

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from twin.report.words import LARGE_PATH_ERROR, Caution, Fact, Section, listing, number, pick
+from twin.report.words import LARGE_PATH_ERROR, Caution, Fact, Section, Verdict, listing, number, pick
 
 # From where on an error is worth a caution.
 _LARGE_SCALE_ERROR = 0.02  # relative
@@ -61,7 +61,19 @@ def truth_section(report: dict[str, Any]) -> Section:
         "does.",
         facts,
         cautions,
+        verdict=_verdict(truth),
     )
+
+
+def _verdict(truth: dict[str, Any]) -> Verdict | None:
+    """How true the twin is in one sentence, where that is known."""
+    off, ground = truth.get("ate_m"), truth.get("ground_median_m")
+    if not isinstance(off, int | float):
+        return None
+    text = f"Against the known truth its cameras are {100 * off:.1f} cm off"
+    if isinstance(ground, int | float):
+        text += f", and its ground {100 * ground:.1f} cm"
+    return Verdict(f"{text}.", "good")
 
 
 def _by_kind(truth: dict[str, Any]) -> str:

@@ -12,10 +12,10 @@ from typing import Any
 
 from twin.config_file import parse
 from twin.errors import InputError
+from twin.files import damaged, exists, read_json, write_json
 from twin.report import ranking
 from twin.report.bootstrap import DRAWS
 from twin.report.statistics import CONFIDENCE
-from twin.scene import read_json, write_json
 
 ALL_TASKS = "all tasks"
 _FILE = "forecast.json"
@@ -167,12 +167,13 @@ class Forecast:
     def load(folder: Path) -> "Forecast":
         """Raises InputError: no such file, or not one that `save` wrote."""
         path = folder / _FILE
-        try:
-            return parse(Forecast, _given(read_json(path)), str(path))
-        except FileNotFoundError:
-            raise InputError(f"{path} does not exist; run python -m twin.forecast SCENE") from None
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path}: {error}; run python -m twin.forecast SCENE anew") from None
+        if not exists(path):
+            raise InputError(f"{path} does not exist; run python -m twin.forecast SCENE")
+        with damaged(path, "run python -m twin.forecast SCENE anew"):
+            try:
+                return parse(Forecast, _given(read_json(path)), str(path))
+            except InputError as error:
+                raise InputError(f"{error}; run python -m twin.forecast SCENE anew") from None
 
 
 def _given(value: Any) -> Any:

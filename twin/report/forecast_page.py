@@ -2,13 +2,23 @@
 
 from pathlib import Path
 
+from twin.files import write_text
 from twin.report import forecast_figures as draw
 from twin.report.figures import svg
 from twin.report.forecast import Estimate, Forecast, Group
-from twin.report.forecast_words import SHARES, STATISTICS, chance, plan_words, points, show, unknowns, verdicts
-from twin.report.markup import LONG, Html, caution, document, element, folded, join, table
+from twin.report.forecast_words import (
+    NOMINAL,
+    SHARES,
+    STATISTICS,
+    chance,
+    plan_words,
+    points,
+    show,
+    unknowns,
+    verdicts,
+)
+from twin.report.markup import LONG, Html, caution, document, element, folded, headline, join, table
 from twin.report.statistics import MIN_POLICIES, MIN_TRIALS
-from twin.scene import write_text
 
 _STYLE = ".whole, td code { white-space:nowrap }\n"
 
@@ -49,12 +59,11 @@ def _header(forecast: Forecast) -> Html:
     tasks = f"{len(forecast.tasks)} tasks" if len(forecast.tasks) > 1 else "one task"
     trials = f"{forecast.twin_trials} trials in the twin, {forecast.real_trials} on the road"
     told = f"{policies} policies on {tasks}: {trials}."
-    sentences = [element("li", verdict.text, class_=verdict.mood) for verdict in verdicts(forecast)]
     return element(
         "header",
         element("h1", f"{forecast.scene}: forecast"),
         element("p", told, class_="kicker"),
-        element("ul", *sentences, class_="verdicts"),
+        element("ul", *map(headline, verdicts(forecast)), class_="verdicts"),
         class_="top",
     )
 
@@ -63,10 +72,11 @@ def _road(forecast: Forecast) -> Html:
     lead = element(
         "p",
         "Policies were driven in the twin and on the road. If the twin is a good judge, those that do better there do "
-        "better here. Numbers in brackets are 90% intervals: what other policies of this kind, driven as often, would "
-        "have shown.",
+        "better here. Numbers in brackets are 90% intervals for what other policies of this kind, driven as often, "
+        "would show on average.",
         class_="done",
     )
+    doubt = element("div", element("b", "The intervals may be too narrow."), NOMINAL, class_="caution", role="note")
     if not forecast.groups:
         return element("p", "No real trials were given, so this cannot be said.", class_="na")
     told = [group for group in forecast.groups if not group.missing]
@@ -84,7 +94,7 @@ def _road(forecast: Forecast) -> Html:
         "Success on the road over success in the twin; on the dashed line the twin is right",
         svg(draw.twin_against_road(forecast)),
     )
-    return join(lead, *refused, table(heads, rows) if told else "", element("div", drawn, class_="charts"))
+    return join(lead, *refused, *((table(heads, rows), doubt) if told else ()), element("div", drawn, class_="charts"))
 
 
 def _show(estimate: Estimate, percent: bool = False) -> Html:
@@ -133,8 +143,9 @@ def _policies(forecast: Forecast) -> Html:
     parts: list[Html] = [
         element(
             "p",
-            "A policy’s rate is the mean over its lightings. Ranks are given with how sure they are: two policies of "
-            "nearly the same rate may as well be the other way round.",
+            "A policy’s rate is the mean over its lightings. Its interval takes trials for independent: those of one "
+            "day that end alike tell less. Ranks are given with how sure they are, with trials taken likewise: two "
+            "policies of nearly the same rate may as well be the other way round.",
             class_="done",
         )
     ]
@@ -222,7 +233,7 @@ def _more(forecast: Forecast) -> Html:
         f"The best policy is settled when the one that leads is the truly best, or within {points(forecast.margin)} of "
         f"it, with {forecast.sure:.0%} probability; the order, when {forecast.sure:.0%} of the pairs that differ by "
         "more are in the right order. Trials are counted per policy, spread over its lightings, and are what is needed "
-        "on average over the rates that are still possible."
+        "on average over the rates that are still possible, were each trial independent of the others."
     )
     words = [element("p", plan_words(forecast, plan)) for plan in forecast.plans]
     return join(*words, element("p", rule, class_="done"))
@@ -242,7 +253,10 @@ def _cells(forecast: Forecast) -> Html:
         counts = _show(pair.twin, True), str(pair.twin.n), _show(pair.real, True), str(pair.real.n)
         rows.append([element("code", pair.policy), pair.task, light, *counts, _show(pair.bias, True), luck])
     heads = ["policy", "task", "lighting", "twin", "n", "road", "n", "road minus twin", ""]
-    lead = f"{beyond} of {len(rows)} cells differ by more than chance; one in ten would if the twin were perfect."
+    lead = (
+        f"{beyond} of {len(rows)} cells differ by more than chance; at most about one in ten would if the twin were "
+        "perfect."
+    )
     parts, told = [element("p", lead, class_="done")], table(heads, rows, (4, 6))
     if len(rows) <= LONG:
         return join(*parts, told)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from twin.report.words import Caution
+from twin.report.words import Caution, Verdict
 
 LONG = 24
 """Rows that a table has at most; a longer one is folded away, below a figure that says the same."""
@@ -60,6 +60,12 @@ def document(title: str, style: str, *body: str) -> str:
 def caution(it: Caution) -> Html:
     """What is not to be relied on, and what helps."""
     return element("div", element("b", it.what), f"What helps: {it.cure}", class_="caution", role="note")
+
+
+def headline(it: Verdict, *below: str) -> Html:
+    """An entry of a list of verdicts: the mood in a word and a colour, the sentence, and what is below it."""
+    word = element("b", f"{it.word}:", class_="mood") if it.word else ""
+    return element("li", word, " " if word else "", it.text, *below, class_=it.mood)
 
 
 def table(head: list[str], rows: list[list[str]], numeric: tuple[int, ...] = ()) -> Html:
@@ -118,9 +124,13 @@ section, header.top { background:var(--card); border:1px solid var(--line); bord
 ul.verdicts { list-style:none; margin:0; padding:0 } ul.verdicts li { padding:7px 0 7px 22px; position:relative }
 ul.verdicts li::before { content:""; position:absolute; left:0; top:1em; width:11px; height:11px; border-radius:50%;
   background:var(--plain) }
-ul.verdicts li:first-child { font-size:clamp(1.1rem, 3.4vw, 1.35rem); font-weight:600; line-height:1.35 }
+ul.verdicts > li:first-child { font-size:clamp(1.1rem, 3.4vw, 1.35rem); font-weight:600; line-height:1.35 }
 ul.verdicts li.good::before { background:var(--good) } ul.verdicts li.mixed::before { background:var(--mixed) }
 ul.verdicts li.bad::before { background:var(--bad) }
+ul.verdicts .mood { font-size:.8em; font-weight:600 } ul.verdicts li.good .mood { color:var(--good) }
+ul.verdicts li.mixed .mood { color:var(--mixed) } ul.verdicts li.bad .mood { color:var(--bad) }
+ul.verdicts ul { margin:2px 0 0; padding-left:18px; font-size:1rem; font-weight:400; line-height:1.55 }
+ul.verdicts ul li { padding:2px 0 } ul.verdicts ul li::before { content:none !important }
 nav { display:flex; flex-wrap:wrap; gap:8px; margin:0 0 18px }
 nav a { text-decoration:none; background:var(--card); border:1px solid var(--line); border-radius:999px;
   padding:3px 12px; font-size:.9rem }

@@ -7,13 +7,12 @@ stage folders, words from `twin.report.sections`.
 from pathlib import Path
 from typing import Any
 
-from twin.report.against_truth import truth_section
+from twin.files import read_json, write_text
 from twin.report.charts import Chart, charts
-from twin.report.markup import Html, caution, data_url, document, element, join, picture, table
-from twin.report.sections import SECTIONS, general_cautions
-from twin.report.seen_section import seen_section
-from twin.report.words import NOT_MEASURED, Section, duration, flat, number, pick, verdicts
-from twin.scene import SceneDir, read_json, write_text
+from twin.report.markup import Html, caution, data_url, document, element, headline, join, picture, table
+from twin.report.sections import SECTIONS, costs_section, sections, summed_up
+from twin.report.words import NOT_MEASURED, Section, duration, flat, number, pick
+from twin.scene import SceneDir
 
 _STAGE_WORDS = {name: make({}).title for name, make in SECTIONS.items()}
 
@@ -32,16 +31,14 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
     """The whole page."""
     drawn, kept = charts(scene, report), _pictures(scene)
     name = str(report.get("scene") or scene.root.name)
-    sections = [make(report) for make in SECTIONS.values()] + [seen_section(report), truth_section(report)]
+    told = [section for section in sections(report) if section.name != "costs"]
     return document(
         f"{name}: a twin's report",
         "",
         _header(name, report),
         _film(scene, kept),
-        element(
-            "nav", *(element("a", s.title, href=f"#{s.name}") for s in sections), element("a", "Costs", href="#costs")
-        ),
-        *(_section(k + 1, s, report, drawn, kept) for k, s in enumerate(sections)),
+        element("nav", *(element("a", s.title, href=f"#{s.name}") for s in told), element("a", "Costs", href="#costs")),
+        *(_section(k + 1, s, report, drawn, kept) for k, s in enumerate(told)),
         _costs(report),
         element("footer", "Every number is in ", element("a", "report.json", href="report.json"), " beside this page."),
     )
@@ -54,15 +51,20 @@ def _header(name: str, report: dict[str, Any]) -> Html:
         seconds = sum(s for s in each if isinstance(s, int | float)) if each else None
     cost = f"built in {duration(seconds)}"
     memory = number(_gibibytes(report.get("peak_memory_bytes")), "{:.1f} GiB of memory at most")
-    sentences = [element("li", verdict.text, class_=verdict.mood) for verdict in verdicts(report)]
     return element(
         "header",
         element("h1", name),
         element("p", f"A filmed place as a MuJoCo twin: {cost}, {memory}.", class_="kicker"),
-        element("ul", *sentences, class_="verdicts"),
-        *map(caution, general_cautions(report)),
+        element("ul", *map(_summary, summed_up(report)), class_="verdicts"),
         class_="top",
     )
+
+
+def _summary(section: Section) -> Html:
+    """A section's headline with its cautions, which link to the section, where the cures are."""
+    assert section.headline is not None
+    below = [element("li", element("a", it.what, href=f"#{section.name}")) for it in section.cautions]
+    return headline(section.headline, element("ul", *below) if below else "")
 
 
 def _film(scene: SceneDir, kept: list[tuple[str, Path, str]]) -> Html:
@@ -166,11 +168,12 @@ def _costs(report: dict[str, Any]) -> Html:
     settings = [row for name, stage in stages.items() for row in flat(pick(stage, "config") or {}, name)]
     inputs = [[str(name), element("code", str(digest)[:16])] for name, digest in (report.get("inputs") or {}).items()]
     versions = [[str(name), str(version)] for name, version in (report.get("versions") or {}).items()]
-    seed = report.get("seed")
+    seed, section = report.get("seed"), costs_section(report)
     return element(
         "section",
-        element("h2", "Costs and origins"),
-        element("p", "Where the time went, and everything needed to build the same twin again.", class_="done"),
+        element("h2", section.title),
+        element("p", section.done, class_="done"),
+        *map(caution, section.cautions),
         table(["stage", "time", "", "peak memory"], rows, (1, 3)),
         element("p", f"Seed: {NOT_MEASURED if seed is None else seed}"),
         _fold("Versions", table(["package", "version"], versions)),

@@ -9,6 +9,7 @@ from twin.report.words import (
     Caution,
     Fact,
     Section,
+    Verdict,
     duration,
     listing,
     number,
@@ -72,9 +73,12 @@ def cameras_section(report: dict[str, Any]) -> Section:
     registered, total = cameras.get("registered"), cameras.get("total")
     error = cameras.get("reprojection_error_px")
     cautions = []
-    placed = NOT_MEASURED
+    placed, verdict = NOT_MEASURED, None
     if isinstance(registered, int) and isinstance(total, int):
         placed = f"{registered} of {total}"
+        if total:
+            text = f"All {total} frames" if registered == total else f"{placed} frames ({registered / total:.0%})"
+            verdict = Verdict(f"{text} were placed in space.", "good")
         if total and registered / total < ENOUGH_REGISTERED:
             cautions.append(
                 Caution(
@@ -124,6 +128,7 @@ def cameras_section(report: dict[str, Any]) -> Section:
         "(structure from motion).",
         facts,
         cautions,
+        verdict=verdict,
     )
 
 
@@ -171,6 +176,8 @@ def metric_section(report: dict[str, Any]) -> Section:
             )
         )
     source = metric.get("scale_source")
+    sure = "" if uncertainty is None else f", sure to about {uncertainty:.1%}"
+    verdict = Verdict(f"Its metres come from {source_words(source)}{sure}.", "good") if source is not None else None
     facts = [
         Fact("metres from", source_words(source) if source else NOT_MEASURED, "what scene.toml gave"),
         Fact("scale uncertainty", number(uncertainty, "{:.1%}"), "one standard deviation, relative"),
@@ -187,4 +194,5 @@ def metric_section(report: dict[str, Any]) -> Section:
         "The reconstruction was turned upright, put on the floor, and brought to metres.",
         facts,
         cautions,
+        verdict=verdict,
     )

@@ -16,6 +16,7 @@ from twin.assets.ground import Ground
 from twin.config import SceneConfig
 from twin.env.follower import Drive, follow
 from twin.env.physics import HuskyPhysics
+from twin.files import write_json
 from twin.geometry.cameras import Cameras
 from twin.mjcf.export import Parts
 from twin.mjcf.world import World, arc_lengths
@@ -42,7 +43,7 @@ from twin.report.studio import Studio, side_by_side, spread
 from twin.report.trust_map import trust_along, trust_metrics, trust_picture
 from twin.report.video import VideoWriter
 from twin.report.words import follower_verdict
-from twin.scene import SceneDir, write_json
+from twin.scene import SceneDir
 
 Array = NDArray[np.float64]
 

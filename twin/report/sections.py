@@ -1,20 +1,25 @@
 """What the report says about each stage: what was done, its numbers, and cautions with their cures; no HTML here.
 
-The stages up to metric cameras are in `reconstruction.py`.
+The stages up to metric cameras are in `reconstruction.py`. `sections` has them all: page, `report.json` and the printed
+summary take headlines and cautions from there alone.
 """
 
 from collections.abc import Callable
 from typing import Any
 
+from twin.report.against_truth import truth_section
 from twin.report.crosslight import cross_lighting_words
 from twin.report.reconstruction import cameras_section, capture_section, metric_section
+from twin.report.seen_section import seen_section
 from twin.report.words import (
     LOW_PSNR,
     NOT_MEASURED,
     Caution,
     Fact,
     Section,
+    Verdict,
     duration,
+    follower_verdict,
     listing,
     number,
     numbers,
@@ -68,10 +73,20 @@ def field_section(report: dict[str, Any]) -> Section:
         "even that). Above about 20 dB a view is easy to recognise, above 30 dB it is hard to tell from the film.",
         facts + swapped,
         cautions + more,
+        verdict=_field_verdict(psnr),
     )
 
 
-def mesh_section(report: dict[str, Any], limit: int | None = None) -> Section:
+def _field_verdict(psnr: dict[str, float]) -> Verdict | None:
+    if not psnr:
+        return None
+    low, high = min(psnr.values()), max(psnr.values())
+    span = f"{low:.1f} dB" if round(low, 1) == round(high, 1) else f"{low:.1f} to {high:.1f} dB"
+    under = f"in {len(psnr)} lightings" if len(psnr) > 1 else f"in the lighting “{next(iter(psnr))}”"
+    return Verdict(f"Views it had never seen were rendered {under} at {span} PSNR.", "good")
+
+
+def mesh_section(report: dict[str, Any]) -> Section:
     mesh = pick(report, "mesh") or {}
     parts = mesh.get("parts")
     cautions = []
@@ -82,9 +97,13 @@ def mesh_section(report: dict[str, Any], limit: int | None = None) -> Section:
                 "if there are obstacles, film them from nearer, raise nerf.steps or lower mesh.obstacle_height.",
             )
         )
-    if isinstance(parts, int) and limit is not None and parts >= limit:
+    left_out = mesh.get("parts_left_out")
+    if isinstance(left_out, int) and left_out > 0:
         cautions.append(
-            Caution(f"All {parts} allowed solid parts were used up.", "raise mesh.max_parts, or mesh.voxel for fewer.")
+            Caution(
+                f"{left_out} solid part(s) were left out, as mesh.max_parts allows no more.",
+                "raise mesh.max_parts, or mesh.voxel for fewer.",
+            )
         )
     beyond, failed = mesh.get("parts_beyond_bound"), mesh.get("coacd_failed")
     if isinstance(beyond, int) and beyond > 0:
@@ -118,7 +137,7 @@ def mesh_section(report: dict[str, Any], limit: int | None = None) -> Section:
             "road’s slope", number(pick(mesh, "ground.route_slope_rms"), "{:.1%}"), "root mean square, along the route"
         ),
         Fact("parts stick out", number(mesh.get("max_protrusion_m"), "{:.2f} m"), "of the surface, at most"),
-        Fact("left out", number(mesh.get("parts_left_out"), "{}"), "parts beyond what mesh.max_parts allows"),
+        Fact("left out", number(left_out, "{}"), "parts beyond what mesh.max_parts allows"),
     ]
     return Section(
         "mesh",
@@ -207,6 +226,7 @@ def review_section(report: dict[str, Any]) -> Section:
         facts,
         cautions,
         str(review.get("not_applicable") or ""),
+        follower_verdict(report),
     )
 
 
@@ -222,14 +242,40 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], Section]] = {
 """Stage name → its section, in the order of the page."""
 
 
-def general_cautions(report: dict[str, Any]) -> list[Caution]:
-    """Warnings that belong to the whole build."""
-    peak = pick(report, "peak_memory_bytes")
+def costs_section(report: dict[str, Any]) -> Section:
+    """What the whole build cost; not a stage."""
+    peak, cautions = pick(report, "peak_memory_bytes"), []
     if isinstance(peak, int | float) and peak / 2**30 > _LARGE_MEMORY:
-        return [
+        cautions.append(
             Caution(
                 f"The build needed {peak / 2**30:.1f} GiB of memory.",
                 "for a smaller machine lower capture.max_size or nerf.rays, or raise mesh.voxel.",
             )
-        ]
-    return []
+        )
+    return Section(
+        "costs",
+        "Costs and origins",
+        "Where the time went, and everything needed to build the same twin again.",
+        cautions=cautions,
+    )
+
+
+def sections(report: dict[str, Any]) -> list[Section]:
+    """Everything the report says, in the order of the page."""
+    beside = (seen_section, truth_section, costs_section)
+    return [make(report) for make in (*SECTIONS.values(), *beside)]
+
+
+def summed_up(report: dict[str, Any]) -> list[Section]:
+    """The sections that have a headline: the drive first, as it is what the twin is for, then in the page's order."""
+    told = [section for section in sections(report) if section.headline]
+    return sorted(told, key=lambda section: section.name != "review")
+
+
+def cautions(report: dict[str, Any]) -> list[dict[str, str]]:
+    """Every caution of every section as in `report.json`: section, title, what, cure."""
+    return [
+        {"section": section.name, "title": section.title, "what": caution.what, "cure": caution.cure}
+        for section in sections(report)
+        for caution in section.cautions
+    ]

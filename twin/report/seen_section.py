@@ -8,7 +8,7 @@ from matplotlib import colormaps
 from twin.report.panels import GROUND, SUNKEN, Picture, depth_colours, fit
 from twin.report.rows import panel, scale_bar, under
 from twin.report.seen_touched import LARGE, REACH, Looks
-from twin.report.words import Caution, Fact, Section, number, pick
+from twin.report.words import Caution, Fact, Section, Verdict, number, pick
 
 _FEW_FOLLOW = 0.05  # [m] median gap from which on it is worth a caution
 _MOST_GAP = 0.3  # [m] at the ends of the gap's colours
@@ -30,9 +30,9 @@ def seen_section(report: dict[str, Any]) -> Section:
         ("corridor_ghost_m", "largest ghost in the corridor", "{:.3f} m", "solid, but seen through"),
         (
             "unfilmed_ghost_m",
-            "the same where no frame looked",
+            "the same, filmed from one place",
             "{:.3f} m",
-            "ground the film began behind of; not above",
+            "where no film shows the corridor from two places; not in the line above",
         ),
         ("standing_median_m", "what stands, to the nearest solid", "{:.3f} m", "median"),
         ("leak_share", "seen far from anything solid", "{:.1%}", f"of what stands, by more than {LARGE:g} m"),
@@ -48,13 +48,14 @@ def seen_section(report: dict[str, Any]) -> Section:
         (
             "unfilmed_ghost_m",
             LARGE,
-            "The robot looks at ground in the corridor that is in no frame, and sees through it",
+            "The robot sees through something solid in the corridor that no film shows from two places; the field’s "
+            "depth there is not determined and may differ from build to build",
             "begin the drive a little further on, or begin to film a little earlier.",
         ),
     ):
         value = found.get(key)
         if isinstance(value, int | float) and value > limit:
-            cautions.append(Caution(f"{what}: {number(value, '{:.2f} m')}, more than {limit:g} m.", cure))
+            cautions.append(Caution(f"{what}: {number(value, '{:.3f} m')}, more than {limit:g} m.", cure))
     return Section(
         name,
         title,
@@ -62,7 +63,15 @@ def seen_section(report: dict[str, Any]) -> Section:
         "along the drive by the robot’s camera and compared, pixel by pixel.",
         facts,
         cautions,
+        verdict=_verdict(found),
     )
+
+
+def _verdict(found: dict[str, Any]) -> Verdict | None:
+    apart = found.get("median_m")
+    if not isinstance(apart, int | float):
+        return None
+    return Verdict(f"What the robot sees is {100 * apart:.1f} cm from what it touches, in the median.", "good")
 
 
 def seen_row(looks: Looks, k: int) -> Picture:

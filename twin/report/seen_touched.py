@@ -4,8 +4,11 @@ Both are looked at by the robot's front camera along its drive. *Gap*: z-depth o
 ray less that of the field. A *leak* is seen but not solid, a *ghost* solid but not seen. On ground that is looked at
 from half a metre above, a centimetre of height is decimetres along the ray; so the size of a leak or ghost is measured
 across: in the corridor by how far above the solid ground something is seen, or below it; elsewhere by the distance of
-what is seen from the nearest solid surface, and the other way round. What no film showed has no field to compare with;
-ghosts there are counted apart.
+what is seen from the nearest solid surface, and the other way round.
+
+Only a film that shows a place from two directions determines its depth, as frames are matched within a film. Elsewhere
+(above all just ahead of the first frame of a drive, which one frame per film shows) the field's depth is not determined
+and may differ from build to build; ghosts there are counted apart, as `unfilmed_ghost_m`.
 """
 
 from dataclasses import dataclass
@@ -35,6 +38,7 @@ _CELL = 0.05  # [m] what is seen is thinned to one point per cell
 _STANDING = 0.2  # [m] above the ground from where on something stands
 _ROUTE_STEP = 0.05  # [m]
 _BIN = 1.0  # [m] of the route, for the figure
+_PARALLAX = 1.0  # [°] between the directions from which a film shows a point, for its depth to be determined
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,7 @@ def compare(looks: Looks, world: World, cameras: Cameras, ground: Ground, parts:
     Args:
         looks: Of both.
         world: Route and corridor.
-        cameras: The filmed frames.
+        cameras: The filmed frames; those held out taught the field nothing and do not count as filmed.
         ground: Whose height field is touched.
         parts: The convex parts.
 
@@ -121,7 +125,8 @@ def compare(looks: Looks, world: World, cameras: Cameras, ground: Ground, parts:
         `standing_median_m` (what is seen standing, to the nearest solid surface), `leak_share`, `ghost_share` (of what
         is seen below the greatest height, further than `LARGE` from anything solid; of what is hit of the parts, as
         far from anything seen), `corridor_leak_m`, `corridor_ghost_m` (the largest), `unfilmed_ghost_m` (the largest
-        where the ground in the corridor is in no frame), and `along`, the largest by metre of the route.
+        where no film shows the corridor from two directions), and `along`, the largest by metre of the route. Every
+        ghost in the corridor is in one of the two.
     """
     seen, solid = looks.points(looks.seen, world.intrinsics), looks.points(looks.solid, world.intrinsics)
     height = np.where(looks.seen < FAR, seen[..., 2] - ground.at(seen[..., :2]), np.inf)
@@ -143,7 +148,7 @@ def compare(looks: Looks, world: World, cameras: Cameras, ground: Ground, parts:
     # Of the ground how far below it something is seen, of a part how far behind it.
     sunken = np.where(np.isfinite(height), -np.minimum(height, 0.0), FAR)
     behind = np.where(looks.seen > looks.solid, np.where(looks.is_ground, sunken, gap), 0.0)
-    filmed = _filmed(cameras, solid, hit)
+    filmed = _depth_determined(cameras, solid, hit)
     leaks, ghosts = np.where(inside, height, 0.0), np.where(hit & filmed, behind, 0.0)
     out["corridor_leak_m"], out["corridor_ghost_m"] = float(max(leaks.max(), 0.0)), float(ghosts.max())
     out["unfilmed_ghost_m"] = float(np.where(hit & ~filmed, behind, 0.0).max())
@@ -182,14 +187,26 @@ def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple
     return station, inside
 
 
-def _filmed(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which points (..., 3) of those `among` are within the picture of some frame."""
+def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which points (..., 3) of those `among` two training frames of one film show from `_PARALLAX` apart or more.
+
+    What hides a point from a frame is not considered, nor are masks.
+    """
     mine = points[among]
     found = np.zeros(len(mine), bool)
-    for pose, intrinsics, size in zip(cameras.camera_to_world, cameras.intrinsics, cameras.sizes, strict=True):
-        left = np.flatnonzero(~found)
-        pixels, depth = project(mine[left], pose, intrinsics)
-        found[left] = (depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= size).all(1)
+    films, trained = np.array(cameras.sources), ~np.asarray(cameras.held_out, bool)
+    for film in dict.fromkeys(cameras.sources):
+        first = np.full((len(mine), 3), np.nan)  # the direction from which the film shows a point first
+        for i in np.flatnonzero((films == film) & trained):
+            left = np.flatnonzero(~found)
+            pixels, depth = project(mine[left], cameras.camera_to_world[i], cameras.intrinsics[i])
+            shown = left[(depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= cameras.sizes[i]).all(1)]
+            ray = cameras.positions[i] - mine[shown]
+            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            # By chords, as the arc cosine of nearly equal directions is imprecise. NaN (not shown before) is not apart.
+            found[shown] = np.linalg.norm(ray - first[shown], axis=1) >= 2.0 * np.sin(np.radians(_PARALLAX) / 2.0)
+            new = np.isnan(first[shown, 0])
+            first[shown[new]] = ray[new]
     out = np.zeros(among.shape, bool)
     out[among] = found
     return out

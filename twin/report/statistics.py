@@ -73,6 +73,32 @@ def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     return mean, float(low), float(high)
 
 
+def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
+    """Mean of the rates of k days, each counting alike, and its interval with the day as the unit.
+
+    Trials of one day share its light and weather and tend to end alike. The interval allows them to agree entirely:
+    with an intra-class correlation of 1 the design effect 1 + (m − 1) ρ equals the m trials of a day (Kish, Survey
+    Sampling, 1965, section 5.4), so k days count as k trials, and the interval is Wilson's for these. Rates between
+    0 and 1 have less variance than successes and failures of the same mean, so it errs to the wide side. It is about
+    further days for the same policies, not about further policies.
+
+    Args:
+        rates: In [0, 1], one per day, shape (k,). A day's rate is the mean over all its trials, of all policies.
+        confidence: Of the interval.
+
+    Returns:
+        Mean, lower and upper end.
+
+    Raises:
+        ValueError: no day, or a rate outside [0, 1].
+    """
+    days = np.asarray(rates, float)
+    if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
+        raise ValueError(f"rates of shape {days.shape}: expected one in [0, 1] per day, (k,), k ≥ 1")
+    low, high = wilson(days.sum(), len(days), confidence)
+    return float(days.mean()), float(low), float(high)
+
+
 def rate_difference(
     *,
     twin_successes: ArrayLike,

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.files import write_bytes
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import read_image
 from twin.nerf.rendering import Field, Rendering
@@ -102,7 +103,7 @@ class Studio:
             raise OSError(f"could not encode picture {name}")
         path = self.out / "pictures" / f"{name}.jpg"
         path.parent.mkdir(exist_ok=True)
-        path.write_bytes(data.tobytes())
+        write_bytes(path, data.tobytes())
         self.kept.append(KeptPicture(f"pictures/{name}.jpg", section, caption))
 
 

@@ -1,6 +1,7 @@
 """Success along a training, from its `episodes.csv`: the curve, and what a policy did that was saved on the way."""
 
 import csv
+import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,12 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.errors import InputError
+from twin.files import damaged, digest_file, read_json, read_text, regular
 from twin.report.statistics import wilson
 from twin.report.trials import RECENT
 from twin.report.validation import share
-from twin.scene import SceneDir, digest_file, read_json
+from twin.scene import SceneDir
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -36,34 +39,54 @@ def trainings(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
         (`share`) over the `RECENT` episodes before that step.
     """
     noted = SceneDir(root).validation / "validated.json"
-    digests = read_json(noted)["policies"] if noted.exists() else {}
+    digests: dict[str, Any] = {}
+    if noted.exists():
+        with damaged(noted, f"move {noted.parent} away and validate anew"):
+            digests = dict(read_json(noted)["policies"])
     out = {}
     for policy in policies:
         run, _, checkpoint = policy.partition("/")
         folder = root / "runs" / run
         head = (folder / "checkpoints" / checkpoint if checkpoint else folder) / "policy.json"
-        if not (head.exists() and (folder / "episodes.csv").exists()) or digest_file(head) != digests.get(policy):
+        if not (_is_there(head) and _is_there(folder / "episodes.csv")) or digest_file(head) != digests.get(policy):
             continue
-        trained = read_json(head).get("trained", {})
-        if "step" not in trained:
-            continue
+        with damaged(head, "copy the whole run again"):
+            trained = dict(read_json(head).get("trained", {}))
+            if "step" not in trained:
+                continue
+            at = float(trained["step"])
         steps, success = read_episodes(folder)
-        won = success[steps <= trained["step"]][-RECENT:]
+        won = success[steps <= at][-RECENT:]
         told = {key: trained.get(key, "") for key in ("step", "task", "observe", "lighting")}
         out[policy] = {"run": run, **told, **share(int(won.sum()), len(won))}
     return out
+
+
+def _is_there(path: Path) -> bool:
+    """Whether there is such a file; False for a name that no file can have, as a table may have any."""
+    try:
+        return bool(regular(path))
+    except InputError:
+        return False
 
 
 def read_episodes(folder: Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Of a run: the steps at which episodes ended, ascending, and success, 0 or 1; both of shape (n,).
 
     Episodes that started on the way are left out, as they are easier.
+
+    Raises:
+        InputError: no such file, or not one that a training wrote.
     """
-    with (folder / "episodes.csv").open(newline="", encoding="utf-8") as file:
+    path = folder / "episodes.csv"
+    text = read_text(path)
+    with damaged(path, "cut its last lines off, or train anew under another name"):
         # Runs of before have no such column: all their episodes were whole.
-        whole = [row for row in csv.DictReader(file) if float(row.get("start_m") or 0.0) == 0.0]
-    rows = [(int(row["step"]), int(row["success"])) for row in whole]
-    steps, success = np.array(rows, np.int64).reshape(-1, 2).T
+        whole = [row for row in csv.DictReader(io.StringIO(text)) if float(row.get("start_m") or 0.0) == 0.0]
+        rows = [(int(row["step"]), int(row["success"])) for row in whole]
+        steps, success = np.array(rows, np.int64).reshape(-1, 2).T
+        if (np.diff(steps) < 0).any() or not np.isin(success, (0, 1)).all():
+            raise ValueError("steps that go back, or success that is neither 0 nor 1")
     return steps, success
 
 
@@ -110,7 +133,8 @@ def success_curve(folder: Path) -> Path:
     if len(steps):
         draw_curve(axes, steps, success, "#1f77b4")
     if (folder / CHOICE).exists():
-        _draw_choice(axes, read_json(folder / CHOICE))
+        with damaged(folder / CHOICE, "delete it, and the best policy is chosen again"):
+            _draw_choice(axes, read_json(folder / CHOICE))
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     axes.set(xlabel="steps of all worlds", ylabel="success in training", ylim=(-0.04, 1.04), xlim=(0, None))

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from twin.env.options import CAUSES
 from twin.errors import InputError
+from twin.files import read_text
 from twin.report.statistics import wilson
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
@@ -32,6 +33,7 @@ OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting")
 RECENT = 20
 """Whole episodes that a success rate in training is taken over; a training on a CPU has some 40."""
 
+_MOST_COUNT, _MOST_SEED = 10**6, 2**63 - 1  # of trials and steps in a cell; of a seed
 _VALIDATE = "python -m twin.validate"
 
 
@@ -215,10 +217,7 @@ def nearest(name: str, valid: Sequence[str]) -> str:
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
     """Where each row stands, and its fields by column name."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None
+    text = read_text(path)
     reader = csv.reader(io.StringIO(text))
     wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
     try:
@@ -253,8 +252,11 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
 
 def _whole(where: str, row: dict[str, str], name: str) -> int:
     text = row[name]
+    most = _MOST_SEED if name == "seed" else _MOST_COUNT
     if not (text.isascii() and text.isdecimal()):
         raise InputError(f"{where}: {name} = {text!r}; expected a whole number, 0 or more")
+    if len(text) > len(str(most)) or int(text) > most:
+        raise InputError(f"{where}: {name} = {text!r}; expected at most {most:,}")
     return int(text)
 
 

@@ -13,9 +13,10 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.files import write_text
 from twin.report import validation_figures as draw
 from twin.report.figures import svg
-from twin.report.markup import LONG, Html, caution, data_url, document, element, folded, join, picture, table
+from twin.report.markup import LONG, Html, caution, data_url, document, element, folded, headline, join, picture, table
 from twin.report.trials import RECENT
 from twin.report.validation_words import (
     FAILURES,
@@ -31,7 +32,7 @@ from twin.report.validation_words import (
     why,
 )
 from twin.report.words import listing
-from twin.scene import SceneDir, write_text
+from twin.scene import SceneDir
 
 _STYLE = """.whole, td code { white-space:nowrap }
 th, td { overflow-wrap:normal }
@@ -97,7 +98,7 @@ def _header(scene: str, said: dict[str, Any]) -> Html:
         "header",
         element("h1", f"{scene}: validation"),
         element("p", told, class_="kicker"),
-        element("ul", *(element("li", v.text, class_=v.mood) for v in verdicts(said)), class_="verdicts"),
+        element("ul", *map(headline, verdicts(said)), class_="verdicts"),
         class_="top",
     )
 

@@ -3,10 +3,13 @@
 A *verdict* is a sentence that a newcomer understands, with a mood: good, mixed, bad or plain. A *fact* is a number with
 its unit and what it means. A *caution* names what is wrong and its *cure*. Whatever a stage did not report is "not
 measured"; nothing is made up.
+
+A section has a verdict and cautions; `Section.headline` is the verdict, at best mixed where there is a caution. Every
+summary is made of headlines and cautions of sections, so no summary is better than what it sums up.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 NOT_MEASURED = "not measured"
@@ -17,12 +20,19 @@ LARGE_SCALE_UNCERTAINTY = 0.03  # relative
 LOW_PSNR = 18.0  # [dB]
 LARGE_PATH_ERROR = 0.08  # [m]
 
+MOOD_WORDS = {"good": "good", "mixed": "caution", "bad": "bad", "plain": ""}
+
 
 @dataclass(frozen=True)
 class Verdict:
     text: str
     mood: str = "plain"
     """good, mixed, bad or plain."""
+
+    @property
+    def word(self) -> str:
+        """The mood for those who do not see its colour; empty where it is plain."""
+        return MOOD_WORDS[self.mood]
 
 
 @dataclass(frozen=True)
@@ -40,10 +50,10 @@ class Caution:
 
 @dataclass(frozen=True)
 class Section:
-    """One stage in the report."""
+    """One stage in the report, or what is told beside the stages."""
 
     name: str
-    """Stage name, as in `report.json`."""
+    """Stage name, as in `report.json`; or "seen_touched", "truth", "costs"."""
     title: str
     done: str
     """What the stage did, for somebody who sees twin for the first time."""
@@ -51,6 +61,17 @@ class Section:
     cautions: list[Caution] = field(default_factory=list)
     not_applicable: str = ""
     """Why there is nothing to show; empty where there is."""
+    verdict: Verdict | None = None
+    """The section in one sentence; None where nothing was measured."""
+
+    @property
+    def headline(self) -> Verdict | None:
+        """The verdict, or else the title where there are cautions. With cautions its mood is mixed, or bad."""
+        if not self.cautions:
+            return self.verdict
+        if self.verdict is None:
+            return Verdict(f"{self.title}.", "mixed")
+        return self.verdict if self.verdict.mood == "bad" else replace(self.verdict, mood="mixed")
 
 
 def pick(report: Any, path: str) -> Any:
@@ -145,44 +166,3 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
     gone = number(follower.get("distance_m"), "it came {:.1f} m far")
     gone = "" if gone == NOT_MEASURED else f"{gone} and "
     return Verdict(f"The Husky did not reach the end of the {length}route: {gone}{contact}.", "bad")
-
-
-def verdicts(report: dict[str, Any]) -> list[Verdict]:
-    """The headlines, the most important first."""
-    out = [follower_verdict(report)]
-    registered, total = pick(report, "cameras.registered"), pick(report, "cameras.total")
-    if isinstance(registered, int) and isinstance(total, int) and total > 0:
-        share = registered / total
-        text = f"All {total} frames" if registered == total else f"{registered} of {total} frames ({share:.0%})"
-        out.append(Verdict(f"{text} were placed in space.", "good" if share >= ENOUGH_REGISTERED else "mixed"))
-    source = pick(report, "metric.scale_source")
-    if source is not None:
-        uncertainty = scale_uncertainty(report)
-        sure = "" if uncertainty is None else f", sure to about {uncertainty:.1%}"
-        good = uncertainty is None or uncertainty <= LARGE_SCALE_UNCERTAINTY
-        out.append(Verdict(f"Its metres come from {source_words(source)}{sure}.", "good" if good else "mixed"))
-    psnr = numbers(pick(report, "field.psnr"))
-    if psnr:
-        low, high = min(psnr.values()), max(psnr.values())
-        span = f"{low:.1f} dB" if round(low, 1) == round(high, 1) else f"{low:.1f} to {high:.1f} dB"
-        under = f"in {len(psnr)} lightings" if len(psnr) > 1 else f"in the lighting “{next(iter(psnr))}”"
-        out.append(
-            Verdict(
-                f"Views it had never seen were rendered {under} at {span} PSNR.",
-                "good" if low >= LOW_PSNR else "mixed",
-            )
-        )
-    true = truth_verdict(report)
-    return [*out, true] if true else out
-
-
-def truth_verdict(report: dict[str, Any]) -> Verdict | None:
-    """How true the twin is in one sentence, where that is known."""
-    truth = pick(report, "truth")
-    off, ground = pick(truth, "ate_m"), pick(truth, "ground_median_m")
-    if not isinstance(off, int | float):
-        return None
-    text = f"Against the known truth its cameras are {100 * off:.1f} cm off"
-    if isinstance(ground, int | float):
-        text += f", and its ground {100 * ground:.1f} cm"
-    return Verdict(f"{text}.", "good" if off <= LARGE_PATH_ERROR else "mixed")

@@ -1,0 +1,200 @@
+"""Hostile values, texts and bytes for `fuzz.py`, all drawn from a `random.Random`."""
+
+import copy
+import json
+from collections.abc import Sequence
+from random import Random
+from typing import Any
+
+DEEP = 100_000  # levels of nesting
+OUTSIDE = "../kept/notes.txt"  # of a case's folder: must stay as it is
+
+
+class Raw(str):
+    """A value that is written as it stands, valid or not."""
+
+
+_NUMBERS = (
+    *("0", "-0.0", "-1", "0.5", "1e400", "-1e400", "1e-400", "1e308", "-1e308", str(2**31), str(-(2**31)), str(2**63)),
+    *(str(2**64), "1" + "0" * 400, "9" * 5000, "-" + "9" * 5000, "1e-9", "3", "255", "65536"),
+)
+_JSON = (
+    *("NaN", "Infinity", "-Infinity", "null", "true", "false", "[]", "{}", "[[]]", "[1, 2, 3]", '"\\ud800"', "nul"),
+    *('{"a": 1}', "[null]", '"\\u0000"', '"\\ufeff"', "01", "1.", '"\t"', "'a'"),
+)
+_TOML = (
+    *("nan", "inf", "-inf", "true", "[]", "{}", "[[]]", "[1, 2, 3]", "1979-05-27T07:32:00Z", "07:32:00", "0xffff"),
+    *("{a = 1}", '[1, "a"]', "[nan]", "[inf, -inf]", "'a'", "bare", '"\\ud800"', "[{}]", "1_000", '"\\u0000"', ""),
+)
+_WORDS = (
+    *("", " ", ".", "..", "/", "~", "a/b", OUTSIDE, "../../../../etc/passwd", "/etc/passwd", "/dev/null", "a:b:c", "+"),
+    *("\x00", "a\x00b", "\ud800", "\udcff", "\ufeff", "\x07\x1b[31m", "a\nb", "a\r\nb", "\u202e", "é", "²", "∞", "'"),
+    *("nan", "inf", "-inf", "1e400", "-1", "0", "9" * 5000, "1" + "0" * 400, "x" * 300, "%s%n", "{}", "{0}", "<b>&"),
+    *("training", "held-out", "any", "+randomised", "day:night:nan", "day:night:2", "day", "true", "None", '"', "\\"),
+)
+_OBJECTS: tuple[Any, ...] = (
+    *(None, True, False, 0, -0.0, -1, 1, 2, 0.5, float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 2**31),
+    *(2**63, -(2**63), 10**400, 10**5000, (), [], {}, [[]], [None], (1, 2, 3), {"a": 1}, b"", b"\xff", 1j, object()),
+    *(int, range(3), {1, 2}, (float("nan"), 90), (0, 0), (2**31, 2**31), (-1, 8), ("a", "b"), [1e400, 8]),
+)
+
+
+def word(rng: Random) -> str:
+    """A hostile text, rarely of a megabyte."""
+    return "x" * 1_000_000 if rng.random() < 0.01 else rng.choice(_WORDS)
+
+
+def anything(rng: Random) -> Any:
+    """A hostile Python value."""
+    which = rng.random()
+    if which < 0.3:
+        return word(rng)
+    if which < 0.32:
+        return nested(500 if which < 0.31 else DEEP)
+    return rng.choice(_OBJECTS)
+
+
+def nested(levels: int) -> list[Any]:
+    """Lists in lists."""
+    out: list[Any] = []
+    for _ in range(levels):
+        out = [out]
+    return out
+
+
+def literal(rng: Random, toml: bool = False) -> Raw:
+    """A hostile value as JSON or TOML has it, or as neither has."""
+    which = rng.random()
+    if which < 0.35:
+        return Raw(rng.choice(_NUMBERS))
+    if which < 0.6:
+        return Raw(json.dumps(word(rng)))
+    if which < 0.94:
+        return Raw(rng.choice(_TOML if toml else _JSON))
+    levels = rng.choice((50, 900, 5000, DEEP))
+    equals = "=" if toml else ":"
+    key = "a" if toml else '"a"'
+    return Raw(
+        rng.choice(
+            (
+                "[" * levels,
+                "[" * levels + "]" * levels,
+                f"{{{key}{equals}" * levels,
+                f"{{{key}{equals}" * levels + "1" + "}" * levels,
+            )
+        )
+    )
+
+
+def spoiled(rng: Random, table: Any, toml: bool = False) -> Any:
+    """A copy of a tree of dicts and lists with one to three things in it changed."""
+    out = copy.deepcopy(table)
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        places = _places(out)
+        if not places:
+            return literal(rng, toml)
+        holder, key = rng.choice(places)
+        what = rng.random()
+        if what < 0.65:
+            holder[key] = literal(rng, toml)
+        elif what < 0.75:
+            del holder[key]
+        elif what < 0.85:
+            other, its = rng.choice(places)
+            if its in other if isinstance(other, dict) else its < len(other):
+                holder[key] = copy.deepcopy(other[its])
+        elif isinstance(holder, dict):
+            name = word(rng) if toml is False else rng.choice(("a.b", '""', '"\\u0000"', "frames", "x" * 300))
+            holder[name if what < 0.93 else key + "s"] = holder[key] if what < 0.93 else literal(rng, toml)
+        else:
+            holder.extend([holder[key]] * rng.choice((1, 3, 1000)))
+    return out
+
+
+def _places(tree: Any, most: int = 2000) -> list[tuple[Any, Any]]:
+    out: list[tuple[Any, Any]] = []
+    stack = [tree]
+    while stack and len(out) < most:
+        here = stack.pop()
+        keys: Sequence[Any] = list(here) if isinstance(here, dict) else range(len(here))
+        for key in keys:
+            out.append((here, key))
+            if isinstance(here[key], dict | list):
+                stack.append(here[key])
+    return out
+
+
+def json_text(tree: Any) -> str:
+    """A tree as JSON, with its `Raw` values as they stand."""
+    if isinstance(tree, Raw):
+        return str(tree)
+    if isinstance(tree, dict):
+        return "{" + ", ".join(f"{json.dumps(str(k))}: {json_text(v)}" for k, v in tree.items()) + "}"
+    if isinstance(tree, list | tuple):
+        return "[" + ", ".join(map(json_text, tree)) + "]"
+    return json.dumps(tree)
+
+
+def toml_text(table: dict[str, Any]) -> str:
+    """A tree as TOML, with its `Raw` values as they stand; tables within are inline."""
+    return "".join(f"{key} = {_toml(value)}\n" for key, value in table.items())
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, Raw):
+        return str(value)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value)
+
+
+def mangled_text(rng: Random, text: str) -> bytes:
+    """A text as bytes, as it is or changed as a text can be."""
+    what = rng.random()
+    if what < 0.6:
+        return text.encode("utf-8", "surrogatepass")
+    if what < 0.65:
+        return b"\xef\xbb\xbf" + text.encode("utf-8", "surrogatepass")
+    if what < 0.7:
+        return text.encode(rng.choice(("utf-16", "utf-32")), "surrogatepass")
+    if what < 0.85:
+        at = rng.randrange(len(text) + 1)
+        text = text[:at] + rng.choice(("\x00", "\x1b", "\n", '"', "[", "=", ",", "\ufeff", "\r", "ÿ")) + text[at:]
+        return text.encode("utf-8", "surrogatepass")
+    if what < 0.87:
+        return (rng.choice(("a." * DEEP + "a = 1\n", "[" + "a." * 5000 + "a]\n", "x" * 1_000_000)) + text).encode(
+            "utf-8", "surrogatepass"
+        )
+    return damaged(rng, text.encode("utf-8", "surrogatepass"))
+
+
+def damaged(rng: Random, data: bytes) -> bytes:
+    """Bytes cut, flipped, doubled, emptied or overwritten by extreme numbers."""
+    out = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 5))):
+        n = len(out)
+        what = rng.random()
+        near = rng.random() < 0.5  # headers are at the start
+        at = rng.randrange(min(n, 128) if near else n) if n else 0
+        if what < 0.35 and n:
+            out[at] ^= 1 << rng.randrange(8)
+        elif what < 0.5:
+            del out[at:]
+        elif what < 0.75 and n:
+            size = rng.choice((1, 2, 4, 8))
+            number = rng.choice((0, 1, 0x7F, 2**31 - 1, 2**31, 2**63 - 1, 2**64 - 1, rng.getrandbits(64)))
+            number %= 256**size
+            out[at : at + size] = number.to_bytes(size, rng.choice(("little", "big")))
+        elif what < 0.85:
+            out[at:at] = rng.randbytes(rng.choice((1, 4, 100)))
+        elif what < 0.93:
+            del out[at : at + rng.choice((1, 4, 100))]
+        elif what < 0.96:
+            out[at : at + 64] = bytes(len(out[at : at + 64]))
+        elif what < 0.98:
+            out += out[: 1 << 16]
+        else:
+            out = bytearray(rng.choice((b"", b"\x00", b"\x00" * 4096, rng.randbytes(300), bytes(data[:1]))))
+    return bytes(out)

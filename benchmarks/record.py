@@ -1,0 +1,145 @@
+"""The files in which benchmarks record their figures: none is replaced by one that has less.
+
+A record is a JSON object. What it *has* are the names of its nested objects' members, the items of lists of objects
+(runs, policies, rows), and the number of `trials` behind a rate; plain values may change. JSON has no NaN and no
+infinity: these become null.
+"""
+
+import argparse
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from twin.errors import InputError, refuse
+from twin.files import read_json, write_json
+
+_NAMES = ("id", "quantity", "task", "setup", "seed", "policy", "name")
+"""Members that identify an object of a list."""
+_LISTED = 4
+"""Missing entries that a refusal names."""
+
+
+def add_record_options(parser: argparse.ArgumentParser) -> None:
+    """Adds `--json` and `--replace-record`."""
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure here")
+    add_replace_option(parser)
+
+
+def add_replace_option(parser: argparse.ArgumentParser) -> None:
+    """Adds `--replace-record`."""
+    parser.add_argument(
+        "--replace-record", action="store_true", help="overwrite a record even with one that lacks some of its entries"
+    )
+
+
+def lost(old: Any, new: Any, where: str = "") -> list[str]:
+    """Names of the entries that a record has and another lacks.
+
+    Args:
+        old: A JSON value.
+        new: Another.
+        where: Name of the two.
+    """
+    if isinstance(old, dict):
+        if not isinstance(new, dict):
+            return [where or "all of it"]
+        return [name for key in old for name in _lost_member(old, new, key, where)]
+    if isinstance(old, list):
+        mine, its = _labelled(old), _labelled(new if isinstance(new, list) else [])
+        return [
+            name
+            for label, item in mine.items()
+            for name in (lost(item, its[label], f"{where}[{label}]") if label in its else [f"{where}[{label}]"])
+        ]
+    return []
+
+
+def _lost_member(old: dict[str, Any], new: dict[str, Any], key: str, where: str) -> list[str]:
+    name, before, now = f"{where}.{key}".lstrip("."), old[key], new.get(key)
+    if key not in new or (now is None and before is not None):
+        return [name]
+    if key == "trials" and isinstance(before, int) and isinstance(now, int) and now < before:
+        return [f"{name} ({now} instead of {before})"]
+    return lost(before, now, name)
+
+
+def _labelled(items: list[Any]) -> dict[str, Any]:
+    """The objects of a list by what identifies them; those that share it are counted. Other items have no label."""
+    out, count = {}, Counter[str]()
+    for item in items:
+        if isinstance(item, dict):
+            label = " ".join(str(item[key]) for key in _NAMES if key in item)
+            count[label] += 1
+            out[label if count[label] == 1 else f"{label} #{count[label]}"] = item
+    return out
+
+
+def write_so_far(path: Path, record: dict[str, Any]) -> None:
+    """Writes what a long run has so far to `<path>.partial`; `write_record` removes it."""
+    write_json(_partial(path), _finite(record))
+
+
+def write_record(path: Path, record: dict[str, Any], replace: bool = False) -> None:
+    """Writes a record.
+
+    Args:
+        path: Its file.
+        record: What to write.
+        replace: Whether a record that has more may be overwritten.
+
+    Raises:
+        InputError: the file has entries that the new record lacks, or is no record. It is left alone then, and the
+            new record is in `<path>.partial`.
+    """
+    if not replace and path.exists():
+        wrong = _objection(path, record)
+        if wrong:
+            write_so_far(path, record)
+            raise InputError(
+                f"{path} {wrong}; it is kept and the new figures are in {_partial(path)}: "
+                "give another file, or --replace-record"
+            )
+    write_json(path, _finite(record))
+    _partial(path).unlink(missing_ok=True)
+
+
+def _objection(path: Path, record: dict[str, Any]) -> str:
+    """What is against overwriting a file; empty: nothing."""
+    try:
+        old = read_json(path)
+    except InputError:
+        return "is no record of figures"
+    gone = lost(old, _finite(record))
+    if not gone:
+        return ""
+    more = f" and {len(gone) - _LISTED} more" if len(gone) > _LISTED else ""
+    return f"has entries that the new record lacks ({', '.join(gone[:_LISTED])}{more})"
+
+
+def save(path: Path | None, record: dict[str, Any], replace: bool = False) -> int:
+    """`write_record` for the end of a script: returns its exit status, 0, or 2 with one line on standard error.
+
+    Args:
+        path: None: nothing is written.
+        record: As `write_record` takes it.
+        replace: As `write_record` takes it.
+    """
+    try:
+        if path:
+            write_record(path, record, replace)
+    except (InputError, OSError) as error:
+        return refuse(error)
+    return 0
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f"{path.name}.partial")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

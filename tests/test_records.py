@@ -1,0 +1,256 @@
+"""Benchmarks' records do not shrink, and what Table 1 says of its record follows from it."""
+
+import copy
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.errors import InputError
+from twin.report.statistics import rate_over_days, wilson
+
+ROOT = Path(__file__).parents[1]
+TABLE1 = ROOT / "benchmarks" / "table1"
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.syspath_prepend(str(TABLE1))
+
+
+@pytest.fixture
+def results() -> dict:
+    return json.loads((TABLE1 / "results.json").read_text(encoding="utf-8"))
+
+
+# ---- records
+
+
+def test_a_record_that_has_more_is_kept(scripts, tmp_path):
+    from record import write_record
+
+    file = tmp_path / "figures.json"
+    full = {"a": 1.0, "rows": [{"id": "B5", "value": 1.0}, {"id": "B5", "value": 2.0}, {"id": "C1", "value": 3.0}]}
+    write_record(file, full)
+    write_record(file, full | {"a": 2.0, "b": 3.0})  # other values and more of them
+    kept = file.read_bytes()
+    assert json.loads(kept)["a"] == 2.0
+    fewer = copy.deepcopy(full) | {"b": 3.0}
+    fewer["rows"].pop(1)
+    for less, name in (({"a": 1.0, "b": 3.0}, "rows"), (fewer, "rows[B5 #2]"), (full, "b")):
+        with pytest.raises(InputError) as refused:
+            write_record(file, less)
+        assert f"({name})" in str(refused.value) and "--replace-record" in str(refused.value)
+        assert file.read_bytes() == kept
+        assert json.loads((tmp_path / "figures.json.partial").read_text()) == less  # an hour's run is not lost
+    write_record(file, {"b": 3.0}, replace=True)
+    assert json.loads(file.read_text()) == {"b": 3.0} and [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+def test_fewer_trials_and_figures_that_became_none_are_less(scripts):
+    from record import lost
+
+    old = {"policies": [{"policy": "p", "real": {"trials": 10, "successes": 3}}], "mmrv": 0.1}
+    assert lost(old, copy.deepcopy(old)) == []
+    assert lost(old, {"policies": [{"policy": "p", "real": {"trials": 20, "successes": 3}}], "mmrv": 0.0}) == []
+    new = {"policies": [{"policy": "p", "real": {"trials": 5, "successes": 3}}], "mmrv": None}
+    assert lost(old, new) == ["policies[p].real.trials (5 instead of 10)", "mmrv"]
+    assert lost(old, {"policies": [], "mmrv": 0.1}) == ["policies[p]"]
+    assert lost(old, []) == ["all of it"]
+
+
+def test_what_is_no_record_is_kept_and_a_run_s_figures_need_not_be_finite(scripts, tmp_path, capsys):
+    from record import save, write_so_far
+
+    file = tmp_path / "notes.json"
+    file.write_text("my notes")
+    assert save(file, {"a": 1.0}) == 2
+    said = capsys.readouterr().err
+    assert "is no record of figures" in said and said.count("\n") == 1 and file.read_text() == "my notes"
+    other = tmp_path / "other.json"
+    write_so_far(other, {"a": 1.0})
+    assert not other.exists()
+    assert save(other, {"a": float("nan"), "b": [float("inf")]}) == 0
+    assert json.loads(other.read_text()) == {"a": None, "b": [None]}
+    assert save(None, {}) == 0
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess:
+    command = [sys.executable, *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+
+def test_table_1_without_runs_leaves_its_record_alone(tmp_path, results):
+    record, scene = tmp_path / "results.json", tmp_path / "scene"
+    record.write_bytes((TABLE1 / "results.json").read_bytes())
+    scene.mkdir()
+    done = run(TABLE1, scene, "--steps", "--results", record)
+    assert done.returncode == 2 and done.stdout == ""
+    said = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(said) == 1 and "runs[straight simulator 0]" in said[0] and "--replace-record" in said[0]
+    assert json.loads(record.read_text()) == results
+    assert run(TABLE1, scene, "--steps", "--results", record, "--replace-record").returncode == 0
+    assert json.loads(record.read_text())["runs"] == []
+
+
+def test_a_benchmark_that_measured_less_is_refused(tmp_path):
+    file = tmp_path / "husky.json"
+    script = ROOT / "benchmarks" / "husky.py"
+    assert run(script, "--only", "A1", "B5", "--json", file).returncode == 0
+    kept = file.read_bytes()
+    done = run(script, "--only", "A1", "--json", file)
+    assert done.returncode == 2 and "rows[B5" in done.stderr and file.read_bytes() == kept
+
+
+# ---- Table 1's scores
+
+
+def test_what_no_choice_had_seen_comes_first_and_is_what_the_docs_say(scripts, results):
+    import scores
+
+    (first, unseen), *_ = scores.GROUPS.items()
+    assert unseen == tuple(f"day_{k}" for k in range(6, 16)) and "no choice had seen" in first
+    policies = scores.judged(results)
+    twin, rule = (scores.scores(name, policies, unseen) for name in list(scores.PREDICTORS)[::2])
+    assert (round(twin.spearman, 2), round(twin.pearson, 2), round(twin.mmrv, 3)) == (0.78, 0.98, 0.084)
+    assert (round(rule.spearman, 2), round(rule.pearson, 2), round(rule.mmrv, 3)) == (0.77, 0.97, 0.143)
+    everything = list(scores.GROUPS.values())[-1]
+    assert len(everything) == 20
+    assert scores.scores("rule that never looks at the twin", policies, everything).cells == pytest.approx(694 / 720)
+    full = scores.scores("twin, by a photo of each day", policies, everything)
+    told = results["forecast_by_photo"]["all tasks"]  # as twin.forecast computed it
+    for name in ("spearman", "pearson", "mmrv"):
+        assert getattr(full, name) == pytest.approx(told[name]["value"])
+    assert full.cells == pytest.approx(told["coverage"]["value"])
+    assert full.regret == pytest.approx(told["winner_regret"]["value"])
+    assert full.corrected == (31, 36) and told["corrected_coverage"]["value"] == pytest.approx(31 / 36)
+    drawn = list(scores.GROUPS.values())[1]
+    assert scores.finals(policies, "varied", "straight", drawn) == "1.00 [0.85, 1.00], 150/150"
+    assert scores.finals(policies, "varied", "right_turn", drawn) == "0.99 [0.84, 1.00], 149/150"
+    text = scores.tables(results)
+    assert text.index(first) < text.index("half of them seen during development")
+    docs = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8").split("## Table 1")[1]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert docs.index("days 6 to 15: twin, by a photo of each day** | **0.78** | **0.98** | **0.084**") < docs.index(
+        "0.92"
+    )
+    assert "Spearman of 0.78" in readme and "benchmarks/table1/scores.py" in readme
+
+
+def test_the_rule_does_not_look_at_the_twin(scripts, results):
+    import scores
+
+    policies = scores.judged(results)
+    assert {scores.rule(p) for p in policies} == {0.0, 1.0}
+    kinds = {(p.setup == "varied", p.trained >= 0.49): scores.rule(p) for p in policies}
+    assert kinds == {(True, True): 1.0, (True, False): 0.0, (False, True): 0.0, (False, False): 0.0}
+    for run_ in results["runs"]:
+        for policy in run_["policies"]:
+            for part in ("validate_by_photo", "validate_randomised"):
+                policy[part]["successes"] = policy[part]["trials"]
+                for cell in policy[part]["by_lighting"].values():
+                    cell["successes"] = cell["trials"]
+    days = next(iter(scores.GROUPS.values()))
+    blind, twin = "rule that never looks at the twin", "twin, by a photo of each day"
+    changed = scores.judged(results)
+    assert scores.scores(blind, changed, days) == scores.scores(blind, policies, days)
+    assert scores.scores(twin, changed, days).spearman is None  # all alike now
+
+
+def test_scores_of_too_few_policies_or_days_are_left_out(scripts, results):
+    import scores
+
+    policies = scores.judged(results)
+    assert scores.scores("twin, by a photo of each day", policies[:4], ("dawn",)) is None
+    assert scores.scores("twin, by a photo of each day", policies, ("dawn", "unknown")) is None
+    assert scores.over_days([]) == scores.over_days([{}]) == "–"
+    assert "–" in scores.tables({"runs": []})
+
+
+def test_table_1_s_real_rates_have_intervals_over_days(scripts, results):
+    from results import table
+
+    rows = [line for line in table(results).splitlines() if line.startswith("| ours | one_light")]
+    assert len(rows) == 1 and "0.05 [0.01, 0.20], 15/250" in rows[0]
+
+
+# ---- rates over days
+
+
+def test_trials_of_a_day_tell_no_more_than_the_day():
+    assert rate_over_days([1.0] * 20) == (1.0, pytest.approx(0.8808, abs=1e-4), 1.0)
+    mean, low, high = rate_over_days([1.0] + [0.0] * 19)
+    assert (mean, low, high) == pytest.approx((0.05, *wilson(1, 20)))
+    assert rate_over_days([0.5, 0.5]) == pytest.approx((0.5, *wilson(1, 2)))
+    for wrong in ([], [1.5], [float("nan")], [[0.5]]):
+        with pytest.raises(ValueError, match="one in"):
+            rate_over_days(wrong)
+
+
+def test_intervals_over_days_hold_where_a_day_s_trials_end_alike_and_those_over_trials_do_not():
+    rng = np.random.default_rng(0)
+    rate, days, trials = 0.7, 20, 10
+    by_day, by_trial = [], []
+    for _ in range(400):
+        won = rng.binomial(trials, np.where(rng.random(days) < rate, 1.0, 0.0))
+        _, low, high = rate_over_days(won / trials)
+        by_day.append(low <= rate <= high)
+        low, high = wilson(won.sum(), days * trials)
+        by_trial.append(bool(low <= rate <= high))
+    assert np.mean(by_day) > 0.86 and np.mean(by_trial) < 0.7
+
+
+# ---- the intervals of a forecast in worlds of this shape
+
+
+def test_an_experiment_is_drawn_from_the_record(scripts, results):
+    import intervals
+
+    record = intervals.recorded(TABLE1 / "results.json")
+    assert record.weight.shape == (36, 20) and [len(s) for s in record.strata] == [18, 18]
+    totals = [[p["real"]["successes"], p["real"]["trials"]] for r in results["runs"] for p in r["policies"]]
+    assert np.array_equal(np.stack([record.real_successes.sum(1), record.real_trials.sum(1)], 1), totals)
+    rng = np.random.default_rng(0)
+    one = intervals.again(rng, record, days_anew=False)
+    assert [s.tolist() for s in one.strata] == [list(range(18)), list(range(18, 36))]
+    assert (one.real_trials[:, 5:] == 5).all() and set(one.real_trials[:, :5].flat) == {5, 10}
+    assert (one.real_successes <= one.real_trials).all() and (one.twin_successes <= one.twin_trials).all()
+    assert (record.real_successes.sum(1) == 0).sum() == 15  # which never arrive in a repetition either
+    assert (one.real_successes.sum(1) == 0).sum() > 5
+    other = intervals.again(rng, record, days_anew=True)
+    of_finals = other.real_trials[other.real_trials.max(1) == 10]
+    assert (of_finals == of_finals[0]).all() and (of_finals[0, 5:] == 10).any()  # one draw of days for all policies
+    aims = intervals.aimed_at(lambda: record)
+    assert aims["Spearman"] == pytest.approx(results["forecast_by_photo"]["all tasks"]["spearman"]["value"])
+
+
+# ---- the alignment's lines
+
+
+def test_level_stands_beside_level_first(scripts):
+    spec = importlib.util.spec_from_file_location("benchmark_align", ROOT / "benchmarks" / "align.py")
+    align = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(align)
+
+    def held(position: float, yaw: float) -> dict:
+        return {"held_out": {"position_m": position, "yaw_deg": yaw}}
+
+    figures = {
+        "scores": {
+            "fitted": held(0.113, 4.58),
+            "icr_kinematics": held(0.178, 6.86),
+            "fitted_on_level_ground": held(0.140, 4.66),
+        }
+    }
+    first, second = align.against_kinematics(figures)
+    assert (
+        first.startswith("level ground") and "0.140 m against 0.178 m (21% better), 4.66° against 6.86° (32%)" in first
+    )
+    assert "0.113 m against 0.178 m (37% better)" in second

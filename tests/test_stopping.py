@@ -1,0 +1,221 @@
+"""However a verb is stopped: one line and 128 + n, nothing half-written, and no process outlives it.
+
+A verb runs in a process of its own. It is stopped as soon as it has started processes, which is when it has most to
+lose.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from test_damaged_input import _film, _noise
+from textured import filmed_corridor, picture, pose_at
+from tiny_runs import tiny_runs
+from tiny_twin import tiny_twin
+
+from twin import verb
+from twin.errors import InputError, refuse, shortened
+from twin.geometry.images import write_image
+from twin.nerf.appearance import initial_appearance
+from twin.nerf.field import untrained
+from twin.nerf.workspace import Layout
+from twin.stamp import seal
+
+_PATIENCE = 120.0  # [s] until a verb has started what it starts
+_WOULD_TAKE = {"validate": 900, "train": 100_000}  # episodes and steps; far more than a test waits for
+
+
+@dataclass(frozen=True)
+class Case:
+    """A verb that starts processes."""
+
+    arguments: tuple[str, ...]
+    child: str
+    """A word of its child's command line."""
+    children: int = 1
+
+
+def _corridor(root: Path) -> Path:
+    """A place that a photo can be registered in, with a field that knows two lightings."""
+    scene = filmed_corridor(root)
+    frames = tuple(f"day/{i:06d}" for i in range(4))
+    appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, 0)
+    layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
+    for stage in ("field", "mesh"):
+        scene.stage(stage).mkdir()
+    untrained(layout, appearance, 0, "cpu").save(scene.stage("field"))
+    for stage in ("capture", "cameras", "metric", "field", "mesh"):
+        seal(scene.stage(stage), stage)
+    return root
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory) -> dict[str, Case]:
+    """The verbs that start processes, each with a scene of its own."""
+    folder = tmp_path_factory.mktemp("stopping")
+    filmed = folder / "filmed"
+    (filmed / "input").mkdir(parents=True)
+    _film(filmed / "input" / "a.mp4", [_noise(i, (360, 640)) for i in range(60)])
+    (filmed / "scene.toml").write_text(
+        '[[source]]\npath = "input/a.mp4"\n[capture]\nfps = 10.0\nmin_motion = 0.0\n[metric]\ncamera_height = 1.2\n'
+    )
+    driven = tiny_twin(folder / "driven")
+    tiny_runs(driven)
+    corridor = _corridor(folder / "corridor")
+    write_image(corridor / "photo.png", picture(pose_at(2.4, 0.2), tint=(0.9, 0.6, 0.4)))
+    many, steps = str(_WOULD_TAKE["validate"]), str(_WOULD_TAKE["train"])
+    validate = ("--policy", "ahead", "--task", "ahead", "--lightings", "day", "--episodes", many, "--processes", "2")
+    train = ("--task", "ahead", "--lighting", "day", "--run", "new", "--steps", steps, "--processes", "2")
+    return {
+        "build": Case((str(filmed), "--until", "metric"), "twin.capture.worker"),
+        "train": Case((str(driven), *train), "twin.env.world_process", 2),
+        "validate": Case((str(driven), *validate), "multiprocessing.spawn", 2),
+        "relight": Case((str(corridor), str(corridor / "photo.png"), "--name", "new"), "twin.capture.worker"),
+    }
+
+
+def _started(name: str, case: Case) -> tuple[subprocess.Popen, list[psutil.Process]]:
+    """The verb, once it has started its processes, and all processes that it has started."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"twin.{name}", *case.arguments, "--quiet"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+    )
+    until = time.monotonic() + _PATIENCE
+    while time.monotonic() < until and process.poll() is None:
+        children = psutil.Process(process.pid).children(recursive=True)
+        named = [one for one in children if case.child in " ".join(_command(one))]
+        if len(named) >= case.children:
+            return process, children
+        time.sleep(0.01)
+    process.kill()
+    raise AssertionError((process.returncode, *process.communicate()))
+
+
+def _command(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
+
+
+def _left(children: list[psutil.Process]) -> list[psutil.Process]:
+    return psutil.wait_procs(children, timeout=5.0)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["build", "train", "validate", "relight"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGKILL])
+def test_nothing_outlives_a_verb(cases, name, number):
+    process, children = _started(name, cases[name])
+    time.sleep(1.5)  # GLFW asks for its version in a process of its own, which dm_control starts when it is imported
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as a terminal does
+    else:
+        process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert not _left(children)
+    if number == signal.SIGKILL:
+        return
+    lines = [line for line in said.splitlines(keepends=True) if not line.startswith("Warp CUDA warning")]
+    assert (process.returncode, lines) == (128 + number, ["stopped; run it again to go on\n"])
+    scene = Path(cases[name].arguments[0])
+    assert not [path for path in scene.rglob("*") if ".partial" in path.name or path.name.endswith(".lock")]
+
+
+def test_children_of_a_killed_decomposition_end(tmp_path):
+    """CoACD's children, started by threads of the mesh stage."""
+    script = f"""
+import trimesh, numpy as np
+from pathlib import Path
+from twin.assets import convex
+ball = trimesh.creation.icosphere(4)
+def piece(k):
+    bumps = 1.0 + 0.3 * np.sin(9.0 * ball.vertices + k).prod(1)
+    return convex.Piece.of(ball.vertices * bumps[:, None], ball.faces)
+convex._coacd([piece(k) for k in range(40)], 0.01, Path({str(tmp_path)!r}), 0)
+"""
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    children: list[psutil.Process] = []
+    until = time.monotonic() + _PATIENCE
+    while len(children) < 2 and process.poll() is None and time.monotonic() < until:
+        children = [c for c in psutil.Process(process.pid).children() if "twin.assets.convex" in _command(c)]
+        time.sleep(0.02)
+    assert len(children) == 2, process.communicate()
+    time.sleep(0.5)
+    process.kill()
+    process.wait()
+    assert not _left(children)
+
+
+def _runs(work, *arguments: str) -> int:
+    return verb.run(verb.Parser(prog="python -m twin.some"), lambda options: work(), list(arguments))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_signal_is_one_line_and_the_handlers_come_back(capfd, number):
+    before = signal.getsignal(number)
+    assert _runs(lambda: signal.raise_signal(number)) == 128 + number
+    assert capfd.readouterr().err == "stopped; run it again to go on\n"
+    assert signal.getsignal(number) is before
+
+
+def test_what_was_to_be_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert _runs(lambda: signal.raise_signal(signal.SIGHUP)) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_colmap_does_not_take_our_signals(tmp_path):
+    script = (
+        "import os, signal, twin.capture.formats, twin.capture.features;"
+        "from twin.verb import *;"
+        "raise SystemExit(run(Parser(), lambda o: os.kill(os.getpid(), signal.SIGTERM), []))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, "stopped; run it again to go on\n")
+
+
+def test_a_reader_that_goes_ends_a_verb_quietly(tmp_path):
+    script = "import sys; from twin.verb import *; sys.exit(run(Parser(), lambda o: print('x' * 10**6), []))"
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout and process.stderr
+    process.stdout.close()
+    assert process.wait() == 128 + signal.SIGPIPE and process.stderr.read() == b""
+
+
+def test_wrong_arguments_are_one_line(capsys):
+    with pytest.raises(SystemExit) as ended:
+        _runs(lambda: None, "--nonsense", "x" * 1000)
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: unrecognized arguments: --nonsense") and said.count("\n") == 1 and len(said) < 500
+
+
+@pytest.mark.parametrize(
+    "value", ["x" * 10**6, "1" * 10**4, list(range(10**5)), "a'b" * 1000, "\x1b[31m\n" * 10**4, "ab " * 10**4]
+)
+def test_a_refusal_repeats_eighty_characters_of_a_value(capsys, value):
+    refuse(InputError(f"scene.toml: key = {value!r}; expected a number"))
+    said = capsys.readouterr().err
+    assert said.startswith("error: scene.toml: key = ") and said.endswith("; expected a number\n")
+    assert said.count("\n") == 1 and "\x1b" not in said and len(said) < 1600
+    if isinstance(value, str) and "'" not in value:
+        assert len(said) < 150
+
+
+def test_ordinary_messages_are_not_cut():
+    said = "the photos' focal lengths differ by more than one lens that is not zoomed shows, as the robot's do"
+    assert shortened(said) == said
