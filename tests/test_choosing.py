@@ -94,6 +94,7 @@ def test_a_training_that_begins_anew_keeps_nothing_of_the_one_before(scene, run,
     copy = shutil.copytree(run, tmp_path / "run")
     choosing.choose(scene, copy, CONFIG)
     shutil.rmtree(copy / "state")
+    (copy / "state").mkdir()
     train(scene, copy, replace(CONFIG, steps=80))
     assert not (copy / CHOICE).exists()
     assert max(int(path.name) for path in (copy / "checkpoints").iterdir()) == 80

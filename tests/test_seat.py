@@ -318,7 +318,7 @@ def test_what_cannot_be_used_is_refused_in_a_line(place, film, registered, tmp_p
     bare = tmp_path / "bare"
     bare.mkdir()
     (bare / "scene.toml").write_text(place.config_file.read_text())
-    assert "is not built; run python -m twin.build" in refused(str(bare), str(film))
+    assert "has no 2_metric yet; run python -m twin.build" in refused(str(bare), str(film))
     assert [path.name for path in bare.iterdir()] == ["scene.toml"]
     bent = replace(registered, error=0.9)
     with monkeypatch.context() as patch:

@@ -44,7 +44,7 @@ class Twin:
         from twin.nerf.baked import BakedField
 
         field = BakedField.load(self._folder("field"), device)
-        field.add_lightings(*added_lightings(self.scene))
+        field.add_lightings(*added_lightings(self.scene, field.lightings_by_name.vectors.shape[1]))
         return field
 
     def radiance_field(self) -> RadianceField:
@@ -53,7 +53,7 @@ class Twin:
         from twin.nerf.field import RadianceField
 
         field = RadianceField.load(self._folder("field"))
-        fresh, stale, _ = added_lightings(self.scene)
+        fresh, stale, _ = added_lightings(self.scene, field.appearance.vectors.shape[1])
         field.add_lightings(fresh, stale)
         return field
 

@@ -282,7 +282,8 @@ def _check_same(
     noted: dict[str, Any] = {"roads": {}, "policies": {}}
     if path.exists():
         with damaged(path, f"move {folder} away to validate anew"):
-            noted |= {name: dict(value) for name, value in read_json(path).items()}
+            there = dict(read_json(path))
+            noted |= {name: dict(there[name]) for name in noted if name in there}
     tables = [folder / "episodes.csv", folder / "worst.csv"]
     trials = [trial for table in tables if table.exists() and _has_rows(table) for trial in read_trials(table)]
     driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}

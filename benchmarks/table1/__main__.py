@@ -27,10 +27,9 @@ from plan import EPISODES, LIGHTINGS, PHOTO_EPISODES, PHOTOS, SETUPS, STEPS, TAS
 from results import HELD_OUT_FORECAST, collect, table
 from scores import RESULTS, tables
 
+import twin
 from twin.config import RANDOMISED
-from twin.nerf.added import added_lightings
 from twin.reality.weather import WEATHER
-from twin.scene import SceneDir
 
 sys.path.append(str(Path(__file__).parents[1]))
 from record import add_replace_option, save
@@ -74,7 +73,7 @@ def validate(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
 def photos(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
     """Validates in the light of each day of the test, as a photo tells it."""
     for name in WEATHER:
-        if name not in added_lightings(SceneDir(scene))[0]:
+        if name not in twin.load_scene(scene).field().lightings:
             photo = scene / "photos" / f"{name}.png"
             verb("twin.reality", "photo", "--lighting", name, "--out", photo)
             verb("twin.relight", scene, photo, "--name", name)

@@ -60,10 +60,12 @@ def field_result(scene: SceneDir) -> str:
 
 
 def added_lightings(
-    scene: SceneDir,
+    scene: SceneDir, dim: int
 ) -> tuple[dict[str, NDArray[np.float32]], tuple[str, ...], dict[str, Air]]:
-    """Embeddings (dim,) by name of the lightings added to a scene's present field, the names of the stale ones, and
-    the air of each.
+    """The lightings added to a scene's present field, whose embeddings have the shape (dim,).
+
+    Returns:
+        Embeddings by name, the names of those that are stale, and the air of each.
 
     Raises:
         InputError: a file there is damaged or of another format.
@@ -85,7 +87,7 @@ def added_lightings(
             air = Air(float(head["air"]["extinction"]), (red, green, blue))
             if not (0.0 <= air.extinction < np.inf and all(0.0 <= share <= 1.0 for share in air.airlight)):
                 raise ValueError(f"air {air.extinction}, {air.airlight}")
-            if vector.ndim != 1 or not np.isfinite(vector).all():
+            if vector.ndim != 1 or not np.isfinite(vector).all() or (made_by == result and vector.shape != (dim,)):
                 raise ValueError(f"embedding of shape {vector.shape}, or not finite")
         if made_by == result:
             fresh[path.stem], airs[path.stem] = vector, air

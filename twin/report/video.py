@@ -18,6 +18,7 @@ from PIL import Image
 
 _BT709 = 1  # ITU-T H.273: matrix, primaries and transfer all number BT.709 as 1
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
+_THREADS = 4  # of x264, whose bytes depend on their number; left alone, it takes as many as the machine has cores free
 
 
 def even(size: int) -> int:
@@ -58,6 +59,7 @@ class VideoWriter:
         codec = self._stream.codec_context
         codec.colorspace = codec.color_primaries = codec.color_trc = _BT709
         codec.color_range = _LIMITED_RANGE
+        codec.thread_count = _THREADS
 
     def write(self, frame: NDArray[np.uint8], count: int = 1) -> None:
         """Appends a frame, shown for `count` frame times.
