@@ -244,7 +244,7 @@ def _killed_trainings(times: int, folder: Path, rng: np.random.Generator) -> dic
         "whole": good,
         "success": [round(float(rate), 3) for rate in rates],
         "rubbish": rubbish,
-        "ok": good and not rubbish and abs(rates[0] - rates[1]) <= noise,
+        "ok": bool(good and not rubbish and abs(rates[0] - rates[1]) <= noise),
     }
 
 

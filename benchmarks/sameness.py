@@ -1,0 +1,147 @@
+"""Whether this tree does what another commit did, bit for bit: for changes that move and rename, and change nothing else.
+
+    python benchmarks/sameness.py COMMIT [--work DIR]
+
+A tiny place is filmed and built by COMMIT. Both trees then open that build, drive the same episodes, train the same few
+steps, forecast from the same tables, and build field, mesh and scene again from the same cameras. Digests of what came
+out are compared; the exit status is 1 where one differs. Only public names are used, so that it outlives renames.
+Structure from motion is not compared, as it is not repeatable.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+_ROOT = Path(__file__).resolve().parents[1]
+_QUICK = ("nerf.steps=80", "nerf.rays=1024", "nerf.max_width=160", "nerf.bake_steps=20", "nerf.max_bricks=1200")
+_QUICK += ("mesh.voxel=0.2", "review.fps=3", "review.width=160")
+_STAGES = ("3_field", "4_mesh", "5_mjcf")
+_EPISODES = """
+import hashlib, itertools, json, sys
+import numpy as np
+import twin
+from twin.env.options import CameraOptions
+
+out = {}
+camera = CameraOptions(vibration=0.3, exposure=0.1, shutter=0.02)
+obstacles = {"none": 0, "drawn": 2, "scene": "scene"}
+lightings = sys.argv[2].split(",")
+settings = itertools.product(("route",), lightings, obstacles, (False, True), ("twist", "steering"))
+for k, (task, lighting, which, randomise, action) in enumerate(settings):
+    options = {"lighting": lighting, "obstacles": obstacles[which], "randomise": randomise, "action": action}
+    options |= {"camera": camera} if k % 2 else {}
+    options |= {"observe": "simulator"} if k % 7 == 6 else {}
+    environment = twin.load(sys.argv[1], task, seed=k, size=(64, 36), **options)
+    digest, rng = hashlib.sha256(), np.random.default_rng(k)
+    step = environment.reset()
+    for _ in range(6):
+        digest.update(np.ascontiguousarray(step.observation["pixels"]).tobytes())
+        digest.update(np.ascontiguousarray(environment.physics.data.qpos).tobytes())
+        digest.update(np.float64(step.reward or 0.0).tobytes())
+        if step.last():
+            break
+        spec = environment.action_spec()
+        step = environment.step(rng.uniform(spec.minimum, spec.maximum))
+    environment.close()
+    name = f"episode {task}, {lighting}, obstacles {which}, randomise {randomise}, {action}"
+    out[name] = digest.hexdigest()
+print(json.dumps(out))
+"""
+_TRAINING = """
+import sys
+from pathlib import Path
+import twin
+from twin.learn.training import TrainConfig, train
+
+small = TrainConfig(task="route", lighting="training", steps=96, worlds=4, starts=40, batch=16, buffer=400, updates=0.5,
+    convolutions=((8, 8, 8),), features=16, hidden=(16,), save_every=48, checkpoints=2)
+train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)
+"""
+
+
+class Tree:
+    """A source tree whose `twin` is run in processes of their own."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def python(self, *arguments: str | Path) -> str:
+        """Runs Python with this tree's `twin`; returns what it printed."""
+        done = subprocess.run(
+            [sys.executable, *map(str, arguments)],
+            cwd=self.root,
+            env={**os.environ, "PYTHONPATH": str(self.root), "CUDA_VISIBLE_DEVICES": ""},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        if done.returncode:
+            raise SystemExit(f"{self.root}: {' '.join(map(str, arguments))[:200]}: {done.stderr[-3000:]}")
+        return done.stdout
+
+    def build(self, scene: Path) -> None:
+        settings = [word for one in _QUICK for word in ("--set", one)]
+        self.python("-m", "twin.build", scene, "--quiet", *settings)
+
+    def digests(self, scene: Path, lightings: str, work: Path) -> dict[str, str]:
+        """Of everything that is compared; `scene` was built by either tree."""
+        out: dict[str, str] = json.loads(self.python("-c", _EPISODES, scene, lightings).splitlines()[-1])
+        again = work / "again"
+        shutil.copytree(scene, again, symlinks=True)
+        self.python("-c", _TRAINING, again, again / "runs" / "small")
+        for name in ("weights.safetensors", "policy.json"):
+            out[f"training, {name}"] = _digest(again / "runs" / "small" / name)
+        drive = ("--task", "route", "--lightings", "held-out", "--episodes", "2", "--quiet")
+        self.python("-m", "twin.validate", again, "--policy", "small", *drive)
+        out["validation, episodes.csv"] = _digest(again / "validation" / "episodes.csv")
+        for stage in _STAGES:
+            shutil.rmtree(again / "build" / stage)
+        self.build(again)
+        for stage in _STAGES:
+            for path in sorted((again / "build" / stage).rglob("*")):
+                if path.is_file() and path.name not in ("stamp.json", "report.json"):
+                    out[f"{stage}/{path.relative_to(again / 'build' / stage)}"] = _digest(path)
+        shutil.rmtree(again)
+        return out
+
+
+def _digest(path: Path) -> str:
+    import hashlib
+
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("commit", help="what is compared with")
+    parser.add_argument("--work", type=Path, help="folder to work in, kept (default: a temporary one)")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        work = (options.work or Path(temporary)).resolve()
+        old, scene = work / "before", work / "scene"
+        if not old.exists():
+            work.mkdir(parents=True, exist_ok=True)
+            archive = subprocess.run(["git", "archive", options.commit], cwd=_ROOT, check=True, stdout=subprocess.PIPE)
+            old.mkdir()
+            subprocess.run(["tar", "x", "-C", str(old)], input=archive.stdout, check=True)
+        before, after = Tree(old), Tree(_ROOT)
+        if not (scene / "build").exists():
+            before.python("-m", "twin.reality", "film", "--tiny", "--out", scene)
+            shutil.rmtree(scene / "truth")  # its comparison takes longer than the build
+            before.build(scene)
+        was = before.digests(scene, "sun,night,training", work)
+        now = after.digests(scene, "sun,night,training", work)
+    different = [name for name in was if now.get(name) != was[name]] + [name for name in now if name not in was]
+    for name in different:
+        print(f"differs: {name}")
+    print(f"{len(was) - sum(name in was for name in different)} of {len(was)} the same as {options.commit}")
+    return int(bool(different))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
