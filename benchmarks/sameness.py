@@ -1,4 +1,4 @@
-"""Whether this tree does what another commit did, bit for bit: for changes that move and rename, and change nothing else.
+"""Compares this tree with another commit, bit for bit: for changes that move and rename, and change nothing else.
 
     python benchmarks/sameness.py COMMIT [--work DIR]
 
@@ -9,6 +9,7 @@ Structure from motion is not compared, as it is not repeatable.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import shutil
@@ -76,8 +77,7 @@ class Tree:
             [sys.executable, *map(str, arguments)],
             cwd=self.root,
             env={**os.environ, "PYTHONPATH": str(self.root), "CUDA_VISIBLE_DEVICES": ""},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            capture_output=True,
             text=True,
         )
         if done.returncode:
@@ -111,8 +111,6 @@ class Tree:
 
 
 def _digest(path: Path) -> str:
-    import hashlib
-
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
