@@ -453,6 +453,14 @@ def test_options_of_another_kind_are_refused(name, value):
         parse_options({name: value})
 
 
+def test_a_range_nested_very_deep_is_refused():
+    deep = [0.5]
+    for _ in range(5000):
+        deep = [deep]
+    with pytest.raises(InputError, match="friction"):
+        Ranges(friction=deep)
+
+
 @pytest.mark.parametrize("pair", [5, "ab", (1,), (1, 2, 3), (0.0, float("inf")), (0, 10**400), None])
 def test_a_range_is_two_numbers(pair):
     with pytest.raises(InputError, match="friction"):

@@ -145,3 +145,10 @@ def test_a_film_of_any_name_becomes_a_lighting_that_is_taken(tmp_path, name):
     write_image(tmp_path / name / "a.png", np.zeros((8, 8, 3), np.uint8))
     config = load_config(new_scene(tmp_path / "scene", [tmp_path / name], 1.2))
     assert 1 <= len(config.source[0].lighting) <= 80
+
+
+def test_an_option_whose_value_is_two_dashes_is_refused(tmp_path, capsys):
+    """argparse makes an empty list of it."""
+    with pytest.raises(SystemExit) as end:
+        new_main([str(tmp_path / "scene"), "film.mp4", "--camera-height=--"])
+    assert end.value.code == 2 and "--camera-height: expected one argument" in capsys.readouterr().err

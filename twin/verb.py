@@ -55,6 +55,12 @@ class Stopped(KeyboardInterrupt):
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line."""
 
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        if action.option_strings and action.nargs is None and arg_strings == ["--"]:
+            # argparse would take the value of --option=-- for the end of the options, and hand on an empty list.
+            raise argparse.ArgumentError(action, "expected one argument")
+        return super()._get_values(action, arg_strings)
+
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {shortened(message)}; see {self.prog} --help\n")
 

@@ -9,7 +9,7 @@ in its range and independent of the others. What is the robot's is applied to th
 What is known of the robot, and of a day by a photo, need not be drawn: see `Ranges.hold_known`.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import mujoco
@@ -109,7 +109,7 @@ class Ranges:
 
     def each(self) -> dict[str, Range]:
         """Every range by its name."""
-        return {name: value for name, value in asdict(self).items() if name != "hold_known"}
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "hold_known"}
 
     def for_robot(self, robot: HuskyParams) -> "Ranges":
         """These ranges for a scene's robot: where it is known better than as published, it is held if that is wanted.

@@ -16,6 +16,7 @@ from twin.nerf.evaluate import evaluate
 from twin.nerf.fit import fit
 from twin.scene import SceneDir
 
+_TIMES = ("seconds", "seconds_train", "rays_per_second")
 _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 
 
@@ -25,6 +26,15 @@ def constant_height(metric: dict[str, Any]) -> float:
     if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
         return 0.0
     return 0.0 if spread is not None and spread > _HEIGHT_SPREAD * height else float(height)
+
+
+def untimed(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Metrics without how long it took: the same field is the same file, and what was fitted to it stays valid."""
+    return {
+        name: untimed(value) if isinstance(value, dict) else value
+        for name, value in metrics.items()
+        if name not in _TIMES
+    }
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
@@ -46,7 +56,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         "seed": config.seed,
         "nerf": asdict(config.nerf),
         "versions": {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")},
-        "metrics": metrics,
+        "metrics": untimed(metrics),
     }
     field.save(out)
     baked.about = field.about
