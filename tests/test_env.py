@@ -17,6 +17,7 @@ from twin import progress
 from twin.config import ObstacleConfig
 from twin.env.batch import Worlds
 from twin.env.drivers import BlindDriver, RouteDriver
+from twin.env.gym import DriveEnv
 from twin.env.options import CAUSES
 from twin.env.randomisation import Ranges
 from twin.env.suite import Stage
@@ -304,7 +305,7 @@ def test_what_cannot_be_had_is_an_input_error(scene):
     with pytest.raises(InputError, match="did you mean 'lighting'"):
         twin.load(scene, "bend", lightning="day")
     with pytest.raises(InputError, match="unknown; the field has day, night"):
-        twin.load(scene, "bend", lighting="noon").reset()
+        twin.load(scene, "bend", lighting="noon")
     for options in ({"action": "jump"}, {"stack": 0}, {"control_timestep": 0.5}, {"rewards": {"fame": 1.0}}):
         with pytest.raises(InputError):
             twin.load(scene, "bend", **options)
@@ -335,3 +336,14 @@ def test_twenty_thousand_steps(scene):
             sizes.append(process.memory_info().rss)
     assert sizes[-1] < sizes[0] + 8 * 2**20
     worlds.close()
+
+
+def test_what_gymnasium_is_asked_wrongly(scene):
+    with pytest.raises(InputError, match="render_mode = 'human'; expected None or 'rgb_array'"):
+        DriveEnv(scene, "bend", render_mode="human", pixels=False)
+    with pytest.raises(InputError, match="lighting 'noon'"):
+        DriveEnv(scene, "bend", lighting="noon")
+    environment = DriveEnv(scene, "bend", pixels=False)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+        environment.step(environment.action_space.sample())
+    environment.close()

@@ -19,6 +19,7 @@ from twin.errors import InputError
 from twin.loading import Twin, load_scene
 from twin.report.statistics import wilson
 from twin.scene import SceneDir, run_folder
+from twin.stamp import finished
 
 if TYPE_CHECKING:
     from twin.learn.train_config import TrainConfig
@@ -38,6 +39,7 @@ def _main(given: argparse.Namespace) -> None:
     config = TrainConfig(**{**PRESETS[given.preset], **asked})
     folder = run_folder(SceneDir(given.scene), given.run)
     twin = load_scene(given.scene)
+    finished(twin.scene, "mjcf")  # before the run's folder is made
     with alone(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
         chosen = _trained(twin, folder, config, given.processes)
     picture = success_curve(folder)

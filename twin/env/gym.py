@@ -16,12 +16,14 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from twin.env.batch import Worlds, worlds_of
 from twin.env.process_worlds import ProcessWorlds
+from twin.errors import InputError, shown
 from twin.loading import Twin
 
 
@@ -32,6 +34,12 @@ def spaces_of(worlds: Worlds | ProcessWorlds) -> tuple[gymnasium.spaces.Box, gym
         width, height = worlds.options.size
         return gymnasium.spaces.Box(0, 255, (3 * worlds.options.stack, height, width), np.uint8), action
     return gymnasium.spaces.Box(-np.inf, np.inf, (worlds.states,), np.float32), action
+
+
+def _checked(render_mode: str | None) -> str | None:
+    if render_mode not in (None, "rgb_array"):
+        raise InputError(f"render_mode = {shown(render_mode)}; expected None or 'rgb_array'")
+    return render_mode
 
 
 class DriveEnv(gymnasium.Env):
@@ -47,8 +55,9 @@ class DriveEnv(gymnasium.Env):
         **options: Any,
     ) -> None:
         """See `twin.load`; `render_mode` is None or rgb_array."""
-        self.render_mode = render_mode
+        self.render_mode = _checked(render_mode)
         self.worlds = worlds_of(scene, task, options, [None])
+        self._begun = False
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.worlds.options.control_timestep)}
         self.observation_space, self.action_space = spaces_of(self.worlds)
 
@@ -59,9 +68,12 @@ class DriveEnv(gymnasium.Env):
         if seed is not None:
             self.worlds.seed(0, seed)
         self.worlds.begin([0])
+        self._begun = True
         return self.worlds.observation()[0], self.worlds.info(0)
 
     def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
+        if not self._begun:
+            raise ResetNeeded("step before reset; call reset() first")
         out = self.worlds.step(np.asarray(action)[None])
         end = bool(out.terminated[0]), bool(out.truncated[0])
         return self.worlds.observation()[0], float(out.reward[0]), *end, self.worlds.info(0)
@@ -92,7 +104,8 @@ class DriveVectorEnv(VectorEnv):
         **options: Any,
     ) -> None:
         """See `twin.load`; for `processes` see `worlds_of`."""
-        self.num_envs, self.render_mode = num_envs, render_mode
+        self.num_envs, self.render_mode = num_envs, _checked(render_mode)
+        self._begun = False
         self.worlds = worlds_of(scene, task, options, [None] * num_envs, processes)
         self.single_observation_space, self.single_action_space = spaces_of(self.worlds)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -107,9 +120,12 @@ class DriveVectorEnv(VectorEnv):
             if one is not None:
                 self.worlds.seed(i, one)
         self.worlds.begin(range(self.num_envs))
+        self._begun = True
         return self.worlds.observation(), self._infos(range(self.num_envs))
 
     def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
+        if not self._begun:
+            raise ResetNeeded("step before reset; call reset() first")
         out = self.worlds.step(np.asarray(actions))
         over = np.flatnonzero(out.over).tolist()
         final: dict[str, Any] = {}

@@ -156,6 +156,13 @@ def _distance(pictures: Floats, picture: Floats) -> NDArray[np.float64]:
     return np.sqrt(((pictures - picture) ** 2).mean(-1))
 
 
+def check_names(wanted: str | Sequence[str], field: BakedField) -> None:
+    """Raises InputError where a name in `wanted`, see the module, is none of the field's."""
+    for name in (wanted,) if isinstance(wanted, str) else wanted:
+        if name not in RESERVED_LIGHTINGS:
+            field.embedding(name)
+
+
 def draw_light(
     wanted: str | Sequence[str], drift: bool, duration: float, sets: LightSets, rng: np.random.Generator
 ) -> Light:

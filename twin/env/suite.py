@@ -55,7 +55,7 @@ class Stage:
 
     @staticmethod
     def open(scene: str | Path | Twin, task: str, options: dict[str, Any]) -> "Stage":
-        """Reads a built scene. Raises InputError: not built, no route, no such task, or unknown options."""
+        """Reads a built scene. Raises InputError: not built, no route, no such task or lighting, or unknown options."""
         parsed = parse_options(options)
         twin = scene if isinstance(scene, Twin) else load_scene(scene)
         finished(twin.scene, "mjcf")
@@ -74,6 +74,8 @@ class Stage:
         add_obstacles(spec, obstacles.pool, world)
         trust = Trust(twin.cameras()) if parsed.pixels else None
         field = twin.field(parsed.device) if parsed.pixels and parsed.observe == NERF else None
+        if field is not None:
+            lightings.check_names(parsed.lighting, field)
         return Stage(world, stretch, parsed, obstacles, spec.compile(), field, trust)
 
     def drive(self, seed: int | None, judge: tuple[Judge, int] | None = None) -> tuple[DrivePhysics, Drive]:
