@@ -15,11 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import motor_currents
 from record import add_record_options, save
 
-from twin import progress
+from twin import runtime
 from twin.align import run, summary
-from twin.alignment import currents
 from twin.robot import REAR_HEAVY, HuskyParams
 
 _DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -32,9 +32,9 @@ TARGETS = {"position_m": 0.12, "yaw_deg": 4.7, "wheels_rad_s": 0.3}
 
 def efforts(data: Path) -> dict[str, dict[str, float]]:
     """Current or torque of a side in a steady turn / of one driving straight: outer, inner, mean of both."""
-    steady = currents.read_currents(sorted((data / _ASPHALT).glob("ASPHALT_pro_*.npz")))
+    steady = motor_currents.read_currents(sorted((data / _ASPHALT).glob("ASPHALT_pro_*.npz")))
     published = HuskyParams()
-    rolling = currents.rolling_resistance_of(steady, published)
+    rolling = motor_currents.rolling_resistance_of(steady, published)
     robots = {
         "simulated, published robot": published,
         "simulated, rear-heavy": replace(published, center_of_mass=REAR_HEAVY),
@@ -42,8 +42,8 @@ def efforts(data: Path) -> dict[str, dict[str, float]]:
             published, rolling_resistance=rolling
         ),
     }
-    found = {"measured": currents.measured_effort(steady)}
-    found |= {name: currents.simulated_effort(steady, params) for name, params in robots.items()}
+    found = {"measured": motor_currents.measured_effort(steady)}
+    found |= {name: motor_currents.simulated_effort(steady, params) for name, params in robots.items()}
     return {
         name: {"outer": round(e.outer, 3), "inner": round(e.inner, 3), "mean": round(e.total, 3)}
         for name, e in found.items()
@@ -90,7 +90,7 @@ def main() -> int:
     rows = judged(figures)
     for name, value, target, met in rows:
         print(f"{name:28} {value:8.4f}   wanted {target:.4f}   {'met' if met else 'missed'}")
-    progress.say("currents on asphalt")
+    runtime.say("currents on asphalt")
     asphalt = efforts(options.data)
     print(f"\n{'a turn against driving straight':64} outer  inner   mean")
     for name, e in asphalt.items():

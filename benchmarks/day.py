@@ -18,19 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from record import add_record_options, save
 
-from twin.env.obstacle_view import camera_intrinsics
-from twin.env.randomisation import ANOTHER_DAY, UNTOLD, Draw
+from twin.env.domain_randomization import ANOTHER_DAY, UNTOLD, RandomizationSample
+from twin.env.mujoco_renderer import camera_intrinsics
 from twin.env.weather import Weather
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import load_scene
-from twin.progress import track
-from twin.reality import onboard
-from twin.reality.route import Route
+from twin.reality import recordings
+from twin.reality.centerline import RoadLine
+from twin.reality.comparison import align_rigid, matched_poses
+from twin.reality.lighting import WEATHER
 from twin.reality.truth import Truth
-from twin.reality.weather import WEATHER
-from twin.report.truth import align_rigid, matched_poses
+from twin.runtime import track
 
 STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the photos were taken at the first
 STRAIGHT = 4  # of them, where policies of the straight road drive
@@ -44,9 +44,9 @@ Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 
 def real(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
     """Pictures of every day at every station, and the camera's poses there, (stations, 4, 4), in the true world."""
-    line, rows, poses = Route(), [], np.zeros((len(STATIONS), 4, 4))
+    line, rows, poses = RoadLine(), [], np.zeros((len(STATIONS), 4, 4))
     for light in track([WEATHER[name] for name in days], "pictures of days", unit="day"):
-        road, eye = onboard._camera(light)
+        road, eye = recordings._camera(light)
         row = []
         for k, station in enumerate(STATIONS):
             x, y = line.at(station).tolist()
@@ -127,10 +127,10 @@ def main() -> int:
     drawn = [[ANOTHER_DAY.draw(rng) for _ in given.days] for _ in range(DRAWS)]
     seeds = rng.integers(2**31, size=(DRAWS, len(given.days)))
 
-    def weathered(scale: float, days: list[Draw], numbers: NDArray) -> Pictures:
+    def weathered(scale: float, days: list[RandomizationSample], numbers: NDArray) -> Pictures:
         rows = []
         for i, (name, draw, number) in enumerate(zip(given.days, days, numbers, strict=True)):
-            weaker = Draw(sunlight=scale * draw.sunlight, shade=scale * draw.shade)
+            weaker = RandomizationSample(sunlight=scale * draw.sunlight, shade=scale * draw.shade)
             weather = Weather(weaker, np.random.default_rng(number), field.air(name))
             seen = zip(clear[i].rgb, depth, poses, strict=True)
             rows.append([weather.over(rgb, far, rays, pose) for rgb, far, pose in seen])

@@ -92,11 +92,12 @@ def driver(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def audit(scene: Path, quick: bool) -> dict[str, Any]:
-    """The exploit audit (`twin.env.audit`): control steps with each event in an hour of simulated time."""
-    from twin.env.audit import audit as run
-    from twin.env.suite import Stage
+    """The exploit audit (`audit.py`): control steps with each event in an hour of simulated time."""
+    from audit import audit as run
 
-    found = run(Stage.open(scene, standard_tasks(scene)[-1], {"pixels": False}), 0.02 if quick else 1.0).summary()
+    from twin.env.suite import EnvFactory
+
+    found = run(EnvFactory.open(scene, standard_tasks(scene)[-1], {"pixels": False}), 0.02 if quick else 1.0).summary()
     out = {f"audit.{key}": found[key] for key in ("simulated_s", "wall_s", "steps_touching", "false_successes")}
     out |= {f"audit.ended.{cause}": n for cause, n in found["episodes"].items()}
     return out | {f"audit.{name}": n for name, n in found["steps_with"].items()}
@@ -120,7 +121,7 @@ def overlay(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def seen_touched(scene: Path, quick: bool) -> dict[str, Any]:
-    """What the last build's report says of what is seen against what is solid (`twin.report.seen_touched`)."""
+    """What the last build's report says of what is seen against what is solid (`twin.report.visual_vs_collision`)."""
     from twin.loading import load_scene
 
     found = load_scene(scene).report().get("seen_touched")

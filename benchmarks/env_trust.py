@@ -12,9 +12,9 @@ from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.loading import load_scene
 from twin.mjcf.world import arc_lengths, heading_at, point_at
+from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import Truth
-from twin.report.truth import align_rigid, matched_poses
 
 LATERALS = (0.0, 0.8, -1.6, 2.5, -4.0)  # [m] from the route
 TURNS = (0.0, 20.0, -45.0, 90.0, 180.0)  # [°] from its heading

@@ -18,7 +18,7 @@ _STEPS = 60  # per timed run
 
 def standard_tasks(scene: Path) -> list[str]:
     """The standard tasks that a scene has, `right_turn` last; `route` where it has none."""
-    from twin.env.stretches import STANDARD, tasks
+    from twin.env.route_segments import STANDARD, tasks
     from twin.loading import load_scene
 
     there = tasks(load_scene(scene).world())
@@ -164,12 +164,12 @@ def memory(scene: Path, count: int) -> dict[str, Any]:
 def soak(scene: Path, steps: int) -> dict[str, Any]:
     import psutil
 
-    from twin.env.batch import Worlds
-    from twin.env.suite import Stage
+    from twin.env.suite import EnvFactory
+    from twin.env.vector_env_local import LocalVectorEnv
 
     count = 8
-    stage = Stage.open(scene, standard_tasks(scene)[-1], {"randomise": True, "obstacles": 3})
-    worlds = Worlds(stage, list(range(count)))  # here, where bodies can be looked at
+    stage = EnvFactory.open(scene, standard_tasks(scene)[-1], {"randomise": True, "obstacles": 3})
+    worlds = LocalVectorEnv(stage, list(range(count)))  # here, where bodies can be looked at
     worlds.begin(range(count))
     rng, sizes, episodes, bad = np.random.default_rng(0), [], 0, 0
     rounds = steps // count
@@ -222,9 +222,8 @@ def host(scene: Path, count: int) -> dict[str, Any]:
 
     import warp
 
-    from twin.env.device_steps import DeviceSteps
-    from twin.env.device_worlds import DeviceWorlds
-    from twin.env.suite import Stage
+    from twin.env.suite import EnvFactory
+    from twin.env.vector_env_gpu import GpuSimulation, GpuVectorEnv
     from twin.nerf.baked import BakedField
 
     with warp.ScopedDevice("cpu"):
@@ -234,10 +233,10 @@ def host(scene: Path, count: int) -> dict[str, Any]:
         field._biases(lighting, len(cameras.camera_to_world))  # as `show` does, on the host
         take(*blank)
 
-    DeviceSteps._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]
-    stage = Stage.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
+    GpuSimulation._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]
+    stage = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
     options = dataclasses.replace(stage.options, device="cuda")  # pictures that stay; the field itself is on the CPU
-    worlds = DeviceWorlds(dataclasses.replace(stage, options=options), list(range(count)), "cpu")
+    worlds = GpuVectorEnv(dataclasses.replace(stage, options=options), list(range(count)), "cpu")
     begin = time.perf_counter()
     worlds.begin(range(count))
     begun, times = time.perf_counter() - begin, []
@@ -267,10 +266,10 @@ def trust(scene: Path) -> dict[str, Any]:
 
 
 def _worlds(scene: Path, count: int, processes: int | None = None, **options: Any) -> Any:
-    from twin.env.batch import worlds_of
+    from twin.env.vector_env import make_vector_env
 
     options = one_obstacle(scene) | options
-    return worlds_of(scene, standard_tasks(scene)[-1], options, list(range(count)), processes)
+    return make_vector_env(scene, standard_tasks(scene)[-1], options, list(range(count)), processes)
 
 
 def _onward(worlds: Any) -> np.ndarray:

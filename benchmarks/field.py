@@ -103,10 +103,10 @@ def main() -> int:
 
 def about(options: argparse.Namespace) -> dict[str, Any]:
     """What the figures were measured with."""
-    from twin.nerf import compute
+    from twin.nerf import buffers
 
     packages = {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")}
-    return {"cores": compute.cores(), "machine": platform.machine(), "versions": packages, "quick": options.quick}
+    return {"cores": buffers.cores(), "machine": platform.machine(), "versions": packages, "quick": options.quick}
 
 
 if __name__ == "__main__":

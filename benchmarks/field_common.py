@@ -83,7 +83,7 @@ def route_views(bench: Bench) -> Path:
     """
     file = bench.work / "views.npz"
     if not file.exists():
-        from twin.env.follower import follow
+        from twin.env.drivers import follow
         from twin.env.physics import HuskyPhysics
         from twin.loading import load_scene
 

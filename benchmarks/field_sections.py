@@ -17,9 +17,8 @@ from field_common import SIZE, Bench, load_baked, load_field, render, route_view
 
 from twin.config import NerfConfig
 from twin.config_file import load_config
-from twin.geometry.cameras import Cameras
-from twin.geometry.points import SparsePoints
-from twin.nerf import compute
+from twin.geometry.cameras import Cameras, SparsePoints
+from twin.nerf import buffers
 from twin.scene import SceneDir
 
 _MARGIN = 0.05  # share of a budget that is left for what the forecast of the pace misses
@@ -43,10 +42,10 @@ class Pace:
 
 def timed_fit(cameras: Cameras, points: SparsePoints, config: NerfConfig, steps: int) -> tuple[Any, float, Pace]:
     """The field after so many steps, the wall seconds of the whole call, and its pace."""
-    from twin.nerf.fit import fit
+    from twin.nerf.trainer import train_field
 
     began = time.perf_counter()
-    field, metrics, _ = fit(cameras, points, replace(config, steps=steps))
+    field, metrics, _ = train_field(cameras, points, replace(config, steps=steps))
     wall = time.perf_counter() - began
     return field, wall, Pace(wall - metrics["seconds_train"], metrics["seconds_train"] / steps)
 
@@ -164,7 +163,7 @@ def speed(bench: Bench) -> Figures:
     place, views = baked_place(bench), route_views(bench)
     count, repeats = bench.pick((60, 5), (4, 1))
     found: Figures = {}
-    for used in (1, 2)[: compute.cores()]:
+    for used in (1, 2)[: buffers.cores()]:
         row = worker("frames", place, views, used, count, repeats)
         found |= {f"render.{key}_{used}core": value for key, value in row.items()}
     row = worker("ratio", place, views, bench.pick(SIZE[0], 16), bench.pick(3, 1))
@@ -190,8 +189,8 @@ def _first_frame(bench: Bench, place: Path, views: Path) -> Figures:
 
 def depth(bench: Bench) -> Figures:
     """Rendered depth against the known truth, up to 10 m away, at the true cameras."""
+    from twin.reality.comparison import align_rigid, depth_errors, matched_poses
     from twin.reality.truth import Truth
-    from twin.report.truth import align_rigid, depth_errors, matched_poses
 
     scene = SceneDir(bench.scene)
     if not (scene.truth / "truth.npz").exists():

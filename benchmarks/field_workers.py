@@ -143,11 +143,9 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
 
     from twin.config_file import load_config
     from twin.files import read_json
-    from twin.geometry.cameras import Cameras
-    from twin.geometry.points import SparsePoints
-    from twin.nerf.fit import fit
-    from twin.nerf.stage import constant_height
-    from twin.progress import set_quiet
+    from twin.geometry.cameras import Cameras, SparsePoints
+    from twin.nerf.trainer import constant_height, train_field
+    from twin.runtime import set_quiet
     from twin.scene import SceneDir
 
     set_quiet(True)
@@ -158,7 +156,9 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     cameras = replace(cameras, held_out=np.zeros(len(cameras), bool))
     chosen = np.resize(np.arange(len(cameras)), int(count))  # the points know the frames by index, so no sorting
     height = constant_height(read_json(paths.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    trained, _, _ = fit(cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height)
+    trained, _, _ = train_field(
+        cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height
+    )
     shown = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
     return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(shown).tolist()}
 

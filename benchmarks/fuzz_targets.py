@@ -99,7 +99,7 @@ class Stuff:
 
     @cached_property
     def cells(self) -> list[Any]:
-        from twin.report.trials import Cell
+        from twin.evaluation.trials import Cell
 
         return [Cell(p, t, "day", 10, 5) for p in ("ahead", "left") for t in ("ahead", "bend")]
 
@@ -113,8 +113,8 @@ class Stuff:
 
     @cached_property
     def forecast(self) -> Any:
-        from twin.report.forecasting import make_forecast
-        from twin.report.trials import Cell
+        from twin.evaluation.forecasting import make_forecast
+        from twin.evaluation.trials import Cell
 
         twin = [Cell(p, "ahead", "day", 10, k) for p, k in (("a", 3), ("b", 6), ("c", 9))]
         real = [dataclasses.replace(c, trials=5, successes=c.successes // 2, twin_lighting="day") for c in twin]
@@ -307,8 +307,8 @@ def _forged(rng: Random, suffix: str, data: bytes) -> bytes:
 
 def _image(case: Case) -> None:
     from twin.capture.formats import image_size
-    from twin.capture.masks import read_mask
     from twin.capture.photos import load_photo
+    from twin.capture.sources import read_mask
     from twin.geometry.images import read_image
 
     rng = case.rng
@@ -400,7 +400,7 @@ def _table(rng: Random, text: str) -> bytes:
 
 
 def _results(case: Case) -> None:
-    from twin.report.trials import read_results
+    from twin.evaluation.trials import read_results
 
     path = case.folder / "results.csv"
     path.write_bytes(_table(case.rng, RESULTS_CSV))
@@ -408,7 +408,7 @@ def _results(case: Case) -> None:
 
 
 def _episodes(case: Case) -> None:
-    from twin.report.trials import read_trials
+    from twin.evaluation.trials import read_trials
 
     path = case.folder / "episodes.csv"
     path.write_bytes(_table(case.rng, EPISODES_CSV))
@@ -416,14 +416,14 @@ def _episodes(case: Case) -> None:
 
 
 def _training(case: Case) -> None:
-    from twin.report.training import read_episodes
+    from twin.evaluation.training_curves import read_episodes
 
     (case.folder / "episodes.csv").write_bytes(_table(case.rng, TRAINING_CSV))
     read_episodes(case.folder)
 
 
 def _log_csv(case: Case) -> None:
-    from twin.alignment.logs import read_log
+    from twin.sysid.logs import read_log
 
     log = case.stuff.log
     rows = zip(*(column[:60] for column in log.values()), strict=True)
@@ -434,7 +434,7 @@ def _log_csv(case: Case) -> None:
 
 
 def _log_npz(case: Case) -> None:
-    from twin.alignment.logs import read_log
+    from twin.sysid.logs import read_log
 
     rng, columns = case.rng, dict(case.stuff.log)
     path = case.folder / "log.npz"
@@ -633,7 +633,7 @@ def _zip(case: Case) -> None:
 
 def _lighting(case: Case) -> None:
     import twin
-    from twin.stamp import result_of
+    from twin.scene import result_of
 
     root = case.folder / "scene"
     (root / "lightings").mkdir(parents=True)
@@ -653,7 +653,7 @@ _STAGES = ("2_metric", "3_field", "4_mesh", "5_mjcf")
 
 def _damage_stage(rng: Random, root: Path, good: Path, sealed: bool) -> str:
     """A copy of a built scene (its whole stages are links) in which one file is damaged; returns the stage's folder."""
-    from twin.stamp import seal
+    from twin.scene import seal
 
     (root / "build").mkdir(parents=True)
     shutil.copyfile(good / "scene.toml", root / "scene.toml")
@@ -714,16 +714,15 @@ def _built(case: Case) -> None:
     elif stage == "5_mjcf":
         scene.world()
     else:
-        from twin.stamp import finished
+        from twin.scene import finished
 
         Ground.load(finished(scene.scene, "mesh"))
 
 
 def _parts(case: Case) -> None:
     """Files of stages by themselves: points, captures and cameras."""
-    from twin.capture.types import Capture, SourceInfo
-    from twin.geometry.cameras import Cameras
-    from twin.geometry.points import SparsePoints
+    from twin.capture.capture_data import Capture, SourceInfo
+    from twin.geometry.cameras import Cameras, SparsePoints
 
     rng, folder = case.rng, case.folder / "stage"
     folder.mkdir()
@@ -752,7 +751,7 @@ def _parts(case: Case) -> None:
 
 
 def _forecast(case: Case) -> None:
-    from twin.report.forecast import Forecast
+    from twin.evaluation.forecasting import Forecast
 
     table = spoiled(case.rng, case.stuff.forecast)
     (case.folder / "forecast.json").write_bytes(mangled_text(case.rng, json_text(table)))
@@ -761,9 +760,9 @@ def _forecast(case: Case) -> None:
 
 def _noted(case: Case) -> None:
     """JSON beside runs and validations."""
-    from twin.learn import state, training
-    from twin.report.training import CHOICE, success_curve, trainings
-    from twin.stamp import digest_file
+    from twin.evaluation.training_curves import CHOICE, success_curve, trainings
+    from twin.learn import checkpoint, training
+    from twin.scene import digest_file
 
     rng, root = case.rng, case.folder / "scene"
     which = rng.random()
@@ -786,11 +785,11 @@ def _noted(case: Case) -> None:
         training._check_same(root, said)
     elif which < 0.9:
         (root / "state").mkdir(parents=True)
-        names = [name for name in vars(state).values() if isinstance(name, str) and name.endswith(".json")]
+        names = [name for name in vars(checkpoint).values() if isinstance(name, str) and name.endswith(".json")]
         for name in names:
             told = {"steps": 100, "updates": 50, "resumed": 0}
             (root / "state" / name).write_bytes(mangled_text(rng, json_text(spoiled(rng, told))))
-        state.saved_steps(root / "state")
+        checkpoint.saved_steps(root / "state")
     else:
         root.mkdir()
         (root / "episodes.csv").write_text(TRAINING_CSV)
@@ -812,8 +811,8 @@ def _keywords(rng: Random, kind: type) -> dict[str, Any]:
 
 
 def _options(case: Case) -> None:
+    from twin.env.domain_randomization import Ranges
     from twin.env.options import Options, Rewards, parse_options
-    from twin.env.randomisation import Ranges
 
     given = _keywords(case.rng, Options)
     what = case.rng.random()
@@ -909,24 +908,23 @@ def _path(case: Case) -> None:
 
 
 def _readers(stuff: Stuff) -> list[tuple[str, Callable[[Path], Any]]]:
-    from twin.alignment.logs import read_log
     from twin.assets.ground import Ground
     from twin.capture import formats
-    from twin.capture.masks import read_mask
+    from twin.capture.capture_data import Capture
     from twin.capture.photos import load_photo
-    from twin.capture.types import Capture
+    from twin.capture.sources import read_mask
     from twin.capture.video import probe
     from twin.config_file import load_config, read_robot
-    from twin.geometry.cameras import Cameras
+    from twin.evaluation.forecasting import Forecast
+    from twin.evaluation.training_curves import read_episodes
+    from twin.evaluation.trials import read_results, read_trials
+    from twin.geometry.cameras import Cameras, SparsePoints
     from twin.geometry.images import read_image
-    from twin.geometry.points import SparsePoints
     from twin.learn.policy import load_policy
     from twin.mjcf.world import World
     from twin.nerf.baked import BakedField
-    from twin.report.forecast import Forecast
-    from twin.report.training import read_episodes
-    from twin.report.trials import read_results, read_trials
-    from twin.stamp import Stamp
+    from twin.scene import Stamp
+    from twin.sysid.logs import read_log
 
     return [
         ("scene.toml", load_config),

@@ -17,16 +17,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import acceptance
 import mujoco
 import numpy as np
+from acceptance import CONTROLS, MEASURES, Row, Subject, chi_on, on_ground, on_plane
 from record import add_record_options, save
 
 from twin.assets.ground import Ground
-from twin.env.acceptance import grounds
-from twin.env.acceptance.drive import on_ground, on_plane
-from twin.env.acceptance.ground import chi_on
-from twin.env.acceptance.rows import Row, Subject
-from twin.env.acceptance.table import CONTROLS, MEASURES
 from twin.loading import load_scene
 
 _STEPS, _PIECES, _REPEATS = 5000, 50, 7
@@ -52,7 +49,7 @@ def steps_per_second(model: mujoco.MjModel) -> float:
 
 def speeds(scene: Path | None) -> list[Row]:
     """Steps per second, and what is wanted of them."""
-    bumps = grounds.reconstructed(np.random.default_rng(0))
+    bumps = acceptance.reconstructed(np.random.default_rng(0))
     models = {"a plane": (on_plane(), 30e3), "a reconstructed flat road": (on_ground(bumps, start=(-7, 0, 0)), 20e3)}
     if scene is not None:
         models[f"{scene.name}'s ground, with its convex parts"] = (load_scene(scene).world().model(), 20e3)

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.special import expit
 
 from twin.config import RANDOMISED
+from twin.evaluation.bootstrap import Paired, Rates, interval, resample, seen
+from twin.evaluation.prediction_powered import Correction, left_out_predictions, powered_mean
+from twin.evaluation.statistics import mmrv_rows, pearson_rows, spearman_rows, winner_rows
 from twin.files import read_json
-from twin.report.bootstrap import Paired, Rates, interval, resample, seen
-from twin.report.correction import Correction, left_out_predictions, powered_mean
-from twin.report.statistics import mmrv_rows, pearson_rows, spearman_rows, winner_rows
 
 _MEAN_OVER = 3000  # experiments, for what an interval aims at
 _DRAWS = 400

@@ -6,7 +6,7 @@ The scene was filmed without any of them. Each is put at a place along the route
 overlay, and once into the known-truth world, in the same colours; both are seen from the same pose of the robot's front
 camera at 160×90, and developed as the film was, without noise. *The obstacle's pixels* are those it is seen in in the
 truth. *Unshaded* is the overlay with everything in its plain colours. How far the field is from what is solid is
-measured along a drive, see `twin/report/seen_touched.py`.
+measured along a drive, see `twin/report/visual_vs_collision.py`.
 """
 
 import argparse
@@ -23,19 +23,19 @@ import warp as wp
 from record import add_record_options, save
 
 from twin.config import ObstacleConfig
-from twin.env.obstacle_shapes import Shape, add_shape
-from twin.env.obstacle_view import camera_pose
+from twin.env.compositor import Compositor
+from twin.env.mujoco_renderer import camera_pose
+from twin.env.obstacle_models import ObstacleModel, add_shape
 from twin.env.obstacles import add_obstacles, place
-from twin.env.overlay import Overlay
 from twin.geometry.cameras import Cameras, opencv_to_mujoco
 from twin.geometry.poses import Similarity
 from twin.loading import load_scene
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
-from twin.reality import world as reality
-from twin.reality.film import develop
+from twin.reality import true_world as reality
+from twin.reality.comparison import align_rigid, matched_poses
+from twin.reality.filming import develop
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import Truth
-from twin.report.truth import align_rigid, matched_poses
 
 SIZE = (160, 90)
 KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
@@ -65,7 +65,7 @@ class TrueWorld:
         spec = reality.spec(lighting, truth.place)
         for kind in KINDS:
             body = spec.worldbody.add_body(name=f"added_{kind}", mocap=True, pos=(0, 0, -100.0))
-            add_shape(Shape(spec, body, group=1, solid=False), kind)
+            add_shape(ObstacleModel(spec, body, group=1, solid=False), kind)
         height = SIZE[1]
         spec.camera("film").fovy = float(np.rad2deg(2 * np.arctan(height / 2 / intrinsics[1])))
         self.model = spec.compile()
@@ -76,7 +76,7 @@ class TrueWorld:
         with wp.ScopedDevice("cpu"):
             self.device_model = mujoco_warp.put_model(self.model)
             self.device = mujoco_warp.put_data(self.model, self.data)
-            # As `twin.reality.film.Renderer`; a second one through pixels' middles, for the mask.
+            # As `twin.reality.filming.Renderer`; a second one through pixels' middles, for the mask.
             self.contexts = [
                 mujoco_warp.create_render_context(
                     self.model,
@@ -148,7 +148,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     add_obstacles(spec, pool, world)
     model = spec.compile()
     data = mujoco.MjData(model)
-    overlays = {"shaded": Overlay(model, field, SIZE), "unshaded": Overlay(model, field, SIZE, shaded=False)}
+    overlays = {"shaded": Compositor(model, field, SIZE), "unshaded": Compositor(model, field, SIZE, shaded=False)}
     errors: dict[str, list[np.ndarray]] = defaultdict(list)
     ious: dict[str, list[tuple[int, int]]] = defaultdict(list)
     length = float(arc_lengths(world.route)[-1])
@@ -230,12 +230,12 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
 
 
 def seen_touched(scene_path: Path) -> dict[str, Any]:
-    """`seen_touched.*` of `twin.report.seen_touched`, along a drive of the scripted follower."""
+    """`seen_touched.*` of `twin.report.visual_vs_collision`, along a drive of the scripted follower."""
     from twin.assets.ground import Ground
-    from twin.env.follower import follow
+    from twin.env.drivers import follow
     from twin.env.physics import HuskyPhysics
-    from twin.mjcf.export import Parts
-    from twin.report.seen_touched import along_the_drive, compare, look
+    from twin.mjcf.scene_xml import Parts
+    from twin.report.visual_vs_collision import along_the_drive, compare, look
 
     scene = load_scene(scene_path)
     world, field, mesh = scene.world(), scene.field(), scene.scene.stage("mesh")

@@ -23,12 +23,12 @@ from twin.geometry.cameras import Cameras
 from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
 from twin.mjcf.world import nearest
-from twin.reality import film, world
+from twin.reality import filming, true_world
 from twin.reality import place as places
-from twin.reality.raster import Raster
-from twin.reality.road import route
+from twin.reality.comparison import align_rigid, matched_poses
+from twin.reality.rasterizer import Raster
+from twin.reality.real_robot import route
 from twin.reality.truth import Truth
-from twin.report.truth import align_rigid, matched_poses
 
 _LIGHTINGS = ("sun", "overcast", "night")
 _EVERY = 12  # frames of the film
@@ -37,12 +37,12 @@ _LOWER = 0.6  # [m] that the robot's camera is below the film's
 
 def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
     """Names and values, lighting by lighting."""
-    place, large = places.build(), film.Plan()
+    place, large = places.build(), filming.FilmingPlan()
     small = replace(large, width=160, height=90)
     for lighting in _LIGHTINGS:
-        raster = Raster(world.spec(lighting, place).compile(), small.intrinsics, (160, 90))
-        renderer, renderer_small = film.Renderer(lighting, place, large), film.Renderer(lighting, place, small)
-        poses = film.trajectory(large, place.route, lighting)[1][::_EVERY]
+        raster = Raster(true_world.spec(lighting, place).compile(), small.intrinsics, (160, 90))
+        renderer, renderer_small = filming.Renderer(lighting, place, large), filming.Renderer(lighting, place, small)
+        poses = filming.trajectory(large, place.route, lighting)[1][::_EVERY]
         raster(poses[0])
         rows, seconds = [], []
         for pose in poses:

@@ -58,14 +58,16 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
     from tiny_twin import tiny_twin
 
     from twin.config import TRAINING
-    from twin.env.batch import Worlds
-    from twin.env.camera_effects import CameraOptions
-    from twin.env.suite import Stage
+    from twin.env.camera_noise import CameraOptions
+    from twin.env.suite import EnvFactory
+    from twin.env.vector_env_local import LocalVectorEnv
 
     camera = CameraOptions(vibration=0.3, exposure=0.1, shutter=0.02, blur_samples=2)
     options = {"lighting": TRAINING, "lighting_drift": True, "obstacles": 2, "randomise": True, "camera": camera}
     scene = tiny_twin(folder / "endurance")
-    worlds = Worlds(Stage.open(scene, "bend", {**options, "size": (32, 18), "start_along": 0.5}), list(range(_WORLDS)))
+    worlds = LocalVectorEnv(
+        EnvFactory.open(scene, "bend", {**options, "size": (32, 18), "start_along": 0.5}), list(range(_WORLDS))
+    )
     worlds.begin(range(_WORLDS))
     rng, process = np.random.default_rng(0), psutil.Process()
     rounds, sizes, episodes, bad, start = steps // _WORLDS, [], 0, 0, time.perf_counter()

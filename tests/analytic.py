@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.files import write_json
-from twin.geometry.cameras import Cameras, Posed, pixel_grid, resized, unproject
-from twin.geometry.points import SparsePoints
+from twin.geometry.cameras import Cameras, Posed, SparsePoints, pixel_grid, resized, unproject
 from twin.geometry.poses import look_at
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 FAR = 200.0  # [m] depth of the sky
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from drive_logs import SOFT, columns
 
-from twin import progress
+from twin import runtime
 
 _LONGEST = ("test_real_places.py", "test_end_to_end.py", "test_alignment.py", "test_env.py")
 """Files that take minutes, and so are begun with."""
@@ -23,7 +23,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(autouse=True)
 def loud() -> None:
     """What a test reads of standard error does not depend on the tests before it: quiet is a state of the process."""
-    progress.set_quiet(False)
+    runtime.set_quiet(False)
 
 
 @pytest.fixture(scope="session")

@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.alignment import logs
-from twin.alignment.simulate import plane_model
 from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.robot import WHEELS, HuskyParams
+from twin.sysid import logs
+from twin.sysid.rollout import plane_model
 
 RATE = 0.05  # [s]
 SOFT = HuskyParams(

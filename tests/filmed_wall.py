@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from twin.capture.capture_data import Capture
 from twin.capture.frames import run
-from twin.capture.types import Capture
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
 from twin.scene import SceneDir

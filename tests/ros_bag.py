@@ -19,7 +19,7 @@ _TOPICS = {
 
 
 def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = ()) -> Path:
-    """A table of `twin.alignment.logs` as a bag; the wheels' own odometry stands still, so that using it shows."""
+    """A table of `twin.sysid.logs` as a bag; the wheels' own odometry stands still, so that using it shows."""
     store = get_typestore(Stores.LATEST)
     t = store.types
     zero = np.zeros(9)

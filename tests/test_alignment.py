@@ -4,20 +4,20 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import motor_currents
 import mujoco
 import numpy as np
 import pytest
 from drive_logs import SOFT, columns, windows_of
 
 from twin.align import main, summary
-from twin.alignment import commands, currents, kinematics, logs, simulate
-from twin.alignment.aligned import Alignment, align, robot_toml
-from twin.alignment.identify import Fit
-from twin.alignment.kinematics import Icr
-from twin.alignment.score import Prediction
 from twin.config_file import parse, read_robot
 from twin.env.controller import Controller
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
+from twin.sysid import drivetrain, kinematics, logs, rollout
+from twin.sysid.estimation import Fit
+from twin.sysid.identification import Alignment, align, robot_toml
+from twin.sysid.kinematics import Icr, Prediction
 
 
 def test_arc_in_closed_form():
@@ -75,7 +75,7 @@ def test_commands_become_the_controllers_wheel_speeds():
             rows.append(told)
         speeds.append(rows)
     windows = windows_of(np.zeros((1, logs.SAMPLES, 2)), commands=np.full((1, logs.SAMPLES, 2), request), twist=True)
-    told, _ = commands.targets(commands.Drive.of(params, True), windows)
+    told, _ = drivetrain.targets(drivetrain.Drivetrain.of(params, True), windows)
     mean = np.mean(speeds, 0)
     assert np.abs(told[0, :200] - mean).max() < 0.3  # of 6 rad/s; the ramp's ends are rounder in the mean
     assert np.abs(told[0, 190:200] - mean[190:]).max() < 1e-6
@@ -83,27 +83,27 @@ def test_commands_become_the_controllers_wheel_speeds():
 
 def test_a_ramp_goes_on_from_window_to_window():
     """Wheels that lag behind a ramp do not show how far it has come when a window begins; the windows before do."""
-    drive = commands.Drive(1.0, 1.0, 9.0, 9.0, 0.2, 1.0, 9.0, 0.3)
+    drive = drivetrain.Drivetrain(1.0, 1.0, 9.0, 9.0, 0.2, 1.0, 9.0, 0.3)
     time = np.arange(3 * logs.SAMPLES) * logs.PERIOD
     ramp = np.maximum(0.0, time - drive.latency)
     lagged = drive.mean_acceleration * (ramp - drive.lag * (1 - np.exp(-ramp / drive.lag)))
     wheels = np.repeat(lagged[:, None], 2, 1).reshape(3, logs.SAMPLES, 2)
     asked = np.full((3, logs.SAMPLES, 2), 8.0)
     windows = replace(windows_of(wheels, commands=asked, twist=False), follows=np.arange(3) > 0)
-    told, turned = commands.targets(drive, windows)
-    step = drive.mean_acceleration * commands.STEP
+    told, turned = drivetrain.targets(drive, windows)
+    step = drive.mean_acceleration * drivetrain.STEP
     assert told[1:, :25] == pytest.approx(told[:-1, 200:])
     assert told[:, 100, 0] == pytest.approx(drive.mean_acceleration * (2.0 * np.arange(3) + 0.8), abs=1.01 * step)
-    assert commands.sampled(turned) == pytest.approx(wheels, abs=step)
+    assert drivetrain.sampled(turned) == pytest.approx(wheels, abs=step)
 
 
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])
 def test_late_poses_are_those_of_before(late):
     """A robot that speeds up along a straight line, and one that goes on around a circle."""
-    time = (np.arange(simulate.BEFORE + logs.SAMPLES + commands.AHEAD) - simulate.BEFORE) * logs.PERIOD
+    time = (np.arange(rollout.BEFORE + logs.SAMPLES + drivetrain.AHEAD) - rollout.BEFORE) * logs.PERIOD
     line = np.stack([(time + 1.0) ** 2, 0 * time, 0 * time], -1)
     circle = np.stack([np.sin(time), 1 - np.cos(time), time], -1)
-    told = logs.retimed(np.stack([line, circle]), np.array([late, late]), simulate.BEFORE)[:, : logs.SAMPLES + 2]
+    told = logs.retimed(np.stack([line, circle]), np.array([late, late]), rollout.BEFORE)[:, : logs.SAMPLES + 2]
     t = np.arange(told.shape[1]) * logs.PERIOD
     assert len(t) == logs.SAMPLES + 2
     np.testing.assert_allclose(told[0, :, 0], (t - late + 1) ** 2 - (1 - late) ** 2, atol=1e-3)
@@ -111,7 +111,7 @@ def test_late_poses_are_those_of_before(late):
 
 
 def test_tyres_in_grass_are_dragged_and_the_chassis_is_not():
-    from twin.alignment.simulate import plane_model
+    from twin.sysid.rollout import plane_model
 
     def drag(params: HuskyParams) -> np.ndarray:
         model = plane_model(params)
@@ -131,7 +131,7 @@ def test_tyres_in_grass_are_dragged_and_the_chassis_is_not():
 def test_grip_grows_with_slip_over_rolling_speed(speed, share):
     """Pushed sideways by a share of its grip, a robot that drives slides by a share of its speed, in closed form."""
     params = HuskyParams(friction=0.3, rolling_resistance=0.12, motor_torque=500.0)
-    model = simulate.plane_model(params)
+    model = rollout.plane_model(params)
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 500)
     base = model.body("base_link").id
@@ -188,7 +188,7 @@ def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) 
     wheels = np.random.default_rng(0).uniform(1, 5, (40, logs.SAMPLES, 2))
     gone = kinematics.predict(kinematics.Icr(y_left=0.6, y_right=-0.6), windows_of(wheels))[:, : logs.SAMPLES + 1]
     windows = windows_of(wheels, gone, twist=twist)
-    drive = commands.Drive.of(params, twist)
+    drive = drivetrain.Drivetrain.of(params, twist)
     prediction = Prediction("made up", windows, kinematics.predict(kinematics.NOMINAL, windows), wheels + 0.1)
     fits = [
         Fit({}, drive_errors or {}, {}, 0.0),
@@ -232,7 +232,7 @@ def test_a_log_that_shows_nothing_is_said_to():
 def test_a_scene_that_overrules_what_was_fitted_is_warned_of(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("twin.align.align", lambda *_: aligned(ground_errors={"friction": 0.01, "spin_friction": 0.01}))
     monkeypatch.setattr("twin.align.check", lambda *_: None)
-    monkeypatch.setattr("twin.alignment.plots.draw", lambda *_: None)
+    monkeypatch.setattr("twin.sysid.plots.draw", lambda *_: None)
     scene, log = tmp_path / "x", tmp_path / "log.npz"
     scene.mkdir()
     (scene / "scene.toml").write_text(
@@ -279,7 +279,7 @@ def test_effort_of_motors():
     """Made-up currents: the right side, outer in a left turn, takes three times a straight drive's, the left half."""
     speeds = np.concatenate([np.full((50, 2), 0.5), np.full((50, 2), [0.4, 0.6])])
     amps = np.concatenate([np.full((50, 2), 2.0), np.full((50, 2), [1.0, 6.0])])
-    effort = currents.measured_effort(currents.Steady(speeds, amps))
+    effort = motor_currents.measured_effort(motor_currents.Steady(speeds, amps))
     assert (effort.outer, effort.inner, effort.total) == pytest.approx((3.0, 0.5, 1.75))
 
 
@@ -288,10 +288,10 @@ def test_rolling_resistance_that_currents_show_is_found():
     turning = rng.uniform(0.25, 0.4, (40, 1)) + np.array([[-0.06, 0.06]])
     speeds = np.concatenate([np.full((40, 2), 0.6), turning])
     truth = HuskyParams(rolling_resistance=0.05)
-    steady = currents.Steady(speeds, np.ones_like(speeds))
-    effort = currents.simulated_effort(steady, truth)
+    steady = motor_currents.Steady(speeds, np.ones_like(speeds))
+    effort = motor_currents.simulated_effort(steady, truth)
     amps = np.concatenate([np.ones((40, 2)), np.full((40, 2), [effort.inner, effort.outer])])
-    found = currents.rolling_resistance_of(currents.Steady(speeds, amps), HuskyParams())
+    found = motor_currents.rolling_resistance_of(motor_currents.Steady(speeds, amps), HuskyParams())
     assert found == pytest.approx(0.05, rel=0.05)
 
 

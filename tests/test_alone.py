@@ -6,14 +6,14 @@ import sys
 
 import pytest
 
-from twin.alone import alone
 from twin.errors import InputError
+from twin.runtime import alone
 
 
 def test_the_lock_names_its_holder_and_goes_with_it(tmp_path):
     path = tmp_path / "new" / ".lock"
     code = (
-        "import sys; from pathlib import Path; from twin.alone import alone\n"
+        "import sys; from pathlib import Path; from twin.runtime import alone\n"
         "with alone(Path(sys.argv[1]), 'x'): print('held', flush=True); sys.stdin.read()\n"
     )
     other = subprocess.Popen(

@@ -6,13 +6,13 @@ import sys
 import numpy as np
 import pytest
 
-from twin import progress
+from twin import runtime
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.nerf.baked import BakedField
+from twin.nerf.brick_layout import BrickLayout, brick_indices, leaps
 from twin.nerf.kernels import bricks
-from twin.nerf.layout import BrickLayout, brick_indices, leaps
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import FAR
 
@@ -24,7 +24,7 @@ LOW, STEP = -6.0, 18.0 / 255.0
 
 @pytest.fixture(autouse=True)
 def quiet():
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
 
 
 def places(layout: BrickLayout, near: np.ndarray, far: np.ndarray) -> np.ndarray:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from twin.report.bootstrap import Paired, Rates, by_task, interval, paired, resample, seen
-from twin.report.statistics import mmrv_rows, pearson_rows, spearman_rows, winner_rows
-from twin.report.trials import Cell
+from twin.evaluation.bootstrap import Paired, Rates, by_task, interval, paired, resample, seen
+from twin.evaluation.statistics import mmrv_rows, pearson_rows, spearman_rows, winner_rows
+from twin.evaluation.trials import Cell
 
 TWIN = [
     Cell("a", "straight", "sun", 10, 9),

@@ -17,8 +17,7 @@ import pytest
 
 from twin import build as verb
 from twin.config import CaptureConfig, MjcfConfig, NerfConfig, SceneConfig, SourceConfig
-from twin.scene import SceneDir
-from twin.stamp import Stamp
+from twin.scene import SceneDir, Stamp
 
 _TOML = '[[source]]\npath = "input/a.txt"\n[metric]\ncamera_height = 1.0\n'
 

@@ -14,19 +14,19 @@ from test_training import SHORT
 from tiny_twin import tiny_twin
 
 import twin
-from twin import progress
-from twin.learn import choosing
-from twin.learn.judging import Driven, episodes
+from twin import runtime
+from twin.evaluation.training_curves import CHOICE, success_curve
+from twin.learn import policy_evaluation
 from twin.learn.policy import load_policy
+from twin.learn.policy_evaluation import EpisodeResult, episodes
 from twin.learn.training import train
-from twin.report.training import CHOICE, success_curve
 
 CONFIG = replace(SHORT, steps=160, save_every=160, checkpoints=8, trials=3)
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
@@ -48,10 +48,11 @@ def scripted(monkeypatch):
         asked.append((step, tuple(seeds)))
         won, reward = script.get(step, (0, 0.0))
         return [
-            Driven(seed, "goal" if i < won else "out_of_bounds", 1.0, 9, 1.0, reward) for i, seed in enumerate(seeds)
+            EpisodeResult(seed, "goal" if i < won else "out_of_bounds", 1.0, 9, 1.0, reward)
+            for i, seed in enumerate(seeds)
         ]
 
-    monkeypatch.setattr(choosing, "episodes", pretend)
+    monkeypatch.setattr(policy_evaluation, "episodes", pretend)
     return script, asked
 
 
@@ -59,10 +60,10 @@ def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
     script, asked = scripted
     (run / CHOICE).unlink(missing_ok=True)
     script |= {120: (2, 1.0), 140: (2, 1.5), 160: (1, 9.0), 40: (3, 9.0)}
-    choice = choosing.choose(scene, run, CONFIG)
+    choice = policy_evaluation.select_checkpoint(scene, run, CONFIG)
     assert [one["step"] for one in choice["candidates"]] == [100, 120, 140, 160]  # of the second half
     # Of those with most successes the one that earns most; its rate is that of the fresh episodes.
-    assert choice["chosen"] == {"step": 140, "trials": choosing.FRESH, "successes": 2, "reward": 1.5}
+    assert choice["chosen"] == {"step": 140, "trials": policy_evaluation.FRESH, "successes": 2, "reward": 1.5}
     assert [one["trials"] for one in choice["candidates"]] == [3, 3, 3, 3]
     for name in ("policy.json", "policy.safetensors", "policy.onnx"):
         assert (run / name).read_bytes() == (run / "checkpoints" / "000000140" / name).read_bytes()
@@ -70,29 +71,29 @@ def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
     shared = {seeds for _, seeds in asked[:-1]}
     assert len(shared) == 1 and len(next(iter(shared))) == CONFIG.trials  # all drive the same episodes
     step, fresh = asked[-1]
-    assert step == 140 and len(fresh) == choosing.FRESH and not set(fresh) & set(next(iter(shared)))
+    assert step == 140 and len(fresh) == policy_evaluation.FRESH and not set(fresh) & set(next(iter(shared)))
     assert success_curve(run).exists()
 
 
 def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, tmp_path, scripted):
     _, asked = scripted
     (run / CHOICE).unlink(missing_ok=True)
-    first = choosing.choose(scene, run, CONFIG)
+    first = policy_evaluation.select_checkpoint(scene, run, CONFIG)
     count = len(asked)
     for config in (CONFIG, replace(CONFIG, steps=80)):  # fewer steps than were trained change nothing
         train(scene, run, config)
-        assert choosing.choose(scene, run, config) == first and len(asked) == count
+        assert policy_evaluation.select_checkpoint(scene, run, config) == first and len(asked) == count
     assert json.loads((run / CHOICE).read_text()) == first
     longer, copy = replace(CONFIG, steps=200), shutil.copytree(run, tmp_path / "run")
     train(scene, copy, longer)
     assert not (copy / CHOICE).exists()
-    again = choosing.choose(scene, copy, longer)
+    again = policy_evaluation.select_checkpoint(scene, copy, longer)
     assert again["steps"] == 200 and again["candidates"][-1]["step"] == 200
 
 
 def test_a_training_that_begins_anew_keeps_nothing_of_the_one_before(scene, run, tmp_path, scripted):
     copy = shutil.copytree(run, tmp_path / "run")
-    choosing.choose(scene, copy, CONFIG)
+    policy_evaluation.select_checkpoint(scene, copy, CONFIG)
     shutil.rmtree(copy / "state")
     (copy / "state").mkdir()
     train(scene, copy, replace(CONFIG, steps=80))
@@ -103,7 +104,7 @@ def test_a_training_that_begins_anew_keeps_nothing_of_the_one_before(scene, run,
 def test_candidates_are_few_and_the_last_is_one(tmp_path):
     for step in range(1000, 21000, 1000):
         (tmp_path / f"{step:09d}").mkdir()
-    found = [int(path.name) for path in choosing._candidates(tmp_path, 20_000)]
+    found = [int(path.name) for path in policy_evaluation._candidates(tmp_path, 20_000)]
     assert found == [11000, 14000, 17000, 20000]
 
 
@@ -119,6 +120,6 @@ def test_they_drive_as_the_training_had_it_but_from_the_start(scene, run, monkey
         return driven
 
     (run / CHOICE).unlink(missing_ok=True)
-    monkeypatch.setattr(choosing, "episodes", spy)
-    choosing.choose(scene, run, CONFIG)
+    monkeypatch.setattr(policy_evaluation, "episodes", spy)
+    policy_evaluation.select_checkpoint(scene, run, CONFIG)
     assert set(map(str, seen)) == {str((0.0, "day", CONFIG.options()["randomise"]))}

@@ -102,7 +102,7 @@ def test_parts_of_films(tmp_path):
 
 
 def test_what_may_be_chosen_is_what_the_libraries_have():
-    cv2, lens = (pytest.importorskip(n) for n in ("cv2", "twin.capture.lens"))
+    cv2, lens = (pytest.importorskip(n) for n in ("cv2", "twin.capture.camera_models"))
     models = set(lens.pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
     assert set(CAMERA_MODELS) == models
     for name, count in CAMERA_MODELS.items():

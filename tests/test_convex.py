@@ -7,8 +7,8 @@ import pytest
 from analytic import right_turn
 
 from twin.assets.convex import (
-    Part,
-    Piece,
+    ConvexPart,
+    SolidPiece,
     decompose,
     half_spaces,
     inside_hull,
@@ -18,15 +18,15 @@ from twin.assets.convex import (
     within_bound,
 )
 from twin.assets.ground import Ground
-from twin.assets.obstacles import HEADROOM, Corridor, clear_corridor, cut
-from twin.assets.route import distance_to_route
+from twin.assets.solids import HEADROOM, Corridor, clear_corridor, cut
+from twin.geometry.route import distance_to_route
 
 BOUND = 0.2  # [m]
 
 
 def _box(low, high):
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
-    part = Part.hull(corners)
+    part = ConvexPart.hull(corners)
     assert part is not None
     return part
 
@@ -61,7 +61,7 @@ def _volume(part):
 
 def test_hull_is_closed_and_faces_outward():
     points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 2, 0.5]
-    part = Part.hull(points)
+    part = ConvexPart.hull(points)
     assert part is not None and len(part.vertices) < len(points)
     normal, offset = half_spaces(part)
     assert (part.vertices.mean(0) @ normal.T < offset).all()
@@ -69,7 +69,7 @@ def test_hull_is_closed_and_faces_outward():
     edges = np.sort(part.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     assert _volume(_box((0, 0, 0), (1, 2, 3))) == pytest.approx(6.0)
-    assert Part.hull(points * [1, 1, 0]) is None and Part.hull(points[:3]) is None
+    assert ConvexPart.hull(points * [1, 1, 0]) is None and ConvexPart.hull(points[:3]) is None
 
 
 def test_winding_number_is_one_inside_and_zero_outside():
@@ -90,8 +90,8 @@ def test_samples_are_on_the_surface_and_no_further_apart_than_asked():
 
 
 def test_the_hull_of_an_ell_sticks_out_as_far_as_geometry_says():
-    piece = Piece.of(*_ell())
-    hull = Part.hull(piece.vertices)
+    piece = SolidPiece.of(*_ell())
+    hull = ConvexPart.hull(piece.vertices)
     assert hull is not None
     # The middle of the hull's slanted face is 0.7 m from either arm.
     assert piece.protrusion(hull) == pytest.approx(0.7, abs=0.05)
@@ -102,8 +102,8 @@ def test_the_hull_of_an_ell_sticks_out_as_far_as_geometry_says():
 
 
 def test_halving_alone_comes_close_and_tells_how_close():
-    piece = Piece.of(*_ell())
-    hull = Part.hull(piece.vertices)
+    piece = SolidPiece.of(*_ell())
+    hull = ConvexPart.hull(piece.vertices)
     assert hull is not None
     halves = within_bound(hull, piece, BOUND)
     assert len(halves) > 1
@@ -116,7 +116,7 @@ def test_halving_alone_comes_close_and_tells_how_close():
 
 def test_decomposition_covers_its_pieces_within_the_bound_and_is_remembered(tmp_path: Path):
     crate = _box((5, 5, 0), (6, 6, 1))
-    pieces = [Piece.of(crate.vertices, crate.faces), Piece.of(*_ell())]
+    pieces = [SolidPiece.of(crate.vertices, crate.faces), SolidPiece.of(*_ell())]
     made = decompose(pieces, BOUND, tmp_path, seed=0)
     assert made.failed == 0 and made.cached == 0 and made.uncovered < 0.01
     assert (made.piece == 0).sum() == 1 and (made.piece == 1).sum() >= 2

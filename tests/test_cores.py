@@ -4,16 +4,16 @@ import os
 
 import pytest
 
-from twin import cores
+from twin import runtime
 
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    monkeypatch.setattr(cores, "_most", None)
+    monkeypatch.setattr(runtime, "_most", None)
     monkeypatch.setattr(os, "sched_getaffinity", lambda who: set(range(8)), raising=False)
-    cores._quota.cache_clear()
+    runtime._quota.cache_clear()
     yield
-    cores._quota.cache_clear()
+    runtime._quota.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -23,10 +23,10 @@ def test_a_container_may_have_fewer(tmp_path, monkeypatch, said, wanted):
     file = tmp_path / "cpu.max"
     if said:
         file.write_text(said + "\n")
-    monkeypatch.setattr(cores, "_QUOTA", file)
-    assert cores.cores() == wanted
+    monkeypatch.setattr(runtime, "_QUOTA", file)
+    assert runtime.cores() == wanted
 
 
 def test_one_of_several_processes_uses_its_share():
-    cores.use(3)
-    assert cores.cores() == min(3, cores._quota() or 3)
+    runtime.use(3)
+    assert runtime.cores() == min(3, runtime._quota() or 3)

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 from scipy.special import expit
 
-from twin.report.correction import Correction, left_out_predictions, powered_mean
-from twin.report.statistics import Refused
+from twin.evaluation.prediction_powered import Correction, left_out_predictions, powered_mean
+from twin.evaluation.statistics import Refused
 
 F = np.array([0.1, 0.3, 0.5, 0.6, 0.9, 0.95])
 Y = np.array([0.0, 0.3, 0.2, 0.5, 0.6, 0.9])

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from test_follower import on_a_plane
 
-from twin.env.controller import Controller
-from twin.env.courses import Controllers
+from twin.env.controller import Controller, VectorController
 from twin.env.physics import HuskyPhysics
 from twin.robot import HuskyParams
 
@@ -25,7 +24,7 @@ def test_many_controllers_do_what_each_does_alone(period):
         return HuskyPhysics(model, replace(PARAMS, command_latency=latencies[i]))
 
     robots = [husky(i) for i in range(n)]
-    many = Controllers(PARAMS, n, period, model.opt.timestep, robots[0].look_steps)
+    many = VectorController(PARAMS, n, period, model.opt.timestep, robots[0].look_steps)
 
     def begin(which: np.ndarray) -> None:
         for i in which:

@@ -7,9 +7,9 @@ import pytest
 from test_review import ChequeredField, make_cameras
 
 from twin.geometry.cameras import Posed
-from twin.nerf.crosslight import cross_lighting, mean_colour
+from twin.nerf.evaluate import cross_lighting, mean_colour
 from twin.nerf.rendering import Rendering
-from twin.progress import set_quiet
+from twin.runtime import set_quiet
 
 
 @pytest.fixture(autouse=True)

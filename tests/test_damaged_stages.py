@@ -7,13 +7,12 @@ import pytest
 from tiny_twin import tiny_twin
 
 from twin.assets.ground import Ground
-from twin.capture.types import Capture, SourceInfo
+from twin.capture.capture_data import Capture, SourceInfo
 from twin.errors import InputError
-from twin.geometry.cameras import Cameras
-from twin.geometry.points import SparsePoints
+from twin.evaluation.training_curves import read_episodes, trainings
+from twin.geometry.cameras import Cameras, SparsePoints
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
-from twin.report.training import read_episodes, trainings
 
 
 @pytest.fixture(scope="module")

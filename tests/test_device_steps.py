@@ -9,16 +9,15 @@ import warp as wp
 from tiny_twin import tiny_twin
 
 import twin
-from twin import progress
+from twin import runtime
 from twin.config import ObstacleConfig
-from twin.env.batch import Worlds
-from twin.env.camera_effects import CameraOptions
-from twin.env.device_pixels import DevicePixels
-from twin.env.device_worlds import DeviceWorlds
-from twin.env.dm import control
-from twin.env.pixels import Pixels
-from twin.env.randomisation import Ranges
-from twin.env.suite import Stage
+from twin.env.camera_noise import CameraOptions
+from twin.env.domain_randomization import Ranges
+from twin.env.observation import GpuPixelObserver, PixelObserver
+from twin.env.options import control
+from twin.env.suite import EnvFactory
+from twin.env.vector_env_gpu import GpuVectorEnv
+from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
 from twin.robot import HuskyParams
 
@@ -30,16 +29,16 @@ OPTIONS = {"pixels": False, "randomise": RANGES, "obstacles": (WALKER,)}
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     # Lagging servos: they have a state of their own.
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin"), robot=HuskyParams(servo_lag=0.05)))
 
 
 def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
     """Robots of different make under different commands, one world after the other and all at once."""
-    stage = Stage.open(scene, "bend", OPTIONS)
+    stage = EnvFactory.open(scene, "bend", OPTIONS)
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
-    plain, device = Worlds(stage, [1, 2, 3]), DeviceWorlds(stage, [1, 2, 3], "cpu")
+    plain, device = LocalVectorEnv(stage, [1, 2, 3]), GpuVectorEnv(stage, [1, 2, 3], "cpu")
     for worlds in (plain, device):
         worlds.begin(range(3))
     rng = np.random.default_rng(0)
@@ -90,12 +89,12 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
 @pytest.mark.parametrize("obstacles", [(), (WALKER,)])
 def test_what_worlds_on_a_device_see(scene, obstacles):
     """Bare pictures that stay there, and such that the host puts something into; nobody asks for the worlds between."""
-    stage = Stage.open(scene, "bend", {"obstacles": obstacles, "lighting": "day", **SMALL})
+    stage = EnvFactory.open(scene, "bend", {"obstacles": obstacles, "lighting": "day", **SMALL})
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
-    plain = Worlds(stage, [1, 2])
+    plain = LocalVectorEnv(stage, [1, 2])
     stage = replace(stage, options=replace(stage.options, device="cuda"))  # the field stays on the CPU
-    device = DeviceWorlds(stage, [1, 2], "cpu")
-    assert type(device.pixels) is (Pixels if obstacles else DevicePixels)
+    device = GpuVectorEnv(stage, [1, 2], "cpu")
+    assert type(device.pixels) is (PixelObserver if obstacles else GpuPixelObserver)
     before = None
     for worlds in (plain, device):
         worlds.begin([0, 1])
@@ -111,7 +110,7 @@ def test_what_worlds_on_a_device_see(scene, obstacles):
 
 
 def test_what_goes_wrong_on_a_device_is_said(scene):
-    worlds = DeviceWorlds(Stage.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
+    worlds = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
     worlds.begin([0])  # the other world lies where the model has it, and is nobody's concern
     device = worlds._device
     device._advance = lambda: None
@@ -130,8 +129,8 @@ def test_what_goes_wrong_on_a_device_is_said(scene):
 
 def test_what_is_touched_on_a_device_ends_the_episode(scene):
     wall = ObstacleConfig("in_the_way", "box", station=1.5, lateral=0.0)
-    stage = Stage.open(scene, "bend", {"pixels": False, "obstacles": (wall,)})
-    worlds = DeviceWorlds(stage, [4, 5], "cpu")
+    stage = EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": (wall,)})
+    worlds = GpuVectorEnv(stage, [4, 5], "cpu")
     worlds.begin(range(2))
     for _ in range(30):
         out = worlds.step(np.array([[1.0, 0.0], [-1.0, 0.0]]))
@@ -148,12 +147,14 @@ def test_what_is_touched_on_a_device_ends_the_episode(scene):
 @pytest.mark.parametrize("latency", [0.0, 0.1])
 def test_pictures_on_a_device_are_those_on_the_host(scene, latency, monkeypatch):
     """Through the ends of episodes, some worlds at a time, and as a tensor that shares the memory."""
-    stage = Stage.open(scene, "bend", {"obstacles": (), "lighting": ("day", "night"), "lighting_drift": True, **SMALL})
+    stage = EnvFactory.open(
+        scene, "bend", {"obstacles": (), "lighting": ("day", "night"), "lighting_drift": True, **SMALL}
+    )
     robot = replace(stage.world.robot, camera_latency=latency)
     stage = replace(stage, world=replace(stage.world, robot=robot))
     parts = [stage.drive(seed) for seed in range(3)]
     monkeypatch.setattr(stage.trust, "offset", lambda poses: np.zeros(len(poses)))  # so that the picture decides
-    host, device = stage.pixels(parts), DevicePixels(stage.field, stage.trust, stage.options, parts)
+    host, device = stage.pixels(parts), GpuPixelObserver(stage.field, stage.trust, stage.options, parts)
     for physics, task in parts:
         task.initialize_episode(physics)
     before = None
@@ -174,12 +175,12 @@ def test_pictures_on_a_device_are_those_on_the_host(scene, latency, monkeypatch)
 
 def test_only_bare_pictures_stay_on_the_device(scene):
     def kind(**options) -> type:
-        stage = Stage.open(scene, "bend", {"obstacles": (), **SMALL, **options})
+        stage = EnvFactory.open(scene, "bend", {"obstacles": (), **SMALL, **options})
         stage = replace(stage, options=replace(stage.options, device="cuda"))  # the field stays on the CPU
         return type(stage.pixels([stage.drive(0)]))
 
-    assert kind() is DevicePixels
-    assert kind(randomise=True) is kind(obstacles=1) is kind(camera=CameraOptions(vibration=0.1)) is Pixels
+    assert kind() is GpuPixelObserver
+    assert kind(randomise=True) is kind(obstacles=1) is kind(camera=CameraOptions(vibration=0.1)) is PixelObserver
 
 
 def test_no_gpu_is_one_clear_line(scene):

@@ -11,7 +11,7 @@ def _run(code: str) -> subprocess.CompletedProcess:
 
 
 def test_scenes_are_built_without_dm_control():
-    done = _run("import twin, twin.build, twin.report.review, twin.mjcf.export, twin.forecast, twin.export")
+    done = _run("import twin, twin.build, twin.report.review_video, twin.mjcf.scene_xml, twin.forecast, twin.export")
     assert done.returncode == 0, done.stderr
 
 

@@ -8,25 +8,26 @@ import pytest
 from test_review import ChequeredField, make_cameras
 from tqdm import tqdm
 
-from twin.env.chase import frame_indices
-from twin.env.follower import Drive
+from twin.env.drivers import FollowedDrive
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
-from twin.report.drive import drive_metrics, film_drive, speeds, stride, trace
-from twin.report.panels import Layout
-from twin.report.plan import Plan
-from twin.report.studio import Studio
-from twin.report.video import VideoWriter, read_frames
+from twin.report.chase_camera import frame_indices
+from twin.report.review_chapters import drive_metrics, film_drive, speeds, stride, trace
+from twin.report.review_studio import Studio
+from twin.report.video_layout import FrameLayout, MapView
+from twin.report.video_writer import VideoWriter, read_frames
 from twin.robot import PixelCamera
 
 
-def drive_along(x: np.ndarray, y: np.ndarray, yaw: np.ndarray, outcome: str = "goal", touched: tuple = ()) -> Drive:
+def drive_along(
+    x: np.ndarray, y: np.ndarray, yaw: np.ndarray, outcome: str = "goal", touched: tuple = ()
+) -> FollowedDrive:
     """A drive through given places, one per 0.1 s, its camera half a metre up."""
     base = np.tile(np.eye(4), (len(x), 1, 1))
     base[:, 0, 0], base[:, 0, 1], base[:, 1, 0], base[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
     base[:, 0, 3], base[:, 1, 3] = x, y
     eyes = [look_at(p[:3, 3] + [0, 0, 0.5], p[:3, 3] + p[:3, 0] * 5) for p in base]
-    return Drive(
+    return FollowedDrive(
         times=0.1 * np.arange(len(x)),
         base_to_world=base,
         camera_to_world=np.array(eyes),
@@ -39,7 +40,7 @@ def drive_along(x: np.ndarray, y: np.ndarray, yaw: np.ndarray, outcome: str = "g
     )
 
 
-def straight(k: int = 101) -> Drive:
+def straight(k: int = 101) -> FollowedDrive:
     x = np.linspace(0.0, 0.1 * (k - 1), k)
     return drive_along(x, 0.2 * np.sin(x), np.zeros(k))
 
@@ -95,13 +96,13 @@ def test_the_drive_is_filmed_within_its_budget(tmp_path: Path, outcome: str, ins
         tmp_path,
         PixelCamera((80.0, 80.0, 80.0, 45.0), (160, 90)),
     )
-    layout = Layout.for_pictures(160, 9 / 16)
+    layout = FrameLayout.for_pictures(160, 9 / 16)
     route = world.route[:, :2]
     with VideoWriter(tmp_path / "film.mp4", layout.size, 5) as writer, tqdm(file=io.StringIO()) as progress:
         studio = Studio("place", field, cameras, layout, writer, tmp_path, 48, route)
         indices = frame_indices(instants, stride(drive, 5)[0])
         chase = [np.full((layout.panel[1], layout.panel[0], 3), i % 256, np.uint8) for i in indices]
-        film_drive(studio, Plan.draw((200, 60), route), world, drive, chase, 12, progress)
+        film_drive(studio, MapView.draw((200, 60), route), world, drive, chase, 12, progress)
     assert 0 < studio.renders <= 12
     assert field.asked[0] == "day" and field.asked[-1] == ("night" if instants > 1 else "day")
     assert len(list(read_frames(tmp_path / "film.mp4"))) == writer.frames > len(indices)

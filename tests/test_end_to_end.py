@@ -39,6 +39,7 @@ def built(tmp_path_factory):
     subprocess.run([sys.executable, "-m", "twin.reality", "film", "--tiny", "--out", str(root)], check=True)
     done = subprocess.run(_command(root), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
+    subprocess.run([sys.executable, "-m", "twin.reality", "compare", str(root)], check=True)
     return root, done.stdout
 
 

@@ -13,14 +13,14 @@ from gymnasium.utils.env_checker import check_env
 from tiny_twin import tiny_twin
 
 import twin
-from twin import progress
+from twin import runtime
 from twin.config import ObstacleConfig
-from twin.env.batch import Worlds
+from twin.env.domain_randomization import Ranges
 from twin.env.drivers import BlindDriver, RouteDriver
-from twin.env.gym import DriveEnv
+from twin.env.gym_env import DriveEnv
 from twin.env.options import CAUSES
-from twin.env.randomisation import Ranges
-from twin.env.suite import Stage
+from twin.env.suite import EnvFactory
+from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
 
 SMALL = {"size": (32, 18)}
@@ -36,7 +36,7 @@ TASKS = ("ahead", "bend", "route")
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
@@ -117,7 +117,7 @@ def test_gymnasium_and_sb3_accept_it(scene, name):
 def test_one_world_of_many_is_the_single_environment(scene, name):
     """Step for step, pixels and all, through the ends of episodes."""
     options = OPTION_SETS[name] | {"time_limit": 1.5}
-    worlds = Worlds(Stage.open(scene, "bend", options), [5, 6, 7])
+    worlds = LocalVectorEnv(EnvFactory.open(scene, "bend", options), [5, 6, 7])
     single = twin.load(scene, "bend", seed=6, **options)
     rng = np.random.default_rng(0)
     spec = single.action_spec()
@@ -144,7 +144,7 @@ def test_one_world_of_many_is_the_single_environment(scene, name):
 def test_vectors_begin_anew_by_themselves(scene):
     from stable_baselines3 import SAC
 
-    from twin.learn.vectors import DriveVecEnv
+    from twin.learn.sb3_env import DriveVecEnv
 
     options = SMALL | {"time_limit": 0.5, "lighting": "day"}
     many = gymnasium.make_vec(
@@ -315,14 +315,16 @@ def test_the_environment_needs_no_torch():
     import subprocess
     import sys
 
-    code = "import sys, twin.env.suite, twin.env.gym, twin.env.batch; assert 'torch' not in sys.modules"
+    code = "import sys, twin.env.suite, twin.env.gym_env, twin.env.vector_env_local; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.slow
 def test_twenty_thousand_steps(scene):
     """No NaN, no memory growth; `benchmarks/env.py --only soak` takes five times as many, with pictures."""
-    worlds = Worlds(Stage.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1])
+    worlds = LocalVectorEnv(
+        EnvFactory.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1]
+    )
     rng = np.random.default_rng(0)
     worlds.begin([0, 1])
     process, sizes = psutil.Process(), []

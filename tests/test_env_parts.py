@@ -7,31 +7,31 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from audit import EVENTS, Findings, Seen, audit
 from tiny_twin import tiny_field, tiny_twin
 from tiny_world import tiny_world
 
 import twin
-from twin import progress
+from twin import runtime
 from twin.config import HELD_OUT, TRAINING, TaskConfig
-from twin.env.audit import EVENTS, Findings, Seen, audit
-from twin.env.batch import worlds_of
+from twin.env.domain_randomization import ANOTHER_DAY, Nominal, RandomizationSample, Ranges
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record
-from twin.env.lightings import Light, LightSets, draw_light
+from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
+from twin.env.episode_model import episode_spec
 from twin.env.options import parse_options
 from twin.env.physics import HuskyPhysics
-from twin.env.randomisation import ANOTHER_DAY, Draw, Nominal, Ranges
-from twin.env.scene_model import episode_spec
-from twin.env.stretches import find_task, tasks
-from twin.env.suite import Stage
+from twin.env.route_segments import find_task, tasks
+from twin.env.suite import EnvFactory
 from twin.env.trust import Trust
+from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
 from twin.film import main
 from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
-from twin.report.video import describe
+from twin.report.video_writer import describe
 from twin.robot import TRACK, HuskyParams
 
 SMALL = {"size": (32, 18)}
@@ -39,7 +39,7 @@ SMALL = {"size": (32, 18)}
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
@@ -94,7 +94,7 @@ def test_own_tasks_are_named_in_the_scene_and_must_fit():
 
 
 def test_training_and_held_out_lights_never_mix(field):
-    sets, rng = LightSets(field), np.random.default_rng(5)
+    sets, rng = LightingSets(field), np.random.default_rng(5)
     for which in (TRAINING, HELD_OUT):
         for _ in range(20):
             assert sets.set_of(sets.sample(which, rng)) == which
@@ -106,7 +106,7 @@ def test_training_and_held_out_lights_never_mix(field):
 
 
 def test_lights_of_rare_anchors_are_drawn_as_often_as_others(field):
-    sets, rng = LightSets(field), np.random.default_rng(3)
+    sets, rng = LightingSets(field), np.random.default_rng(3)
     for which, held_out in ((TRAINING, False), (HELD_OUT, True)):
         own = set(np.flatnonzero(sets.anchors.held_out == held_out))
         near = [sets._place_of(sets.sample(which, rng))[1] for _ in range(40 * len(own))]
@@ -119,33 +119,33 @@ def test_a_photo_added_later_moves_no_set():
     rng = np.random.default_rng(0)
     lights = [plain.sample_lighting(rng) for _ in range(30)]
     added.add_lightings({"photo": np.array([0.4, 0.5, 0.3, 0.0], np.float32)})
-    before, after = LightSets(plain), LightSets(added)
+    before, after = LightingSets(plain), LightingSets(added)
     assert [before.set_of(light) for light in lights] == [after.set_of(light) for light in lights]
 
 
 def test_lights_are_drawn_as_asked(field):
-    sets, rng = LightSets(field), np.random.default_rng(1)
-    assert np.array_equal(draw_light("day", False, 1.0, sets, rng).at(9.0), field.embedding("day"))
-    mixed = draw_light("day:night:0.25", False, 1.0, sets, rng).at(0.0)
+    sets, rng = LightingSets(field), np.random.default_rng(1)
+    assert np.array_equal(sample_lighting("day", False, 1.0, sets, rng).at(9.0), field.embedding("day"))
+    mixed = sample_lighting("day:night:0.25", False, 1.0, sets, rng).at(0.0)
     np.testing.assert_allclose(mixed, 0.75 * field.embedding("day") + 0.25 * field.embedding("night"), atol=1e-6)
-    names = {draw_light(("day", "night"), False, 1.0, sets, rng).name for _ in range(30)}
+    names = {sample_lighting(("day", "night"), False, 1.0, sets, rng).name for _ in range(30)}
     assert names == {"day", "night"}
-    drifting = draw_light("day", True, 10.0, sets, rng)
+    drifting = sample_lighting("day", True, 10.0, sets, rng)
     assert drifting.name == "day → night"
     np.testing.assert_allclose(drifting.at(5.0), 0.5 * (field.embedding("day") + field.embedding("night")), atol=1e-6)
     assert np.array_equal(drifting.at(99.0), field.embedding("night"))
-    assert isinstance(draw_light("any", False, 1.0, sets, rng), Light)
+    assert isinstance(sample_lighting("any", False, 1.0, sets, rng), EpisodeLighting)
 
 
 # ---- randomisation
 
 
 def test_a_draw_does_to_the_model_what_it_says(scene):
-    stage = Stage.open(scene, "bend", {"pixels": False})
+    stage = EnvFactory.open(scene, "bend", {"pixels": False})
     physics, _ = stage.drive(0)
     model, nominal = physics.model.ptr, Nominal(stage.model)
     plain = model.geom_size[model.geom("front_left_tyre").id].copy()
-    draw = Draw(1.2, 12.0, 0.05, (0.01, 0.0, -0.01), (0.0, 2.0, 0.0), 0.97)
+    draw = RandomizationSample(1.2, 12.0, 0.05, (0.01, 0.0, -0.01), (0.0, 2.0, 0.0), 0.97)
     nominal.apply(draw, model)
     tyre = model.geom("front_left_tyre")
     assert tyre.friction[0] == pytest.approx(1.2 * world_friction(stage))
@@ -157,12 +157,12 @@ def test_a_draw_does_to_the_model_what_it_says(scene):
     assert np.linalg.norm(camera.pos - before.pos) == pytest.approx(np.hypot(0.01, 0.01))
     turn = 2 * np.arccos(abs(camera.quat @ before.quat))
     assert np.rad2deg(turn) == pytest.approx(2.0, abs=1e-6)
-    nominal.apply(Draw(), model)
+    nominal.apply(RandomizationSample(), model)
     for name in ("geom_friction", "geom_size", "body_mass", "cam_pos", "cam_quat", "body_invweight0"):
         np.testing.assert_allclose(getattr(model, name), getattr(stage.model, name), atol=1e-12, err_msg=name)
 
 
-def world_friction(stage: Stage) -> float:
+def world_friction(stage: EnvFactory) -> float:
     return float(stage.world.robot.friction)
 
 
@@ -352,27 +352,27 @@ def test_a_film_of_nothing_possible_is_one_line(scene, capsys, option, words):
 
 
 def test_the_audit_finds_holes_and_finds_none_where_there_are_none(scene, tmp_path):
-    stage = Stage.open(scene, "bend", {"pixels": False})
+    stage = EnvFactory.open(scene, "bend", {"pixels": False})
     found = audit(stage, hours=0.02)
     assert found.seconds >= 72.0 and found.touching > 0
     assert found.false_successes == 0 and found.events["episode_tunnelling"] == found.events["tunnelling"] == 0
     assert found.events["episode_wall_sliding"] == found.events["gap"] == found.events["climbing"] == 0
     assert set(found.summary()["steps_with"]) == {*EVENTS, *(f"episode_{name}" for name in EVENTS)}
     # A visual mesh across the road that nothing solid stands for is a gap.
-    from twin.env import audit as module
+    import audit as module
 
     seen = Seen(stage.world)
     seen._points = np.array([[3.0, y, z] for y in np.arange(-2, 2, 0.1) for z in np.arange(0.3, 1.0, 0.05)])
     seen._tree = module.cKDTree(seen._points[:, :2])
     holes = Findings()
-    module._episodes(stage, holes, seen, True, 20.0, np.random.default_rng(0), progress.bar("", 1))
+    module._episodes(stage, holes, seen, True, 20.0, np.random.default_rng(0), runtime.bar("", 1))
     assert holes.events["episode_gap"] > 0 and holes.false_successes == holes.episodes["goal"] > 0
 
 
 def test_the_examiner_knows_tunnelling_climbing_and_sliding(scene):
-    from twin.env.audit import Examiner
+    from audit import Examiner
 
-    stage = Stage.open(scene, "bend", {"pixels": False})
+    stage = EnvFactory.open(scene, "bend", {"pixels": False})
     robot = HuskyPhysics(episode_spec(stage.world, 0.0, 10.0, 5.0).compile(), stage.world.robot)
     examiner = Examiner(robot, Seen(stage.world))
     robot.place(1.0, 0.0, 0.0)
@@ -409,7 +409,7 @@ def test_what_is_no_action_is_a_clear_error_and_the_episode_goes_on(scene, actio
 
 
 def test_what_is_no_action_of_many_worlds(scene):
-    worlds = worlds_of(scene, "ahead", {"pixels": False, "action": "steering"}, [1, 2], 1)
+    worlds = make_vector_env(scene, "ahead", {"pixels": False, "action": "steering"}, [1, 2], 1)
     worlds.begin([0, 1])
     for actions in (np.zeros((2, 2)), np.zeros(2), np.zeros((1, 1)), np.full((2, 1), np.nan), np.zeros((2, 1), bool)):
         with pytest.raises(ValueError, match=r"expected finite numbers of shape \(2, 1\)"):

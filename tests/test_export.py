@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from twin import export
-from twin.assets.gaussians import Gaussians, gaussians_of_views, sharpest
+from twin.assets.splats import Gaussians, gaussians_of_views, sharpest
 from twin.assets.views import Views
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.poses import look_at

@@ -10,13 +10,21 @@ from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
+from twin.nerf.buffers import (
+    CameraArrays,
+    Layout,
+    Space,
+    Workspace,
+    level_cells,
+    level_shapes,
+    opacity_grids,
+    space_of_cameras,
+)
 from twin.nerf.field import RadianceField, untrained
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid
 from twin.nerf.kernels.space import contract_points
 from twin.nerf.rendering import FAR
-from twin.nerf.sampling import Space, level_cells, level_shapes, space_of_cameras, stop_grids
-from twin.nerf.workspace import CameraArrays, Layout, Workspace
 
 LAYOUT = Layout(
     (1.0, -2.0, 0.5), (8.0, 6.0, 2.0), 0.3, levels=3, growth=2.0, log2_table=11, hidden=16, appearance_dim=32
@@ -186,7 +194,7 @@ def test_contraction_keeps_the_near_box_and_holds_all_of_space():
 def solid_below(field: RadianceField, height: float) -> None:
     """Makes everything below z = height [m] opaque for sampling."""
     near, far = field.grids
-    stop = stop_grids(field.layout.space)
+    stop = opacity_grids(field.layout.space)
     low, high = field.bounds[:, 2]
     z = low + (np.arange(stop.near_shape[2]) + 0.5) / stop.near_shape[2] * (high - low)
     near[:] = torch.from_numpy(np.where(z < height, 0.99, 0.0).astype(np.float32))

@@ -13,11 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin import files
-from twin.alignment.logs import read_log
 from twin.errors import InputError
-from twin.report.trials import Cell, read_results, read_trials
-from twin.scene import SceneDir, check_name, run_folder
-from twin.stamp import finished, seal
+from twin.evaluation.trials import Cell, read_results, read_trials
+from twin.scene import SceneDir, check_name, finished, run_folder, seal
+from twin.sysid.logs import read_log
 
 _DEEP = 100_000
 

@@ -10,23 +10,19 @@ import torch
 from twin.config import NerfConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
 from twin.files import write_json
-from twin.geometry.cameras import Cameras, Viewpoints, project
+from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, project
 from twin.geometry.images import psnr, write_image
-from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
-from twin.nerf import compute
+from twin.nerf import buffers
+from twin.nerf.appearance_fit import fit_appearance
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
-from twin.nerf.compute import single_threaded_torch
+from twin.nerf.buffers import CameraArrays, single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
-from twin.nerf.fit import Trainer, fit, free_segments
-from twin.nerf.fit_light import fit_light
-from twin.nerf.losses import bending
-from twin.nerf.stage import constant_height, run
-from twin.nerf.workspace import CameraArrays
-from twin.progress import set_quiet
+from twin.nerf.trainer import Trainer, bending, constant_height, free_segments, run, train_field
+from twin.runtime import set_quiet
 from twin.scene import SceneDir
 
 WIDTH, HEIGHT = 32, 24
@@ -183,7 +179,7 @@ def trained(cameras: Cameras, config: NerfConfig) -> RadianceField:
 
 def test_two_runs_are_equal_bit_by_bit_on_any_number_of_cores(cameras, monkeypatch):
     first = trained(cameras, CONFIG)
-    monkeypatch.setattr(compute, "cores", lambda: 1)
+    monkeypatch.setattr(buffers, "cores", lambda: 1)
     second = trained(cameras, CONFIG)
     assert torch.equal(first.table, second.table)
     assert all(torch.equal(a, b) for a, b in zip(first.grids, second.grids, strict=True))
@@ -200,7 +196,7 @@ def test_another_seed_is_another_field(cameras):
 
 def test_it_learns_the_floor_and_both_lightings(cameras):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, metrics, _ = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    field, metrics, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
     metrics |= evaluate(field, cameras, WIDTH)
     assert metrics["n"] == {"day": 1, "night": 1}
     assert metrics["train_psnr"] > 17.0
@@ -220,7 +216,7 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
     pixels = np.stack([column.ravel() + 0.5 for column in np.mgrid[:HEIGHT, :WIDTH][::-1]], -1)
     features, harmonics, _, _ = field.trace(one, np.zeros(len(pixels), int), pixels)
     colours = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
-    fitted, _ = fit_light(field, features, harmonics, colours, field.embedding("day"))
+    fitted, _ = fit_appearance(field, features, harmonics, colours, field.embedding("day"))
     seen = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), fitted).rgb[0]
     assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
 
@@ -249,7 +245,7 @@ def bricks(facts) -> int:
 
 def test_a_baked_field_shows_what_the_field_shows(cameras, monkeypatch):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, _, _ = fit(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    field, _, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     baked, facts = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
     again, _ = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
@@ -284,11 +280,11 @@ def test_a_device_that_is_not_there_is_an_input_error(monkeypatch, value, messag
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setenv("TWIN_DEVICE", value)
     with pytest.raises(InputError, match=message):
-        compute.device()
+        buffers.device()
 
 
 def test_a_field_that_no_camera_sees_is_not_baked(cameras):
     config = replace(CONFIG, steps=2, near_plane=100.0)  # [m] everything is nearer
-    field, _, _ = fit(cameras, floor_points(cameras), config)
+    field, _, _ = train_field(cameras, floor_points(cameras), config)
     with pytest.raises(InputError, match=r"nothing to bake.*near_plane"):
         bake(field, TrainingPixels(cameras, SparsePoints.empty(), WIDTH), steps=1)

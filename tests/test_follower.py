@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from tiny_world import tiny_config, tiny_scene, tiny_world
 
-from twin.env.chase import SceneCamera, chase_poses, frame_indices, overlay
-from twin.env.follower import follow, pursuit_curvature
+from twin.env.drivers import follow, pursuit_curvature
 from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import project
 from twin.geometry.poses import inverse_pose
-from twin.mjcf.export import run
 from twin.mjcf.husky import add_husky, set_options
+from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
+from twin.report.chase_camera import SceneCamera, chase_poses, frame_indices, overlay
 from twin.robot import REAR_HEAVY, HuskyParams
 
 

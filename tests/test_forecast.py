@@ -11,12 +11,13 @@ from scipy.special import expit
 
 from twin.env.options import CAUSES
 from twin.errors import InputError
+from twin.evaluation.forecasting import ALL_TASKS, Estimate, Forecast, make_forecast
+from twin.evaluation.statistics import mmrv, pearson, spearman, wilson
+from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
-from twin.report import forecast_figures
-from twin.report.forecast import ALL_TASKS, Estimate, Forecast
-from twin.report.forecast_figures import columns_of
-from twin.report.forecast_page import forecast_page
-from twin.report.forecast_words import (
+from twin.report import forecast_report
+from twin.report.forecast_report import columns_of, forecast_page
+from twin.report.forecast_summary import (
     CSV_COLUMNS,
     NOMINAL,
     STATISTICS,
@@ -26,10 +27,7 @@ from twin.report.forecast_words import (
     unknowns,
     verdicts,
 )
-from twin.report.forecasting import make_forecast
-from twin.report.markup import LONG
-from twin.report.statistics import mmrv, pearson, spearman, wilson
-from twin.report.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
+from twin.report.html import LONG
 
 LIGHTS = ("held-out", "sun")
 
@@ -255,9 +253,9 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
             (lambda p: p.lighting, lambda p: p.bias.value),
         )
     )
-    for figure, wanted in ((forecast_figures.twin_cells, twin), (forecast_figures.road_cells, road)):
+    for figure, wanted in ((forecast_report.twin_cells, twin), (forecast_report.road_cells, road)):
         assert tile_texts(figure(candidates, pairs)) == {key: f"{100 * rate:.0f}" for key, rate in wanted.items()}
-    figure = forecast_figures.road_minus_twin(candidates, pairs)
+    figure = forecast_report.road_minus_twin(candidates, pairs)
     told = tile_texts(figure)
     assert {key: int(text.replace("−", "-")) for key, text in told.items()} == {
         key: round(100 * bias) for key, bias in off.items()
@@ -272,7 +270,7 @@ def test_ranks_that_are_hardly_possible_have_no_tile() -> None:
     made = make_forecast("road", *cells(n=8))
     ranks = np.array([c.twin_ranks for c in made.candidates])
     assert (ranks < 0.005).sum() > 0
-    told, names = tile_texts(forecast_figures.rank_chances(made.candidates)), [c.policy for c in made.candidates]
+    told, names = tile_texts(forecast_report.rank_chances(made.candidates)), [c.policy for c in made.candidates]
     assert told == {(names[i], str(k + 1)): f"{100 * ranks[i, k]:.0f}" for i, k in np.argwhere(ranks > 0.005).tolist()}
 
 

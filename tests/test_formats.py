@@ -11,10 +11,17 @@ import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
-from twin.capture.colmap import read_model, rotation_from_quaternion
-from twin.capture.exif import focal_from_exif, photo_facts
-from twin.capture.formats import detect_kind, natural_key, read_colmap, read_image_folder, read_transforms
-from twin.capture.lens import Lens, checked_lens, flattened, same_aspect
+from twin.capture.camera_models import Lens, checked_lens, flattened, same_aspect
+from twin.capture.formats import (
+    detect_kind,
+    natural_key,
+    read_colmap,
+    read_image_folder,
+    read_model,
+    read_transforms,
+    rotation_from_quaternion,
+)
+from twin.capture.photos import focal_from_exif, photo_facts
 from twin.errors import InputError
 from twin.geometry.images import write_image
 from twin.geometry.poses import inverse_pose, look_at

@@ -11,8 +11,19 @@ import pytest
 from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views, wall
 
 from twin.capture.frames import held_out_frames, source_names
-from twin.capture.motion import median_motion, sharpness, stands_still
-from twin.capture.video import FilmCount, FilmFacts, decode, index_of, oriented, probe, slot_of, upright
+from twin.capture.video import (
+    FilmCount,
+    FilmFacts,
+    decode,
+    index_of,
+    median_motion,
+    oriented,
+    probe,
+    sharpness,
+    slot_of,
+    stands_still,
+    upright,
+)
 from twin.config import CalibrationConfig, SourceConfig
 from twin.geometry.images import read_image, write_image
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.assets.fusion import LOOK_THROUGH, fuse
+from twin.assets.tsdf import LOOK_THROUGH, fuse
 from twin.assets.views import Views
 
 BAND, FAR = 0.3, 10.0

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.assets.ground import Ground
-from twin.assets.ground_fit import Data, Grid, bias_to_path, cell_medians, fit_height
+from twin.assets.ground import Ground, HeightData, HeightGrid, bias_to_path, cell_medians, fit_height
 
 
 def _ground(height):
@@ -55,8 +54,8 @@ def test_fit_finds_hills_under_noise_and_things_that_stand():
     xyz = _noisy(rng, 3000, low, high, 0.03)
     standing = rng.random(len(xyz)) < 0.15
     xyz[standing, 2] += rng.uniform(0.3, 1.5, standing.sum())
-    data = Data(xyz, np.full(len(xyz), 0.03), np.zeros(len(xyz), np.int8))
-    grid = Grid.covering(low, high, 0.4, 10_000)
+    data = HeightData(xyz, np.full(len(xyz), 0.03), np.zeros(len(xyz), np.int8))
+    grid = HeightGrid.covering(low, high, 0.4, 10_000)
     height, weights = fit_height(data, grid)
     error = np.abs(height - _hills(grid.nodes()))
     assert np.median(error) < 0.01 and np.quantile(error, 0.95) < 0.03
@@ -67,8 +66,8 @@ def test_a_slope_goes_on_through_a_gap():
     rng = np.random.default_rng(4)
     xy = rng.uniform([-8.0, -4.0], [8.0, 4.0], (1500, 2))
     xy = xy[np.abs(xy[:, 0]) > 1.5]
-    data = Data(np.column_stack([xy, 0.1 * xy[:, 0] + 0.2]), np.full(len(xy), 0.03), np.zeros(len(xy), np.int8))
-    grid = Grid.covering(np.array([-8.0, -4.0]), np.array([8.0, 4.0]), 0.4, 10_000)
+    data = HeightData(np.column_stack([xy, 0.1 * xy[:, 0] + 0.2]), np.full(len(xy), 0.03), np.zeros(len(xy), np.int8))
+    grid = HeightGrid.covering(np.array([-8.0, -4.0]), np.array([8.0, 4.0]), 0.4, 10_000)
     height, _ = fit_height(data, grid)
     assert np.abs(height - 0.1 * grid.nodes()[..., 0] - 0.2).max() < 0.02
 
@@ -85,9 +84,11 @@ def test_cells_hold_the_median_of_their_points():
 
 def test_bias_is_what_lies_beside_the_path_only():
     rng = np.random.default_rng(5)
-    path = Data(np.column_stack([np.arange(0.0, 10.0, 0.25), np.zeros((40, 2))]), np.ones(40), np.full(40, 2, np.int8))
+    path = HeightData(
+        np.column_stack([np.arange(0.0, 10.0, 0.25), np.zeros((40, 2))]), np.ones(40), np.full(40, 2, np.int8)
+    )
     xyz = rng.uniform([0.0, -6.0, 0.0], [10.0, 6.0, 0.0], (800, 3))
     near = np.abs(xyz[:, 1]) < 0.85
     xyz[:, 2] = np.where(near, 0.07, 1.0)
-    assert bias_to_path(Data(xyz, np.ones(800), np.zeros(800, np.int8)), path) == 0.07
-    assert bias_to_path(Data(xyz[:5], np.ones(5), np.zeros(5, np.int8)), path) == 0.0
+    assert bias_to_path(HeightData(xyz, np.ones(800), np.zeros(800, np.int8)), path) == 0.07
+    assert bias_to_path(HeightData(xyz[:5], np.ones(5), np.zeros(5, np.int8)), path) == 0.0

@@ -3,12 +3,10 @@
 import mujoco
 import numpy as np
 import pytest
+from acceptance import MASS, drive, on_plane, start_of
 
-from twin.env.acceptance.drive import drive, on_plane, start_of
-from twin.env.acceptance.rows import MASS
 from twin.env.physics import HuskyPhysics
-from twin.mjcf.husky import HUSKY_XML, add_husky, center_of_mass, set_options, standalone_xml
-from twin.mjcf.skid import coulomb_track_ratio
+from twin.mjcf.husky import HUSKY_XML, add_husky, center_of_mass, coulomb_track_ratio, set_options, standalone_xml
 from twin.robot import GEAR_RATIO, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams, PixelCamera
 
 

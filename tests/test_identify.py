@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from twin.alignment.identify import Fit, Parameter, fit, search
-from twin.alignment.robust import unlikelihood
+from twin.sysid.estimation import Fit, Parameter, fit, negative_log_likelihood, search
 
 ONE = (0,)
 
@@ -153,7 +152,7 @@ def test_nothing_identified_is_a_fit_too(guess):
     found = fit(table, lambda v: noise + 0 * (v["a"] + v["b"]), ONE, np.arange(50), {"a": 3.0, "b": 3.0})
     assert found.values == {"a": 7.0, "b": 7.0}
     assert not found.errors and set(found.refused) == {"a", "b"}
-    assert found.unlikelihood == unlikelihood(noise, ONE)
+    assert found.unlikelihood == negative_log_likelihood(noise, ONE)
 
 
 @pytest.mark.parametrize("kept", [0, 1])

@@ -6,17 +6,17 @@ from importlib import import_module
 import pytest
 import warp as wp
 
-from twin.nerf import compute, kernels
-from twin.nerf.kernels import march, shade
+from twin.nerf import buffers, kernels
+from twin.nerf.kernels import color_head, march
 
 _ARCH = 90  # sm_90: Hopper
 _SLOW = {"stereo"}
 """Unrolled windows make it 20 s of compiling to machine code; to PTX, which a driver takes on, it is half of that."""
 _MADE = {
-    "many worlds' steps": lambda: import_module("twin.env.device_steps"),
-    "many worlds' pictures": lambda: import_module("twin.env.device_pixels"),
+    "many worlds' steps": lambda: import_module("twin.env.vector_env_gpu"),
+    "many worlds' pictures": lambda: import_module("twin.env.observation"),
     "march of one lane": lambda: march.march(march.LANES["cuda"]).module,
-    "shade of one lane": lambda: shade.shade(shade.LANES["cuda"], 64, 32)[0].module,
+    "shade of one lane": lambda: color_head.shade(color_head.LANES["cuda"], 64, 32)[0].module,
 }
 """Those elsewhere; and kernels that are made for a number of lanes, which are in modules of their own."""
 _NO_KERNEL = {"lookup", "shade", "vectorised"}
@@ -26,7 +26,7 @@ _NO_KERNEL = {"lookup", "shade", "vectorised"}
     "name", [*(m.name for m in pkgutil.iter_modules(kernels.__path__) if m.name not in _NO_KERNEL), *_MADE]
 )
 def test_kernels_compile_for_sm_90(name, tmp_path):
-    assert compute.wp is wp  # importing it initialises Warp quietly
+    assert buffers.wp is wp  # importing it initialises Warp quietly
     module = _MADE[name]() if name in _MADE else import_module(f"{kernels.__name__}.{name}")
     made = wp.compile_aot_module(module, arch=_ARCH, module_dir=tmp_path, use_ptx=name in _SLOW)
     suffix = f".sm{_ARCH}.ptx" if name in _SLOW else f".sm{_ARCH}.cubin"

@@ -8,10 +8,9 @@ from test_baked import baked
 from test_overlay import SIZE, K, nothing
 
 from twin.config import ObstacleConfig
-from twin.env.light import SIDES, FieldLight, Light, harmonics
+from twin.env.compositor import Compositor, ContactShadows
+from twin.env.irradiance import SIDES, Irradiance, IrradianceEstimator, harmonics
 from twin.env.obstacles import add_obstacles
-from twin.env.overlay import Overlay
-from twin.env.shadow import Shadows
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
@@ -20,7 +19,7 @@ from twin.nerf.network import spherical_harmonics
 ROUTE = np.column_stack([np.linspace(-3.0, 3.0, 25), np.zeros(25), np.full(25, -1.0)])
 
 
-def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Light:
+def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Irradiance:
     """A uniform sky over dim ground, and a sun, exactly."""
     rise = 0.625  # of upright surfaces under such a sky
     a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
@@ -28,7 +27,7 @@ def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Light:
     sides = share / np.tan(e) * np.maximum(SIDES @ toward, 0.0)
     growing = np.concatenate([[(1.0 - share) * rise], sides])[:, None] * np.ones(3)
     spots = np.random.default_rng(0).uniform(-5, 5, (200, 2))
-    return Light(spots, np.full((200, 3), level), np.zeros((5, 3)), growing)
+    return Irradiance(spots, np.full((200, 3), level), np.zeros((5, 3)), growing)
 
 
 def test_harmonics_are_the_networks_own():
@@ -42,7 +41,7 @@ def test_what_faces_up_has_the_level_of_its_place():
     level = mine.level(np.array([[0.0, 0.0], [50.0, 0.0]]))
     assert np.allclose(level, 0.8)
     assert np.allclose(mine.irradiance(level, np.array([[0.0, 0.0, 1.0]] * 2)), 0.8)
-    spotty = Light(np.array([[0.0, 0.0], [6.0, 0.0]]), np.array([[1.0] * 3, [0.2] * 3]), mine.steady, mine.growing)
+    spotty = Irradiance(np.array([[0.0, 0.0], [6.0, 0.0]]), np.array([[1.0] * 3, [0.2] * 3]), mine.steady, mine.growing)
     assert spotty.level(np.array([[0.2, 0.0], [6.1, 0.3], [3.0, 0.0]]))[:, 0] == pytest.approx(
         [1.0, 0.2, 0.6], abs=0.01
     )
@@ -72,14 +71,14 @@ def pole() -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
-def shade(mine: Light) -> tuple[np.ndarray, np.ndarray]:
+def shade(mine: Irradiance) -> tuple[np.ndarray, np.ndarray]:
     """Darkening seen from above of ground at z = −1, shape (h, w), and the ground's points (h, w, 3)."""
     model, data = pole()
     size, k = (120, 120), np.array([80.0, 80.0, 60.0, 60.0])
     pose = look_at(np.array([1e-3, 0.0, 3.0]), np.array([0.0, 0.0, -1.0]))
     rays, depth = unproject(pixel_grid(*size), k), np.full(size[::-1], 4.0)
     rgb = np.ones((*size[::-1], 3), np.float32)
-    Shadows(model, np.arange(model.ngeom)).darken(rgb, depth, rays, pose, data, mine)
+    ContactShadows(model, np.arange(model.ngeom)).darken(rgb, depth, rays, pose, data, mine)
     assert np.ptp(rgb, axis=-1).max() == 0.0
     return 1.0 - rgb[..., 0], (rays * 4.0) @ pose[:3, :3].T + pose[:3, 3]
 
@@ -123,7 +122,7 @@ def test_a_darker_lighting_is_darker_light():
     from twin.nerf.baked import BakedField
 
     field = BakedField(field.layout, field.lightings_by_name, dim)
-    found = FieldLight(field, ROUTE)
+    found = IrradianceEstimator(field, ROUTE)
     day, night = found.under("day"), found.under("night")
     here = np.array([[0.0, 0.0]])
     assert (night.level(here) < 0.6 * day.level(here)).all() and bias.shape == (3,)
@@ -139,9 +138,9 @@ def test_a_darker_lighting_is_darker_light():
 
 def test_an_obstacle_is_darker_where_the_field_is():
     model, data = pole()
-    bright = Overlay(model, baked(ground_and_wall), SIZE)
-    plain = Overlay(model, baked(ground_and_wall), SIZE, shaded=False)
-    empty = Overlay(model, baked(nothing), SIZE, shaded=False).render([data], "day")
+    bright = Compositor(model, baked(ground_and_wall), SIZE)
+    plain = Compositor(model, baked(ground_and_wall), SIZE, shaded=False)
+    empty = Compositor(model, baked(nothing), SIZE, shaded=False).render([data], "day")
     hit = empty.opacity[0] > 0.9
     assert hit.sum() > 20
     lit, unlit = bright.render([data], "day").rgb[0][hit], plain.render([data], "day").rgb[0][hit]

@@ -8,10 +8,10 @@ import pytest
 from drive_logs import columns, write_csv
 
 from twin.align import main
-from twin.alignment import kinematics, logs
-from twin.alignment.checks import check
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
+from twin.sysid import kinematics, logs
+from twin.sysid.log_checks import check
 
 
 def _bad(table: dict[str, np.ndarray], **changes) -> dict[str, np.ndarray]:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from analytic import AnalyticField, Box, Post, drive
 
-from twin.assets.convex import Part, inside_hull
+from twin.assets.convex import ConvexPart, inside_hull
 from twin.assets.ground import Ground
 from twin.assets.mesh import make
-from twin.assets.obstacles import HEADROOM
-from twin.assets.route import distance_to_route
+from twin.assets.solids import HEADROOM
 from twin.config import MeshConfig, MetricConfig, MjcfConfig, SceneConfig, SourceConfig
-from twin.geometry.points import SparsePoints
+from twin.geometry.cameras import SparsePoints
+from twin.geometry.route import distance_to_route
 
 HALF_WIDTH = 1.0  # [m]
 WALL = Box(7.0, 3.0, 3.0, 1.0, 1.4)
@@ -45,11 +45,11 @@ def _load(folder: Path, name: str) -> dict[str, np.ndarray]:
         return dict(data)
 
 
-def _parts(folder: Path) -> list[Part]:
+def _parts(folder: Path) -> list[ConvexPart]:
     data = _load(folder, "parts")
     at, of = data["vertex_start"], data["face_start"]
     return [
-        Part(data["vertices"][at[i] : at[i + 1]].astype(float), data["faces"][of[i] : of[i + 1]].astype(np.int64))
+        ConvexPart(data["vertices"][at[i] : at[i + 1]].astype(float), data["faces"][of[i] : of[i + 1]].astype(np.int64))
         for i in range(len(at) - 1)
     ]
 

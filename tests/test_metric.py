@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from twin.capture import metric
+from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.gravity import find_road, up_from_ground
 from twin.capture.scale import local_east_north_up
-from twin.capture.types import Capture, SourceInfo
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json
-from twin.geometry.cameras import Cameras, pixel_grid, project, unproject
+from twin.geometry.cameras import Cameras, SparsePoints, pixel_grid, project, unproject
 from twin.geometry.images import write_image
-from twin.geometry.points import SparsePoints
 from twin.geometry.poses import Similarity, inverse_pose, look_at, umeyama
 from twin.scene import SceneDir
 

@@ -6,10 +6,10 @@ import pytest
 from test_baked import LOW, baked, wall
 
 from twin.config import ObstacleConfig
-from twin.env.camera_effects import CameraEffects, CameraOptions, rolled_off
-from twin.env.obstacle_view import ObstacleView, camera_intrinsics, camera_pose
+from twin.env.camera_noise import CameraNoise, CameraOptions, rolled_off
+from twin.env.compositor import Compositor
+from twin.env.mujoco_renderer import ObjectRenderer, camera_intrinsics, camera_pose
 from twin.env.obstacles import add_obstacles
-from twin.env.overlay import Overlay
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints
 from twin.mjcf.husky import ZED2, PixelCamera, add_husky
@@ -67,7 +67,7 @@ def test_before_an_opaque_wall_the_obstacle_is_itself(box, depth):
     model, data = box
     put(model, data, depth - 2.5, 0.0, -0.5)
     field = baked(BEHIND)
-    out, alone = Overlay(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
+    out, alone = Compositor(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
     reach = round(0.5 * FOCAL / depth)  # of its face from the middle of the picture [px]
     inner = np.s_[0, 18 - reach + 1 : 18 + reach - 1, 32 - reach + 1 : 32 + reach - 1]
     outside = np.ones((1, SIZE[1], SIZE[0]), bool)
@@ -83,7 +83,7 @@ def test_behind_an_opaque_wall_nothing_of_it_is_seen(box):
     model, data = box
     put(model, data, 0.0, 0.0, -0.5)
     field = baked(BEFORE)
-    out, alone = Overlay(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
+    out, alone = Compositor(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
     assert np.abs(out.rgb - alone.rgb).max() < 0.04
     assert np.abs(out.depth - alone.depth).max() < 1e-3
 
@@ -91,7 +91,7 @@ def test_behind_an_opaque_wall_nothing_of_it_is_seen(box):
 def test_depth_is_right_to_a_centimetre_at_ten_metres(box):
     model, data = box
     put(model, data, 7.5, 0.3, -0.4)
-    out = Overlay(model, baked(nothing), SIZE, shaded=False).render([data], "day")
+    out = Compositor(model, baked(nothing), SIZE, shaded=False).render([data], "day")
     hit = out.opacity[0] > 0.999
     assert hit.sum() >= 9
     assert np.abs(out.depth[0][hit] - 10.0).max() < 0.01
@@ -102,7 +102,7 @@ def test_through_a_half_transparent_layer_the_rest_of_the_light_comes(box, raw):
     model, data = box
     put(model, data, 1.0, 0.0, -0.5)
     field = baked(lambda p: np.where(np.abs(p[..., 0] + 1.0) < 0.501, raw, LOW))
-    out = Overlay(model, field, SIZE, shaded=False).render([data], "day")
+    out = Compositor(model, field, SIZE, shaded=False).render([data], "day")
     front = field.render(view(data), "day", stop=np.full((1, SIZE[1], SIZE[0]), 3.5))
     middle = np.s_[0, SIZE[1] // 2, SIZE[0] // 2]
     held = 1.0 - np.exp(-field.layout.density_unit * np.exp(raw) * 1.0)
@@ -120,7 +120,7 @@ def test_at_an_edge_it_covers_its_share_of_a_pixel(share, covers):
     model, data = scene((1.0, 1.0, 1.0))
     put(model, data, -0.5, -edge + 0.5, -0.5)
     field = baked(BEHIND)
-    out, alone = Overlay(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
+    out, alone = Compositor(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
     pixel = np.s_[0, 18, 37]
     covered = (out.rgb[pixel] - alone.rgb[pixel]) / (np.array(COLOR) - alone.rgb[pixel])
     assert covered == pytest.approx(np.full(3, covers), abs=0.02)
@@ -135,7 +135,7 @@ def test_half_a_pixel_more_covers_half_a_pixel_more():
     for edge in (0.30, 0.325, 0.35):
         model, data = scene((1.0, 2 * edge, 1.0))
         put(model, data, -0.5, 0.0, -0.5)
-        out, alone = Overlay(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
+        out, alone = Compositor(model, field, SIZE, shaded=False).render([data], "day"), field.render(view(data), "day")
         row = (out.rgb[0, 18] - alone.rgb[0, 18]) / (np.array(COLOR) - alone.rgb[0, 18])
         widths.append(row.mean(1).sum())
     assert widths == pytest.approx([2 * edge * FOCAL / 2.0 for edge in (0.30, 0.325, 0.35)], abs=0.6)
@@ -144,7 +144,7 @@ def test_half_a_pixel_more_covers_half_a_pixel_more():
 def test_out_of_view_it_is_the_field_alone(box):
     model, data = box
     field = baked(hall)
-    overlay = Overlay(model, field, SIZE)
+    overlay = Compositor(model, field, SIZE)
     for place in ((-6.0, 0.0, 0.0), (0.0, 9.0, 0.0), (0.0, 0.0, -100.0)):
         put(model, data, *place)
         out, alone = overlay.render([data], "night"), field.render(view(data), "night")
@@ -153,7 +153,7 @@ def test_out_of_view_it_is_the_field_alone(box):
 
 def test_without_ground_there_is_nothing_to_tell_the_light_from(box):
     with pytest.raises(InputError, match="no ground"):
-        Overlay(box[0], baked(nothing), SIZE)
+        Compositor(box[0], baked(nothing), SIZE)
 
 
 def test_many_worlds_are_as_each_alone(box):
@@ -161,14 +161,14 @@ def test_many_worlds_are_as_each_alone(box):
     datas = [put(model, mujoco.MjData(model), x, y, -0.5) for x, y in ((0.0, 0.0), (1.0, 0.6), (-9.0, 0.0))]
     field = baked(hall)
     lightings = ["day", "night", field.embedding("day:night:0.5")]
-    together = Overlay(model, field, SIZE, worlds=3).render(datas, lightings)
-    single = Overlay(model, field, SIZE)
+    together = Compositor(model, field, SIZE, worlds=3).render(datas, lightings)
+    single = Compositor(model, field, SIZE)
     for k, (data, lighting) in enumerate(zip(datas, lightings, strict=True)):
         alone = single.render([data], lighting)
         for name in ("rgb", "depth", "opacity"):
             assert np.array_equal(getattr(alone, name)[0], getattr(together, name)[k]), name
     with pytest.raises(InputError, match="at most 3"):
-        Overlay(model, field, SIZE, worlds=3).render([*datas, datas[0]], "day")
+        Compositor(model, field, SIZE, worlds=3).render([*datas, datas[0]], "day")
 
 
 def test_the_camera_of_the_model_is_that_of_the_pictures():
@@ -188,7 +188,7 @@ def test_the_robot_does_not_see_itself_in_its_usual_camera():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     index = model.camera("front").id
-    view = ObstacleView(model, index, (160, 90))
+    view = ObjectRenderer(model, index, (160, 90))
     assert len(view.geoms) > 20
     assert view.in_view(data, camera_pose(data, index)) is None
 
@@ -196,14 +196,14 @@ def test_the_robot_does_not_see_itself_in_its_usual_camera():
 def test_a_perfect_camera_changes_nothing_and_the_same_seed_repeats(box):
     model, data = box
     put(model, data, 0.0, 0.0, -0.5)
-    overlay = Overlay(model, baked(hall), SIZE)
+    overlay = Compositor(model, baked(hall), SIZE)
     sharp = overlay.render([data], "day")
-    perfect = overlay.render([data], "day", [CameraEffects(CameraOptions(), np.random.default_rng(0))])
+    perfect = overlay.render([data], "day", [CameraNoise(CameraOptions(), np.random.default_rng(0))])
     assert np.array_equal(sharp.rgb, perfect.rgb)
     options = CameraOptions(vibration=0.5, exposure=0.2, shutter=0.02)
     films = []
     for seed in (1, 1, 2):
-        effects = CameraEffects(options, np.random.default_rng(seed))
+        effects = CameraNoise(options, np.random.default_rng(seed))
         film = []
         for step in range(3):
             data.time = 0.1 * step
@@ -214,7 +214,7 @@ def test_a_perfect_camera_changes_nothing_and_the_same_seed_repeats(box):
 
 
 def test_a_turning_camera_smears_along_its_turn():
-    from twin.env.camera_effects import smeared
+    from twin.env.camera_noise import smeared
     from twin.geometry.cameras import pixel_grid, unproject
 
     rays = unproject(pixel_grid(*SIZE), K)

@@ -18,14 +18,24 @@ from hypothesis import strategies as st
 from twin.build import summary
 from twin.files import write_json
 from twin.geometry.images import write_image
-from twin.report import against_truth, crosslight, reconstruction, seen_section
-from twin.report import page as report_page
-from twin.report import sections as section_words
-from twin.report.against_truth import truth_section
-from twin.report.markup import Html, element, table
-from twin.report.page import page, write_page
-from twin.report.sections import SECTIONS, cautions, sections, summed_up
-from twin.report.words import NOT_MEASURED, Caution, duration, flat, follower_verdict, listing, number, pick
+from twin.report import build_report as report_page
+from twin.report import build_sections, visual_vs_collision
+from twin.report import build_sections as section_words
+from twin.report.build_report import page, write_page
+from twin.report.build_sections import SECTIONS, cautions, sections, summed_up, truth_section
+from twin.report.html import (
+    NOT_MEASURED,
+    Caution,
+    Html,
+    duration,
+    element,
+    flat,
+    follower_verdict,
+    listing,
+    number,
+    pick,
+    table,
+)
 from twin.scene import STAGES, SceneDir
 
 REPORT: dict[str, Any] = {
@@ -305,7 +315,7 @@ def test_what_is_wrong_is_said_with_a_cure_below_and_above(
 
 def test_every_kind_of_caution_is_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """A caution that the code can give and the list above lacks would not be tested."""
-    modules = (against_truth, crosslight, reconstruction, section_words, seen_section)
+    modules = (build_sections, build_sections, build_sections, section_words, visual_vs_collision)
     given: set[tuple[str, int]] = set()
 
     def recording(*args: str) -> Caution:
@@ -377,7 +387,7 @@ def test_a_failed_drive_says_what_to_try() -> None:
 
 
 def test_truth_is_told_where_it_is_known(scene: SceneDir) -> None:
-    assert "real place" in truth_section(REPORT).not_applicable
+    assert "generated places only" in truth_section(REPORT).not_applicable
     known = changed("truth", {"ate_m": 0.042, "ground_median_m": 0.09, "corridor_intrusions": 2, "scale_error": None})
     section = truth_section(known)
     values = {fact.name: fact.value for fact in section.facts}

@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from twin.capture.outliers import path_outliers
-from twin.capture.pairs import SEQUENCE_STEPS, expanded_pairs, frame_signatures, near_pairs, probe_pairs, sequence_pairs
+from twin.capture.mapping import path_outliers
+from twin.capture.matching import (
+    SEQUENCE_STEPS,
+    expanded_pairs,
+    frame_signatures,
+    near_pairs,
+    probe_pairs,
+    sequence_pairs,
+)
 from twin.geometry.poses import look_at
 
 

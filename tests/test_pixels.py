@@ -8,14 +8,13 @@ import pytest
 from tiny_twin import tiny_twin
 
 import twin
-from twin import progress
+from twin import runtime
 from twin.config import ObstacleConfig
-from twin.env.obstacle_view import camera_pose
+from twin.env.compositor import Compositor
+from twin.env.domain_randomization import Nominal, RandomizationSample, Ranges
+from twin.env.mujoco_renderer import SceneRenderer, camera_pose
 from twin.env.options import NERF, SIMULATOR
-from twin.env.overlay import Overlay
-from twin.env.randomisation import Draw, Nominal, Ranges
-from twin.env.simulator_view import SimulatorView
-from twin.env.suite import SeenDrive, Stage
+from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.geometry.cameras import Viewpoints
 
 SIZE = (64, 36)
@@ -26,16 +25,16 @@ LIGHT = "day"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
 def film(scene, latency: float, steps: int, **options) -> np.ndarray:
     """Newest pictures (steps + 1, height, width, 3) of one drive."""
-    stage = Stage.open(scene, "bend", {"size": SIZE, "stack": 1, "time_limit": 60.0, **options})
+    stage = EnvFactory.open(scene, "bend", {"size": SIZE, "stack": 1, "time_limit": 60.0, **options})
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=latency)))
     physics, task = stage.drive(3)
-    environment = SeenDrive(physics, task, stage.pixels([(physics, task)]))
+    environment = DriveEnvironment(physics, task, stage.pixels([(physics, task)]))
     rng = np.random.default_rng(0)
     pictures = [environment.reset().observation["pixels"][0]]
     for _ in range(steps):
@@ -61,12 +60,12 @@ def test_a_late_picture_is_the_picture_of_then(scene, observe, period, late):
     assert len(there[0]) and len(there[-1]) and there[0].mean() > there[steps // 2].mean() + 5
 
 
-def views(stage: Stage, shaded: bool = False) -> tuple[Overlay, SimulatorView]:
+def views(stage: EnvFactory, shaded: bool = False) -> tuple[Compositor, SceneRenderer]:
     simulated = replace(stage, field=None, options=replace(stage.options, observe=SIMULATOR))
-    return Overlay(stage.model, stage.field, SIZE, shaded=shaded), simulated.pixels([stage.drive(0)])._overlay  # type: ignore
+    return Compositor(stage.model, stage.field, SIZE, shaded=shaded), simulated.pixels([stage.drive(0)])._overlay  # type: ignore
 
 
-def standing(stage: Stage, draw: Draw) -> mujoco.MjData:
+def standing(stage: EnvFactory, draw: RandomizationSample) -> mujoco.MjData:
     """The robot at the start, as drawn."""
     physics, task = stage.drive(0)
     task.initialize_episode(physics)
@@ -77,10 +76,10 @@ def standing(stage: Stage, draw: Draw) -> mujoco.MjData:
 
 @pytest.mark.parametrize("ranges", [Ranges(), Ranges(camera_shift=(-0.05, 0.05))])
 def test_no_camera_sees_its_own_housing(scene, ranges):
-    stage = Stage.open(scene, "bend", {"size": SIZE, "start_offset": 0.0, "start_heading": 0.0})
+    stage = EnvFactory.open(scene, "bend", {"size": SIZE, "start_offset": 0.0, "start_heading": 0.0})
     overlay, simulator = views(stage)
     rng = np.random.default_rng(1)
-    data = standing(stage, Draw())
+    data = standing(stage, RandomizationSample())
     model, nominal = data.model, Nominal(stage.model)
     for _ in range(100):
         nominal.apply(ranges.draw(rng), model)
@@ -94,8 +93,8 @@ def test_no_camera_sees_its_own_housing(scene, ranges):
 
 def test_the_rest_of_the_robot_is_seen_where_in_view(scene):
     """A camera that looks down at its own bumper."""
-    stage = Stage.open(scene, "bend", {"size": SIZE, "start_offset": 0.0, "start_heading": 0.0})
-    data = standing(stage, Draw(camera_turn=(-65.0, 0.0, 0.0)))
+    stage = EnvFactory.open(scene, "bend", {"size": SIZE, "start_offset": 0.0, "start_heading": 0.0})
+    data = standing(stage, RandomizationSample(camera_turn=(-65.0, 0.0, 0.0)))
     bumper = data.body("base_link").xpos + data.body("base_link").xmat.reshape(3, 3) @ [0.479, 0.0, 0.165]
     pose = camera_pose(data, data.model.camera("front").id)
     away = float((bumper - pose[:3, 3]) @ pose[:3, 2])
@@ -106,8 +105,8 @@ def test_the_rest_of_the_robot_is_seen_where_in_view(scene):
 
 
 def test_another_robot_keeps_its_camera(scene):
-    stage = Stage.open(scene, "bend", {"size": SIZE, "obstacles": (OTHER,)})
-    names = {stage.model.geom(int(i)).name for i in Overlay(stage.model, stage.field, SIZE)._painters[0].view.geoms}
+    stage = EnvFactory.open(scene, "bend", {"size": SIZE, "obstacles": (OTHER,)})
+    names = {stage.model.geom(int(i)).name for i in Compositor(stage.model, stage.field, SIZE)._painters[0].view.geoms}
     assert {name for name in names if "camera" in name} == {
         f"obstacle_other_camera_{part}" for part in ("bracket", "housing", "lens_left", "lens_right")
     }

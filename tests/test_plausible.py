@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from twin.errors import InputError
-from twin.nerf import plausible
+from twin.nerf import appearance_prior
+from twin.nerf.appearance_prior import AppearancePrior, Probes, numbers
 from twin.nerf.lightings import Lightings
-from twin.nerf.plausible import Judge, Probes, numbers
 
 _LIFT = 20.0  # keeps the rectifiers of the made-up head open, so that it is linear
 
@@ -108,8 +108,10 @@ def test_one_lighting_varies_as_its_frames_do():
 
 def test_it_gives_up_with_a_reason(monkeypatch):
     mine = lightings(DAY_AND_DUSK)
-    monkeypatch.setattr(Judge, "faults", lambda self, embedding: ["brightness 9 (filmed: 0 to 1)"])
-    with pytest.raises(InputError, match=rf"among {plausible._TRIES} drawn; the last is brightness 9 .*nerf\.steps"):
+    monkeypatch.setattr(AppearancePrior, "faults", lambda self, embedding: ["brightness 9 (filmed: 0 to 1)"])
+    with pytest.raises(
+        InputError, match=rf"among {appearance_prior._TRIES} drawn; the last is brightness 9 .*nerf\.steps"
+    ):
         mine.sample(np.random.default_rng(0))
 
 

@@ -12,8 +12,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from twin.errors import InputError
-from twin.learn.architecture import Architecture, levelled, onnx_bytes, prepared, shrink
 from twin.learn.policy import JSON, ONNX, WEIGHTS, Control, load_policy, save_policy
+from twin.learn.policy_network import Architecture, normalized, onnx_bytes, prepared, shrink
 
 SMALL = Architecture(convolutions=((8, 4, 4), (8, 3, 2)), features=16, hidden=(32, 32))
 
@@ -98,20 +98,20 @@ def test_levelled_pictures_do_not_depend_on_exposure_contrast_or_white_balance()
     road = np.clip(rng.normal(110.0, 30.0, (3, 40, 60)), 30, 220)
     other = np.array([0.55, 0.5, 0.35])[:, None, None] * road + np.array([20.0, 12.0, 30.0])[:, None, None]
     as_bytes = [np.round(one).astype(np.uint8) for one in (road, other)]
-    first, second = (levelled(one).astype(int) for one in as_bytes)
+    first, second = (normalized(one).astype(int) for one in as_bytes)
     assert np.abs(as_bytes[0].astype(int) - as_bytes[1]).mean() > 20
     assert np.abs(first - second).mean() < 6 and np.abs(first - second).max() < 25
     ground = first[:, 20:].reshape(3, -1)
     np.testing.assert_allclose(ground.mean(1), 128, atol=1)
     assert (ground.std(1) > 38).all() and (ground.std(1) < 48).all()
-    assert (levelled(np.full((3, 4, 4), 77, np.uint8)) == 128).all()
+    assert (normalized(np.full((3, 4, 4), 77, np.uint8)) == 128).all()
     # Noise where there is nothing else is not made into a picture.
-    assert levelled(rng.integers(9, 11, (3, 40, 60), np.uint8)).std() < 8
+    assert normalized(rng.integers(9, 11, (3, 40, 60), np.uint8)).std() < 8
 
 
 def test_preparing_is_shrinking_and_then_levelling():
     some = pictures(2)
-    np.testing.assert_array_equal(prepared(some, 2), levelled(shrink(some, 2)))
+    np.testing.assert_array_equal(prepared(some, 2), normalized(shrink(some, 2)))
 
 
 def test_neither_torch_nor_sb3_is_needed(folder, tmp_path):

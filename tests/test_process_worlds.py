@@ -12,10 +12,11 @@ import pytest
 from tiny_twin import tiny_twin
 
 import twin
-from twin import progress
-from twin.env.batch import Worlds, worlds_of
-from twin.env.process_worlds import ProcessWorlds, _Child
-from twin.env.suite import Stage
+from twin import runtime
+from twin.env.suite import EnvFactory
+from twin.env.vector_env import make_vector_env
+from twin.env.vector_env_local import LocalVectorEnv
+from twin.env.vector_env_processes import ProcessVectorEnv, _Child
 from twin.errors import InputError
 
 PICTURES = {"size": (32, 18), "randomise": True, "time_limit": 1.5}
@@ -24,13 +25,13 @@ STATES = {"pixels": False, "randomise": True, "obstacles": 2, "time_limit": 1.5}
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
 @pytest.fixture
 def spread(scene):
-    worlds = ProcessWorlds(scene, "bend", {"pixels": False}, [1, 2, 3], 2)
+    worlds = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2, 3], 2)
     yield worlds
     worlds.close()
 
@@ -39,8 +40,8 @@ def spread(scene):
 def test_they_are_as_in_one_process(scene, options):
     """Rewards, ends, pictures, states, infos, bit by bit; with some of the worlds left out, in any order."""
     seeds = [5, 6, 7]
-    here = Worlds(Stage.open(scene, "bend", options), seeds)
-    there = ProcessWorlds(scene, "bend", options, seeds, 2)
+    here = LocalVectorEnv(EnvFactory.open(scene, "bend", options), seeds)
+    there = ProcessVectorEnv(scene, "bend", options, seeds, 2)
     assert (len(there), there.actions, there.states) == (len(here), here.actions, here.states)
     rng, over = np.random.default_rng(0), 0
     for worlds in (here, there):
@@ -95,11 +96,11 @@ def test_what_a_child_cannot_read_is_told(spread, monkeypatch):
 
 def test_bad_input_is_told_in_one_line(scene):
     with pytest.raises(InputError, match="nowhere"):
-        ProcessWorlds(scene, "nowhere", {"pixels": False}, [1, 2], 2)
+        ProcessVectorEnv(scene, "nowhere", {"pixels": False}, [1, 2], 2)
     with pytest.raises(InputError, match="processes = 0"):
-        worlds_of(scene, "bend", {}, [1, 2], 0)
+        make_vector_env(scene, "bend", {}, [1, 2], 0)
     with pytest.raises(InputError, match="did you mean 'lighting'"):
-        ProcessWorlds(scene, "bend", {"lightning": "day"}, [1, 2], 2)
+        ProcessVectorEnv(scene, "bend", {"lightning": "day"}, [1, 2], 2)
 
 
 def test_a_process_that_dies_is_an_error_with_a_cure(spread):
@@ -137,7 +138,7 @@ def test_they_end_with_their_parent(scene):
     """However it ends, and though its script has no `if __name__ == "__main__"`."""
     script = f"""
         import os, signal
-        from twin.env.process_worlds import ProcessWorlds
+        from twin.env.vector_env_processes import ProcessWorlds
         worlds = ProcessWorlds({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
         worlds.begin([0, 1])
         fork = os.fork()
@@ -168,7 +169,7 @@ def test_closing_does_not_wait_for_who_else_has_the_sockets(spread):
 
 
 def test_nobody_is_left_when_they_are_dropped(scene):
-    worlds = ProcessWorlds(scene, "bend", {"pixels": False}, [1, 2], 2)
+    worlds = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2], 2)
     processes = [child.process for child in worlds._children]
     del worlds
     gc.collect()
@@ -176,11 +177,16 @@ def test_nobody_is_left_when_they_are_dropped(scene):
 
 
 def test_few_worlds_stay_here(scene, monkeypatch):
-    monkeypatch.setattr("twin.env.batch.cores", lambda: 4)
+    monkeypatch.setattr("twin.env.vector_env_local.cores", lambda: 4)
     options = {"pixels": False}
-    for count, processes, kind in ((1, None, Worlds), (3, None, Worlds), (4, None, ProcessWorlds), (4, 1, Worlds)):
-        worlds = worlds_of(scene, "bend", options, list(range(count)), processes)
+    for count, processes, kind in (
+        (1, None, LocalVectorEnv),
+        (3, None, LocalVectorEnv),
+        (4, None, ProcessVectorEnv),
+        (4, 1, LocalVectorEnv),
+    ):
+        worlds = make_vector_env(scene, "bend", options, list(range(count)), processes)
         assert type(worlds) is kind, (count, processes)
-        if isinstance(worlds, ProcessWorlds):
+        if isinstance(worlds, ProcessVectorEnv):
             assert len(worlds._children) == 2
         worlds.close()

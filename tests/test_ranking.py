@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.report.ranking import (
+from twin.evaluation.ranking import (
     MARGIN,
     SURE,
     Tallies,

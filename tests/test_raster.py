@@ -11,15 +11,13 @@ import warp as wp
 
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr
-from twin.reality import film, world
+from twin.geometry.mesh_rays import Surface
+from twin.reality import filming, true_world
 from twin.reality import place as places
-from twin.reality.flatten import flatten
-from twin.reality.raster import SAMPLES, Raster
-from twin.reality.route import ground_height
-from twin.reality.shadows import Map, draw, in_light
-from twin.reality.surface import Surface
+from twin.reality.centerline import ground_height
+from twin.reality.rasterizer import SAMPLES, Raster, ShadowMap, draw, flatten, in_light
 
-PLAN = replace(film.Plan(), width=160, height=90)
+PLAN = replace(filming.FilmingPlan(), width=160, height=90)
 
 
 @pytest.fixture(scope="module")
@@ -29,12 +27,12 @@ def campus():
 
 @pytest.fixture(scope="module")
 def sunny(campus):
-    return world.spec("sun", campus).compile()
+    return true_world.spec("sun", campus).compile()
 
 
 def robot_poses(campus, lighting="sun", every=40):
     """Where the film's camera was, but at a robot's height."""
-    poses = film.trajectory(film.Plan(), campus.route, lighting)[1][::every].copy()
+    poses = filming.trajectory(filming.FilmingPlan(), campus.route, lighting)[1][::every].copy()
     poses[:, 2, 3] -= 0.6
     return poses
 
@@ -55,7 +53,7 @@ def test_depth_is_that_of_rays(campus, sunny):
 
 
 @wp.kernel
-def _ask(shadows: Map, points: wp.array[wp.vec3], out: wp.array[float]):
+def _ask(shadows: ShadowMap, points: wp.array[wp.vec3], out: wp.array[float]):
     i = wp.tid()
     out[i] = in_light(shadows, points[i], wp.vec3(0.0, 0.0, 1.0))
 
@@ -77,7 +75,7 @@ def test_shadows_are_where_rays_to_the_sun_are_blocked(campus, sunny):
 
 
 def test_no_sun_casts_no_shadow(campus):
-    flat = flatten(world.spec("overcast", campus).compile())
+    flat = flatten(true_world.spec("overcast", campus).compile())
     assert draw(wp.array(flat.corners[:1], dtype=wp.vec3, device="cpu"), flat).sun == -1
 
 
@@ -91,9 +89,9 @@ def test_pictures_repeat(campus, sunny):
 @pytest.mark.parametrize(("lighting", "least"), [("sun", 30.0), ("night", 35.0)])
 def test_pictures_look_like_the_film(campus, lighting, least):
     """Against frames of the film's renderer in the film's size, shrunk: nearer than its own small ones."""
-    model = world.spec(lighting, campus).compile()
+    model = true_world.spec(lighting, campus).compile()
     raster = Raster(model, PLAN.intrinsics, (160, 90))
-    large, small = film.Renderer(lighting, campus, film.Plan()), film.Renderer(lighting, campus, PLAN)
+    large, small = filming.Renderer(lighting, campus, filming.FilmingPlan()), filming.Renderer(lighting, campus, PLAN)
     for pose in robot_poses(campus, lighting)[:2]:
         wanted = cv2.resize(large(pose)[0], (160, 90), interpolation=cv2.INTER_AREA)
         mine = raster(pose)[0]

@@ -11,27 +11,26 @@ import numpy as np
 import pytest
 from dm_control.rl import control
 
-from twin.alignment.logs import read_log
-from twin.alone import alone
 from twin.config import MjcfConfig
 from twin.env.drivers import RouteDriver
 from twin.env.options import parse_options
-from twin.env.stretches import STANDARD
+from twin.env.route_segments import STANDARD
 from twin.errors import InputError
+from twin.evaluation.trials import Cell, read_results, read_trials
 from twin.geometry.images import read_image
-from twin.learn.architecture import Architecture
 from twin.learn.policy import Control, Policy, load_policy, save_policy
+from twin.learn.policy_network import Architecture
 from twin.mjcf.world import arc_lengths, point_at
-from twin.reality import drive, log, onboard, road
 from twin.reality import place as places
+from twin.reality import real_robot, real_test, recordings
 from twin.reality.__main__ import main
-from twin.reality.drive import Test
-from twin.reality.lighting import LIGHTINGS
-from twin.reality.robot import Robot, robot
-from twin.reality.route import Route
-from twin.reality.weather import WEATHER
-from twin.report.trials import Cell, read_results, read_trials
+from twin.reality.centerline import RoadLine
+from twin.reality.lighting import LIGHTINGS, WEATHER
+from twin.reality.real_robot import HiddenRobot, robot
+from twin.reality.real_test import RealTest
 from twin.robot import HuskyParams
+from twin.runtime import alone
+from twin.sysid.logs import read_log
 
 ROOT = Path(__file__).parents[1]
 STEERING = parse_options({"action": "steering", "pixels": False})
@@ -66,7 +65,7 @@ class Grey:
 
 @pytest.fixture
 def grey(monkeypatch):
-    monkeypatch.setattr(drive, "_raster", lambda *_: Grey())
+    monkeypatch.setattr(real_test, "_raster", lambda *_: Grey())
 
 
 # ---- robot, road, light
@@ -83,8 +82,8 @@ def test_the_robot_is_one_and_another_than_the_published():
 def test_the_same_commands_lead_elsewhere():
     """With the published robot on the same road: the training side cannot know where reality's goes."""
     ends = []
-    for one in (robot(), Robot(HuskyParams(), (0.0, 0.0, 0.0), robot().camera, 0.0)):
-        physics = road.Road("straight", one, STEERING).physics.robot
+    for one in (robot(), HiddenRobot(HuskyParams(), (0.0, 0.0, 0.0), robot().camera, 0.0)):
+        physics = real_robot.TrueRoad("straight", one, STEERING).physics.robot
         physics.place(10.0, 0.0, 0.0)
         for k in range(40):
             physics.command(0.8, 0.6 if k < 20 else -0.6)
@@ -96,18 +95,18 @@ def test_the_same_commands_lead_elsewhere():
 def test_tasks_are_the_twins():
     """Straight 30 m and right turn 60 m of the filmed path, which is nowhere far from the road's centre."""
     for task in STANDARD:
-        one = road.Road(task, robot(), STEERING)
+        one = real_robot.TrueRoad(task, robot(), STEERING)
         assert one.stretch.length == pytest.approx({"straight": 30.0, "right_turn": 60.0}[task], abs=1.0)
         assert one.drive.half_width == MjcfConfig().half_width
-    line = road.route()
+    line = real_robot.route()
     assert arc_lengths(line)[-1] == pytest.approx(60.0, abs=1.0)
     assert np.abs(places.build().route.project(line[:, :2])[1]).max() < 0.35
 
 
 def test_the_corridor_is_free_and_a_drive_along_it_arrives():
     """The robot's width beyond the corridor, nothing solid stands; who knows the way reaches the goal."""
-    points = point_at(road.route()[:, :2], np.arange(0.0, 60.0, 0.1))
-    for thing in road.place().things:
+    points = point_at(real_robot.route()[:, :2], np.arange(0.0, 60.0, 0.1))
+    for thing in real_robot.place_robot().things:
         for solid in thing.solids:
             c, s = np.cos(solid.yaw), np.sin(solid.yaw)
             off = (points - solid.centre[:2]) @ np.array([[c, -s], [s, c]])
@@ -116,7 +115,7 @@ def test_the_corridor_is_free_and_a_drive_along_it_arrives():
             distance = (round_one if solid.kind == "cylinder" else square).min()
             assert distance > MjcfConfig().half_width + 0.35, thing.name
     for task in STANDARD:
-        one = road.Road(task, robot(), STEERING)
+        one = real_robot.TrueRoad(task, robot(), STEERING)
         environment = control.Environment(one.physics, one.drive, control_timestep=0.1)
         one.drive.seed(3)
         step, driver = environment.reset(), RouteDriver()
@@ -163,7 +162,7 @@ def test_nothing_leaks():
 
 def test_a_policy_sees_pictures_and_nothing_else(grey):
     seen: list = []
-    trial = Test(steering(0.9, seen), "straight").trial("rain", 1)
+    trial = RealTest(steering(0.9, seen), "straight").trial("rain", 1)
     assert trial.cause == "out_of_bounds" and len(seen) == trial.steps
     assert all(stacks.shape == (1, 12, 90, 160) and stacks.dtype == np.uint8 for stacks in seen)
     assert np.array_equal(seen[0][0, :3], seen[0][0, 9:])  # at first the first picture four times
@@ -175,7 +174,7 @@ def test_trials_repeat_and_differ_by_seed():
     sums, ends = [], []
     for seed in (1, 1, 2):
         frames: list = []
-        ends.append(Test(steering(0.9), "straight").trial("evening", seed, frames.append))
+        ends.append(RealTest(steering(0.9), "straight").trial("evening", seed, frames.append))
         sums.append(hashlib.sha256(np.stack(frames).tobytes()).hexdigest())
     assert sums[0] == sums[1] != sums[2] and ends[0] == ends[1]
     assert ends[0].progress != ends[2].progress
@@ -184,7 +183,7 @@ def test_trials_repeat_and_differ_by_seed():
 
 def test_the_seed_alone_decides_where_a_trial_starts(grey):
     """Not the trials before it, nor the policy, nor the light: policies are compared pair by pair."""
-    one, starts = Test(steering(0.0), "straight"), []
+    one, starts = RealTest(steering(0.0), "straight"), []
     environment = one._environment
     for seed, lighting in ((5, "rain"), (6, "dawn"), (5, "haze")):
         one.trial(lighting, seed)
@@ -200,7 +199,7 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
     out = tmp_path / "real" / "results.csv"
     stack = np.zeros((12, 90, 160), np.uint8)
     assert load_policy(left)(stack) == pytest.approx(0.9) and load_policy(ahead)(stack) == pytest.approx(0.001)
-    drive.run([left, ahead, left], "straight", ["rain", "haze", "rain"], 2, out)
+    real_test.run([left, ahead, left], "straight", ["rain", "haze", "rain"], 2, out)
     twin = [Cell(policy, "straight", "held-out+randomised", 10, 5) for policy in ("left", "ahead")]
     cells = read_results(out, twin)
     trials = read_trials(out.with_name("results_trials.csv"))
@@ -213,16 +212,16 @@ def test_results_are_the_sums_of_trials(grey, tmp_path):
         assert cell.twin_key == (cell.policy, "straight", "held-out+randomised")
     before = out.with_name("results_trials.csv").read_text()
     with alone(out.with_name(".results.lock"), "x"), pytest.raises(InputError, match="is being written"):
-        drive.run([left], "straight", ["rain"], 3, out)
+        real_test.run([left], "straight", ["rain"], 3, out)
     third = max(t.seed for t in trials if t.lighting == "rain") + 1
-    drive.run([left], "straight", ["rain"], 3, out, "sun", films=tmp_path / "films")
+    real_test.run([left], "straight", ["rain"], 3, out, "sun", films=tmp_path / "films")
     assert {cell.twin_lighting for cell in read_results(out, twin)} == {"held-out+randomised"}  # as it was before
     assert [film.name for film in (tmp_path / "films").iterdir()] == [f"left_straight_rain_{third}.mp4"]
     after = out.with_name("results_trials.csv").read_text()
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
     written(left, 0.5)
     with pytest.raises(InputError, match="another file drove under the name 'left'"):
-        drive.run([left], "straight", ["rain"], 4, out)
+        real_test.run([left], "straight", ["rain"], 4, out)
 
 
 @pytest.mark.parametrize("what", ["math:sqrt", "missing", "policy.zip", "policy.txt", "folder"])
@@ -257,13 +256,13 @@ class Recorder:
 
 def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
     """It weaves, stays on the road, and is of the camera's full size; nothing but a film comes out."""
-    monkeypatch.setattr(onboard, "Raster", Recorder)
-    monkeypatch.setattr(onboard.worlds, "spec", lambda light, place: mujoco.MjSpec())
-    monkeypatch.setattr(onboard, "_FPS", 1)
+    monkeypatch.setattr(recordings, "Raster", Recorder)
+    monkeypatch.setattr(recordings.worlds, "spec", lambda light, place: mujoco.MjSpec())
+    monkeypatch.setattr(recordings, "_FPS", 1)
     path = tmp_path / "robot.mp4"
     assert main(["onboard", "--out", str(path)]) == 0
     positions = np.array(Recorder.last.poses)[:, :3, 3]
-    station, lateral = Route().project(positions[:, :2])
+    station, lateral = RoadLine().project(positions[:, :2])
     assert station[0] < 5.0 and 26.0 < station[-1] < 32.0 and np.all(np.diff(station)[5:] > 0.05)
     assert lateral.min() < -0.3 and lateral.max() > 0.3 and np.abs(lateral).max() < 1.0
     with av.open(str(path)) as film:
@@ -273,8 +272,8 @@ def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
 
 def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
     lights: list = []
-    monkeypatch.setattr(onboard, "Raster", Recorder)
-    monkeypatch.setattr(onboard.worlds, "spec", lambda light, place: lights.append(light) or mujoco.MjSpec())
+    monkeypatch.setattr(recordings, "Raster", Recorder)
+    monkeypatch.setattr(recordings.worlds, "spec", lambda light, place: lights.append(light) or mujoco.MjSpec())
     path = tmp_path / "photos" / "haze.png"
     assert main(["photo", "--lighting", "haze", "--out", str(path)]) == 0
     assert lights == [WEATHER["haze"]] and read_image(path).shape == (*robot().params.camera_size[::-1], 3)
@@ -286,13 +285,13 @@ def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
 
 
 def test_the_log_is_what_alignment_reads(tmp_path):
-    table = log.record(40.0)
-    log.write(tmp_path / "drive.csv", table)
+    table = recordings.record(40.0)
+    recordings.log_write(tmp_path / "drive.csv", table)
     windows = read_log(tmp_path / "drive.csv")
     assert len(windows) == 19 and windows.twist and windows.acceleration is not None
     assert np.ptp(table["cmd_v"]) > 0.8 and np.ptp(table["cmd_yaw_rate"]) > 1.5
     assert np.abs(table["y"]).max() < 2.2
     assert np.abs(np.diff(table["yaw"])).max() < 0.3
-    assert np.array_equal(log.record(12.0)["x"], log.record(12.0)["x"])
+    assert np.array_equal(recordings.record(12.0)["x"], recordings.record(12.0)["x"])
     with pytest.raises(InputError, match="duration = 3 s"):
-        log.record(3.0)
+        recordings.record(3.0)

@@ -9,14 +9,15 @@ import pytest
 import trimesh
 
 from twin.assets.ground import Ground
+from twin.errors import InputError
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
+from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
-from twin.reality import film, place, route, world
+from twin.reality import centerline, filming, place, true_world
+from twin.reality.centerline import RoadLine
+from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky
-from twin.reality.route import Route
-from twin.reality.surface import Surface
-from twin.reality.truth import HALF_WIDTH, Film, Truth
-from twin.report.truth import align_rigid, camera_errors, compare, intrudes, mesh_quality
+from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
 from twin.scene import SceneDir
 
 DEMO = Path(__file__).parent.parent / "scenes" / "demo"
@@ -29,16 +30,16 @@ def campus():
 
 @pytest.fixture(scope="module")
 def truth(campus):
-    plan = film.Plan(lightings=("sun", "night"))
+    plan = filming.FilmingPlan(lightings=("sun", "night"))
     films = {}
     for name in plan.lightings:
-        times, poses = film.trajectory(plan, campus.route, name)
-        films[name] = Film(times, poses, np.zeros(0, np.int64), np.zeros((0, 90, 160), np.float16))
+        times, poses = filming.trajectory(plan, campus.route, name)
+        films[name] = TrueFilm(times, poses, np.zeros(0, np.int64), np.zeros((0, 90, 160), np.float16))
     return Truth(campus.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (640, 360), films)
 
 
 def test_route_projects_back():
-    road = Route()
+    road = RoadLine()
     rng = np.random.default_rng(0)
     station, lateral = rng.uniform(-5.0, 80.0, 2000), rng.uniform(-3.0, 3.0, 2000)
     back_station, back_lateral = road.project(road.at(station, lateral))
@@ -47,7 +48,7 @@ def test_route_projects_back():
 
 
 def test_route_runs_straight_then_right_at_unit_speed():
-    road = Route()
+    road = RoadLine()
     station = np.linspace(0.0, 60.0, 6001)
     xy = road.at(station)
     steps = np.diff(xy, axis=0)
@@ -58,12 +59,12 @@ def test_route_runs_straight_then_right_at_unit_speed():
 
 
 def test_ground_is_gentle_but_not_flat():
-    road = Route()
+    road = RoadLine()
     station = np.linspace(0.0, 60.0, 601)
-    middle = route.ground_height(road, road.at(station))
+    middle = centerline.ground_height(road, road.at(station))
     assert 0.06 < np.ptp(middle) < 0.3
     assert np.abs(np.gradient(middle, station)).max() < 0.05
-    across = route.cross_profile(np.linspace(-2.9, 2.9, 59))
+    across = centerline.cross_profile(np.linspace(-2.9, 2.9, 59))
     assert across.max() - across.min() > 0.03  # crowned
     assert np.abs(np.diff(across)).max() < 0.005
 
@@ -75,7 +76,7 @@ def test_nothing_solid_in_the_corridor(campus):
         mesh = trimesh.Trimesh(thing.part.vertices, thing.part.faces, process=False)
         points = np.concatenate([mesh.vertices, mesh.triangles_center])
         station, lateral = campus.route.project(points[:, :2])
-        low = points[:, 2] - route.ground_height(campus.route, points[:, :2]) < 2.2
+        low = points[:, 2] - centerline.ground_height(campus.route, points[:, :2]) < 2.2
         inside = low & (np.abs(lateral) < 1.6) & (station > -2.0) & (station < 65.0)
         assert not inside.any(), thing.name
 
@@ -91,17 +92,17 @@ def test_what_blocks_is_solid(campus):
 
 
 def test_trajectories_are_what_a_cart_does():
-    plan, road = film.Plan(), Route()
+    plan, road = filming.FilmingPlan(), RoadLine()
     paths = {}
     for name in LIGHTINGS:
-        times, poses = film.trajectory(plan, road, name)
-        again = film.trajectory(plan, road, name)
+        times, poses = filming.trajectory(plan, road, name)
+        again = filming.trajectory(plan, road, name)
         assert np.array_equal(poses, again[1])
         paths[name] = poses[:, :3, 3]
         xy = poses[:, :2, 3]
-        height = poses[:, 2, 3] - route.ground_height(road, xy)
-        assert abs(height.mean() - film.CAMERA_HEIGHT) < 0.005
-        assert np.abs(height - film.CAMERA_HEIGHT).max() < 0.02
+        height = poses[:, 2, 3] - centerline.ground_height(road, xy)
+        assert abs(height.mean() - filming.CAMERA_HEIGHT) < 0.005
+        assert np.abs(height - filming.CAMERA_HEIGHT).max() < 0.02
         assert np.abs(road.project(xy)[1]).max() <= 0.3 + 1e-9
         assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
         down = np.rad2deg(np.arcsin(-poses[:, 2, 2]))
@@ -120,10 +121,12 @@ def test_sky_is_seamless_and_brighter_by_day():
 
 def test_one_drives_on_the_true_ground(campus):
     """A ball dropped on the road comes to rest on the height field, which is the true ground."""
-    spec = world.solids(campus)
+    spec = true_world.solids(campus)
     xy = campus.route.at(np.array([12.3, 36.4, 55.1]), np.array([0.2, -0.9, 1.1]))
     for k, point in enumerate(xy):
-        body = spec.worldbody.add_body(name=f"ball_{k}", pos=[*point, route.ground_height(campus.route, point) + 0.12])
+        body = spec.worldbody.add_body(
+            name=f"ball_{k}", pos=[*point, centerline.ground_height(campus.route, point) + 0.12]
+        )
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], damping=4.0)
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], mass=1.0)
     model = spec.compile()
@@ -131,7 +134,7 @@ def test_one_drives_on_the_true_ground(campus):
     mujoco.mj_step(model, data, 600)
     for k, point in enumerate(xy):
         rest = data.body(f"ball_{k}").xpos[2] - 0.1
-        assert rest == pytest.approx(route.ground_height(campus.route, point), abs=0.006)
+        assert rest == pytest.approx(centerline.ground_height(campus.route, point), abs=0.006)
 
 
 def test_truth_survives_saving(truth, tmp_path):
@@ -189,7 +192,7 @@ def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) ->
 
 
 def test_a_perfect_build_has_no_error(truth, tmp_path):
-    found = compare(fake_build(truth, tmp_path, Similarity.identity()))
+    found = measure(fake_build(truth, tmp_path, Similarity.identity()))["figures"]
     assert found["ate_m"] < 1e-9
     assert abs(found["scale_error"]) < 1e-9
     assert found["tilt_deg"] < 1e-5
@@ -200,7 +203,7 @@ def test_a_perfect_build_has_no_error(truth, tmp_path):
 
 
 def test_errors_are_measured(truth, tmp_path):
-    found = compare(fake_build(truth, tmp_path / "lift", Similarity.identity(), lift=0.07))
+    found = measure(fake_build(truth, tmp_path / "lift", Similarity.identity(), lift=0.07))["figures"]
     assert found["ground_median_m"] == pytest.approx(0.07, abs=0.002)
     assert found["ground_bias_m"] == pytest.approx(0.07, abs=0.002)
     tilt = np.deg2rad(2.0)
@@ -239,7 +242,7 @@ def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(trut
             vertices=np.concatenate([p.vertices for p in parts]),
             faces=np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)]),
         )
-        found.append(compare(scene))
+        found.append(measure(scene)["figures"])
     whole, flat = found
     assert whole["mesh_chamfer_m"] < 1e-3 and whole["mesh_completeness_5cm"] == 1.0
     assert flat["mesh_accuracy_mean_m"] < 1e-3  # what there is, is right
@@ -249,7 +252,8 @@ def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(trut
 
 
 def test_a_scene_without_truth_is_not_compared(tmp_path):
-    assert compare(SceneDir(tmp_path)) is None
+    with pytest.raises(InputError, match="has no truth"):
+        compare(SceneDir(tmp_path))
 
 
 def test_rigid_alignment_holds_on_a_straight_drive(truth):
@@ -277,9 +281,9 @@ def test_intrusion(truth, lateral, height, expected):
 @pytest.mark.parametrize("lighting", sorted(LIGHTINGS))
 def test_frames_are_true_and_rich(campus, lighting):
     """Depth of the road is that of the true ground; SIFT finds the whole picture and the road, under every lighting."""
-    plan = film.Plan()
-    render = film.Renderer(lighting, campus, plan)
-    times, poses = film.trajectory(plan, campus.route, lighting)
+    plan = filming.FilmingPlan()
+    render = filming.Renderer(lighting, campus, plan)
+    times, poses = filming.trajectory(plan, campus.route, lighting)
     frame = len(times) // 5
     light, depth = render(poses[frame])
     # The first of the 2 × 2 samples of a pixel lies a quarter of a pixel right of and below its corner.
@@ -287,10 +291,10 @@ def test_frames_are_true_and_rich(campus, lighting):
     points = (rays * depth[..., None]) @ poses[frame][:3, :3].T + poses[frame][:3, 3]
     road = np.abs(campus.route.project(points[..., :2])[1]) < 1.5
     road &= (depth > 0) & (depth < 15)
-    error = points[road][:, 2] - route.ground_height(campus.route, points[road][:, :2])
+    error = points[road][:, 2] - centerline.ground_height(campus.route, points[road][:, :2])
     assert road.sum() > 20_000
     assert np.quantile(np.abs(error), 0.99) < 0.004
-    image = film.develop(np.random.default_rng(0), light, LIGHTINGS[lighting], 1.0)
+    image = filming.develop(np.random.default_rng(0), light, LIGHTINGS[lighting], 1.0)
     keypoints = cv2.SIFT_create(contrastThreshold=0.02).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
     at = np.array([k.pt for k in keypoints]).astype(int)
     on_road = road[at[:, 1].clip(0, 359), at[:, 0].clip(0, 639)].sum()
@@ -306,11 +310,11 @@ def test_the_demo_is_this_world(campus):
     for name in truth.films:
         with av.open(str(DEMO / "input" / f"{name}.mp4")) as container:
             shipped = next(container.decode(video=0)).to_ndarray(format="rgb24").astype(float)
-        plan = film.Plan()
-        times, poses = film.trajectory(plan, campus.route, name)
+        plan = filming.FilmingPlan()
+        times, poses = filming.trajectory(plan, campus.route, name)
         assert np.allclose(poses, truth.films[name].camera_to_world, atol=1e-9)
-        light, _ = film.Renderer(name, campus, plan)(poses[0])
-        frame = film.develop(np.random.default_rng(0), light, LIGHTINGS[name], film.exposures(name, times)[0])
+        light, _ = filming.Renderer(name, campus, plan)(poses[0])
+        frame = filming.develop(np.random.default_rng(0), light, LIGHTINGS[name], filming.exposures(name, times)[0])
         error = cv2.GaussianBlur(frame.astype(float) - shipped, (0, 0), 2.0)
         assert np.sqrt((error**2).mean()) < 4.0
 
@@ -321,7 +325,7 @@ def test_films_repeat_byte_for_byte(tmp_path):
     picture = cv2.GaussianBlur(rng.uniform(0, 255, (180, 400, 3)).astype(np.float32), (0, 0), 2.0)
     noise = rng.normal(0, 2, (12, 180, 320, 3))
     frames = [np.clip(picture[:, 5 * k : 5 * k + 320] + noise[k], 0, 255).astype(np.uint8) for k in range(12)]
-    plan = film.Plan(width=320, height=180)
+    plan = filming.FilmingPlan(width=320, height=180)
     for name in ("a.mp4", "b.mp4", "c.mp4"):
-        film.encode(iter(frames), plan, tmp_path / name)
+        filming.encode(iter(frames), plan, tmp_path / name)
     assert len({(tmp_path / name).read_bytes() for name in ("a.mp4", "b.mp4", "c.mp4")}) == 1

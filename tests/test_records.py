@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from twin.errors import InputError
-from twin.report.statistics import rate_over_days, wilson
+from twin.evaluation.statistics import rate_over_days, wilson
 
 ROOT = Path(__file__).parents[1]
 TABLE1 = ROOT / "benchmarks" / "table1"

@@ -9,10 +9,10 @@ import warp as wp
 from test_fit import CONFIG, floor_points, make_cameras
 
 from twin.geometry.cameras import Cameras
-from twin.nerf.compute import single_threaded_torch
-from twin.nerf.fit import Trainer, fit
+from twin.nerf.buffers import single_threaded_torch
 from twin.nerf.kernels import space
-from twin.nerf.refine import Refinement, corrected
+from twin.nerf.pose_refinement import Refinement, corrected
+from twin.nerf.trainer import Trainer, train_field
 
 REFINING = replace(CONFIG, refine_cameras=True)
 
@@ -110,9 +110,9 @@ def test_frames_that_were_turned_find_back_in_a_field_that_is_right(cameras, mon
 
 
 def test_cameras_stay_where_no_refinement_is_asked_for(cameras):
-    _, metrics, same = fit(cameras, floor_points(cameras), CONFIG, camera_height=1.5)
+    _, metrics, same = train_field(cameras, floor_points(cameras), CONFIG, camera_height=1.5)
     assert metrics["cameras_moved"] is None and same is cameras
-    _, metrics, moved = fit(cameras, floor_points(cameras), REFINING, camera_height=1.5)
+    _, metrics, moved = train_field(cameras, floor_points(cameras), REFINING, camera_height=1.5)
     assert metrics["cameras_moved"]["most_m"] > 0.0 and moved.names == cameras.names
     assert not np.array_equal(moved.camera_to_world, cameras.camera_to_world)
 

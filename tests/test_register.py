@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from textured import SIZE, K, filmed_corridor, picture, pose_at
 
-from twin import progress
-from twin.capture.exif import PhotoFacts
-from twin.capture.register import MIN_INLIERS, candidate_lenses, register
+from twin import runtime
+from twin.capture.localize import MIN_INLIERS, candidate_lenses, register_photo
+from twin.capture.photos import PhotoFacts
 from twin.errors import InputError
 from twin.geometry.poses import rotation_angle
 
@@ -15,7 +15,7 @@ NOTHING = PhotoFacts(None, (np.nan, np.nan, np.nan), None, 1)
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return filmed_corridor(tmp_path_factory.mktemp("corridor") / "scene")
 
 
@@ -27,7 +27,7 @@ def error(found, pose: np.ndarray) -> tuple[float, float]:
 
 def test_a_new_view_in_other_light_is_found_with_the_scenes_camera(scene):
     pose = pose_at(2.6, -0.3, 0.4)
-    found = register(picture(pose, tint=(0.6, 0.5, 0.4)), NOTHING, scene)
+    found = register_photo(picture(pose, tint=(0.6, 0.5, 0.4)), NOTHING, scene)
     metres, degrees = error(found, pose)
     assert metres < 0.03
     assert degrees < 0.3
@@ -42,7 +42,7 @@ def test_another_camera_is_found_with_its_focal_length(scene):
     size, intrinsics, pose = (480, 480), np.array([520.0, 520.0, 240.0, 240.0]), pose_at(2.1, 0.1, -0.3)
     photo = picture(pose, size, intrinsics)
     for facts, said in ((NOTHING, "estimated"), (PhotoFacts(1.05, NOTHING.gps, None, 1), "EXIF")):
-        found = register(photo, facts, scene)
+        found = register_photo(photo, facts, scene)
         assert found.lens_from == said
         assert found.lens.intrinsics[0] == pytest.approx(520.0, rel=0.03)
         metres, degrees = error(found, pose)
@@ -53,9 +53,9 @@ def test_another_camera_is_found_with_its_focal_length(scene):
 def test_a_photo_of_something_else_is_refused(scene):
     noise = np.kron(np.random.default_rng(0).integers(0, 255, (60, 80, 3)), np.ones((4, 4, 1))).astype(np.uint8)
     with pytest.raises(InputError, match=rf"\d+ features of the photo fit the place \(need {MIN_INLIERS}"):
-        register(noise, NOTHING, scene)
+        register_photo(noise, NOTHING, scene)
     with pytest.raises(InputError, match="0 features of the photo fit"):
-        register(np.full((240, 320, 3), 90, np.uint8), NOTHING, scene)
+        register_photo(np.full((240, 320, 3), 90, np.uint8), NOTHING, scene)
 
 
 def test_the_photos_own_header_comes_before_the_scenes_cameras(scene):

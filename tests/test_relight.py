@@ -9,20 +9,19 @@ import torch
 from textured import SIZE, K, filmed_corridor, picture, pose_at
 
 import twin
-from twin import progress
+from twin import runtime
 from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
-from twin.nerf.added import AddedLighting, added_lightings, check_name, field_result
-from twin.nerf.air import Air, mixed
+from twin.nerf.added_lightings import AddedLighting, added_lightings, check_name, field_result
 from twin.nerf.appearance import initial_appearance
+from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained
+from twin.nerf.fog import Fog, mixed
 from twin.nerf.lightings import Lightings
-from twin.nerf.workspace import Layout
 from twin.relight import fit_photo, main
-from twin.scene import SceneDir
-from twin.stamp import seal
+from twin.scene import SceneDir, seal
 
 
 def small_field(seed: int = 0) -> RadianceField:
@@ -35,7 +34,7 @@ def small_field(seed: int = 0) -> RadianceField:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> SceneDir:
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     scene = filmed_corridor(tmp_path_factory.mktemp("relight") / "scene")
     scene.stage("field").mkdir()
     small_field().save(scene.stage("field"))
@@ -75,14 +74,14 @@ def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
     monkeypatch.setattr(field, "trace", traced)  # an untrained field is as near everywhere
     distance = depth * np.linalg.norm(unproject(pixel_grid(*size), wide), axis=-1)
     noise = rng.normal(0.0, 0.01, seen.rgb[0].shape).astype(np.float32)
-    hidden = Air(0.02, (0.8, 0.7, 0.6))
+    hidden = Fog(0.02, (0.8, 0.7, 0.6))
     hazy = fit_photo(field, hidden.over(seen.rgb[0], distance.astype(np.float32)) + noise, pose, wide)
     assert hazy.air.extinction == pytest.approx(0.02, rel=0.05)
     np.testing.assert_allclose(hazy.air.airlight, hidden.airlight, atol=0.03)
     assert psnr(hazy.pictures[1], hidden.over(seen.rgb[0], distance.astype(np.float32))) > 40.0
     assert hazy.psnr_other_half > hazy.psnr_clear_other_half + 0.2
     clear = fit_photo(field, seen.rgb[0] + noise, pose, wide)
-    assert clear.air == Air() and clear.psnr_other_half == clear.psnr_clear_other_half
+    assert clear.air == Fog() and clear.psnr_other_half == clear.psnr_clear_other_half
 
 
 def test_a_half_is_judged_by_what_was_fitted_to_the_other():
@@ -94,21 +93,21 @@ def test_a_half_is_judged_by_what_was_fitted_to_the_other():
 
 def test_air_by_closed_forms_and_between_two_lightings():
     rgb, distance = np.full((1, 2, 3), 0.5, np.float32), np.array([[0.0, 1e6]], np.float32)
-    np.testing.assert_array_equal(Air().over(rgb, distance), rgb)
-    near, far = Air(0.03, (1.0, 0.0, 0.5)).over(rgb, distance)[0]
+    np.testing.assert_array_equal(Fog().over(rgb, distance), rgb)
+    near, far = Fog(0.03, (1.0, 0.0, 0.5)).over(rgb, distance)[0]
     kept = np.exp(-3.0)  # air reaches 100 m
     np.testing.assert_allclose(near, 0.5)
     np.testing.assert_allclose(far, kept * 0.5 + (1 - kept) * np.array([1.0, 0.0, 0.5]), rtol=1e-5)
     names, vectors = ("filmed", "a", "b"), np.eye(3, dtype=np.float32)
-    airs = {"a": Air(0.02, (1.0, 1.0, 1.0)), "b": Air(0.06, (0.0, 0.0, 0.0))}
+    airs = {"a": Fog(0.02, (1.0, 1.0, 1.0)), "b": Fog(0.06, (0.0, 0.0, 0.0))}
     mine = Lightings(names[:1], vectors[:1], ("filmed/0",), vectors[:1])
     mine = mine.added(dict(zip(names[1:], vectors[1:], strict=True)), airs=airs)
     assert mine.air("filmed") is None and mine.air("filmed/0") is None and mine.air("any") is None
     assert mine.air("a") == airs["a"] and mine.filmed().airs == {}
-    assert mine.air("filmed:a:0.5") == Air(0.01, (1.0, 1.0, 1.0))
+    assert mine.air("filmed:a:0.5") == Fog(0.01, (1.0, 1.0, 1.0))
     between = mine.air("a:b:0.25")
     assert between and between.extinction == pytest.approx(0.03) and between.airlight == pytest.approx((0.5,) * 3)
-    assert mixed(Air(), None, 0.5) == Air() and mixed(None, None, 0.5) is None
+    assert mixed(Fog(), None, 0.5) == Fog() and mixed(None, None, 0.5) is None
     for share in ("x", "3"):
         with pytest.raises(InputError, match="a:b:"):
             mine.air(f"a:b:{share}")
@@ -139,7 +138,7 @@ def _without_gaps(picture: np.ndarray) -> np.ndarray:
 
 
 def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
-    AddedLighting("old", [0.0] * 8, Air(), field_result(scene), "photo.png", {}).save(scene)
+    AddedLighting("old", [0.0] * 8, Fog(), field_result(scene), "photo.png", {}).save(scene)
     assert "old" in added_lightings(scene, 8)[0]
     another = scene.stage("field") / "another"
     another.touch()
@@ -179,7 +178,7 @@ def test_what_cannot_be_used_ends_with_one_line_and_status_2(scene, tmp_path, ca
 def test_a_damaged_file_is_named(scene):
     path = scene.lightings / "broken.json"
     scene.lightings.mkdir(exist_ok=True)
-    whole = asdict(AddedLighting("broken", [0.0] * 8, Air(), "first", "photo.png", {})) | {"format": 2}
+    whole = asdict(AddedLighting("broken", [0.0] * 8, Fog(), "first", "photo.png", {})) | {"format": 2}
     without_air = {key: value for key, value in whole.items() if key != "air"}
     bad_air = whole | {"air": {"extinction": -0.1, "airlight": [1, 1, 1]}}
     try:
@@ -213,7 +212,7 @@ def test_a_lighting_from_before_photos_told_the_air_is_stale(scene):
 
 
 def test_the_air_of_a_hazy_photo_is_kept_and_told(scene, monkeypatch, capsys):
-    air = Air(0.03, (0.9, 0.8, 0.7))
+    air = Fog(0.03, (0.9, 0.8, 0.7))
 
     def hazy(field, photo, camera_to_world, intrinsics):
         return replace(fit_photo(field, photo, camera_to_world, intrinsics), air=air, psnr_clear_other_half=12.34)

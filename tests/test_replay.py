@@ -8,7 +8,7 @@ pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not instal
 from gymnasium import spaces
 
 from twin.errors import InputError
-from twin.learn.replay import FrameReplayBuffer
+from twin.learn.replay_buffer import FrameReplayBuffer
 
 WORLDS, STACK, SIZE, STATES = 3, 4, (5, 7), 2
 SPACE = spaces.Box(0, 255, (3 * STACK, *SIZE), np.uint8)

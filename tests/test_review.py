@@ -13,15 +13,34 @@ from twin.geometry.cameras import Cameras, Posed, Viewpoints, nearest_frame, pix
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
-from twin.report.ahead import Ahead
-from twin.report.drive import lighting_along
-from twin.report.overview import bird_pose
-from twin.report.panels import Layout, depth_colours, draw_text, fit, shorten, text_width, wrap
-from twin.report.plan import Plan, footprints, turn_of
-from twin.report.review import film
-from twin.report.rows import error_colours, judged_row, scale_bar
-from twin.report.studio import Studio, frames_to_compare, greyed, light_of_frame, side_by_side, spread
-from twin.report.video import describe, read_frames
+from twin.report.chase_camera import bird_pose
+from twin.report.review_chapters import lighting_along
+from twin.report.review_studio import (
+    Prefetched,
+    Studio,
+    error_colours,
+    frames_to_compare,
+    greyed,
+    judged_row,
+    light_of_frame,
+    scale_bar,
+    side_by_side,
+    spread,
+)
+from twin.report.review_video import write_review_video
+from twin.report.video_layout import (
+    FrameLayout,
+    MapView,
+    depth_colours,
+    draw_text,
+    fit,
+    footprints,
+    shorten,
+    text_width,
+    turn_of,
+    wrap,
+)
+from twin.report.video_writer import describe, read_frames
 from twin.scene import SceneDir
 
 
@@ -99,7 +118,7 @@ def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path
     field.asked.clear()
     out = tmp_path / "out"
     out.mkdir()
-    metrics = film(scene, config(), out, field)
+    metrics = write_review_video(scene, config(), out, field)
     assert metrics["follower"] is None
     assert "no route" in metrics["not_applicable"]
     about = describe(out / "review.mp4")
@@ -121,7 +140,9 @@ def test_a_route_that_was_not_wanted_is_told_apart(scene: SceneDir, tmp_path: Pa
     out = tmp_path / "out"
     out.mkdir()
     base = config()
-    metrics = film(scene, dataclasses.replace(base, mjcf=dataclasses.replace(base.mjcf, route=False)), out, field)
+    metrics = write_review_video(
+        scene, dataclasses.replace(base, mjcf=dataclasses.replace(base.mjcf, route=False)), out, field
+    )
     assert "mjcf.route = false" in metrics["not_applicable"]
     assert metrics["renders"] <= 5  # the first chapter's share: one lighting turns into nothing
 
@@ -132,7 +153,7 @@ def test_the_same_scene_makes_the_same_files(scene: SceneDir, tmp_path: Path) ->
     contents = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        film(scene, config(), tmp_path / name, field)
+        write_review_video(scene, config(), tmp_path / name, field)
         files = sorted(p for p in (tmp_path / name).rglob("*") if p.is_file())
         contents.append([(p.relative_to(tmp_path / name), p.read_bytes()) for p in files])
     assert contents[0] == contents[1]
@@ -178,7 +199,11 @@ def test_every_lighting_has_its_stretch_of_the_drive() -> None:
 
 
 def test_panels_do_not_overlap_and_fit_the_canvas() -> None:
-    for layout in (Layout.for_pictures(480, 9 / 16), Layout.for_pictures(161, 3.0), Layout.for_pictures(480, 0.2)):
+    for layout in (
+        FrameLayout.for_pictures(480, 9 / 16),
+        FrameLayout.for_pictures(161, 3.0),
+        FrameLayout.for_pictures(480, 0.2),
+    ):
         width, height = layout.size
         assert width % 2 == height % 2 == 0
         covered = np.zeros((height, width), int)
@@ -220,7 +245,7 @@ def test_near_is_brighter_than_far_and_nothing_is_empty() -> None:
 
 def test_the_plan_runs_from_left_to_right() -> None:
     path = np.stack([np.full(20, 3.0), np.linspace(0, -30, 20)], 1)  # southwards
-    plan = Plan.draw((200, 80), path)
+    plan = MapView.draw((200, 80), path)
     start, end = path[[0, -1]] @ plan.to_pixel[:, :2].T + plan.to_pixel[:, 2]
     assert start[0] < 40 and end[0] > 160
     assert start[1] == pytest.approx(40, abs=1) and end[1] == pytest.approx(40, abs=1)
@@ -260,14 +285,14 @@ def test_a_row_of_pictures_has_one_height() -> None:
 
 
 def test_work_ahead_keeps_order_and_hands_on_errors() -> None:
-    with Ahead(iter(range(20)), depth=3) as items:
+    with Prefetched(iter(range(20)), depth=3) as items:
         assert list(items) == list(range(20))
 
     def fails() -> Iterator[int]:
         yield 1
         raise ValueError("broken")
 
-    with Ahead(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
+    with Prefetched(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
         list(items)
 
 
@@ -279,7 +304,7 @@ def test_work_ahead_stops_when_nobody_reads() -> None:
             made.append(len(made))
             yield made[-1]
 
-    with Ahead(endless(), depth=2) as items:
+    with Prefetched(endless(), depth=2) as items:
         assert next(iter(items)) == 0
     count = len(made)
     assert count <= 5
@@ -298,7 +323,7 @@ def test_a_judged_row_shows_the_lighting_as_learnt_and_scores_what_is_not_masked
         spoilt = read_image(cameras.image_path(14))
         spoilt[:, :150] = 255  # what the mask ignores
         write_image(cameras.image_path(14), spoilt)
-    layout = Layout.for_pictures(160, 9 / 16)
+    layout = FrameLayout.for_pictures(160, 9 / 16)
     studio = Studio("x", field, cameras, layout, None, tmp_path, 48, cameras.positions[:, :2])  # type: ignore[arg-type]
     field.asked.clear()
     row, score = judged_row(studio, 14)

@@ -9,10 +9,10 @@ from tiny_world import tiny_config, tiny_scene
 from twin.build import PIPELINE, _depends
 from twin.config_file import load_config
 from twin.errors import InputError
-from twin.mjcf.export import run
+from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
 from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
-from twin.stamp import key_of
+from twin.scene import key_of
 
 _SCENE = """
 [[source]]

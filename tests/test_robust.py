@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import multivariate_t
 
-from twin.alignment.robust import FREEDOM, bent, bent_slopes, in_turns, unit, unlikelihood
+from twin.sysid.estimation import FREEDOM, in_turns, negative_log_likelihood, robust_loss, robust_slopes, unit
 
 POSE = (0, 0, 1)
 
@@ -24,7 +24,9 @@ def test_scales_are_those_of_the_distribution():
 def test_looks_of_a_window_count_as_one():
     misses = drawn((0.06, 0.06, 0.1), 100)
     assert unit(np.repeat(misses, 3, 1), POSE) == pytest.approx(unit(misses, POSE))
-    assert unlikelihood(np.repeat(misses, 3, 1), POSE) == pytest.approx(unlikelihood(misses, POSE))
+    assert negative_log_likelihood(np.repeat(misses, 3, 1), POSE) == pytest.approx(
+        negative_log_likelihood(misses, POSE)
+    )
 
 
 def test_no_other_scales_are_likelier():
@@ -42,7 +44,7 @@ def test_no_other_scales_are_likelier():
     for other in (3 * misses, misses**3 * 1e4):
         _, position, yaw = unit(other, POSE)
         more = unlikely(position, yaw, other) - least
-        assert unlikelihood(other, POSE) - unlikelihood(misses, POSE) == pytest.approx(more)
+        assert negative_log_likelihood(other, POSE) - negative_log_likelihood(misses, POSE) == pytest.approx(more)
 
 
 def test_scales_hardly_care_for_impossible_windows():
@@ -61,16 +63,16 @@ def test_misses_without_noise_have_a_scale(share):
 
 def test_bent_misses_count_as_logarithms():
     scaled = np.random.default_rng(0).normal(size=(5, 2, 3)) * np.logspace(-6, 3, 5)[:, None, None]
-    assert (bent(scaled) ** 2).sum((1, 2)) == pytest.approx(np.log1p((scaled**2).sum((1, 2)) / 2), rel=1e-6)
+    assert (robust_loss(scaled) ** 2).sum((1, 2)) == pytest.approx(np.log1p((scaled**2).sum((1, 2)) / 2), rel=1e-6)
 
 
 def test_gradients_by_bent_slopes_are_exact():
     rng = np.random.default_rng(1)
     at, slopes = rng.normal(size=(20, 2, 3)), rng.normal(size=(20, 2, 3, 4))
-    gradient = bent_slopes(at, slopes).reshape(-1, 4).T @ bent(at).ravel()
+    gradient = robust_slopes(at, slopes).reshape(-1, 4).T @ robust_loss(at).ravel()
 
     def half(x: np.ndarray) -> float:
-        return (bent(at + slopes @ x) ** 2).sum() / 2
+        return (robust_loss(at + slopes @ x) ** 2).sum() / 2
 
     steps = 1e-6 * np.eye(4)
     assert gradient == pytest.approx([(half(step) - half(-step)) / 2e-6 for step in steps], rel=1e-6)
@@ -85,6 +87,6 @@ def test_model_and_scales_are_found_in_turns(noise):
         np.array([500.0 * noise]),
         lambda x: misses + x,
         (0,),
-        lambda x, scale: least_squares(lambda x: bent((misses + x) / scale).ravel(), x).x,
+        lambda x, scale: least_squares(lambda x: robust_loss((misses + x) / scale).ravel(), x).x,
     )
     assert found == pytest.approx(0.0, abs=0.2 * noise)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from analytic import drive, right_turn, street
 
-from twin.assets.route import (
+from twin.errors import InputError
+from twin.geometry.route import (
     SPACING,
     distance_to_route,
     filmed_route,
@@ -18,7 +19,6 @@ from twin.assets.route import (
     smooth_route,
     without_rocking,
 )
-from twin.errors import InputError
 
 
 def _lifted(xy):

@@ -14,11 +14,11 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from twin.errors import InputError
-from twin.learn.architecture import Architecture, levelled, prepared
+from twin.learn.checkpoint import load_state, save_state
 from twin.learn.policy import load_policy, save_policy
-from twin.learn.replay import FrameReplayBuffer
+from twin.learn.policy_network import Architecture, normalized, prepared
+from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
-from twin.learn.state import load_state, save_state
 from twin.learn.train_config import TrainConfig
 
 SIZE = (32, 18)
@@ -49,7 +49,7 @@ class SpotEnv(gymnasium.Env):
         picture = np.zeros((6, 9, 16), np.uint8)
         picture[:, :, self.where : self.where + 2] = 255
         self.raw = picture
-        return levelled(picture)
+        return normalized(picture)
 
 
 def spot_model(folder: Path | None = None, seed: int = 0, privileged: bool = False) -> PixelSAC:

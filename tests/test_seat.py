@@ -12,24 +12,29 @@ from scipy.spatial.transform import Rotation
 from textured import K, filmed_corridor, picture
 from tiny_world import tiny_world
 
-from twin import progress
+from twin import runtime
 from twin.align import main
-from twin.alignment.aligned import toml_text
-from twin.alignment.camera import align_camera
-from twin.alignment.seat import Seat, find_seat, heading_of, seated
 from twin.assets.ground import Ground
-from twin.capture.lens import Lens
-from twin.capture.register_film import _shared_focal, _Sight, register_film
+from twin.capture.camera_models import Lens
+from twin.capture.localize import _shared_focal, _Sight, register_film
 from twin.config_file import overruled, read_robot
 from twin.errors import InputError
 from twin.geometry.images import read_image
 from twin.geometry.poses import rotation_angle
 from twin.mjcf import husky
-from twin.mjcf.export import rest_pose
+from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
 from twin.robot import BASE_HEIGHT, HuskyParams
-from twin.stamp import seal
+from twin.scene import seal
+from twin.sysid.camera_extrinsics import (
+    CameraExtrinsics,
+    align_camera,
+    estimate_extrinsics,
+    heading_of,
+    with_extrinsics,
+)
+from twin.sysid.identification import toml_text
 
 ASKEW = HuskyParams(camera_height=0.75, camera_yaw=1.4, camera_pitch=7.0, camera_roll=-2.0, camera_offset=(0.3, 0.05))
 GIVEN = Lens("PINHOLE", tuple(K), 320, 240)
@@ -101,13 +106,13 @@ def test_a_seated_camera_is_where_the_model_has_it(tmp_path):
         below = origin - BASE_HEIGHT * normal
         return below[2] - (xy - below[:2]) @ normal[:2] / normal[2]
 
-    pose = seated(world.robot, camera.xpos[:2], heading, ground_at)
+    pose = with_extrinsics(world.robot, camera.xpos[:2], heading, ground_at)
     np.testing.assert_allclose(pose[:3, 3], camera.xpos, atol=1e-4)
     np.testing.assert_allclose(pose[:3, :3] * [1, -1, -1], camera.xmat.reshape(3, 3), atol=1e-3)
 
 
 def test_the_seat_is_found():
-    seat, error = find_seat(drive(ASKEW), hills, ASKEW.camera_offset)
+    seat, error = estimate_extrinsics(drive(ASKEW), hills, ASKEW.camera_offset)
     assert seat.height == pytest.approx(0.75, abs=0.002)
     assert (seat.yaw, seat.pitch, seat.roll) == pytest.approx((1.4, 7.0, -2.0), abs=0.05)
     assert max(vars(error).values()) < 0.05
@@ -115,7 +120,7 @@ def test_the_seat_is_found():
 
 def test_errors_tell_how_far_it_may_be_off():
     poses = shaken(drive(ASKEW), 0.01, 0.3)
-    seat, error = find_seat(poses, hills, ASKEW.camera_offset)
+    seat, error = estimate_extrinsics(poses, hills, ASKEW.camera_offset)
     for name in ("height", "yaw", "pitch", "roll"):
         sigma = getattr(error, name)
         assert 0.0 < sigma < (0.01 if name == "height" else 0.3), name
@@ -124,7 +129,7 @@ def test_errors_tell_how_far_it_may_be_off():
 
 def test_driving_straight_or_backwards_tells_the_yaw_too():
     for poses in (drive(ASKEW, weave=0.0), drive(ASKEW)[::-1]):
-        assert find_seat(poses, hills, ASKEW.camera_offset)[0].yaw == pytest.approx(1.4, abs=0.05)
+        assert estimate_extrinsics(poses, hills, ASKEW.camera_offset)[0].yaw == pytest.approx(1.4, abs=0.05)
 
 
 def test_gaps_and_wrong_frames_do_no_harm():
@@ -134,7 +139,7 @@ def test_gaps_and_wrong_frames_do_no_harm():
     astray[44, :3, 3] += [5.0, 3.0, 2.0]
     lost = np.delete(poses, range(40, 52), 0)  # 2.4 m
     for film in (lost, astray):
-        seat, error = find_seat(film, hills, ASKEW.camera_offset)
+        seat, error = estimate_extrinsics(film, hills, ASKEW.camera_offset)
         assert (seat.yaw, seat.pitch, seat.roll) == pytest.approx((1.4, 7.0, -2.0), abs=0.15)
         assert seat.height == pytest.approx(0.75, abs=0.005)
         assert error.yaw < 0.2
@@ -145,7 +150,7 @@ def test_errors_are_of_the_size_that_they_say():
     """Over many films: neither a third nor three times of what the values scatter by."""
     off = []
     for seed in range(24):
-        seat, error = find_seat(shaken(drive(ASKEW), 0.01, 0.3, seed), hills, ASKEW.camera_offset)
+        seat, error = estimate_extrinsics(shaken(drive(ASKEW), 0.01, 0.3, seed), hills, ASKEW.camera_offset)
         names = ("height", "yaw", "pitch", "roll")
         off.append([(getattr(seat, n) - getattr(ASKEW, f"camera_{n}")) / getattr(error, n) for n in names])
     rms = np.sqrt(np.mean(np.square(off), axis=0))
@@ -155,9 +160,9 @@ def test_errors_are_of_the_size_that_they_say():
 def test_a_short_film_is_refused():
     poses = drive(ASKEW)
     with pytest.raises(InputError, match=r"10 frames .* over 1\.\d m; expected at least 16 over 6 m"):
-        find_seat(poses[:10], hills, (0.3, 0.0))
+        estimate_extrinsics(poses[:10], hills, (0.3, 0.0))
     with pytest.raises(InputError, match=r"20 frames .* over 3\.\d m"):
-        find_seat(poses[:20], hills, (0.3, 0.0))
+        estimate_extrinsics(poses[:20], hills, (0.3, 0.0))
 
 
 # ---- a film on a place
@@ -166,7 +171,7 @@ def test_a_short_film_is_refused():
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """The textured corridor with flat ground, filmed densely."""
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     scene = filmed_corridor(tmp_path_factory.mktemp("corridor") / "scene", frames=16)
     mesh = scene.stage("mesh")
     mesh.mkdir()
@@ -198,7 +203,7 @@ def registered(scene, filmed):
 def found_once(registered, monkeypatch):
     """Registering takes long; a lens that is given is kept."""
     monkeypatch.setattr(
-        "twin.alignment.camera.register_film",
+        "twin.sysid.camera_extrinsics.register_film",
         lambda frames, given, scene: replace(registered, lens=given or registered.lens),
     )
 
@@ -260,7 +265,7 @@ class Painted:
 @pytest.fixture
 def place(scene, monkeypatch):
     """The scene, with a scene.toml that can be read and changed, and nothing of a robot yet."""
-    monkeypatch.setattr("twin.alignment.camera.load_scene", lambda root: Painted())
+    monkeypatch.setattr("twin.sysid.camera_extrinsics.load_scene", lambda root: Painted())
     before = scene.config_file.read_text()
     scene.config_file.write_text(before + "[metric]\ncamera_height = 1.2\n")
     yield scene
@@ -322,7 +327,7 @@ def test_what_cannot_be_used_is_refused_in_a_line(place, film, registered, tmp_p
     assert [path.name for path in bare.iterdir()] == ["scene.toml"]
     bent = replace(registered, error=0.9)
     with monkeypatch.context() as patch:
-        patch.setattr("twin.alignment.camera.register_film", lambda *_: bent)
+        patch.setattr("twin.sysid.camera_extrinsics.register_film", lambda *_: bent)
         assert "0.9 px off where a pinhole camera would show them, expected at most 0.8; rectify" in refused(
             root, str(film)
         )
@@ -373,8 +378,10 @@ def test_a_wall_in_front_does_not_tell_the_focal_length():
 
 
 def test_a_seat_that_stays_unknown_is_refused(scene, film, found_once, monkeypatch):
-    vague = Seat(0.001, 0.5, 0.1, 0.1)
-    monkeypatch.setattr("twin.alignment.camera.find_seat", lambda *_: (Seat(1.0, 0.0, 5.0, 0.0), vague))
+    vague = CameraExtrinsics(0.001, 0.5, 0.1, 0.1)
+    monkeypatch.setattr(
+        "twin.sysid.camera_extrinsics.find_seat", lambda *_: (CameraExtrinsics(1.0, 0.0, 5.0, 0.0), vague)
+    )
     known = HuskyParams(camera_intrinsics=tuple(K), camera_size=(320, 240))
     with pytest.raises(InputError, match=r"uncertain by 0\.50, 0\.10, 0\.10° .* film a longer drive"):
         align_camera(film, scene, known)

@@ -10,12 +10,11 @@ from tiny_world import tiny_world
 from twin.assets.ground import Ground
 from twin.geometry.cameras import Cameras, pixel_grid, resized, unproject
 from twin.geometry.poses import look_at
-from twin.mjcf.export import Parts
+from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import point_at
 from twin.nerf.rendering import FAR, Rendering
-from twin.report.page import page
-from twin.report.seen_section import seen_row, seen_section
-from twin.report.seen_touched import Looks, along_the_drive, compare, look
+from twin.report.build_report import page
+from twin.report.visual_vs_collision import Looks, along_the_drive, compare, look, seen_row, seen_section
 from twin.scene import SceneDir
 
 STATIONS = (0.0, 1.0, 2.0)

@@ -14,12 +14,11 @@ import pycolmap
 import pytest
 
 from twin.capture import sfm, worker
-from twin.capture.types import Capture, SourceInfo
+from twin.capture.capture_data import Capture, SourceInfo
 from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
-from twin.geometry.cameras import Cameras, pixel_grid, unproject
+from twin.geometry.cameras import Cameras, SparsePoints, pixel_grid, unproject
 from twin.geometry.images import write_image
-from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at, rotation_angle, umeyama
 from twin.scene import SceneDir
 
@@ -145,7 +144,7 @@ def test_street_is_solved(street: Street, tmp_path: Path) -> None:
 
 
 def test_masked_parts_have_no_features(street: Street, tmp_path: Path) -> None:
-    from twin.capture.features import open_database
+    from twin.capture.matching import open_database
 
     capture = Capture.load(street.scene.stage("capture"))
     matcher = open_database(capture, street.scene.stage("capture"), tmp_path, False, 2, 0)
@@ -169,7 +168,7 @@ def test_given_poses_are_kept(tmp_path: Path) -> None:
 
 def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) -> None:
     from twin.capture import mapping
-    from twin.capture.features import open_database
+    from twin.capture.matching import open_database
 
     stage = street.scene.stage("capture")
     matcher = open_database(Capture.load(stage), stage, tmp_path, False, 2, 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.report.statistics import (
+from twin.evaluation.statistics import (
     CONFIDENCE,
     Refused,
     mean_rate,

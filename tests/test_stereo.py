@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from analytic import AnalyticField, Box
 
-from twin import progress
-from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, project, unproject
+from twin import runtime
+from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, project, unproject
 from twin.geometry.images import write_image
-from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
 from twin.nerf.dataset import TrainingPixels
-from twin.nerf.stereo import choose_sources, stereo_sightings
+from twin.nerf.stereo import choose_sources, stereo_depths
 
 WIDTH, HEIGHT = 160, 90
 K = np.array([110.0, 110.0, 80.0, 45.0])
@@ -22,7 +21,7 @@ PLACE = AnalyticField(boxes=(Box(9.0, 3.0, 2.0, 2.0, 2.5), Box(14.0, -2.5, 1.0, 
 
 @pytest.fixture(autouse=True)
 def quiet():
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
 
 
 def pattern(points: np.ndarray) -> np.ndarray:
@@ -80,7 +79,7 @@ def true_distance(cameras: Cameras, found) -> np.ndarray:
 def test_it_finds_the_ground_and_what_stands_on_it(tmp_path):
     cameras = film(tmp_path)
     pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
-    found, facts = stereo_sightings(pixels, 0, "cpu")
+    found, facts = stereo_depths(pixels, 0, "cpu")
     true = true_distance(cameras, found)
     error = np.abs(found.distance / true - 1.0)
     assert facts["frames"] == len(cameras)
@@ -102,16 +101,16 @@ def test_it_finds_nothing_where_nothing_matches(tmp_path, kind):
         return np.random.default_rng(i).random(places.shape[:2]) if kind == "noise" else np.full(places.shape[:2], 0.5)
 
     cameras = film(tmp_path, paint=paint)
-    _, facts = stereo_sightings(TrainingPixels(cameras, points_of(cameras), WIDTH), 0, "cpu")
+    _, facts = stereo_depths(TrainingPixels(cameras, points_of(cameras), WIDTH), 0, "cpu")
     assert facts["share"] < 0.01
 
 
 def test_same_seed_same_sightings_on_any_number_of_cores(tmp_path, monkeypatch):
     cameras = film(tmp_path, 5)
     pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
-    first, _ = stereo_sightings(pixels, 4, "cpu")
-    monkeypatch.setattr("twin.nerf.compute.cores", lambda: 1)
-    second, _ = stereo_sightings(pixels, 4, "cpu")
+    first, _ = stereo_depths(pixels, 4, "cpu")
+    monkeypatch.setattr("twin.nerf.buffers.cores", lambda: 1)
+    second, _ = stereo_depths(pixels, 4, "cpu")
     assert np.array_equal(first.distance, second.distance)
     assert np.array_equal(first.pixel, second.pixel)
 
@@ -124,14 +123,14 @@ def test_masked_pixels_are_not_sighted(tmp_path):
         (tmp_path / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
         write_image(tmp_path / "masks" / f"{name}.png", mask)
     cameras = replace(cameras, masks=tmp_path / "masks")
-    found, facts = stereo_sightings(TrainingPixels(cameras, points_of(cameras), WIDTH), 0, "cpu")
+    found, facts = stereo_depths(TrainingPixels(cameras, points_of(cameras), WIDTH), 0, "cpu")
     assert facts["sightings"] > 0
     assert found.pixel[:, 0].min() > WIDTH // 2
 
 
 def test_without_sparse_points_there_is_no_stereo(tmp_path):
     cameras = film(tmp_path, 4)
-    found, facts = stereo_sightings(TrainingPixels(cameras, SparsePoints.empty(), WIDTH), 0, "cpu")
+    found, facts = stereo_depths(TrainingPixels(cameras, SparsePoints.empty(), WIDTH), 0, "cpu")
     assert len(found.frame) == 0
     assert facts["sightings"] == 0
 

@@ -20,13 +20,13 @@ from textured import filmed_corridor, picture, pose_at
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
-from twin import verb
+from twin import cli
 from twin.errors import InputError, refuse, shortened
 from twin.geometry.images import write_image
 from twin.nerf.appearance import initial_appearance
+from twin.nerf.buffers import Layout
 from twin.nerf.field import untrained
-from twin.nerf.workspace import Layout
-from twin.stamp import seal
+from twin.scene import seal
 
 _PATIENCE = 120.0  # [s] until a verb has started what it starts
 _WOULD_TAKE = {"validate": 900, "train": 100_000}  # episodes and steps; far more than a test waits for
@@ -75,7 +75,7 @@ def cases(tmp_path_factory) -> dict[str, Case]:
     train = ("--task", "ahead", "--lighting", "day", "--run", "new", "--steps", steps, "--processes", "2")
     return {
         "build": Case((str(filmed), "--until", "metric"), "twin.capture.worker"),
-        "train": Case((str(driven), *train), "twin.env.world_process", 2),
+        "train": Case((str(driven), *train), "twin.env.vector_env_child", 2),
         "validate": Case((str(driven), *validate), "multiprocessing.spawn", 2),
         "relight": Case((str(corridor), str(corridor / "photo.png"), "--name", "new"), "twin.capture.worker"),
     }
@@ -159,7 +159,7 @@ convex._coacd([piece(k) for k in range(40)], 0.01, Path({str(tmp_path)!r}), 0)
 
 
 def _runs(work, *arguments: str) -> int:
-    return verb.run(verb.Parser(prog="python -m twin.some"), lambda options: work(), list(arguments))
+    return cli.run(cli.Parser(prog="python -m twin.some"), lambda options: work(), list(arguments))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
@@ -180,8 +180,8 @@ def test_what_was_to_be_ignored_stays_ignored():
 
 def test_colmap_does_not_take_our_signals(tmp_path):
     script = (
-        "import os, signal, twin.capture.formats, twin.capture.features;"
-        "from twin.verb import *;"
+        "import os, signal, twin.capture.formats, twin.capture.matching;"
+        "from twin.cli import *;"
         "raise SystemExit(run(Parser(), lambda o: os.kill(os.getpid(), signal.SIGTERM), []))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
@@ -189,7 +189,7 @@ def test_colmap_does_not_take_our_signals(tmp_path):
 
 
 def test_a_reader_that_goes_ends_a_verb_quietly(tmp_path):
-    script = "import sys; from twin.verb import *; sys.exit(run(Parser(), lambda o: print('x' * 10**6), []))"
+    script = "import sys; from twin.cli import *; sys.exit(run(Parser(), lambda o: print('x' * 10**6), []))"
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout and process.stderr
     process.stdout.close()

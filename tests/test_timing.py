@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from drive_logs import windows_of
 
-from twin.alignment import logs
+from twin.sysid import logs
 
 
 def held(appeared: list[list[float]]) -> logs.Windows:

@@ -18,23 +18,23 @@ from safetensors.torch import load_file
 from tiny_twin import tiny_twin
 
 import twin
-from twin import progress, train
-from twin.alone import alone
-from twin.env.randomisation import Ranges
+from twin import runtime, train
+from twin.env.domain_randomization import Ranges
 from twin.errors import InputError
+from twin.evaluation.training_curves import read_episodes
+from twin.evaluation.trials import csv_text
 from twin.files import write_json
-from twin.learn.choosing import FRESH
 from twin.learn.policy import load_policy
+from twin.learn.policy_evaluation import FRESH
+from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
 from twin.learn.training import EPISODE_COLUMNS, _check_same, _keep_rows
-from twin.learn.vectors import DriveVecEnv
-from twin.report.training import read_episodes
-from twin.report.trials import csv_text
+from twin.runtime import alone
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return tiny_twin(tmp_path_factory.mktemp("twin"))
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from twin.errors import InputError
-from twin.report.statistics import wilson
-from twin.report.trials import (
+from twin.evaluation.statistics import wilson
+from twin.evaluation.trials import (
     CELL_COLUMNS,
     EPISODE_COLUMNS,
     Cell,

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from twin.capture.undistort import pinhole_of, undistortion_map, write_pinhole_image
+from twin.capture.camera_models import pinhole_of, undistortion_map, write_pinhole_image
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
 

@@ -12,19 +12,19 @@ from test_policy import some_weights
 from tiny_runs import SMALL, tiny_runs
 from tiny_twin import tiny_twin
 
-from twin import load_scene, progress, validate
-from twin.alone import alone
-from twin.env import lightings
-from twin.env.randomisation import ANOTHER_DAY, asked
-from twin.env.suite import Stage, fingerprint
+from twin import load_scene, runtime, validate
+from twin.env import episode_lighting
+from twin.env.domain_randomization import ANOTHER_DAY, asked
+from twin.env.suite import EnvFactory, fingerprint
 from twin.errors import InputError
-from twin.learn import judging
-from twin.learn.judging import Chunk, campaign, drawn_light, drive
+from twin.evaluation.trials import Trial, read_trials
+from twin.learn import policy_evaluation
 from twin.learn.policy import Control, load_policy, save_policy
+from twin.learn.policy_evaluation import EpisodeChunk, campaign, drawn_light, run_chunk
 from twin.loading import Twin
-from twin.report.trials import Trial, read_trials
-from twin.report.validation import lines, pairs, rate, summary
+from twin.report.validation_summary import lines, pairs, rate, summary
 from twin.robot import HuskyParams
+from twin.runtime import alone
 from twin.validate import seeds_of
 
 FIRST = seeds_of("day", 1)[0]
@@ -32,7 +32,7 @@ FIRST = seeds_of("day", 1)[0]
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     root = tiny_twin(tmp_path_factory.mktemp("twin"))
     tiny_runs(root)
     return root
@@ -45,16 +45,16 @@ def fresh(scene):
     return scene
 
 
-def chunk(scene: Path, seeds, lighting="day", name="ahead") -> Chunk:
-    return Chunk(str(scene), "ahead", str(scene / "runs" / name), False, lighting, tuple(seeds))
+def chunk(scene: Path, seeds, lighting="day", name="ahead") -> EpisodeChunk:
+    return EpisodeChunk(str(scene), "ahead", str(scene / "runs" / name), False, lighting, tuple(seeds))
 
 
 def test_an_episode_is_the_same_whoever_drives_beside(scene):
-    together = drive(chunk(scene, range(11)))
+    together = run_chunk(chunk(scene, range(11)))
     assert [one.seed for one in together] == list(range(11))
     assert len({one.steps for one in together}) > 1  # they end at different times
-    assert [drive(chunk(scene, [k]))[0] for k in (0, 7, 10)] == [together[k] for k in (0, 7, 10)]
-    assert drive(chunk(scene, (10, 3))) == [together[10], together[3]]
+    assert [run_chunk(chunk(scene, [k]))[0] for k in (0, 7, 10)] == [together[k] for k in (0, 7, 10)]
+    assert run_chunk(chunk(scene, (10, 3))) == [together[10], together[3]]
 
 
 def test_an_episode_is_that_of_the_environment_alone(scene):
@@ -63,7 +63,7 @@ def test_an_episode_is_that_of_the_environment_alone(scene):
     from twin.env.episode import record
 
     policy = load_policy(scene / "runs" / "ahead")
-    (driven,) = drive(chunk(scene, [5]))
+    (driven,) = run_chunk(chunk(scene, [5]))
     environment = twin.load(scene, "ahead", 5, lighting="day", **policy.options())
     episode = record(environment, PolicyDriver(policy))
     assert (driven.cause, driven.steps) == (episode.cause, len(episode.times) - 1)
@@ -78,7 +78,7 @@ def test_processes_give_what_one_gives(scene):
 
 def test_drawn_lights_do_not_depend_on_those_before(scene):
     def light(numbers):
-        stage = Stage.open(load_scene(scene), "ahead", {"size": (32, 18)})
+        stage = EnvFactory.open(load_scene(scene), "ahead", {"size": (32, 18)})
         for number in numbers:
             drawn_light(stage, number)
         return stage.field.embedding(f"drawn_{numbers[-1]}")
@@ -94,26 +94,28 @@ def run(scene: Path, *policies: str, lightings=("day", "night"), episodes=5) -> 
 
 def test_randomised_episodes_are_others_and_repeat(scene, monkeypatch):
     seeds = range(6)
-    plain, drawn = drive(chunk(scene, seeds)), drive(chunk(scene, seeds, "day+randomised"))
+    plain, drawn = run_chunk(chunk(scene, seeds)), run_chunk(chunk(scene, seeds, "day+randomised"))
     assert [one.seed for one in drawn] == list(seeds)
     assert [one.progress for one in plain] != [one.progress for one in drawn]
-    assert drive(chunk(scene, [2], "day+randomised")) == [drawn[2]]
+    assert run_chunk(chunk(scene, [2], "day+randomised")) == [drawn[2]]
     assert fingerprint(load_scene(scene), "ahead", "day") != fingerprint(load_scene(scene), "ahead", "day+randomised")
     said = [fingerprint(load_scene(scene), "ahead", name) for name in ("day", "any", "held-out", "training+randomised")]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lightings, "VERSION", -1)
+        patch.setattr(episode_lighting, "VERSION", -1)
         other = [fingerprint(load_scene(scene), "ahead", n) for n in ("day", "any", "held-out", "training+randomised")]
     assert [a == b for a, b in zip(said, other, strict=True)] == [True, True, False, False]
-    assert drive(chunk(scene, seeds)) == plain
-    stage = Stage.open(scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")})
+    assert run_chunk(chunk(scene, seeds)) == plain
+    stage = EnvFactory.open(
+        scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")}
+    )
     assert stage.options.lighting == "day" and stage.options.randomise == ANOTHER_DAY
     fitted = dataclasses.replace(load_scene(scene).world(), robot=HuskyParams(friction=0.6))
     monkeypatch.setattr(Twin, "world", lambda self: fitted)
     options = load_policy(scene / "runs" / "ahead").options()
-    stages = [Stage.open(scene, "ahead", {**options, **asked(f"day{what}")}) for what in ("+randomised", "")]
+    stages = [EnvFactory.open(scene, "ahead", {**options, **asked(f"day{what}")}) for what in ("+randomised", "")]
     assert stages[0].options.randomise.friction == (1.0, 1.0) and stages[1].options.randomise is None
     with pytest.raises(InputError, match="randomized"):
-        drive(chunk(scene, [0], "day+randomized"))
+        run_chunk(chunk(scene, [0], "day+randomized"))
 
 
 def test_a_killed_validation_ends_with_the_same_table(fresh, monkeypatch):
@@ -129,20 +131,20 @@ def test_a_killed_validation_ends_with_the_same_table(fresh, monkeypatch):
     def killed(one):
         if left.pop() == 0:
             raise Killed
-        return drive(one)
+        return run_chunk(one)
 
     left = [0, 1, 2, 3]
-    monkeypatch.setattr(judging, "drive", killed)
+    monkeypatch.setattr(policy_evaluation, "run_chunk", killed)
     with pytest.raises(Killed):
         run(fresh, "ahead", "left")
-    monkeypatch.setattr(judging, "drive", drive)
+    monkeypatch.setattr(policy_evaluation, "run_chunk", run_chunk)
     assert whole.startswith(path.read_text()) and 1 < len(path.read_text().splitlines()) < len(whole.splitlines())
     assert run(fresh, "ahead", "left") == whole
     # Killed while it wrote: within a row, and within the header.
     for cut in (len(whole) - 60, 9):
         path.write_text(whole[:cut])
         assert run(fresh, "ahead", "left") == whole
-    monkeypatch.setattr(judging, "drive", None)  # nothing is driven twice
+    monkeypatch.setattr(policy_evaluation, "run_chunk", None)  # nothing is driven twice
     assert run(fresh, "ahead", "left") == whole
 
 

@@ -14,17 +14,28 @@ from test_forecast import Text
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
-from twin import film, progress, validate
+from twin import film, runtime, validate
 from twin.errors import InputError
+from twin.evaluation.training_curves import RECENT, binned, trainings
+from twin.evaluation.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.files import digest_file, write_json
 from twin.report.figures import SERIES
-from twin.report.training import RECENT, binned, trainings
-from twin.report.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
-from twin.report.validation import rate, share, summary, typical_episode, worst_episode
-from twin.report.validation_figures import FEW, better, rate_tiles, rates
-from twin.report.validation_page import Curve, validation_page
-from twin.report.validation_words import FAILURES, chance_words, pair_words, percent, unknowns, verdicts, why
-from twin.report.video import describe
+from twin.report.validation_report import FEW, Curve, better, rate_tiles, rates, validation_page
+from twin.report.validation_summary import (
+    FAILURES,
+    chance_words,
+    pair_words,
+    percent,
+    rate,
+    share,
+    summary,
+    typical_episode,
+    unknowns,
+    verdicts,
+    why,
+    worst_episode,
+)
+from twin.report.video_writer import describe
 
 TRAINED = {"run": "ahead", "task": "ahead", "observe": "nerf", "lighting": "training", "step": 300}
 EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: step, success
@@ -32,7 +43,7 @@ EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     root = tiny_twin(tmp_path_factory.mktemp("twin"))
     tiny_runs(root, TRAINED)
     write_episodes(root / "runs" / "ahead", EPISODES)
@@ -230,7 +241,7 @@ def episodes(monkeypatch):
 
     whole = film.film
     monkeypatch.setattr(film, "film", spy)
-    monkeypatch.setattr("twin.report.episode_film.SceneCamera", NoCamera)
+    monkeypatch.setattr("twin.report.episode_video.SceneCamera", NoCamera)
     return seen
 
 

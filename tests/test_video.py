@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.report.video import VideoWriter, describe, even, read_frames
+from twin.report.video_writer import VideoWriter, describe, even, read_frames
 
 
 def _gradient(i: int, width: int = 64, height: int = 48) -> np.ndarray:

@@ -7,18 +7,15 @@ import pytest
 from tiny_twin import tiny_twin
 
 import twin
-from twin import progress
-from twin.env.haze import Haze
-from twin.env.lightings import LightSets, draw_light
-from twin.env.randomisation import ANOTHER_DAY, UNTOLD, Draw, Ranges
-from twin.env.shade import _solids
-from twin.env.sides import Sides
-from twin.env.suite import Stage, fingerprint
-from twin.env.tasks import WEATHER, Drive
-from twin.env.weather import Weather
+from twin import runtime
+from twin.env.domain_randomization import ANOTHER_DAY, UNTOLD, RandomizationSample, Ranges
+from twin.env.episode_lighting import LightingSets, sample_lighting
+from twin.env.suite import EnvFactory, fingerprint
+from twin.env.task import WEATHER, DriveTask
+from twin.env.weather import DirectionalRelighting, FogSample, Weather, _solids
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
-from twin.nerf.added import AddedLighting, field_result
-from twin.nerf.air import Air
+from twin.nerf.added_lightings import AddedLighting, field_result
+from twin.nerf.fog import Fog
 from twin.scene import SceneDir
 
 SMALL = {"size": (32, 18)}
@@ -26,25 +23,25 @@ SMALL = {"size": (32, 18)}
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
 def test_haze_hides_by_distance_and_spares_what_is_near():
     distance = np.array([[1500.0, 1500.0], [30.0, 3.0]], np.float32)
     rgb = np.array([[[0.8] * 3, [0.6] * 3], [[0.1] * 3, [0.1] * 3]], np.float32)
-    np.testing.assert_array_equal(Haze(0.0).over(rgb, distance), rgb)
-    hazy = Haze(0.05).over(rgb, distance)
+    np.testing.assert_array_equal(FogSample(0.0).over(rgb, distance), rgb)
+    hazy = FogSample(0.05).over(rgb, distance)
     np.testing.assert_allclose(hazy[0], 0.7, atol=1e-3)  # the horizon, whose mean is the airlight
     for column, metres in ((0, 30.0), (1, 3.0)):
         kept = np.exp(-0.05 * metres)
         np.testing.assert_allclose(hazy[1, column], kept * 0.1 + (1 - kept) * 0.7, rtol=1e-5)
-    np.testing.assert_allclose(Haze(0.05, 0.5).over(rgb, distance)[0], 0.35, atol=4e-3)
-    air = Haze(0.05)
+    np.testing.assert_allclose(FogSample(0.05, 0.5).over(rgb, distance)[0], 0.35, atol=4e-3)
+    air = FogSample(0.05)
     air.over(rgb, distance)
     np.testing.assert_allclose(air.over(0.0 * rgb, distance)[0], 0.7, atol=6e-3)  # that of the first picture
     near = np.ones_like(distance)
-    np.testing.assert_allclose(Haze(1e3).over(rgb, near)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
+    np.testing.assert_allclose(FogSample(1e3).over(rgb, near)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
 
 
 def _pose(x: float, turned: float) -> np.ndarray:
@@ -60,7 +57,7 @@ def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
     rgb, depth = np.ones((32, 32, 3), np.float32), np.full((32, 32), 2.0, np.float32)
     covers = []
     for seed in range(30):
-        weather = Weather(Draw(shade=0.5), np.random.default_rng(seed))
+        weather = Weather(RandomizationSample(shade=0.5), np.random.default_rng(seed))
         light = weather.over(rgb, depth, rays, _pose(0.0, 0.0))
         assert light.min() >= 0.5 and light.max() <= 1.0
         moved = weather.over(rgb, depth, rays, _pose(0.5, 0.0))  # five pixels further
@@ -77,7 +74,7 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
     robot = ("payload", "latency", "wheel_difference", "camera_shift", "camera_turn")
     still |= dict.fromkeys((*robot, "sunlight", "shade", "bystanders"), (0.0, 0.0))
 
-    def first(seed: int = 3, **ranges) -> tuple[np.ndarray, Drive]:
+    def first(seed: int = 3, **ranges) -> tuple[np.ndarray, DriveTask]:
         environment = twin.load(scene, "ahead", seed, lighting="day", **SMALL, randomise=Ranges(**(still | ranges)))
         step = environment.reset()
         return step.observation["pixels"][-1].astype(float), environment.task
@@ -104,16 +101,16 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
     assert {Ranges(bystanders=(0, 3)).draw(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
 
 
-FOG = Air(0.1, (0.9, 0.8, 0.7))
+FOG = Fog(0.1, (0.9, 0.8, 0.7))
 
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     """A built scene that also knows the light of its first lighting in two airs."""
-    progress.set_quiet(True)
+    runtime.set_quiet(True)
     scene = SceneDir(tiny_twin(tmp_path_factory.mktemp("photos")))
     day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
-    for name, air in (("clear", Air()), ("foggy", FOG)):
+    for name, air in (("clear", Fog()), ("foggy", FOG)):
         AddedLighting(name, day, air, field_result(scene), "photo.png", {}).save(scene)
     return twin.load_scene(scene.root)
 
@@ -137,9 +134,9 @@ def test_a_picture_under_a_photos_light_is_seen_through_its_air(photos):
     np.testing.assert_allclose(first("foggy")[0], 255.0 * expected, atol=2.0)
     half = first("day:foggy:0.5")[0]
     assert np.abs(half - plain).mean() < np.abs(first("foggy")[0] - plain).mean()
-    bare = [Stage.open(built, "ahead", {"lighting": name, **SMALL})._bare for name in ("day", "clear", "foggy")]
+    bare = [EnvFactory.open(built, "ahead", {"lighting": name, **SMALL})._bare for name in ("day", "clear", "foggy")]
     assert bare == [True, True, False]  # pictures that stay on a device have no air
-    assert not Stage.open(built, "ahead", {"lighting": ("day", "foggy"), **SMALL})._bare
+    assert not EnvFactory.open(built, "ahead", {"lighting": ("day", "foggy"), **SMALL})._bare
 
 
 def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
@@ -152,7 +149,7 @@ def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
     intrinsics, task = environment.pixels._overlay.intrinsics, environment.task
     pose, rays = environment.physics.camera_to_world, unproject(pixel_grid(*SMALL["size"]), intrinsics)
     seen = photos.field().render(Viewpoints.of(pose[None], intrinsics, SMALL["size"]), "day")
-    left = Draw(sunlight=0.7 * UNTOLD, shade=0.75 * UNTOLD)
+    left = RandomizationSample(sunlight=0.7 * UNTOLD, shade=0.75 * UNTOLD)
     lit = Weather(left, task.rng(WEATHER)).over(seen.rgb[0], seen.depth[0], rays, pose)
     distance = seen.depth[0] * np.linalg.norm(rays, axis=-1)
     expected = FOG.over(lit, distance.astype(np.float32))
@@ -161,10 +158,10 @@ def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
 
 
 def test_the_air_drifts_with_the_light(photos):
-    sets = LightSets(photos.field())
+    sets = LightingSets(photos.field())
 
     def light(wanted, seed: int = 0):
-        return draw_light(wanted, True, 10.0, sets, np.random.default_rng(seed))
+        return sample_lighting(wanted, True, 10.0, sets, np.random.default_rng(seed))
 
     ends = {light("foggy", seed).name for seed in range(20)}
     assert ends == {"foggy → day", "foggy → night"}  # filmed ones
@@ -188,7 +185,7 @@ def test_the_air_drifts_with_the_light(photos):
 
 @pytest.mark.parametrize("lighting", ["foggy", "clear"])
 def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows_are_weaker(photos, lighting):
-    def draw(lighting: str, ranges: Ranges) -> Draw:
+    def draw(lighting: str, ranges: Ranges) -> RandomizationSample:
         environment = twin.load(photos, "ahead", 5, lighting=lighting, **SMALL, randomise=ranges)
         environment.reset()
         told = environment.task.draw
@@ -253,7 +250,7 @@ def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]
 def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
     depth, points, masks = street(ground)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
-    lit = Sides(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)
+    lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)
     light = {name: np.median(lit[mask][:, 1]) / 0.5 for name, mask in masks.items()}
     assert light["ground"] == pytest.approx(1.0, abs=0.01)
     assert light["right"] == pytest.approx(np.exp(0.7 * (np.cos(LOW) - np.sin(LOW))), rel=0.01)
@@ -262,14 +259,16 @@ def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
     assert warm[0] > warm[1] > warm[2]
     towards, away = (lit[masks["sky"] & side][:, 1].mean() for side in (RAYS[..., 0] < 0.0, RAYS[..., 0] > 0.0))
     assert towards > 1.05 * away
-    np.testing.assert_array_equal(Sides(0.0, LEFT, np.random.default_rng(0)).over(rgb, depth, points), rgb)
+    np.testing.assert_array_equal(
+        DirectionalRelighting(0.0, LEFT, np.random.default_rng(0)).over(rgb, depth, points), rgb
+    )
 
 
 def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
     ahead = np.tile(np.linspace(20.0, 45.0, 251, dtype=np.float32), (3, 1))
     points = np.stack([np.minimum(ahead, 40.0), 0.0 * ahead, 0.0 * ahead - 1.0], -1)  # the ground, 1 m below
     rgb = np.full((*ahead.shape, 3), 0.5, np.float32)
-    lit = np.log(Sides(0.7, LEFT, np.random.default_rng(3)).over(rgb, ahead, points)[0, :, 1] / 0.5)
+    lit = np.log(DirectionalRelighting(0.7, LEFT, np.random.default_rng(3)).over(rgb, ahead, points)[0, :, 1] / 0.5)
     assert abs(lit[0]) < 1e-3 and np.ptp(lit[-40:]) < 1e-3 and abs(lit[-1]) > 0.05
     steps = np.diff(lit)
     assert np.abs(steps).max() < 0.02 * abs(lit[-1]) and (np.sign(lit[-1]) * steps > -1e-3).all()
@@ -278,13 +277,14 @@ def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
 def test_what_is_low_keeps_its_light_and_skies_differ():
     depth, points, masks = street(1.0)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
-    lit = Sides(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)[..., 1] / 0.5
+    lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)[..., 1] / 0.5
     high, right = points[..., 2], points[..., 1] < -3.9
     middle = np.median(lit[right & (abs(high + 0.2) < 0.05) & (depth < 15.0)])
     assert np.log(middle) == pytest.approx(0.5 * 0.7 * (np.cos(LOW) - np.sin(LOW)), rel=0.15)
     assert np.median(lit[right & (high < -0.5) & (high > -0.9) & (depth < 15.0)]) == pytest.approx(1.0, abs=0.01)
     skies = [
-        np.median(Sides(0.7, LEFT, np.random.default_rng(k)).over(rgb, depth, points)[masks["sky"]]) for k in range(20)
+        np.median(DirectionalRelighting(0.7, LEFT, np.random.default_rng(k)).over(rgb, depth, points)[masks["sky"]])
+        for k in range(20)
     ]
     assert np.std(np.log(skies)) > 0.2
 
@@ -295,7 +295,7 @@ def test_the_sun_stays_where_it_is_when_the_robot_turns_and_its_shadows_are_its_
     up = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera axes to x ahead, y left, z up
     ratios = []
     for seed in range(12):
-        weather = Weather(Draw(sunlight=0.7), np.random.default_rng(seed))
+        weather = Weather(RandomizationSample(sunlight=0.7), np.random.default_rng(seed))
         seen = []
         for turned in (-0.15, 0.15):
             pose = np.eye(4)
@@ -311,6 +311,6 @@ def test_the_sun_stays_where_it_is_when_the_robot_turns_and_its_shadows_are_its_
         ratios.append(seen[0])
     assert max(ratios) > 1.3 and min(ratios) < 0.6
     sides = weather._sides
-    both = Weather(Draw(sunlight=0.7, shade=0.5), np.random.default_rng(11))
+    both = Weather(RandomizationSample(sunlight=0.7, shade=0.5), np.random.default_rng(11))
     np.testing.assert_allclose(both._sides._sun, sides._sun)
     np.testing.assert_allclose(both._shade._slant, sides._sun[:2] / sides._sun[2], rtol=1e-5)

@@ -11,9 +11,16 @@ from tiny_world import box, tiny_config, tiny_ground, tiny_route, tiny_scene, ti
 
 from twin.errors import InputError
 from twin.geometry.images import read_image
-from twin.mjcf.check import check_portable
-from twin.mjcf.export import add_ground, compacted, covered_by_ground, film_camera, rest_pose, run
-from twin.mjcf.files import face_tiles
+from twin.mjcf.scene_xml import (
+    add_ground,
+    check_portable,
+    compacted,
+    covered_by_ground,
+    face_tiles,
+    film_camera,
+    rest_pose,
+    run,
+)
 from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest, point_at, total_turn
 from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams
 

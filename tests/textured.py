@@ -8,10 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from twin.capture.types import Capture, SourceInfo
-from twin.geometry.cameras import Cameras, pixel_grid, unproject
+from twin.capture.capture_data import Capture, SourceInfo
+from twin.geometry.cameras import Cameras, SparsePoints, pixel_grid, unproject
 from twin.geometry.images import write_image
-from twin.geometry.points import SparsePoints
 from twin.geometry.poses import look_at
 from twin.scene import SceneDir
 

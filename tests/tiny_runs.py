@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from test_policy import some_weights
 
-from twin.learn.architecture import Architecture
 from twin.learn.policy import Control, save_policy
+from twin.learn.policy_network import Architecture
 
 SMALL = Architecture((32, 18), 2, 1, ((4, 5, 4),), 8, (8,), 1)
 

@@ -8,12 +8,12 @@ import numpy as np
 from test_baked import LOW, STEP, networks, places
 from tiny_world import tiny_config, tiny_ground, tiny_scene
 
-from twin.mjcf.export import run
+from twin.mjcf.scene_xml import run
 from twin.nerf.baked import BakedField
-from twin.nerf.layout import BrickLayout, leaps
+from twin.nerf.brick_layout import BrickLayout, leaps
 from twin.nerf.lightings import Lightings
 from twin.robot import HuskyParams
-from twin.stamp import seal
+from twin.scene import seal
 
 LAYOUT = BrickLayout((4.5, -2.5, 1.0), (8.0, 6.0, 2.0), 0.1, 0.5, (12, 9, 5), (8, 8, 4))
 

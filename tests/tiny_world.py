@@ -8,7 +8,7 @@ import numpy as np
 from twin.assets.ground import Ground
 from twin.config import MjcfConfig, SceneConfig
 from twin.geometry.cameras import Cameras
-from twin.mjcf.export import run
+from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
 from twin.scene import SceneDir
 

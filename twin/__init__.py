@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 if TYPE_CHECKING:
+    from twin.env.suite import load
     from twin.errors import InputError
     from twin.geometry.cameras import Viewpoints
-    from twin.loading import Twin, load, load_scene
+    from twin.loading import Twin, load_scene
 
 __all__ = ["InputError", "Twin", "Viewpoints", "load", "load_scene"]
 
@@ -17,7 +18,7 @@ _MODULES = {
     "InputError": "twin.errors",
     "Twin": "twin.loading",
     "Viewpoints": "twin.geometry.cameras",
-    "load": "twin.loading",
+    "load": "twin.env.suite",
     "load_scene": "twin.loading",
 }
 
@@ -40,5 +41,5 @@ def __getattr__(name: str) -> Any:
 
 # Where gymnasium.make("twin/Drive-v0") finds the environment, without any of it being imported here.
 gymnasium.register(
-    "twin/Drive-v0", entry_point="twin.env.gym:DriveEnv", vector_entry_point="twin.env.gym:DriveVectorEnv"
+    "twin/Drive-v0", entry_point="twin.env.gym_env:DriveEnv", vector_entry_point="twin.env.gym_env:DriveVectorEnv"
 )

@@ -19,7 +19,7 @@ VERBS = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs a verb; returns its exit status, see `twin.verb`."""
+    """Runs a verb; returns its exit status, see `twin.cli`."""
     given = sys.argv[1:] if arguments is None else arguments
     if not given or given[0] in ("-h", "--help", "help"):
         print(_map())

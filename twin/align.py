@@ -23,18 +23,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from twin import progress, verb
-from twin.alignment.aligned import Alignment, align, robot_toml, told_error, toml_text
-from twin.alignment.checks import check
-from twin.alignment.logs import read_log
+from twin import cli, runtime
 from twin.config_file import ROBOT_TOML, load_config, overruled, parse, read_robot
 from twin.errors import InputError
 from twin.files import digest_file, read_toml, write_json, write_text
 from twin.robot import HuskyParams
 from twin.scene import SceneDir
+from twin.sysid.identification import Alignment, align, robot_toml, told_error, toml_text
+from twin.sysid.log_checks import check
+from twin.sysid.logs import read_log
 
 if TYPE_CHECKING:
-    from twin.alignment.camera import CameraAlignment
+    from twin.sysid.camera_extrinsics import CameraAlignment
 
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 """Suffixes of what is taken for a film."""
@@ -50,7 +50,7 @@ def run(target: str, log: Path, out: Path | None = None, use_slope: bool = True)
 
     Args:
         target: Folder of a scene, a `robot.toml`, or `PUBLISHED`.
-        log: See `twin.alignment.logs`.
+        log: See `twin.sysid.logs`.
         out: Folder for the results; by default the scene's.
         use_slope: Whether to use the log's accelerations, if it has any.
 
@@ -62,14 +62,14 @@ def run(target: str, log: Path, out: Path | None = None, use_slope: bool = True)
     if folder is None:
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")
     windows = read_log(log)
-    progress.say(f"{log}: {len(windows)} windows, {int(windows.fitting.sum())} to fit to, the others to score on")
+    runtime.say(f"{log}: {len(windows)} windows, {int(windows.fitting.sum())} to fit to, the others to score on")
     check(windows, str(log))
     pictures = folder / FOLDER
     _writable(pictures)
     _writable(folder)
-    result = align(windows, params, use_slope, progress.say)
+    result = align(windows, params, use_slope, runtime.say)
 
-    from twin.alignment.plots import draw
+    from twin.sysid.plots import draw
 
     draw(pictures, result.windows, result.fitted, result.baseline)
     figures = {"log": str(log), "log_sha256": digest_file(log) if log.is_file() else None} | result.figures()
@@ -88,7 +88,7 @@ def run_camera(target: str, film: Path) -> "tuple[CameraAlignment, Path]":
     Raises:
         InputError: no such scene or film, no place for the results, or a film that cannot be used.
     """
-    from twin.alignment.camera import align_camera, pictures
+    from twin.sysid.camera_extrinsics import align_camera, pictures
 
     root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
     if not SceneDir(root).config_file.exists():
@@ -179,8 +179,8 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(
         prog="python -m twin.align",
         description="Fit the Husky's parameters to a log of a real one driving, scored on windows not fitted to; "
         "or how its camera sits to a film by that camera.",
@@ -195,7 +195,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help=f"folder for robot.toml and {FOLDER}/; by default the scene's")
     parser.add_argument("--level", action="store_true", help="take the ground for level, whatever the log's IMU says")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return verb.run(parser, _main, arguments)
+    return cli.run(parser, _main, arguments)
 
 
 def _main(options: argparse.Namespace) -> None:

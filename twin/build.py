@@ -2,7 +2,7 @@
 
     python -m twin.build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
 
-A stage runs in `build/<folder>.partial`, which is renamed when it is complete. See `twin.stamp` for when it runs again.
+A stage runs in `build/<folder>.partial`, which is renamed when it is complete. See `twin.scene` for when it runs again.
 """
 
 import argparse
@@ -15,15 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from twin import progress, verb
-from twin.alone import alone
+from twin import cli, runtime
 from twin.config import SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError
 from twin.files import digest_file, path_is_link, remove, write_json
-from twin.memory import PeakMemory
-from twin.scene import STAGES, SceneDir
-from twin.stamp import Stamp, commit, key_of, package_versions, recover, replace_file, seal
+from twin.runtime import PeakMemory, alone
+from twin.scene import STAGES, SceneDir, Stamp, commit, key_of, package_versions, recover, replace_file, seal
 
 
 @dataclass(frozen=True)
@@ -47,10 +45,16 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric", "mjcf.route"), ("capture", "cameras")),
-    Stage("field", "twin.nerf.stage", 3, ("nerf", "mjcf.route"), ("cameras", "metric")),
+    Stage("field", "twin.nerf.trainer", 3, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 2, ("mesh", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
-    Stage("mjcf", "twin.mjcf.export", 3, ("mjcf", "robot"), ("metric", "mesh")),
-    Stage("review", "twin.report.review", 4, ("review", "mjcf.route"), ("cameras", "metric", "field", "mesh", "mjcf")),
+    Stage("mjcf", "twin.mjcf.scene_xml", 3, ("mjcf", "robot"), ("metric", "mesh")),
+    Stage(
+        "review",
+        "twin.report.review_video",
+        4,
+        ("review", "mjcf.route"),
+        ("cameras", "metric", "field", "mesh", "mjcf"),
+    ),
 )
 
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")
@@ -93,7 +97,7 @@ def build(
             if stage.name == until:
                 break
         report = _report(scene, config, stamps, skipped)
-        _publish(scene, report)
+        publish(scene, report)
     return report
 
 
@@ -112,7 +116,7 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
         InputError: one is absent, or neither a file nor a folder.
     """
     from twin.capture.formats import files_read, is_image
-    from twin.capture.paths import is_folder
+    from twin.files import is_folder
 
     files: set[Path] = set()
     for source in config.source:
@@ -181,7 +185,7 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
 
 
 def _run(stage: Stage, scene: SceneDir, config: SceneConfig, depends: dict[str, Any]) -> Stamp:
-    progress.say(f"{stage.name}")
+    runtime.say(f"{stage.name}")
     out = scene.partial(stage.name)
     out.mkdir()
     start = time.perf_counter()
@@ -220,21 +224,26 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
     if "review" in report:  # beside the stages, as it is about all of them
         report["review"] = {k: v for k, v in report["review"].items() if k != "seen_touched"}
         report["seen_touched"] = stamps["review"].metrics.get("seen_touched")
-    report["truth"] = None
-    if scene.truth.exists() and "mesh" in stamps:
-        from twin.report.truth import compare
-
-        report["truth"] = compare(scene)
-    from twin.report.sections import cautions
-
-    report["cautions"] = cautions(report)
     return report
 
 
-def _publish(scene: SceneDir, report: dict[str, Any]) -> None:
+def publish(scene: SceneDir, report: dict[str, Any]) -> None:
+    """Writes `report.json` and, where the build is whole, `report.html` with its film beside it.
+
+    Args:
+        scene: A built scene.
+        report: All but `truth`, the comparison with the known truth if this build has one, and `cautions`, which are
+            put into it.
+    """
+    from twin.report.build_report import comparison_of
+    from twin.report.build_sections import cautions
+
+    compared = comparison_of(scene)
+    report["truth"] = compared and compared["figures"]
+    report["cautions"] = cautions(report)
     write_json(scene.report_json, report)
     if "review" in report:
-        from twin.report.page import write_page
+        from twin.report.build_report import write_page
 
         replace_file(scene.stage("review") / "review.mp4", scene.review_mp4)
         write_page(scene, report)
@@ -253,7 +262,7 @@ def _select_device(device: str | None) -> None:
 
 def summary(report: dict[str, Any]) -> str:
     """What is printed at the end of a build: a row per stage, then every caution of the report, a line each."""
-    from twin.report.sections import cautions
+    from twin.report.build_sections import cautions
 
     def pick(*path: str) -> Any:
         value: Any = report
@@ -311,8 +320,8 @@ python -m twin.new SCENE VIDEO... writes such a folder.
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(
         prog="python -m twin.build",
         description="Turn a filmed place into a drivable MuJoCo twin.",
         epilog=_EPILOG,
@@ -324,7 +333,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return verb.run(parser, _main, argv)
+    return cli.run(parser, _main, argv)
 
 
 def _main(options: argparse.Namespace) -> None:

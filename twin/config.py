@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from twin.robot import HuskyParams
 
 TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
-"""Said where a lighting's name could be: one drawn at random, as `twin/env/lightings.py` has it."""
+"""Said where a lighting's name could be: one drawn at random, as `twin/env/episode_lighting.py` has it."""
 RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 """So no lighting may be called so."""
 RANDOMISED = "+randomised"
@@ -289,7 +289,7 @@ class ObstacleConfig:
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """A stretch of the route to be driven, besides the standard tasks (see `twin/env/stretches.py`)."""
+    """A stretch of the route to be driven, besides the standard tasks (see `twin/env/route_segments.py`)."""
 
     name: str = ""
     start: float = 0.0

@@ -3,6 +3,7 @@
 import contextlib
 import re
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 _VALUE = 80  # characters of a value that a message repeats
@@ -49,6 +50,14 @@ def shown(value: Any) -> str:
     except ValueError:  # an integer of more digits than Python prints
         return f"a {type(value).__name__} of too many digits to be shown"
     return text if len(text) <= _VALUE else f"{text[: _VALUE - 3]}..."
+
+
+def listing(names: Iterable[str], most: int = 4) -> str:
+    """ "a", "a and b", "a, b and c"; beyond `most`, how many more there are."""
+    names = [str(name) for name in names]
+    if len(names) > most:
+        names = [*names[: most - 1], f"{len(names) - most + 1} more"]
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]])) if names else "none"
 
 
 def refuse(why: Exception | str) -> int:

@@ -3,7 +3,7 @@
     python -m twin.export scenes/demo --glb road.glb --ply road.ply --lighting night
 
 Both have the colours of one lighting. The mesh is that of the build; the splats are the field's own depth and colour,
-rendered from the filmed poses (see `assets/gaussians.py`), not fitted to photos.
+rendered from the filmed poses (see `assets/splats.py`), not fitted to photos.
 """
 
 import argparse
@@ -15,14 +15,14 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from twin import verb
-from twin.assets.gaussians import gaussians_of_views
+from twin import cli
+from twin.assets.splats import gaussians_of_views
 from twin.assets.views import Views, render_views
 from twin.errors import InputError
 from twin.files import load_arrays, write_bytes
 from twin.geometry.cameras import project
 from twin.loading import load_scene
-from twin.stamp import finished
+from twin.scene import finished
 
 _VIEWS, _WIDTH = 60, 320
 _FAR = 100.0  # [m] what is further becomes background
@@ -88,8 +88,8 @@ def export(scene: Path, lighting: str | None, glb: Path | None, ply: Path | None
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(
         prog="python -m twin.export",
         description="Write a built place for other programs: its mesh as glTF, its field as Gaussian splats.",
     )
@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--ply", type=Path, help="write gaussians as 3DGS viewers read them (z up)")
     parser.add_argument("--lighting", help="name, or two and a share as sun:night:0.5; by default the first filmed one")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return verb.run(parser, _main, arguments)
+    return cli.run(parser, _main, arguments)
 
 
 def _main(options: argparse.Namespace) -> None:

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import dm_env
 import numpy as np
 
-from twin import progress, verb
+from twin import cli, runtime
+from twin.env.suite import load
 from twin.errors import InputError
-from twin.loading import load, load_scene
+from twin.loading import load_scene
 
 _MOST_DIGITS = 6  # of a number of obstacles
 
@@ -54,8 +55,8 @@ def film(
     """
     from twin.env.drivers import Driver, PolicyDriver, RouteDriver
     from twin.env.episode import record
-    from twin.report.episode_film import film_episode
-    from twin.report.review import surroundings
+    from twin.report.episode_video import film_episode
+    from twin.report.review_video import surroundings
 
     if seed < 0:
         raise InputError(f"seed = {seed}: expected 0 or more")
@@ -77,7 +78,7 @@ def film(
         seen.append(step.observation["pixels"][-1])
         wheel.update()
 
-    with progress.bar("drive", longest, "step") as wheel:
+    with runtime.bar("drive", longest, "step") as wheel:
         episode = record(environment, driver, watch)
     path = out or root / "films" / film_name(task, episode.lighting, seed)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -101,8 +102,8 @@ def film_name(task: str, lighting: str, seed: int) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(
         prog="python -m twin.film",
         description="Film a drive in a built scene: robot view, chase view, map, speed and reward.",
     )
@@ -121,7 +122,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; by default in SCENE/films")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return verb.run(parser, _main, arguments)
+    return cli.run(parser, _main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
@@ -131,7 +132,7 @@ def _main(given: argparse.Namespace) -> None:
         "obstacles": _obstacles(given.obstacles),
     }
     if given.lighting:
-        from twin.env.randomisation import asked
+        from twin.env.domain_randomization import asked
 
         options |= {name: value for name, value in asked(given.lighting).items() if value}
     path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)

@@ -11,11 +11,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from twin import verb
+from twin import cli
 from twin.errors import InputError
+from twin.evaluation.forecasting import Estimate, Forecast
+from twin.evaluation.trials import RESULT_COLUMNS, read_results, read_trials, tally
 from twin.files import write_text
-from twin.report.forecast import Estimate, Forecast
-from twin.report.trials import RESULT_COLUMNS, read_results, read_trials, tally
 from twin.scene import SceneDir
 
 
@@ -30,10 +30,10 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     Raises:
         InputError: nothing validated, or a table that is wrong; nothing is written then.
     """
-    from twin.report.forecast_page import write_forecast_page
-    from twin.report.forecast_words import candidates_csv
-    from twin.report.forecasting import make_forecast
-    from twin.report.training import trainings
+    from twin.evaluation.forecasting import make_forecast
+    from twin.evaluation.training_curves import trainings
+    from twin.report.forecast_report import write_forecast_page
+    from twin.report.forecast_summary import candidates_csv
 
     scene = SceneDir(root)
     if not root.is_dir():
@@ -66,8 +66,8 @@ held-out+randomised.
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(
         prog="python -m twin.forecast",
         description="What success in the twin says about success on the road.",
         epilog=_EPILOG,
@@ -77,7 +77,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--real", type=Path, metavar="CSV", help="trials on the road; see below")
     parser.add_argument("--seed", type=int, default=0, help="of the resampling (default 0)")
     parser.add_argument("--quiet", action="store_true", help="no summary")
-    return verb.run(parser, _main, argv)
+    return cli.run(parser, _main, argv)
 
 
 def _main(options: argparse.Namespace) -> None:
@@ -85,7 +85,7 @@ def _main(options: argparse.Namespace) -> None:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     out = forecast(options.scene, options.real, options.seed)
     if not options.quiet:
-        from twin.report.forecast_words import summary
+        from twin.report.forecast_summary import summary
 
         print(summary(out))
         print(f"look at {SceneDir(options.scene).forecast / 'forecast.html'}")

@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from twin.errors import InputError
 from twin.files import read_json
-from twin.scene import SceneDir
-from twin.stamp import finished
+from twin.scene import SceneDir, finished
 
 if TYPE_CHECKING:
-    from dm_control.rl.control import Environment
-
     from twin.geometry.cameras import Cameras
     from twin.mjcf.world import World
     from twin.nerf.baked import BakedField
@@ -40,7 +37,7 @@ class Twin:
 
         Needs no torch. `device` is cpu or cuda.
         """
-        from twin.nerf.added import added_lightings
+        from twin.nerf.added_lightings import added_lightings
         from twin.nerf.baked import BakedField
 
         field = BakedField.load(self._folder("field"), device)
@@ -49,7 +46,7 @@ class Twin:
 
     def radiance_field(self) -> RadianceField:
         """The field as it was trained, in torch: slower and a little finer than `field`, with its lightings."""
-        from twin.nerf.added import added_lightings
+        from twin.nerf.added_lightings import added_lightings
         from twin.nerf.field import RadianceField
 
         field = RadianceField.load(self._folder("field"))
@@ -79,20 +76,3 @@ def load_scene(path: str | Path) -> Twin:
     if not scene.config_file.exists():
         raise InputError(f"no scene.toml in {path}; give the scene's folder, such as scenes/demo")
     return Twin(scene)
-
-
-def load(scene: str | Path | Twin, task: str = "right_turn", seed: int | None = None, **options: Any) -> Environment:
-    """A task in a built scene as a dm_control environment.
-
-    Args:
-        scene: Its folder, or what `load_scene` returned.
-        task: `straight`, `right_turn`, `route`, or a [[task]] of its scene.toml.
-        seed: Of the sequence of episodes; None: unpredictable.
-        options: See `twin.env.options.Options`.
-
-    Raises:
-        InputError: the scene is not built or has no such task, or an option is not to be had.
-    """
-    from twin.env.suite import environment
-
-    return environment(scene, task, seed, **options)

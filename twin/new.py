@@ -15,15 +15,13 @@ import shutil
 import sys
 from pathlib import Path
 
-from twin import verb
-from twin.capture.colmap import find_model
-from twin.capture.formats import ImageSet, detect_kind, files_named, read_colmap, read_transforms
-from twin.capture.paths import is_file
+from twin import cli
+from twin.capture.formats import ImageSet, detect_kind, files_named, find_model, read_colmap, read_transforms
 from twin.capture.video import probe
 from twin.config import RANDOMISED, RESERVED_LIGHTINGS
 from twin.config_file import LONGEST_NAME
 from twin.errors import InputError
-from twin.files import digest_file, toml_string, write_text
+from twin.files import digest_file, is_file, toml_string, write_text
 from twin.scene import SceneDir
 
 _POSED = ("colmap", "transforms")
@@ -196,12 +194,12 @@ def _lighting(path: Path, kind: str) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(prog="python -m twin.new", description="Start a scene folder from films.")
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(prog="python -m twin.new", description="Start a scene folder from films.")
     parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
     parser.add_argument("films", type=Path, nargs="+", metavar="VIDEO", help="films or image folders, one per lighting")
     parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
-    return verb.run(parser, _main, arguments)
+    return cli.run(parser, _main, arguments)
 
 
 def _main(options: argparse.Namespace) -> None:

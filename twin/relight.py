@@ -2,7 +2,7 @@
 
     python -m twin.relight scenes/demo photo.jpg --name afternoon
 
-finds where the photo was taken (`capture/register.py`), then the appearance embedding and the air under which the
+finds where the photo was taken (`capture/localize.py`), then the appearance embedding and the air under which the
 frozen field looks most like it. The lighting goes to `<scene>/lightings/afternoon.json`, with a picture beside it: the
 photo, the field under what was fitted, and under the most similar filmed one. From then on
 `twin.load_scene(scene).field()` has it: `lighting="afternoon"`, `"sun:afternoon:0.5"`; environments lay its air over
@@ -17,16 +17,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import verb
+from twin import cli
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
-from twin.nerf.added import AddedLighting, check_name, field_result
-from twin.nerf.air import Air
-from twin.scene import SceneDir
-from twin.stamp import finished
+from twin.nerf.added_lightings import AddedLighting, check_name, field_result
+from twin.nerf.fog import Fog
+from twin.scene import SceneDir, finished
 
-_CLEAR = Air()
+_CLEAR = Fog()
 _MAX_WIDTH = 480  # [px] longer side of the picture fitted, as that of the frames trained on
 _STEPS = 300
 _RAYS = 10_000  # fitted at most, spread evenly
@@ -43,7 +42,7 @@ class Relit:
     """The filmed lighting that looks most like the photo."""
     embedding: NDArray[np.float32]
     """Shape (dim,)."""
-    air: Air
+    air: Fog
     """Clear where haze does not explain the picture better."""
     pictures: tuple[NDArray, NDArray, NDArray]
     """Photo, field under the fitted lighting and air, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
@@ -71,9 +70,8 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     """
     import torch
 
-    from twin.nerf.compute import single_threaded_torch
-    from twin.nerf.fit_light import fit_light
-    from twin.nerf.workspace import CameraArrays
+    from twin.nerf.appearance_fit import fit_appearance
+    from twin.nerf.buffers import CameraArrays, single_threaded_torch
 
     height, width = photo.shape[:2]
     v, u = np.mgrid[:height, :width] + 0.5
@@ -85,13 +83,13 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     distances = torch.as_tensor(distance.ravel(), device=field.where)
     colours = torch.as_tensor(photo.reshape(-1, 3).astype(np.float32), device=field.where)
 
-    def picture(embedding: NDArray, air: Air = _CLEAR) -> NDArray:
+    def picture(embedding: NDArray, air: Fog = _CLEAR) -> NDArray:
         return air.over(field.colour(features, harmonics, embedding).reshape(photo.shape), distance)
 
-    def fitted(use: NDArray, start: NDArray, hazy: bool) -> tuple[NDArray, Air]:
+    def fitted(use: NDArray, start: NDArray, hazy: bool) -> tuple[NDArray, Fog]:
         some = torch.as_tensor(use[:: max(1, len(use) // _RAYS)], device=field.where)
         seen = field, features[some], harmonics[some], colours[some]
-        return fit_light(*seen, start, _STEPS, distances[some] if hazy else None)
+        return fit_appearance(*seen, start, _STEPS, distances[some] if hazy else None)
 
     filmed = {name: picture(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
@@ -127,9 +125,9 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
         raise InputError(f"no scene.toml in {root}; give the scene's folder, such as scenes/demo")
     result = field_result(scene)
 
-    from twin.capture.lens import flattened
+    from twin.capture.camera_models import flattened
+    from twin.capture.localize import register_photo
     from twin.capture.photos import load_photo
-    from twin.capture.register import register
     from twin.geometry.cameras import Cameras
     from twin.nerf.field import RadianceField
 
@@ -139,7 +137,7 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
     check_name(name, field.lightings)
     image, facts = load_photo(photo, None)
     try:
-        found = register(image, facts, scene)
+        found = register_photo(image, facts, scene)
     except InputError as error:
         raise InputError(f"{photo}: {error}") from None
     position = found.camera_to_world[:3, 3]
@@ -187,8 +185,8 @@ def summary(lighting: AddedLighting) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(
         prog="python -m twin.relight",
         description="Learn one more lighting of a built place from a single photo of it: find where it was taken, then "
         "fit the field's appearance and the air to it. What it looks like this afternoon, the twin then looks like, "
@@ -198,7 +196,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
     parser.add_argument("--name", required=True, help="what the lighting is to be called; an added one is replaced")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return verb.run(parser, _main, arguments)
+    return cli.run(parser, _main, arguments)
 
 
 def _main(options: argparse.Namespace) -> None:

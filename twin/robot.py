@@ -13,11 +13,9 @@ Figures: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.errors import InputError
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of wheel arrays everywhere; body, joint and encoder of a wheel are `<name>_wheel`."""

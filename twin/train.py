@@ -13,26 +13,25 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from twin import progress, verb
-from twin.alone import alone
+from twin import cli, runtime
 from twin.errors import InputError
+from twin.evaluation.statistics import wilson
 from twin.loading import Twin, load_scene
-from twin.report.statistics import wilson
-from twin.scene import SceneDir, run_folder
-from twin.stamp import finished
+from twin.runtime import alone
+from twin.scene import SceneDir, finished, run_folder
 
 if TYPE_CHECKING:
     from twin.learn.train_config import TrainConfig
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    return verb.run(_parser(), _main, arguments)
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    return cli.run(_parser(), _main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
+    from twin.evaluation.training_curves import success_curve
     from twin.learn.train_config import PRESETS, TrainConfig
-    from twin.report.training import success_curve
 
     names = {field.name for field in dataclasses.fields(TrainConfig)}
     asked = {k: v for k, v in vars(given).items() if k in names and v is not None}
@@ -56,11 +55,11 @@ def _trained(twin: Twin, folder: Path, config: "TrainConfig", processes: int | N
     """Trains under a bar; returns what the best of the late policies did."""
     try:
         from twin.learn import training
-        from twin.learn.choosing import choose
+        from twin.learn.policy_evaluation import select_checkpoint
     except ImportError as error:
         raise InputError(f"training needs more: pip install .[learn] ({error})") from None
 
-    with progress.bar("train", config.steps, "step") as bar:
+    with runtime.bar("train", config.steps, "step") as bar:
 
         def watch(now: training.Progress) -> None:
             if not bar.n:  # what was trained before was not trained in this time
@@ -73,11 +72,11 @@ def _trained(twin: Twin, folder: Path, config: "TrainConfig", processes: int | N
                 )
 
         training.train(twin, folder, config, watch, processes)
-    return choose(twin, folder, config, processes)["chosen"]
+    return select_checkpoint(twin, folder, config, processes)["chosen"]
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = verb.Parser(prog="python -m twin.train", description="Train a policy by SAC from pixels.")
+    parser = cli.Parser(prog="python -m twin.train", description="Train a policy by SAC from pixels.")
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     parser.add_argument("--run", required=True, help="name of the run, a folder in SCENE/runs")

@@ -15,20 +15,20 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from twin import progress, verb
-from twin.alone import alone
+from twin import cli, runtime
 from twin.config import HELD_OUT, RANDOMISED
-from twin.env.randomisation import asked, known_of
+from twin.env.domain_randomization import asked, known_of
 from twin.env.suite import fingerprint
 from twin.errors import InputError
+from twin.evaluation.training_curves import read_episodes, trainings
+from twin.evaluation.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
 from twin.files import damaged, digest_file, digest_json, read_json, write_bytes, write_json, write_text
-from twin.learn.judging import CHUNK, Chunk, Driven, campaign
 from twin.learn.policy import JSON, find_policy, load_policy
+from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign
 from twin.loading import Twin, load_scene
-from twin.report.training import read_episodes, trainings
-from twin.report.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
-from twin.report.validation import failure_map, lines, summary, typical_episode, worst_episode
-from twin.report.validation_page import Curve, write_validation_page
+from twin.report.validation_report import Curve, write_validation_page
+from twin.report.validation_summary import failure_map, lines, summary, typical_episode, worst_episode
+from twin.runtime import alone
 from twin.scene import SceneDir
 
 DEFAULT_LIGHTINGS = (HELD_OUT, HELD_OUT + RANDOMISED)
@@ -70,14 +70,14 @@ class Campaign:
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
         """Trials of (policy, lighting, seeds), in that order; what is not in the table yet is driven and added."""
         keys = [(name, self.task, lighting, seed) for name, lighting, seeds in wanted for seed in seeds]
-        chunks: list[tuple[str, Chunk]] = []
+        chunks: list[tuple[str, EpisodeChunk]] = []
         for name, lighting, seeds in wanted:
             left = [seed for seed in seeds if (name, self.task, lighting, seed) not in self._done]
             for k in range(0, len(left), CHUNK):
                 source, trust = self._policies[name]
-                chunk = Chunk(self._scene, self.task, source, trust, lighting, tuple(left[k : k + CHUNK]))
+                chunk = EpisodeChunk(self._scene, self.task, source, trust, lighting, tuple(left[k : k + CHUNK]))
                 chunks.append((name, chunk))
-        with progress.bar(what, len(keys), "episode") as bar:
+        with runtime.bar(what, len(keys), "episode") as bar:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
             driven = self._campaign([chunk for _, chunk in chunks])
             for (name, chunk), outcomes in zip(chunks, driven, strict=True):
@@ -98,9 +98,9 @@ class Campaign:
                 bar.update(len(trials))
         return [self._done[key] for key in keys]
 
-    def _campaign(self, chunks: list[Chunk]) -> Iterator[list[Driven]]:
+    def _campaign(self, chunks: list[EpisodeChunk]) -> Iterator[list[EpisodeResult]]:
         if self._ray and chunks:
-            from twin.learn.cluster import campaign_on_ray
+            from twin.learn.policy_evaluation import campaign_on_ray
 
             return campaign_on_ray(chunks, self._ray)
         return campaign(chunks, self._processes)
@@ -186,7 +186,7 @@ def _worst_lights(path: Path) -> list[dict]:
 def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[Trial]) -> None:
     """Films the typical and the worst of a policy's episodes on a task; what is filmed already is kept."""
     from twin.film import film, film_name
-    from twin.report.video import last_frame
+    from twin.report.video_writer import last_frame
 
     noted = folder / "films" / "films.json"
     before = _filmed(noted)
@@ -321,7 +321,7 @@ def _digest(path: Path, source: str) -> str:
 
 def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
     from twin.config_file import load_config
-    from twin.env.stretches import find_task
+    from twin.env.route_segments import find_task
 
     world, config = twin.world(), load_config(twin.scene.config_file)
     for task in dict.fromkeys(t.task for t in trials):
@@ -348,8 +348,8 @@ def _has_rows(path: Path) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(prog="python -m twin.validate", description="How often policies succeed.")
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(prog="python -m twin.validate", description="How often policies succeed.")
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
@@ -366,7 +366,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
     parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
     parser.add_argument("--quiet", action="store_true", help="no progress, no table")
-    return verb.run(parser, _main, arguments)
+    return cli.run(parser, _main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:

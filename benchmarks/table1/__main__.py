@@ -29,7 +29,7 @@ from scores import RESULTS, tables
 
 import twin
 from twin.config import RANDOMISED
-from twin.reality.weather import WEATHER
+from twin.reality.lighting import WEATHER
 
 sys.path.append(str(Path(__file__).parents[1]))
 from record import add_replace_option, save

@@ -18,18 +18,16 @@ import numpy as np
 from matplotlib.colors import is_color_like, to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from numpy.typing import NDArray
 
 import twin
+from twin.evaluation.forecasting import Forecast
+from twin.evaluation.training_curves import success_curve
 from twin.learn.policy import load_policy
-from twin.reality.drive import Test
-from twin.reality.weather import WEATHER
+from twin.reality.lighting import WEATHER
+from twin.reality.real_test import RealTest
 from twin.report.figures import CARD, INK, LINE, MUTED, SERIES
-from twin.report.forecast import Forecast
-from twin.report.forecast_figures import twin_against_road
-from twin.report.training import success_curve
-
-Picture = NDArray[np.uint8]
+from twin.report.forecast_report import twin_against_road
+from twin.types import Image
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
 _PER_ROW = 5  # pictures
@@ -53,7 +51,7 @@ def main() -> None:
     parser.add_argument("--run", default="straight_varied_0", help="whose training is shown")
     given = parser.parse_args()
     run = given.scene / "runs" / given.run
-    test = Test(load_policy(run), "straight")
+    test = RealTest(load_policy(run), "straight")
     road = [test.begin(name, _TRIAL).look(test.road.physics.camera_to_world, 0.0) for name in _SHOWN]
     drawn = twin_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(success_curve(run)))[..., ::-1]
@@ -73,13 +71,13 @@ def main() -> None:
         parser.error(f"{given.out} cannot be written")
 
 
-def _first(scene: Path, seed: int, **options: Any) -> Picture:
+def _first(scene: Path, seed: int, **options: Any) -> Image:
     """The first picture of an episode."""
     step = twin.load(scene, "straight", seed, **options).reset()
     return step.observation["pixels"][-1]
 
 
-def _drawn(figure: Figure) -> Picture:
+def _drawn(figure: Figure) -> Image:
     """A figure of a page, whose colours stand for the page's, in those of paper."""
     for artist in figure.findobj():
         if isinstance(artist, Text) and artist.get_bbox_patch():
@@ -94,18 +92,18 @@ def _drawn(figure: Figure) -> Picture:
     return cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_COLOR_RGB)
 
 
-def _caption(text: str) -> Picture:
+def _caption(text: str) -> Image:
     out = np.full((_LINE, _WIDTH, 3), 255, np.uint8)
     return _written(out, text, (_GAP, _LINE - 11), 0.62, (20, 20, 20))
 
 
-def _rows(pictures: list[Picture], names: Sequence[str] = ()) -> list[Picture]:
+def _rows(pictures: list[Image], names: Sequence[str] = ()) -> list[Image]:
     """Pictures of one size, `_PER_ROW` beside each other."""
     starts = range(0, len(pictures), _PER_ROW)
     return [_row(pictures[i : i + _PER_ROW], names[i : i + _PER_ROW]) for i in starts]
 
 
-def _row(pictures: list[Picture], names: Sequence[str]) -> Picture:
+def _row(pictures: list[Image], names: Sequence[str]) -> Image:
     """Pictures of one size beside each other, over the whole width."""
     width = (_WIDTH - _GAP) // len(pictures) - _GAP
     height = round(width * pictures[0].shape[0] / pictures[0].shape[1])
@@ -120,7 +118,7 @@ def _row(pictures: list[Picture], names: Sequence[str]) -> Picture:
     return out
 
 
-def _side_by_side(*drawings: Picture) -> Picture:
+def _side_by_side(*drawings: Image) -> Image:
     height = min(round(d.shape[0] * (_WIDTH / len(drawings)) / d.shape[1]) for d in drawings)
     scaled = [
         cv2.resize(d, (height * d.shape[1] // d.shape[0], height), interpolation=cv2.INTER_AREA) for d in drawings
@@ -133,7 +131,7 @@ def _side_by_side(*drawings: Picture) -> Picture:
     return out
 
 
-def _written(out: Picture, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int], thick: int = 1):
+def _written(out: Image, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int], thick: int = 1):
     return cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
 
 

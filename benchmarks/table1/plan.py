@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from twin.config import HELD_OUT, RANDOMISED
+from twin.evaluation.statistics import MIN_TRIALS
+from twin.evaluation.training_curves import CHOICE
 from twin.files import read_json
-from twin.reality.weather import WEATHER
-from twin.report.statistics import MIN_TRIALS
-from twin.report.training import CHOICE
+from twin.reality.lighting import WEATHER
 
 TASKS = {"straight": "straight", "right": "right_turn"}
 """In names of runs → in `twin.load`."""

@@ -8,10 +8,10 @@ from plan import PAPER, PHOTOS, SETUPS, TASKS, Run
 from scores import counts, over_days
 
 from twin.config import HELD_OUT, RANDOMISED
+from twin.evaluation.statistics import wilson
+from twin.evaluation.training_curves import CHOICE, read_episodes
+from twin.evaluation.trials import RECENT, Trial, read_trials
 from twin.files import read_json
-from twin.report.statistics import wilson
-from twin.report.training import CHOICE, read_episodes
-from twin.report.trials import RECENT, Trial, read_trials
 
 _JUDGED = ("validate", "validate_randomised", "validate_by_photo", "real")
 _BY_DAY = ("validate_by_photo", "real")

@@ -21,10 +21,8 @@ import numpy as np
 from plan import SETUPS, SHARES, STEPS, TASKS
 
 from twin.config import RANDOMISED
-from twin.files import read_json
-from twin.reality.weather import WEATHER
-from twin.report.correction import left_out_predictions
-from twin.report.statistics import (
+from twin.evaluation.prediction_powered import left_out_predictions
+from twin.evaluation.statistics import (
     MIN_POLICIES,
     Refused,
     mmrv,
@@ -34,6 +32,8 @@ from twin.report.statistics import (
     spearman,
     winner_regret,
 )
+from twin.files import read_json
+from twin.reality.lighting import WEATHER
 
 RESULTS = Path(__file__).with_name("results.json")
 _USED = 5  # of the drawn days, the first, were looked at before everything was fixed

@@ -26,11 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from twin import progress
-from twin.child import die_with_parent, environment
+from twin import runtime
 from twin.files import digest_json
-
-Array = NDArray[np.float64]
+from twin.runtime import die_with_parent, environment
+from twin.types import Array
 
 _FACES = 400  # a piece is thinned to this many for CoACD, whose time grows fast with them; the check uses all of them
 _TIME_LIMIT = 120.0  # [s] per piece: far more than any takes, so that a busy machine does not change the answer
@@ -42,7 +41,7 @@ _MAX_HALVINGS = 5
 
 
 @dataclass(frozen=True)
-class Part:
+class ConvexPart:
     """A closed convex hull."""
 
     vertices: Array
@@ -51,7 +50,7 @@ class Part:
     """Shape (f, 3), outward."""
 
     @staticmethod
-    def hull(points: Array) -> "Part | None":
+    def hull(points: Array) -> "ConvexPart | None":
         """The hull of points (k, 3), or None where they span no volume."""
         if len(points) < 4:
             return None
@@ -65,11 +64,11 @@ class Part:
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
         faces[inward] = faces[inward][:, ::-1]
-        return Part(vertices, faces.astype(np.int64))
+        return ConvexPart(vertices, faces.astype(np.int64))
 
 
 @dataclass(frozen=True)
-class Piece:
+class SolidPiece:
     """A closed mesh, with points spread over its surface."""
 
     vertices: Array
@@ -82,7 +81,7 @@ class Piece:
     """Which points (k, 3) the mesh encloses."""
 
     @staticmethod
-    def of(vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None) -> "Piece":
+    def of(vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None) -> "SolidPiece":
         """A piece; give `inside` where something knows it faster than by winding numbers."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         samples = surface_samples(vertices, faces, _SAMPLING)
@@ -90,9 +89,9 @@ class Piece:
         def by_winding(points: Array) -> NDArray[np.bool_]:
             return winding_number(points, vertices, faces) > 0.5
 
-        return Piece(vertices, faces, samples, cKDTree(samples), inside or by_winding)
+        return SolidPiece(vertices, faces, samples, cKDTree(samples), inside or by_winding)
 
-    def protrusion(self, part: Part) -> float:
+    def protrusion(self, part: ConvexPart) -> float:
         """How far the part sticks out [m]; an upper estimate, by up to half the sampling."""
         points = surface_samples(part.vertices, part.faces, 2 * _SAMPLING)
         away = self.tree.query(points)[0]
@@ -105,7 +104,7 @@ class Piece:
 class Decomposition:
     """What became of all pieces."""
 
-    parts: list[Part]
+    parts: list[ConvexPart]
     piece: NDArray[np.int64]
     """Which piece each part came from."""
     protrusion: Array
@@ -120,7 +119,7 @@ class Decomposition:
     """Pieces whose answer was known."""
 
 
-def decompose(pieces: list[Piece], bound: float, cache: Path, seed: int) -> Decomposition:
+def decompose(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) -> Decomposition:
     """Convex parts of closed meshes, each within `bound` [m] of its mesh.
 
     Args:
@@ -129,7 +128,7 @@ def decompose(pieces: list[Piece], bound: float, cache: Path, seed: int) -> Deco
         cache: Folder of earlier answers; made if absent.
         seed: CoACD's.
     """
-    whole = [Part.hull(piece.vertices) for piece in pieces]
+    whole = [ConvexPart.hull(piece.vertices) for piece in pieces]
     sticks = [np.inf if hull is None else piece.protrusion(hull) for hull, piece in zip(whole, pieces, strict=True)]
     hard = [i for i, protrusion in enumerate(sticks) if protrusion > bound]
     answers, cached = _coacd([pieces[i] for i in hard], bound, cache, seed)
@@ -163,7 +162,9 @@ def decompose(pieces: list[Piece], bound: float, cache: Path, seed: int) -> Deco
     )
 
 
-def within_bound(part: Part, piece: Piece, bound: float, halvings: int = _MAX_HALVINGS) -> list[tuple[Part, float]]:
+def within_bound(
+    part: ConvexPart, piece: SolidPiece, bound: float, halvings: int = _MAX_HALVINGS
+) -> list[tuple[ConvexPart, float]]:
     """The part and its protrusion if it fits, else those of hulls of the halves of the surface inside it, and so on."""
     sticks_out = piece.protrusion(part)
     if halvings == 0 or sticks_out <= bound:
@@ -175,19 +176,19 @@ def within_bound(part: Part, piece: Piece, bound: float, halvings: int = _MAX_HA
     middle = float(inside[:, axis].min() + inside[:, axis].max()) / 2
     halves = []
     for half in (inside[inside[:, axis] <= middle + _SAMPLING], inside[inside[:, axis] >= middle - _SAMPLING]):
-        hull = Part.hull(half)
+        hull = ConvexPart.hull(half)
         if hull is not None:
             halves += within_bound(hull, piece, bound, halvings - 1)
     return halves
 
 
-def inside_hull(part: Part, points: Array, slack: float = 0.0) -> NDArray[np.bool_]:
+def inside_hull(part: ConvexPart, points: Array, slack: float = 0.0) -> NDArray[np.bool_]:
     """Which points (k, 3) are in the part, or within about `slack` [m] of it."""
     normal, offset = half_spaces(part)
     return np.all(points @ normal.T <= offset + slack, axis=1)
 
 
-def half_spaces(part: Part) -> tuple[Array, Array]:
+def half_spaces(part: ConvexPart) -> tuple[Array, Array]:
     """Outward normals (f, 3) and offsets (f,): inside is normal · x ≤ offset."""
     a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -197,7 +198,7 @@ def half_spaces(part: Part) -> tuple[Array, Array]:
     return normal, (normal * a[solid]).sum(1)
 
 
-def uncovered(piece: Piece, parts: list[Part], bound: float) -> float:
+def uncovered(piece: SolidPiece, parts: list[ConvexPart], bound: float) -> float:
     """Share of the piece's surface further than about `bound` from every part."""
     open_ = np.ones(len(piece.samples), bool)
     for part in parts:
@@ -236,7 +237,7 @@ def winding_number(points: Array, vertices: Array, faces: NDArray) -> Array:
     return out
 
 
-def _coacd(pieces: list[Piece], bound: float, cache: Path, seed: int) -> tuple[list[list[Part] | None], int]:
+def _coacd(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) -> tuple[list[list[ConvexPart] | None], int]:
     """CoACD's parts of each piece, None where it failed, and how many were known from before."""
     cache.mkdir(parents=True, exist_ok=True)
     setting = {"bound": bound, "seed": seed, "faces": _FACES, "coacd": metadata.version("coacd")}
@@ -248,7 +249,7 @@ def _coacd(pieces: list[Piece], bound: float, cache: Path, seed: int) -> tuple[l
     open_ = [job for job in jobs if not job[1].exists()]
     for source, _, piece in open_:
         np.savez(source, vertices=piece.vertices, faces=piece.faces, bound=bound, seed=seed)
-    with progress.bar("convex parts", len(open_), "piece") as bar, ThreadPoolExecutor(_CHILDREN) as pool:
+    with runtime.bar("convex parts", len(open_), "piece") as bar, ThreadPoolExecutor(_CHILDREN) as pool:
         # Alternate pieces, so that both children have large and small ones.
         shares = [[(job[0], job[1]) for job in open_[k::_CHILDREN]] for k in range(_CHILDREN)]
         stopped = threading.Event()
@@ -256,14 +257,14 @@ def _coacd(pieces: list[Piece], bound: float, cache: Path, seed: int) -> tuple[l
             list(pool.map(lambda share: _work_off(share, bar, stopped), shares))
         finally:
             stopped.set()
-    answers: list[list[Part] | None] = []
+    answers: list[list[ConvexPart] | None] = []
     for source, target, _ in jobs:
         source.unlink(missing_ok=True)
         answers.append(_read(target) if target.exists() else None)
     return answers, len(jobs) - len(open_)
 
 
-def _work_off(jobs: list[tuple[Path, Path]], bar: progress.tqdm, stopped: threading.Event) -> None:
+def _work_off(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
     """Runs children until every job is done or has killed one; a job that does is given up. Ends early once stopped."""
     todo = list(jobs)
     while todo:
@@ -293,11 +294,11 @@ def _work_off(jobs: list[tuple[Path, Path]], bar: progress.tqdm, stopped: thread
         todo = [job for job in todo if not job[1].exists()][1:]
 
 
-def _read(path: Path) -> list[Part] | None:
+def _read(path: Path) -> list[ConvexPart] | None:
     with np.load(path, allow_pickle=False) as data:
         counts = data["counts"]
         points = np.split(data["points"], np.cumsum(counts)[:-1]) if len(counts) else []
-    parts = [part for part in (Part.hull(p) for p in points) if part is not None]
+    parts = [part for part in (ConvexPart.hull(p) for p in points) if part is not None]
     return parts or None
 
 

@@ -12,18 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import progress
-from twin.assets import convex, ground_fit, obstacles, surface
-from twin.assets.fusion import LOOK_THROUGH, colour
+from twin import runtime
+from twin.assets import convex, solids, tsdf
+from twin.assets import ground as assets_ground
 from twin.assets.ground import Ground
-from twin.assets.route import distance_to_route, filmed_route, route_length
-from twin.assets.views import Field, Views, render_views
+from twin.assets.tsdf import LOOK_THROUGH, colour
+from twin.assets.views import ColorField, Views, render_views
 from twin.config import SceneConfig
-from twin.geometry.cameras import Cameras
-from twin.geometry.points import SparsePoints
+from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.route import distance_to_route, filmed_route, route_length
 from twin.scene import SceneDir
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 _VISUAL_FACES = 150_000
 _ABOVE = 2.0  # [m] the visual mesh reaches this much higher than the obstacles
@@ -43,10 +42,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 
 def make(
-    field: Field, cameras: Cameras, points: SparsePoints, config: SceneConfig, out: Path, cache: Path
+    field: ColorField, cameras: Cameras, points: SparsePoints, config: SceneConfig, out: Path, cache: Path
 ) -> dict[str, Any]:
     """Everything of the stage, from any field. Returns its metrics."""
-    clock = _Clock()
+    clock = _Stopwatch()
     settings = config.mesh
     route = filmed_route(cameras) if config.mjcf.route else None
     path = route if route is not None else cameras.positions[:, :2]
@@ -58,22 +57,22 @@ def make(
     views = render_views(field, cameras, settings.views, settings.view_width, LOOK_THROUGH * far)
     clock.lap("render")
     height = _camera_height(config) if route is not None else None
-    ground, ground_facts = ground_fit.build_ground(views, cameras, points, (low, high), settings, height)
+    ground, ground_facts = assets_ground.build_ground(views, cameras, points, (low, high), settings, height)
     ground.save(out)
     clock.lap("ground")
     top = float(ground.height.max()) + settings.max_height + _ABOVE
     box = np.stack([np.append(low, ground.height.min() - _BELOW), np.append(high, top)])
     hits = _hits(views, ground, box, far)
-    volume = surface.fuse_volume(hits, views, box, settings.voxel, far)
+    volume = tsdf.fuse_volume(hits, views, box, settings.voxel, far)
     clock.lap("fuse")
     visual, visual_facts = _visual(volume, views, ground)
     np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
     clock.lap("surface")
     corridor = None
     if route is not None:
-        corridor = obstacles.Corridor(route, config.mjcf.half_width + config.mjcf.corridor_margin)
+        corridor = solids.Corridor(route, config.mjcf.half_width + config.mjcf.corridor_margin)
         np.savez(out / "route.npz", xy=route, z=ground.at(route))
-    pieces, left_out = obstacles.solid_pieces(volume, ground, corridor, cameras, settings)
+    pieces, left_out = solids.solid_pieces(volume, ground, corridor, cameras, settings)
     clock.lap("solids")
     part_facts = _save_parts(pieces, corridor, ground, config, out, cache)
     clock.lap("convex")
@@ -95,7 +94,7 @@ def make(
     }
 
 
-class _Clock:
+class _Stopwatch:
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
         self._last = time.perf_counter()
@@ -122,19 +121,19 @@ def _hits(views: Views, ground: Ground, box: Array, far: float) -> Array:
     return np.concatenate(hits)
 
 
-def _visual(volume: surface.Volume, views: Views, ground: Ground) -> tuple[dict[str, NDArray], dict[str, Any]]:
+def _visual(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """Coloured triangles: the seen side of what stands, and the ground as fitted."""
-    vertices, faces = surface.zero_level(volume.distance, volume.origin, volume.voxel)
+    vertices, faces = tsdf.zero_level(volume.distance, volume.origin, volume.voxel)
     above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
-    vertices, faces = surface.compact(vertices, faces[above[faces].any(1)])
-    colours, seen = colour(vertices, surface.vertex_normals(vertices, faces), views, volume.band)
+    vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
+    colours, seen = colour(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band)
     # The back of the band is no surface: no view looks at it from outside.
-    vertices, faces = surface.compact(vertices, faces[seen[faces].all(1)])
-    vertices, faces, floaters = surface.without_specks(vertices, faces, _SPECK_AREA)
-    vertices, faces = surface.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
-    colours, seen = colour(vertices, surface.vertex_normals(vertices, faces), views, 2 * volume.band)
+    vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
+    vertices, faces, floaters = tsdf.without_specks(vertices, faces, _SPECK_AREA)
+    vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
+    colours, seen = colour(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * volume.band)
     colours = _nearest_colour(vertices, colours, seen)
-    ground_vertices, ground_faces = surface.height_mesh(ground, _VISUAL_GROUND_CELL, _VISUAL_FACES // 3)
+    ground_vertices, ground_faces = tsdf.height_mesh(ground, _VISUAL_GROUND_CELL, _VISUAL_FACES // 3)
     column, row = np.rint((ground_vertices[:, :2] - ground.origin) / ground.cell).astype(int).T
     rows, columns = ground.height.shape
     ground_colours = ground.rgb[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
@@ -162,8 +161,8 @@ def _nearest_colour(vertices: Array, colours: NDArray[np.uint8], known: NDArray[
 
 
 def _save_parts(
-    pieces: list[convex.Piece],
-    corridor: obstacles.Corridor | None,
+    pieces: list[convex.SolidPiece],
+    corridor: solids.Corridor | None,
     ground: Ground,
     config: SceneConfig,
     out: Path,
@@ -175,12 +174,12 @@ def _save_parts(
     kept = list(enumerate(made.parts))
     clipped = 0
     if corridor is not None:
-        kept, clipped = obstacles.clear_corridor(made.parts, corridor, ground)
+        kept, clipped = solids.clear_corridor(made.parts, corridor, ground)
     dropped = len(kept) - config.mesh.max_parts
     if dropped > 0:
         # Pieces come nearest first, and so do their parts: what goes is what the robot is least likely to meet.
         kept = kept[: config.mesh.max_parts]
-        progress.say(f"  {dropped} convex parts beyond mesh.max_parts = {config.mesh.max_parts} left out, the farthest")
+        runtime.say(f"  {dropped} convex parts beyond mesh.max_parts = {config.mesh.max_parts} left out, the farthest")
     parts = [part for _, part in kept]
     corners = [len(part.vertices) for part in parts]
     triangles = [len(part.faces) for part in parts]

@@ -11,10 +11,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import progress
+from twin import runtime
 from twin.geometry.cameras import Cameras, Posed, pixel_grid, scaled_intrinsics, unproject
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 _BATCH = 8
 _TURN = 3.0  # [m per rad] how far apart two views are that differ by direction only
@@ -35,7 +34,7 @@ class Rendered(Protocol):
     def opacity(self) -> NDArray[np.float32]: ...
 
 
-class Field(Protocol):
+class ColorField(Protocol):
     """What is needed of a `RadianceField` here."""
 
     @property
@@ -74,7 +73,7 @@ class Views:
 
 
 def render_views(
-    field: Field, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
+    field: ColorField, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
 ) -> Views:
     """Renders the field from `count` spread-out training frames, under its first lighting unless another is given.
 
@@ -90,7 +89,7 @@ def render_views(
     old = [(int(w), int(h)) for w, h in chosen.sizes]
     intrinsics = np.stack([scaled_intrinsics(k, s, size) for k, s in zip(chosen.intrinsics, old, strict=True)])
     rgb, depth = [], []
-    with progress.bar("rendering depth", len(chosen), "view") as bar:
+    with runtime.bar("rendering depth", len(chosen), "view") as bar:
         for start in range(0, len(chosen), _BATCH):
             part = slice(start, start + _BATCH)
             image = field.render(chosen.select(np.arange(len(chosen))[part]), lighting or field.lightings[0], size)

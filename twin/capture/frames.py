@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import progress
+from twin import runtime
+from twin.capture.capture_data import Capture
 from twin.capture.formats import detect_kind, read_colmap, read_image_folder, read_transforms
-from twin.capture.keep import NO_GPS, FrameWriter, Image, Kept, Task
-from twin.capture.masks import Masks, read_mask
-from twin.capture.paths import folder
 from twin.capture.photos import read_photos
-from twin.capture.types import Capture
+from twin.capture.sources import NO_GPS, FrameWriter, KeptFrame, Masks, SourceTask, read_mask
 from twin.capture.video import FilmCount, damage_note, read_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
 from twin.config_file import LONGEST_NAME, check_lighting
 from twin.errors import InputError
+from twin.files import folder
 from twin.scene import SceneDir
+from twin.types import Image
 
 # Words in a path that say what a thing is and not which one.
 _PLAIN_NAMES = ("images", "image", "sparse", "colmap", "input", "0", "dense", "data")
@@ -93,11 +93,11 @@ def _lighting(source: SourceConfig) -> str:
 
 def _read_source(
     root: Path, name: str, lighting: str, source: SourceConfig, config: CaptureConfig, writer: FrameWriter
-) -> Kept:
+) -> KeptFrame:
     path = root / source.path
     kind = detect_kind(path) if source.kind == "auto" else source.kind
     masks = Masks(root / source.mask) if source.mask else None
-    task = Task(path, name, lighting, kind, source, config, masks, writer)
+    task = SourceTask(path, name, lighting, kind, source, config, masks, writer)
     images = root / source.images if source.images else None
     if images:
         folder(images, "check images = in scene.toml, a folder")
@@ -108,14 +108,14 @@ def _read_source(
     return read_photos(task, read_colmap(path, images) if kind == "colmap" else read_transforms(path, images))
 
 
-def _read_video(task: Task) -> Kept:
+def _read_video(task: SourceTask) -> KeptFrame:
     def mask_of(index: int, width: int, height: int) -> Image | None:
         found = task.masks.find((f"{index:06d}",)) if task.masks else None
         return read_mask(found, width, height) if found else None
 
-    kept, count, unmasked = Kept(task.info((0, 0), None, False)), FilmCount(), 0
+    kept, count, unmasked = KeptFrame(task.info((0, 0), None, False)), FilmCount(), 0
     size = (0, 0)
-    with progress.bar(f"reading {task.name}", 0, "frame") as bar:
+    with runtime.bar(f"reading {task.name}", 0, "frame") as bar:
         for frame in read_film(task.path, task.config, count, mask_of, task.parts):
             size = (frame.image.shape[1], frame.image.shape[0])
             task.writer.put(frame.index, frame.image, frame.mask)
@@ -126,7 +126,7 @@ def _read_video(task: Task) -> Kept:
             bar.total = count.promised
             bar.update(count.decoded - bar.n)
     if note := damage_note(task.path, count):
-        progress.say(f"  {note}")
+        runtime.say(f"  {note}")
     task.check_masked(unmasked, len(kept.index))
     lens = task.given_lens(count.size)
     kept.info = task.info(size, lens.scaled(*size) if lens else None, lens is not None)
@@ -147,11 +147,11 @@ def _read_video(task: Task) -> Kept:
     return kept
 
 
-def _joined(kept: list[Kept], config: CaptureConfig) -> Capture:
+def _joined(kept: list[KeptFrame], config: CaptureConfig) -> Capture:
     without = [one.info.name for one in kept if not one.poses]
     if 0 < len(without) < len(kept):
         bare = ", ".join(without)
-        progress.say(f"  the poses given are not used: {bare} brings none, so all cameras are reconstructed together")
+        runtime.say(f"  the poses given are not used: {bare} brings none, so all cameras are reconstructed together")
     counts = [len(one.index) for one in kept]
     return Capture(
         sources=tuple(one.info for one in kept),

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from twin.geometry.poses import Array
+from twin.types import Array
 
 _SIGMA_RIGHT = np.radians(1.0)
 """A camera is mounted level to about this [rad]; the error is common to all frames, so averaging does not reduce it."""
@@ -65,7 +65,7 @@ class Road:
 
 
 @dataclass(frozen=True)
-class Up:
+class Gravity:
     """Direction away from the ground."""
 
     direction: Array
@@ -160,7 +160,7 @@ def _layer(drop: Array, offset: Array, reach: float) -> Road | None:
     return Road(below[chosen], height, spread, reach)
 
 
-def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Up, Road | None]:
+def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Gravity, Road | None]:
     """Up by all three witnesses, and the road under the path.
 
     Args:
@@ -178,7 +178,7 @@ def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Up, Road | No
             evidence = evidence + (np.eye(3) - np.outer(normal, normal)) / _SIGMA_ROAD**2
             witnesses.append("road")
     up, sigma = _solve(evidence, roughly)
-    return Up(up, sigma, " + ".join(witnesses)), find_road(points, centres, up)
+    return Gravity(up, sigma, " + ".join(witnesses)), find_road(points, centres, up)
 
 
 def _road_normal(road: Array, centres: Array, up: Array) -> Array | None:

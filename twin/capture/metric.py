@@ -10,18 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from twin.assets.route import refuse_jumps
-from twin.capture.gravity import Road, Up, camera_up, find_road, heights_above_road, up_from_ground
-from twin.capture.markers import scale_from_marker
-from twin.capture.scale import Scale, chosen_way, scale_from_distance, scale_from_gps, scale_from_height
-from twin.capture.types import Capture
+from twin.capture.capture_data import Capture
+from twin.capture.gravity import Gravity, Road, camera_up, find_road, heights_above_road, up_from_ground
+from twin.capture.scale import (
+    Scale,
+    chosen_way,
+    scale_from_distance,
+    scale_from_gps,
+    scale_from_height,
+    scale_from_marker,
+)
 from twin.config import SceneConfig
 from twin.errors import InputError
 from twin.files import write_json
-from twin.geometry.cameras import Cameras
-from twin.geometry.points import SparsePoints
-from twin.geometry.poses import Array, Similarity
+from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.poses import Similarity
+from twin.geometry.route import refuse_jumps
 from twin.scene import SceneDir
+from twin.types import Array
 
 _START = 0.08
 """The way driven first is the first part of the first source's path [share of its length]."""
@@ -82,17 +88,17 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     return metrics
 
 
-def _find_up(cameras: Cameras, points: Array, wanted: str, capture: Capture) -> tuple[Up, Road | None]:
+def _find_up(cameras: Cameras, points: Array, wanted: str, capture: Capture) -> tuple[Gravity, Road | None]:
     if wanted == "ground":
         return up_from_ground(cameras.camera_to_world, points)
     if wanted == "cameras":
         up = camera_up(cameras.camera_to_world)
         tilt = np.arccos(np.clip(-cameras.camera_to_world[:, :3, 1] @ up, -1.0, 1.0))
-        found = Up(up, float(np.sqrt(np.mean(tilt**2)) / np.sqrt(min(len(cameras), 10))), "cameras")
+        found = Gravity(up, float(np.sqrt(np.mean(tilt**2)) / np.sqrt(min(len(cameras), 10))), "cameras")
     elif wanted == "poses":
         if capture.camera_to_world is None:
             raise InputError('metric.up = "poses": the input brought no poses; use "ground" or "cameras"')
-        found = Up(np.array([0.0, 0.0, 1.0]), 0.0, "poses")
+        found = Gravity(np.array([0.0, 0.0, 1.0]), 0.0, "poses")
     else:
         raise InputError(f"metric.up = {wanted!r}; expected ground, cameras or poses")
     return found, find_road(points, cameras.positions, found.direction)
@@ -144,7 +150,7 @@ def _metrics(
     points: SparsePoints,
     way: str,
     scale: Scale,
-    up: Up,
+    up: Gravity,
     road: Road | None,
     floor_source: str,
     similarity: Similarity,

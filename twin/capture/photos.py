@@ -7,33 +7,155 @@ orientation wants it shown.
 import hashlib
 import itertools
 import math
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ExifTags
 
-from twin import progress
-from twin.capture.exif import PhotoFacts, photo_facts
+from twin import runtime
+from twin.capture.camera_models import Lens, flattened, same_aspect
 from twin.capture.formats import ImageSet
-from twin.capture.keep import BLANK, Image, Kept, Task, ahead
-from twin.capture.lens import Lens, flattened, same_aspect
-from twin.capture.masks import read_mask
+from twin.capture.pycolmap_import import pycolmap
+from twin.capture.sources import BLANK, KeptFrame, SourceTask, ahead, read_mask
 from twin.capture.video import fitted_size, within
 from twin.errors import InputError
 from twin.geometry.images import BROKEN, decoded, opened, resize
+from twin.types import Image
+
+# ---- What a photo's EXIF header knows: focal length, position and clock.
+#
+# A *prior* is a focal length that comes from the header and not from a calibration: structure from motion starts at it
+# and improves it.
+
+
+_FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
+
+
+@dataclass(frozen=True)
+class PhotoFacts:
+    """One photo's header."""
+
+    focal: float | None
+    """Focal length in units of the longer side of the picture; None where the header does not say."""
+    gps: tuple[float, float, float]
+    """Latitude [°], longitude [°], altitude [m]; NaN where unknown."""
+    time: float | None
+    """Clock time [s since the epoch, the camera's own zone]; None where unknown."""
+    orientation: int
+    """1 is upright; 2 to 8 as EXIF has them."""
+
+
+def photo_facts(path: Path) -> PhotoFacts:
+    """Reads a photo's header; whatever is absent or malformed is unknown, never an error."""
+    nothing = PhotoFacts(None, (math.nan, math.nan, math.nan), None, 1)
+    try:
+        found = opened(path)
+        if found is None:
+            return nothing
+        with found as image:
+            width, height = image.size
+            exif = image.getexif()
+            if not exif:
+                return nothing
+            photo, gps = exif.get_ifd(ExifTags.IFD.Exif), exif.get_ifd(ExifTags.IFD.GPSInfo)
+    except BROKEN:
+        return nothing
+    orientation = exif.get(ExifTags.Base.Orientation, 1)
+    return PhotoFacts(
+        focal=focal_from_exif(photo, width, height) or _focal_from_model(path, width, height),
+        gps=gps_from_exif(gps),
+        time=time_from_exif(photo),
+        orientation=orientation if orientation in range(1, 9) else 1,
+    )
+
+
+def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
+    """Focal length over the longer side of the picture, from the Exif block of a header, or None.
+
+    The 35 mm equivalent compares diagonals (CIPA DCG-001). Without it, the focal length and the pitch of the sensor
+    do, if the header gives both.
+    """
+    longer, diagonal = max(width, height), math.hypot(width, height)
+    equivalent = _number(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    if equivalent > 0.0:
+        return equivalent / _FULL_FRAME_DIAGONAL * diagonal / longer
+    millimetres = _number(photo.get(ExifTags.Base.FocalLength))
+    pitch = _number(photo.get(ExifTags.Base.FocalPlaneXResolution))  # [px per unit]
+    unit = _UNIT_MM.get(photo.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    full_width = _number(photo.get(ExifTags.Base.ExifImageWidth)) or width
+    full_height = _number(photo.get(ExifTags.Base.ExifImageHeight)) or height
+    if millimetres > 0.0 and pitch > 0.0 and unit:
+        return millimetres * pitch / unit / max(full_width, full_height)
+    return None
+
+
+def _focal_from_model(path: Path, width: int, height: int) -> float | None:
+    """COLMAP's own table of sensor sizes, by camera model."""
+    try:
+        camera = pycolmap.infer_camera_from_image(str(path))
+    except (RuntimeError, ValueError):
+        return None
+    return camera.mean_focal_length() / max(width, height) if camera.has_prior_focal_length else None
+
+
+def gps_from_exif(gps: Any) -> tuple[float, float, float]:
+    """Latitude [°], longitude [°], altitude [m] from the GPS block; NaN where unknown."""
+    tag = ExifTags.GPS
+    latitude = _degrees(gps.get(tag.GPSLatitude), gps.get(tag.GPSLatitudeRef), "S")
+    longitude = _degrees(gps.get(tag.GPSLongitude), gps.get(tag.GPSLongitudeRef), "W")
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+        return math.nan, math.nan, math.nan
+    altitude = _number(gps.get(tag.GPSAltitude), math.nan)
+    below = gps.get(tag.GPSAltitudeRef) in (1, b"\x01")
+    return latitude, longitude, -altitude if below else altitude
+
+
+def time_from_exif(photo: Any) -> float | None:
+    """When the photo was taken [s], with its fraction of a second, or None."""
+    text = photo.get(ExifTags.Base.DateTimeOriginal)
+    try:
+        taken = datetime.strptime(str(text).strip("\x00 "), "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+    fraction = str(photo.get(ExifTags.Base.SubsecTimeOriginal) or "").strip("\x00 ")
+    seconds = (taken - datetime(1970, 1, 1)).total_seconds()
+    return seconds + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
+
+
+def _degrees(parts: Any, reference: Any, negative: str) -> float:
+    try:
+        values = [float(part) for part in parts]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return math.nan
+    total = sum(value / 60.0**i for i, value in enumerate(values))
+    return -total if str(reference).strip("\x00 ").upper() == negative else total
+
+
+def _number(value: Any, missing: float = 0.0) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return missing
+    return number if math.isfinite(number) else missing
+
 
 _MAX_FOCAL_SPREAD = 0.05  # relative; photos of one source that differ more were zoomed
 
 
-def read_photos(task: Task, images: ImageSet) -> Kept:
+def read_photos(task: SourceTask, images: ImageSet) -> KeptFrame:
     """Reads, scales and writes the images of a set; exact duplicates and blank images are dropped.
 
     Raises:
         InputError: an unreadable image, images of different shapes, or none that shows anything.
     """
     if images.missing:
-        progress.say(f"  {task.path.name}: {images.missing} images are listed but do not exist; going on without them")
+        runtime.say(f"  {task.path.name}: {images.missing} images are listed but do not exist; going on without them")
     lenses = images.lenses
     if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):
         lenses = (given,) * len(lenses)
@@ -45,7 +167,7 @@ def read_photos(task: Task, images: ImageSet) -> Kept:
     def load(i: int) -> tuple[int, Image, PhotoFacts]:
         return i, *load_photo(images.paths[i], lenses[i] if lenses else None)
 
-    kept = Kept(task.info((0, 0), None, False))
+    kept = KeptFrame(task.info((0, 0), None, False))
     seen: set[bytes] = set()
     duplicates = blank = unmasked = 0
     clock: list[float | None] = []
@@ -53,7 +175,7 @@ def read_photos(task: Task, images: ImageSet) -> Kept:
     kept_lenses: list[Lens] = []
     native = size = (0, 0)
     stream = ahead(task.writer.pool, load, chosen)
-    for i, image, facts in progress.track(stream, f"reading {task.name}", len(chosen), "image"):
+    for i, image, facts in runtime.track(stream, f"reading {task.name}", len(chosen), "image"):
         shape = (image.shape[1], image.shape[0])
         if size == (0, 0):
             native, size = shape, fitted_size(*shape, task.config.max_size)
@@ -114,7 +236,7 @@ def read_photos(task: Task, images: ImageSet) -> Kept:
     return kept
 
 
-def _in_parts(task: Task, images: ImageSet) -> NDArray[np.int64]:
+def _in_parts(task: SourceTask, images: ImageSet) -> NDArray[np.int64]:
     """Indices of the photos that lie in the parts of the source that are used.
 
     Raises:
@@ -185,7 +307,7 @@ def focal_prior(focal: list[float], size: tuple[int, int], name: str) -> Lens | 
         return None
     middle = float(np.median(focal))
     if max(focal) - min(focal) > _MAX_FOCAL_SPREAD * middle:
-        progress.say(f"  {name}: the photos' focal lengths differ (zoomed); give each zoom a source of its own")
+        runtime.say(f"  {name}: the photos' focal lengths differ (zoomed); give each zoom a source of its own")
     return Lens("SIMPLE_RADIAL", (middle * max(size), 0.5 * size[0], 0.5 * size[1], 0.0), *size)
 
 
@@ -216,7 +338,7 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
     return stored
 
 
-def _mask(task: Task, images: ImageSet, i: int, size: tuple[int, int]) -> Image | None:
+def _mask(task: SourceTask, images: ImageSet, i: int, size: tuple[int, int]) -> Image | None:
     path, own = images.paths[i], images.masks[i] if images.masks else None
     found = task.masks.find((path.stem, path.name)) if task.masks else own
     return read_mask(found, *size) if found else None

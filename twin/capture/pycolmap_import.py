@@ -1,6 +1,6 @@
 """`pycolmap`, imported so that SIGTERM stays ours: its log library would answer it with a C++ stack trace."""
 
-from twin.verb import signals_kept
+from twin.cli import signals_kept
 
 with signals_kept():
     import pycolmap

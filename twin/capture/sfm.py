@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import progress
+from twin import runtime
+from twin.capture.camera_models import pinhole_of, undistortion_map, write_pinhole_image
+from twin.capture.capture_data import Capture
 from twin.capture.pycolmap_import import pycolmap
-from twin.capture.types import Capture
-from twin.capture.undistort import pinhole_of, undistortion_map, write_pinhole_image
 from twin.capture.worker import run_worker
 from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json
-from twin.geometry.cameras import Cameras
-from twin.geometry.points import SparsePoints
+from twin.geometry.cameras import Cameras, SparsePoints
 from twin.scene import SceneDir
 
 _MAX_THREADS = 16
@@ -122,7 +121,7 @@ def _write_images(
     """Writes the pinhole images and masks; returns intrinsics (n, 4) and sizes (n, 2)."""
     intrinsics, sizes = np.zeros((len(frames), 4)), np.zeros((len(frames), 2), np.int64)
     known: dict[str, tuple[tuple[float, float, float, float], NDArray[np.float32] | None]] = {}
-    for k, i in enumerate(progress.track(frames, "pinhole images", unit="frame")):
+    for k, i in enumerate(runtime.track(frames, "pinhole images", unit="frame")):
         lens = lenses[k]
         key = repr(lens)
         if key not in known:

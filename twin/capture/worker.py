@@ -1,7 +1,7 @@
 """Runs structure from motion in a process of its own.
 
 Some failures inside COLMAP abort the whole process instead of raising. The *parent* (the stage) starts a *worker*
-(`python -m twin.capture.worker JOB`), reads its news line by line and turns an abort into an error that names a cure.
+(`python -m twin.capture.solver JOB`), reads its news line by line and turns an abort into an error that names a cure.
 
 A line of news on the worker's standard output is JSON: {"bar": name, "total": n} starts a bar, {"step": n} moves it,
 {"say": text} speaks, {"error": text} is bad input. COLMAP's own log comes on standard error and goes to a file.
@@ -15,17 +15,16 @@ import signal
 import subprocess
 import sys
 import threading
-import traceback
 from collections import deque
 from pathlib import Path
 from typing import IO, Any
 
-from twin import progress
-from twin.child import die_with_parent, environment
+from twin import runtime
 from twin.errors import InputError
+from twin.runtime import environment
 
 _LOG = "colmap.log"
-_BAD_INPUT = 2
+BAD_INPUT = 2
 _CURES = {
     "SIGABRT": "film slower and with more texture in view, check the calibration, or set cameras.mapper = "
     '"incremental"',
@@ -63,7 +62,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     job_file.write_text(json.dumps(job), encoding="utf-8")
     log_file = folder / _LOG
     process = subprocess.Popen(
-        [sys.executable, "-m", "twin.capture.worker", str(job_file)],
+        [sys.executable, "-m", "twin.capture.solver", str(job_file)],
         stdin=subprocess.PIPE,  # closed by our death, however it comes; the worker then ends, too
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -92,7 +91,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     if code == 0:
         return
     tail = " | ".join(last)[-1500:]
-    if code == _BAD_INPUT and error:
+    if code == BAD_INPUT and error:
         raise InputError(error)
     if any(words in tail.lower() for words in _DISK_FULL):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
@@ -123,11 +122,11 @@ class _Bars:
             if "bar" in news:
                 self._end()
                 self._mapping = news["bar"] == "mapping"
-                self._bar = progress.bar(news["bar"], news["total"] or len(_MAPPING_STEPS))
+                self._bar = runtime.bar(news["bar"], news["total"] or len(_MAPPING_STEPS))
             if "step" in news and self._bar is not None:
                 self._bar.update(news["step"])
             if "say" in news:
-                progress.say(news["say"])
+                runtime.say(news["say"])
         return news
 
     def log(self, line: str) -> None:
@@ -153,39 +152,3 @@ def _keep_log(stream: IO[str], path: Path, bars: _Bars, last: deque[str]) -> Non
             bars.log(line)
             with contextlib.suppress(OSError):  # a full disk, on which the worker fails by itself
                 log.write(line.encode())
-
-
-def _end_with_parent() -> None:
-    """Ends this process when its standard input closes, which the parent's death does, even by kill -9."""
-    with contextlib.suppress(OSError, ValueError):
-        while os.read(0, 1024):
-            pass
-    os._exit(1)
-
-
-def main(argv: list[str]) -> int:
-    """The worker. Exit status: 0 done, 2 bad input (said in the news), 1 anything else."""
-    die_with_parent()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    # Loaded here only: the parent needs no COLMAP to start a worker.
-    from twin.capture import mapping, register, register_film
-
-    job = json.loads(Path(argv[0]).read_text(encoding="utf-8"))
-    tasks = {"map": mapping.solve, "register": register.solve, "register_film": register_film.solve}
-    solve = tasks[job["task"]]
-    try:
-        solve(job)
-    except InputError as error:
-        tell(error=str(error))
-        return _BAD_INPUT
-    except Exception:  # a bug, shown here because the exit below goes past the interpreter and its own report
-        traceback.print_exc()
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    code = main(sys.argv[1:])
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)  # past COLMAP's destructors: all results are on disk already

@@ -8,6 +8,7 @@ pictures.
 import importlib
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -15,13 +16,189 @@ import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.dm import control
-from twin.env.follower import Pursuit
-from twin.env.options import STEERING
-from twin.env.tasks import checked_actions
+from twin.env.controller import CONTROL_PERIOD
+from twin.env.options import STEERING, control
+from twin.env.physics import HuskyPhysics
+from twin.env.task import checked_actions
 from twin.errors import InputError, shown
+from twin.mjcf.world import World, arc_lengths, heading_error, nearest, point_at
+from twin.types import Array
 
-Array = NDArray[np.float64]
+# ---- A scripted driver that follows a route from poses alone: the first proof that a scene can be driven.
+#
+# Pure pursuit (Coulter 1992): steer on the circle through a point of the route some way ahead. A skid-steered robot
+# turns faster or slower than commanded, by a factor that depends on ground and load, so the driver also compares the yaw
+# rate it asked for with what the poses show, and corrects its commands by the ratio.
+
+
+GOAL_RADIUS = 1.0  # [m]
+
+_LOOK_AHEAD = 1.0  # [m] on the route
+_GAIN_RATE = 0.15  # share of the observed ratio taken over per control step
+_GAIN_RANGE = (0.5, 2.5)
+_GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; below this the ratio is noise
+_SEARCH = (1.0, 3.0)  # [m] behind and ahead of the last foot point
+
+
+@dataclass(frozen=True)
+class FollowedDrive:
+    """A recorded drive of k instants, one per control step of 0.1 s, the first at rest at the start."""
+
+    times: Array
+    """[s], shape (k,)."""
+    base_to_world: Array
+    """Shape (k, 4, 4)."""
+    camera_to_world: Array
+    """Of the front camera, OpenCV axes, shape (k, 4, 4)."""
+    qpos: Array
+    """MuJoCo's positions, shape (k, nq), so that the drive can be drawn again."""
+    commands: Array
+    """v [m/s], ω [rad/s] given at each instant (the last row is zero), shape (k, 2)."""
+    cross_track: Array
+    """Distance from the route, left positive [m], shape (k,)."""
+    progress: Array
+    """Arc length of the nearest point of the route [m], shape (k,)."""
+    touched: tuple[str, ...]
+    """Names of what was touched besides the ground, sorted."""
+    outcome: str
+    """goal, touched, off_corridor or timeout."""
+
+    @property
+    def reached_goal(self) -> bool:
+        return self.outcome == "goal"
+
+    @property
+    def max_cross_track(self) -> float:
+        """[m]"""
+        return float(np.abs(self.cross_track).max())
+
+    @property
+    def mean_cross_track(self) -> float:
+        """[m]"""
+        return float(np.abs(self.cross_track).mean())
+
+
+def pursuit_curvature(pose: Array, target: Array) -> float:
+    """Curvature [1/m] of the circle that leaves `pose` (x, y, yaw) along its heading and passes `target` (x, y)."""
+    ahead = target - pose[:2]
+    lateral = np.cos(pose[2]) * ahead[1] - np.sin(pose[2]) * ahead[0]
+    return float(2.0 * lateral / max(ahead @ ahead, 1e-9))
+
+
+class PurePursuit:
+    """The driver: from one pose after the other to the commands that follow the route."""
+
+    def __init__(self, route: Array, speed: float, fastest_turn: float, start: float = 0.0) -> None:
+        """
+        Args:
+            route: Shape (m, ≥2) [m].
+            speed: [m/s]
+            fastest_turn: Largest yaw rate [rad/s].
+            start: Arc length near which it begins [m].
+        """
+        self._route, self._speed, self._fastest = route[:, :2], speed, fastest_turn
+        self._length = float(arc_lengths(route)[-1])
+        self.s = start
+        """Arc length reached so far [m]."""
+        self._gain = 1.0
+        self._last: tuple[Array, tuple[float, float]] | None = None
+
+    def look(self, pose: Array) -> tuple[float, float]:
+        """Arc length of the foot point and cross-track error [m] of a pose (x, y, yaw)."""
+        foot, error = nearest(self._route, pose[:2], (self.s - _SEARCH[0], self.s + _SEARCH[1]))
+        self.s = max(self.s, float(foot))
+        return float(foot), float(error)
+
+    def command(self, pose: Array) -> tuple[float, float]:
+        """v [m/s] and ω [rad/s] for the control step that begins at a pose (x, y, yaw)."""
+        if self._last is not None:
+            self._gain = _updated_gain(self._gain, self._last[0], pose, self._last[1])
+        target = _target(self._route, self.s + _LOOK_AHEAD, self._length)
+        wanted = np.clip(self._speed * pursuit_curvature(pose, target), -self._fastest, self._fastest)
+        command = (self._speed, float(np.clip(self._gain * wanted, -self._fastest, self._fastest)))
+        self._last = (pose, command)
+        return command
+
+
+def follow(world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: float | None = None) -> FollowedDrive:
+    """Drives from the start along the route until the goal, a touch, the corridor's edge or the time limit.
+
+    Args:
+        world: Route, goal and corridor.
+        physics: Of the world's model; it is reset.
+        speed: [m/s]; the robot itself does at most 1 m/s at a wheel, so less in a turn.
+        timeout: [s]; by default what three times the route takes, and 10 s.
+    """
+    speed = min(speed, physics.params.max_speed)
+    length = float(arc_lengths(world.route)[-1])
+    timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
+    physics.reset()
+
+    times, bases, cameras, positions, commands, errors, feet = [], [], [], [], [], [], []
+    touched: set[str] = set()
+    driver = PurePursuit(world.route, speed, physics.params.max_yaw_rate)
+    while True:
+        pose = physics.planar_pose
+        foot, error = driver.look(pose)
+        times.append(physics.time)
+        bases.append(physics.base_to_world)
+        cameras.append(physics.camera_to_world)
+        positions.append(physics.data.qpos.copy())
+        errors.append(error)
+        feet.append(foot)
+        outcome = _outcome(world, pose, driver.s, length, abs(error), touched, physics.time > timeout)
+        if outcome:
+            commands.append((0.0, 0.0))
+            break
+        command = driver.command(pose)
+        commands.append(command)
+        physics.command(*command)
+        physics.step()
+        touched |= set(physics.touched)
+    return FollowedDrive(
+        times=np.array(times),
+        base_to_world=np.array(bases),
+        camera_to_world=np.array(cameras),
+        qpos=np.array(positions),
+        commands=np.array(commands),
+        cross_track=np.array(errors),
+        progress=np.array(feet),
+        touched=tuple(sorted(touched)),
+        outcome=outcome,
+    )
+
+
+def _outcome(world: World, pose: Array, s: float, length: float, error: float, touched: set[str], late: bool) -> str:
+    """Why the drive ends here; empty while it goes on."""
+    if touched:
+        return "touched"
+    # A route that passes its own goal early is not done there.
+    if np.linalg.norm(pose[:2] - world.goal[:2]) < GOAL_RADIUS and s > length - 2 * GOAL_RADIUS:
+        return "goal"
+    if error > world.half_width:
+        return "off_corridor"
+    return "timeout" if late else ""
+
+
+def _target(route: Array, s: float, length: float) -> Array:
+    """The point of the route at s [m]; past its end the route goes on straight."""
+    if s <= length:
+        return point_at(route, s)
+    direction = route[-1] - point_at(route, length - 1.0)
+    return route[-1] + direction / max(float(np.linalg.norm(direction)), 1e-9) * (s - length)
+
+
+def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
+    """Follows the ratio of path curvature commanded to achieved, which for skid steering is not 1."""
+    turned = float(heading_error(pose[2], previous[2])) / CONTROL_PERIOD
+    moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
+    v, yaw_rate = command
+    if abs(yaw_rate) < _GAIN_MIN_YAW_RATE or abs(turned) < _GAIN_MIN_YAW_RATE or yaw_rate * turned < 0 or moved < 0.2:
+        return gain
+    ratio = (yaw_rate / v) / (turned / moved)
+    return float(np.clip(gain + _GAIN_RATE * (ratio - gain), *_GAIN_RANGE))
+
+
 Policy = Callable[[NDArray[np.uint8]], NDArray]
 """Pictures (3 · stack, height, width), the newest three channels last → numbers in [-1, 1], one per action."""
 
@@ -38,7 +215,7 @@ class RouteDriver:
     def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
         task, pose = environment.task, environment.physics.planar_pose
         if step.first():
-            self._pursuit = Pursuit(task.world.route, task.options.speed, task.options.yaw_rate, task.stretch.start)
+            self._pursuit = PurePursuit(task.world.route, task.options.speed, task.options.yaw_rate, task.stretch.start)
         self._pursuit.look(pose)
         v, yaw_rate = self._pursuit.command(pose)
         return np.array([yaw_rate]) if task.options.action == STEERING else np.array([v, yaw_rate])

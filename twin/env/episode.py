@@ -7,15 +7,13 @@ from typing import Any
 
 import dm_env
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.config import ObstacleConfig
 from twin.config_file import parse
-from twin.env.dm import control
 from twin.env.drivers import Driver
+from twin.env.options import control
 from twin.files import read_json, write_json
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 _ARRAYS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed", "cross_track", "progress", "trust")
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from twin.config import TRAINING, ObstacleConfig
-from twin.env.camera_effects import CameraOptions
+from twin.env.camera_noise import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
-from twin.env.randomisation import Ranges
+from twin.env.domain_randomization import Ranges
 from twin.errors import InputError, shown
 
 CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
@@ -75,7 +76,7 @@ class Options:
     observe: str = NERF
     """nerf: pictures of the field; simulator: MuJoCo's own of the extracted mesh, in its own light."""
     lighting: str | Sequence[str] = TRAINING
-    """See `lightings.py`."""
+    """See `episode_lighting.py`."""
     lighting_drift: bool = False
     """The light changes during an episode."""
     obstacles: str | int | Sequence[ObstacleConfig] = "scene"
@@ -200,3 +201,17 @@ def _rewards(given: dict[str, float]) -> Rewards:
         if name not in names:
             raise InputError(f"unknown reward {name!r}; there are {', '.join(names)}")
     return Rewards(**given)
+
+
+# ---- dm_control's control loop, or one line that says why there is none.
+
+
+try:
+    from dm_control.rl import control
+except ModuleNotFoundError as error:
+    raise InputError(
+        f"{error}: to drive in a scene needs dm_control, which installs on Python 3.11 and 3.12; this is "
+        f"{sys.version_info.major}.{sys.version_info.minor}"
+    ) from None
+
+__all__ = ["control"]

@@ -16,36 +16,32 @@ from dm_env import specs
 
 from twin.config import HELD_OUT, RANDOMISED, TRAINING
 from twin.config_file import load_config
-from twin.env import lightings
-from twin.env.dm import control
-from twin.env.dm_physics import DrivePhysics
-from twin.env.episode_obstacles import EpisodeObstacles
-from twin.env.judge import Judge
-from twin.env.obstacle_view import ObstacleView, camera_pose
-from twin.env.obstacles import add_obstacles
-from twin.env.options import CPU, NERF, Options, parse_options
-from twin.env.overlay import Overlay
-from twin.env.pixels import Pixels
-from twin.env.randomisation import ANOTHER_DAY, UNTOLD, VERSION, Ranges
-from twin.env.scene_model import episode_spec
-from twin.env.simulator_view import SimulatorView
-from twin.env.stretches import Stretch, find_task
-from twin.env.tasks import Drive
+from twin.env import episode_lighting
+from twin.env.compositor import Compositor
+from twin.env.domain_randomization import ANOTHER_DAY, UNTOLD, VERSION, Ranges
+from twin.env.episode_model import episode_spec
+from twin.env.mujoco_renderer import ObjectRenderer, SceneRenderer, camera_pose
+from twin.env.observation import PixelObserver
+from twin.env.obstacles import EpisodeObstacles, add_obstacles
+from twin.env.options import CPU, NERF, Options, control, parse_options
+from twin.env.physics import DrivePhysics
+from twin.env.route_segments import RouteSegment, find_task
+from twin.env.task import DriveTask, RewardAndTermination
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import digest_file, digest_json
 from twin.loading import Twin, load_scene
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
-from twin.stamp import finished, result_of
+from twin.scene import finished, result_of
 
 
 @dataclass(frozen=True)
-class Stage:
+class EnvFactory:
     """A scene and a task, ready for any number of worlds."""
 
     world: World
-    stretch: Stretch
+    stretch: RouteSegment
     options: Options
     obstacles: EpisodeObstacles
     model: mujoco.MjModel
@@ -54,7 +50,7 @@ class Stage:
     trust: Trust | None
 
     @staticmethod
-    def open(scene: str | Path | Twin, task: str, options: dict[str, Any]) -> "Stage":
+    def open(scene: str | Path | Twin, task: str, options: dict[str, Any]) -> "EnvFactory":
         """Reads a built scene. Raises InputError: not built, no route, no such task or lighting, or unknown options."""
         parsed = parse_options(options)
         twin = scene if isinstance(scene, Twin) else load_scene(scene)
@@ -75,13 +71,15 @@ class Stage:
         trust = Trust(twin.cameras()) if parsed.pixels else None
         field = twin.field(parsed.device) if parsed.pixels and parsed.observe == NERF else None
         if field is not None:
-            lightings.check_names(parsed.lighting, field)
-        return Stage(world, stretch, parsed, obstacles, spec.compile(), field, trust)
+            episode_lighting.check_names(parsed.lighting, field)
+        return EnvFactory(world, stretch, parsed, obstacles, spec.compile(), field, trust)
 
-    def drive(self, seed: int | None, judge: tuple[Judge, int] | None = None) -> tuple[DrivePhysics, Drive]:
+    def drive(
+        self, seed: int | None, judge: tuple[RewardAndTermination, int] | None = None
+    ) -> tuple[DrivePhysics, DriveTask]:
         """One more world, with a model of its own; see `Drive`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
-        return physics, Drive(self.world, self.stretch, self.options, self.obstacles, self.model, seed, judge)
+        return physics, DriveTask(self.world, self.stretch, self.options, self.obstacles, self.model, seed, judge)
 
     @property
     def _bare(self) -> bool:
@@ -95,23 +93,23 @@ class Stage:
         data, camera = mujoco.MjData(self.model), self.model.camera("front").id
         mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("spawn").id)
         mujoco.mj_forward(self.model, data)
-        return ObstacleView(self.model, camera, self.options.size).in_view(data, camera_pose(data, camera)) is None
+        return ObjectRenderer(self.model, camera, self.options.size).in_view(data, camera_pose(data, camera)) is None
 
-    def pixels(self, worlds: list[tuple[DrivePhysics, Drive]]) -> Pixels | None:
+    def pixels(self, worlds: list[tuple[DrivePhysics, DriveTask]]) -> PixelObserver | None:
         if self.trust is None:
             return None
         size, count = self.options.size, len(worlds)
         if self.field is not None and self.options.device != CPU and self._bare:
-            from twin.env.device_pixels import DevicePixels  # its kernels are for that alone
+            from twin.env.observation import GpuPixelObserver  # its kernels are for that alone
 
-            return DevicePixels(self.field, self.trust, self.options, worlds)
+            return GpuPixelObserver(self.field, self.trust, self.options, worlds)
         if self.field is not None:
-            overlay = Overlay(self.model, self.field, size, count)
-            return Pixels(overlay, self.field, self.trust, self.options, worlds)
+            overlay = Compositor(self.model, self.field, size, count)
+            return PixelObserver(overlay, self.field, self.trust, self.options, worlds)
         half_width = self.options.half_width or self.world.half_width
         spec = episode_spec(self.world, self.stretch.start, self.stretch.end, half_width, looks=True)
         add_obstacles(spec, self.obstacles.pool, self.world)
-        return Pixels(SimulatorView(spec.compile(), size, count), None, self.trust, self.options, worlds)
+        return PixelObserver(SceneRenderer(spec.compile(), size, count), None, self.trust, self.options, worlds)
 
 
 def fingerprint(twin: Twin, task: str, lighting: str) -> str:
@@ -134,17 +132,17 @@ def fingerprint(twin: Twin, task: str, lighting: str) -> str:
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
             **({"randomise": drawn} if drawn else {}),
-            **({"lights": lightings.VERSION} if plain in (TRAINING, HELD_OUT) else {}),
+            **({"lights": episode_lighting.VERSION} if plain in (TRAINING, HELD_OUT) else {}),
             "photos": [digest_file(path) for path in photos],
             **({"untold": UNTOLD} if photos and drawn else {}),
         }
     )
 
 
-class SeenDrive(control.Environment):
+class DriveEnvironment(control.Environment):
     """A drive whose observations are pictures: `pixels`, uint8, shape (stack, height, width, 3), the newest last."""
 
-    def __init__(self, physics: DrivePhysics, task: Drive, pixels: Pixels) -> None:
+    def __init__(self, physics: DrivePhysics, task: DriveTask, pixels: PixelObserver) -> None:
         super().__init__(physics, task, control_timestep=task.options.control_timestep)
         self.pixels = pixels
 
@@ -169,11 +167,23 @@ class SeenDrive(control.Environment):
         return step._replace(observation={"pixels": np.ascontiguousarray(self.pixels.stacks[0].transpose(0, 2, 3, 1))})
 
 
-def environment(scene: str | Path | Twin, task: str, seed: int | None, **options: Any) -> control.Environment:
-    """See `twin.load`."""
-    stage = Stage.open(scene, task, options)
+def load(
+    scene: str | Path | Twin, task: str = "right_turn", seed: int | None = None, **options: Any
+) -> control.Environment:
+    """A task in a built scene as a dm_control environment.
+
+    Args:
+        scene: Its folder, or what `load_scene` returned.
+        task: `straight`, `right_turn`, `route`, or a [[task]] of its scene.toml.
+        seed: Of the sequence of episodes; None: unpredictable.
+        options: See `twin.env.options.Options`.
+
+    Raises:
+        InputError: the scene is not built or has no such task, or an option is not to be had.
+    """
+    stage = EnvFactory.open(scene, task, options)
     physics, drive = stage.drive(seed)
     pixels = stage.pixels([(physics, drive)])
     if pixels is None:
         return control.Environment(physics, drive, control_timestep=drive.options.control_timestep)
-    return SeenDrive(physics, drive, pixels)
+    return DriveEnvironment(physics, drive, pixels)

@@ -10,13 +10,11 @@ view counts for (`_PER_TURN` metres per unit of 1 − cos of the angle between t
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from twin.geometry.cameras import Posed
 from twin.nerf.rendering import Rendering
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 SKY = 0.5
 """Opacity below which a pixel shows the sky."""

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from twin.errors import InputError
 from twin.files import check_shapes, checked_text, damaged, load_arrays, read_json, write_json
 from twin.geometry.poses import Similarity, inverse_pose
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 _CV_TO_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -233,3 +232,62 @@ def scaled_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[
     """Intrinsics after resizing an image from `size` to `new_size` (width, height)."""
     sx, sy = new_size[0] / size[0], new_size[1] / size[1]
     return np.asarray(intrinsics) * np.array([sx, sy, sx, sy])
+
+
+# ---- The sparse points of structure from motion, and which frames saw them.
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """m points and their k observations (one row per point and frame that sees it)."""
+
+    xyz: NDArray[np.float64]
+    """Shape (m, 3), in the frame of the `Cameras` beside them."""
+    rgb: NDArray[np.uint8]
+    """Shape (m, 3)."""
+    error: NDArray[np.float64]
+    """Mean reprojection error [px], shape (m,)."""
+    point: NDArray[np.int64]
+    """Point index per observation, shape (k,)."""
+    frame: NDArray[np.int64]
+    """Frame index (into the `Cameras` beside them) per observation, shape (k,)."""
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def track_length(self) -> NDArray[np.int64]:
+        """How many frames saw each point, shape (m,)."""
+        return np.bincount(self.point, minlength=len(self.xyz))
+
+    def transformed(self, similarity: Similarity) -> "SparsePoints":
+        return replace(self, xyz=similarity.points(self.xyz))
+
+    @staticmethod
+    def empty() -> "SparsePoints":
+        none = np.zeros(0, np.int64)
+        return SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none)
+
+    def save(self, folder: Path) -> None:
+        """Writes `points.npz`."""
+        np.savez(folder / "points.npz", **vars(self))
+
+    @staticmethod
+    def load(folder: Path) -> "SparsePoints":
+        """Raises InputError: no such file, or not one that `save` wrote."""
+        path = folder / "points.npz"
+        with damaged(path, "build the scene again"):
+            points = SparsePoints(**load_arrays(path))
+            m, k = len(points.xyz), len(points.point)
+            check_shapes(
+                {
+                    "xyz": (points.xyz, (m, 3), "f"),
+                    "rgb": (points.rgb, (m, 3), "u"),
+                    "error": (points.error, (m,), "f"),
+                    "point": (points.point, (k,), "i"),
+                    "frame": (points.frame, (k,), "i"),
+                }
+            )
+            if k and not (points.point.min() >= 0 and points.point.max() < m and points.frame.min() >= 0):
+                raise ValueError(f"observations of points that are not among the {m}")
+        return points

@@ -7,9 +7,8 @@ A *pose* is a 4×4 matrix that maps one frame's homogeneous points to another's,
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twin.types import Array
 
 
 @dataclass(frozen=True)

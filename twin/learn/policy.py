@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as safetensors_load
 from safetensors.numpy import save as safetensors_save
@@ -33,10 +32,10 @@ from twin.env.drivers import find_callable
 from twin.env.options import STEERING, TWIST
 from twin.errors import InputError, shown
 from twin.files import aside, digest_file, json_bytes, parse_json, read_bytes, read_json
-from twin.learn.architecture import Architecture, Floats, onnx_bytes
+from twin.learn.policy_network import Architecture, onnx_bytes
+from twin.types import Array32, Image
 
-Pictures = NDArray[np.uint8]
-Act = Callable[[Pictures], Floats]
+Act = Callable[[Image], Array32]
 """Stacks (n, 3 · stack, height, width) → actions (n, actions)."""
 
 JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
@@ -89,7 +88,7 @@ class Policy:
     trained: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Of a policy folder: scene, task, run, step, and so on."""
 
-    def actions(self, stacks: Pictures) -> Floats:
+    def actions(self, stacks: Image) -> Array32:
         """Stacks uint8 (n, 3 · stack, height, width) → actions (n, actions), each number in [-1, 1].
 
         Raises:
@@ -110,11 +109,11 @@ class Policy:
             )
         return np.clip(out, -1.0, 1.0)
 
-    def __call__(self, stack: Pictures) -> Floats:
+    def __call__(self, stack: Image) -> Array32:
         """One stack uint8 (3 · stack, height, width) → its action (actions,)."""
         return self.actions(stack[None])[0]
 
-    def command(self, action: Floats) -> tuple[float, float]:
+    def command(self, action: Array32) -> tuple[float, float]:
         """Speed [m/s] and yaw rate [rad/s] that an action (actions,) means."""
         c = self.control
         v = c.speed if c.action == STEERING else (float(action[0]) + 1.0) / 2.0 * c.speed
@@ -126,7 +125,7 @@ class Policy:
 
 
 def save_policy(
-    folder: Path, architecture: Architecture, control: Control, weights: dict[str, Floats], trained: dict[str, Any]
+    folder: Path, architecture: Architecture, control: Control, weights: dict[str, Array32], trained: dict[str, Any]
 ) -> None:
     """Writes a policy folder's files; policy.json comes last, without which there is no policy.
 
@@ -281,13 +280,13 @@ def _tensors(model: Any) -> Iterator[Any]:
 def _from_callable(name: str) -> Policy:
     function = find_callable(name)
 
-    def answered(stack: Pictures) -> Floats:
+    def answered(stack: Image) -> Array32:
         try:
             return np.asarray(function(stack), np.float32)
         except (Exception, SystemExit) as error:  # whatever the user's own code raises
             raise InputError(f"policy {name}: raised {type(error).__name__}: {error}") from error
 
-    def act(stacks: Pictures) -> Floats:
+    def act(stacks: Image) -> Array32:
         each = [answered(stack) for stack in stacks]
         if any(one.shape != answer.shape for one in each):
             raise InputError(f"policy {name}: answered {shown(each)}; expected {answer.shape[0]} number(s) as before")
@@ -315,7 +314,7 @@ def _from_zip(path: Path) -> Policy:
         raise InputError(f"{path}: takes {shape}, gives {actions}; expected (3 · stack, height, width), 1 or 2 numbers")
     control = Control(STEERING if actions == (1,) else TWIST)
 
-    def act(stacks: Pictures) -> Floats:
+    def act(stacks: Image) -> Array32:
         return model.predict(stacks, deterministic=True)[0]
 
     return Policy(path.stem, act, control, (shape[2], shape[1]), shape[0] // 3)
@@ -336,7 +335,7 @@ def _session(model: bytes, path: Path) -> Act:
     if given.type not in kinds:
         raise InputError(f"{path}: takes {given.type}; expected uint8 or float32 pictures of values 0 to 255")
 
-    def act(stacks: Pictures) -> Floats:
+    def act(stacks: Image) -> Array32:
         try:
             return session.run(None, {given.name: stacks.astype(kinds[given.type], copy=False)})[0]
         except Exception as error:

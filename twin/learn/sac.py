@@ -27,8 +27,9 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
-from twin.learn.architecture import NORM_EPSILON, Architecture, Floats
-from twin.learn.replay import FrameReplayBuffer
+from twin.learn.policy_network import NORM_EPSILON, Architecture
+from twin.learn.replay_buffer import FrameReplayBuffer
+from twin.types import Array32
 
 _LOGGED = ("critic_loss", "actor_loss", "state_loss", "ent_coef", "value")
 _FARTHEST = 3.0  # times its scale: what a state is cut at
@@ -174,7 +175,7 @@ class PixelSAC(SAC):
         return action, log_prob.reshape(-1, 1)
 
 
-def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Floats]:
+def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Array32]:
     """The steady, deterministic actor's weights by the names of `Architecture.shapes`."""
     actor = model.steady
     encoder = actor.features_extractor

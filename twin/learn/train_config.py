@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from twin.config import ANY, HELD_OUT, TRAINING
+from twin.env.domain_randomization import Ranges
 from twin.env.options import CPU, CUDA, NERF, SIMULATOR, STEERING, TWIST, Rewards
-from twin.env.randomisation import Ranges
 from twin.errors import InputError, shown
-from twin.learn.architecture import Architecture
 from twin.learn.policy import Control
+from twin.learn.policy_network import Architecture
 
 _STATES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
 """Speed [m/s], yaw rate [rad/s], cross-track [m], heading error and turns 1, 2 and 4 m ahead [rad]."""
@@ -65,7 +65,7 @@ class TrainConfig:
     observe: str = NERF
     """nerf, or simulator: MuJoCo's own picture of the extracted mesh."""
     lighting: str = TRAINING
-    """See `env/lightings.py`; the default varies between episodes."""
+    """See `env/episode_lighting.py`; the default varies between episodes."""
     seed: int = 0
     steps: int = 12_000
     worlds: int = 8
@@ -109,12 +109,12 @@ class TrainConfig:
     shift: int = 2
     """Random shift of pictures in updates [px of the small ones]."""
     colours: float = 1.0
-    """Strength of the random weather laid over pictures in updates (see `colours.py`) where the lighting varies. One
+    """Strength of the random weather laid over pictures in updates (see `replay_buffer.py`) where the lighting varies. One
     lighting and the simulator's pictures are learnt as they are."""
     checkpoints: int = 20
     """Policies kept along the way."""
     trials: int = 8
-    """Episodes that each of the last policies drives without exploring, to choose the best; see `choosing.py`."""
+    """Episodes that each of the last policies drives without exploring, to choose the best; see `policy_evaluation.py`."""
     save_every: int = 4_000
     """Steps between two saves of everything."""
     device: str = "cpu"

@@ -3,12 +3,12 @@
     runs/<name>/
       config.json                what was asked for
       policy.json .safetensors .onnx     the newest policy (see `policy.py`); in the end the chosen one
-      choice.json                which that is (see `choosing.py`)
+      choice.json                which that is (see `policy_evaluation.py`)
       checkpoints/<steps>/       policies along the way, of varied quality
       episodes.csv               every episode driven in training
       log.csv                    speed, memory and losses at every save
       tensorboard/
-      state/                     what the training goes on from (see `state.py`), and its pictures
+      state/                     what the training goes on from (see `checkpoint.py`), and its pictures
 
 *Steps* are control steps of all worlds together. *Updates* are steps of the optimisers.
 """
@@ -32,22 +32,22 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from twin.cli import StopNotice, Stopped, stop_noted
 from twin.config import RANDOMISED
 from twin.env.suite import fingerprint
 from twin.errors import InputError
+from twin.evaluation.training_curves import CHOICE
+from twin.evaluation.trials import RECENT, csv_text
 from twin.files import damaged, read_json, write_json, write_text
-from twin.learn.architecture import prepared
+from twin.learn.checkpoint import has_state, load_state, save_state
 from twin.learn.policy import save_policy
-from twin.learn.replay import FrameReplayBuffer
+from twin.learn.policy_network import prepared
+from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
-from twin.learn.state import has_state, load_state, save_state
+from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
-from twin.learn.vectors import DriveVecEnv
 from twin.loading import Twin
-from twin.memory import resident
-from twin.report.training import CHOICE
-from twin.report.trials import RECENT, csv_text
-from twin.verb import Stop, Stopped, stop_noted
+from twin.runtime import resident
 
 EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m")
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
@@ -236,7 +236,7 @@ class _Keeper(BaseCallback):
         wall: float,
         resumed: int,
         watch: Callable[[Progress], None] | None,
-        stop: Stop,
+        stop: StopNotice,
     ) -> None:
         super().__init__()
         self.model: PixelSAC

@@ -10,13 +10,11 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.config_file import parse
 from twin.files import check_shapes, checked_text, damaged, read_json, write_json
 from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
-
-Array = NDArray[np.float64]
+from twin.types import Array
 
 SCENE_XML = "scene.xml"
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4

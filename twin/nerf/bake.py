@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from twin.errors import InputError
 from twin.nerf import network
 from twin.nerf.baked import BakedField
-from twin.nerf.compute import parallel, single_threaded_torch, view
+from twin.nerf.brick_layout import BrickLayout, brick_indices, leaps
+from twin.nerf.buffers import CameraArrays, Workspace, parallel, single_threaded_torch, view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import RadianceField
 from twin.nerf.kernels import bricks as kernels
 from twin.nerf.kernels import composite as volume
-from twin.nerf.layout import BrickLayout, brick_indices, leaps
-from twin.nerf.workspace import CameraArrays, Workspace
-from twin.progress import bar
+from twin.runtime import bar
 
 _SHARDS = 4
 _RAYS = 4096  # per step of fine-tuning
@@ -38,7 +37,7 @@ _RAW_RANGE = (-6.0, 12.0)  # of raw density, that bytes cover
 _TAIL = 2e-4  # share of the features' values beyond what bytes cover
 _RATES = (0.05, 0.02)  # of raw density and features
 _BATCH = 65536
-_PROBES = 1024  # rays that random lightings are judged on, see `plausible.py`
+_PROBES = 1024  # rays that random lightings are judged on, see `appearance_prior.py`
 
 
 def bake(

@@ -19,26 +19,25 @@ import warp as wp
 from numpy.typing import NDArray
 from safetensors.numpy import save as to_bytes
 
-from twin.cores import cores
 from twin.errors import InputError, shown
 from twin.files import check_shapes, checked_text, damaged, load_tensors, read_json, write_json
 from twin.geometry.cameras import Posed, resized
-from twin.nerf.air import Air
+from twin.nerf.appearance_prior import Probes
+from twin.nerf.brick_layout import BrickLayout, brick_indices, brick_leaps, density_codes
+from twin.nerf.fog import Fog
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bytes
+from twin.nerf.kernels.color_head import HARMONICS, Eight, shade
+from twin.nerf.kernels.color_head import LANES as SHADE_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.lookup import Bricks
-from twin.nerf.kernels.shade import HARMONICS, Eight, shade
-from twin.nerf.kernels.shade import LANES as SHADE_LANES
-from twin.nerf.layout import BrickLayout, brick_indices, brick_leaps, density_codes
 from twin.nerf.lightings import Lightings
-from twin.nerf.plausible import Probes
 from twin.nerf.rendering import Rendering
-from twin.progress import bar
+from twin.runtime import bar, cores
+from twin.types import Array32
 
 wp.config.log_level = wp.LOG_ERROR
 
-Floats = NDArray[np.float32]
 
 _FORMAT = 2
 _PIECES = 3  # of a picture, per core
@@ -136,20 +135,20 @@ class BakedField:
         """Size of the arrays."""
         return sum(array.nbytes for array in self._arrays.values())
 
-    def embedding(self, lighting: str) -> Floats:
+    def embedding(self, lighting: str) -> Array32:
         """See `Lightings.embedding`."""
         return self.lightings_by_name.embedding(lighting)
 
-    def air(self, lighting: str) -> Air | None:
+    def air(self, lighting: str) -> Fog | None:
         """See `Lightings.air`. `render` shows the place without it; environments lay it over their pictures."""
         return self.lightings_by_name.air(lighting)
 
-    def sample_lighting(self, rng: np.random.Generator) -> Floats:
+    def sample_lighting(self, rng: np.random.Generator) -> Array32:
         """The embedding of a random lighting that could have been filmed, shape (dim,). See `Lightings.sample`."""
         return self.lightings_by_name.sample(rng)
 
     def add_lightings(
-        self, more: Mapping[str, Floats], stale: tuple[str, ...] = (), airs: Mapping[str, Air] | None = None
+        self, more: Mapping[str, Array32], stale: tuple[str, ...] = (), airs: Mapping[str, Fog] | None = None
     ) -> None:
         """See `Lightings.added`."""
         self.lightings_by_name = self.lightings_by_name.added(more, stale, airs)
@@ -212,7 +211,7 @@ class BakedField:
             list(self._pool.map(picture.develop, picture.pieces))
         return picture
 
-    def _biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Floats:
+    def _biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Array32:
         """The head's first bias with the appearance in it, shape (n, hidden)."""
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
         vectors = np.stack(
@@ -292,7 +291,7 @@ class _Picture:
         def new(shape: tuple[int, ...], dtype: Any = wp.float32) -> Any:
             return wp.zeros(shape, dtype=dtype, device=where)
 
-        film: Any = kernels.Film()
+        film: Any = kernels.ImageBuffers()
         film.rotation, film.position = new((n,), wp.mat33f), new((n,), wp.vec3f)
         film.intrinsics = new((n,), wp.vec4f)
         film.stop = new((n, pixels) if stopped else (0, 0))

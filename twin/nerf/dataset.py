@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import InputError
-from twin.geometry.cameras import Cameras, project, scaled_intrinsics
+from twin.geometry.cameras import Cameras, SparsePoints, project, scaled_intrinsics
 from twin.geometry.images import read_image, resize
-from twin.geometry.points import SparsePoints
-from twin.progress import track
+from twin.runtime import track
 
 _MAX_POINT_ERROR = 2.0  # reprojection error of a point that is believed [px]
 _MIN_TRACK = 3  # frames that must have seen it
@@ -38,7 +37,7 @@ class RayBatch:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class DepthSupervision:
     """k known distances along rays."""
 
     frame: NDArray[np.int32]
@@ -49,9 +48,9 @@ class Sightings:
     """[m], shape (k,)."""
 
 
-def joined(parts: list[Sightings]) -> Sightings:
+def joined(parts: list[DepthSupervision]) -> DepthSupervision:
     """All sightings in one."""
-    return Sightings(
+    return DepthSupervision(
         np.concatenate([np.zeros(0, np.int32), *(p.frame for p in parts)]),
         np.concatenate([np.zeros((0, 2)), *(p.pixel for p in parts)]),
         np.concatenate([np.zeros(0, np.float32), *(p.distance for p in parts)]),
@@ -93,7 +92,7 @@ class TrainingPixels:
         self.path = self._sight_path(camera_height) if camera_height > 0.0 else joined([])
         self.stereo = joined([])  # see `stereo.stereo_sightings`
 
-    def _sight(self, i: int, xyz: NDArray) -> "Sightings":
+    def _sight(self, i: int, xyz: NDArray) -> "DepthSupervision":
         """Those of the points (k, 3) [m] that fall on open pixels of training frame i."""
         pixel, depth = project(xyz, self.cameras.camera_to_world[i], self.intrinsics[i])
         inside = (depth > 0) & (pixel > 0.5).all(1) & (pixel < [self.width[i] - 0.5, self.height[i] - 0.5]).all(1)
@@ -101,9 +100,9 @@ class TrainingPixels:
         u, v = pixel.astype(int).T
         seen = self.open[self.start[i] + v * self.width[i] + u]
         distance = np.linalg.norm(xyz[seen] - self.cameras.positions[i], axis=1)
-        return Sightings(np.full(seen.sum(), i, np.int32), pixel[seen], distance.astype(np.float32))
+        return DepthSupervision(np.full(seen.sum(), i, np.int32), pixel[seen], distance.astype(np.float32))
 
-    def _sight_points(self, points: SparsePoints, chosen: NDArray) -> "Sightings":
+    def _sight_points(self, points: SparsePoints, chosen: NDArray) -> "DepthSupervision":
         good = (points.error < _MAX_POINT_ERROR) & (points.track_length >= _MIN_TRACK)
         found = []
         for i, original in enumerate(chosen):
@@ -111,7 +110,7 @@ class TrainingPixels:
             found.append(self._sight(i, points.xyz[seen]))
         return joined(found)
 
-    def _sight_path(self, camera_height: float) -> "Sightings":
+    def _sight_path(self, camera_height: float) -> "DepthSupervision":
         """The ground under the path ahead, as far as the path runs nearly straight from each frame on.
 
         What the vehicle drove over afterwards is ground, at the camera's height below the path, and nothing hid it.
@@ -183,7 +182,7 @@ class TrainingPixels:
             triple = np.where(self.open[triple].all(1, keepdims=True), triple, middle[:, None])
         return self._pixels(triple.ravel())
 
-    def _sightings(self, rng: np.random.Generator, pool: "Sightings", n: int) -> tuple[NDArray, ...]:
+    def _sightings(self, rng: np.random.Generator, pool: "DepthSupervision", n: int) -> tuple[NDArray, ...]:
         pick = rng.integers(len(pool.frame), size=n)
         frame, pixel = pool.frame[pick], pool.pixel[pick]
         return frame, pixel, self._interpolated(frame, pixel), pool.distance[pick]

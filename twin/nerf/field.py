@@ -22,12 +22,22 @@ from twin.files import checked_text, damaged, read_json, regular, write_json
 from twin.geometry.cameras import Posed, resized
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
-from twin.nerf.compute import device, load_kernels, parallel, single_threaded_torch, view
+from twin.nerf.buffers import (
+    CameraArrays,
+    Layout,
+    Workspace,
+    device,
+    level_cells,
+    level_shapes,
+    load_training_kernels,
+    opacity_grids,
+    parallel,
+    single_threaded_torch,
+    view,
+)
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler, space
 from twin.nerf.rendering import FAR, Rendering
-from twin.nerf.sampling import level_cells, level_shapes, stop_grids
-from twin.nerf.workspace import CameraArrays, Layout, Workspace
 
 _FORMAT = 1
 _RENDER_RAYS = 4096  # per batch
@@ -62,7 +72,7 @@ class RadianceField:
         self.layout, self.appearance, self.about = layout, appearance, about or {}
         self.table, self.parameters, self.grids = table, parameters, grids
         self.where = "cpu" if table.device.type == "cpu" else "cuda"
-        load_kernels(self.where)
+        load_training_kernels(self.where)
         self.w_table = view(table, hashgrid.Feature)
         self.w_near_grid, self.w_far_grid = (view(grid, wp.float32) for grid in grids)
         cells = level_cells(layout.space, layout.levels, layout.growth)
@@ -71,7 +81,7 @@ class RadianceField:
         self.mask = wp.uint32(2**layout.log2_table - 1)
         self.centre = wp.vec3f(*layout.centre)
         self.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        self.stop = stop_grids(layout.space)
+        self.stop = opacity_grids(layout.space)
         self._spare: list[Workspace] = []
 
     @property
@@ -311,7 +321,7 @@ def untrained(layout: Layout, appearance: Appearance, seed: int, where: str) -> 
     parameters = network.initial_parameters(
         layout.levels * hashgrid.FEATURES, layout.hidden, layout.appearance_dim, seed
     )
-    stop = stop_grids(layout.space)
+    stop = opacity_grids(layout.space)
     near = torch.full(stop.near_shape, -math.expm1(-layout.density_unit * stop.near_cell), device=where)
     far = torch.full(stop.far_shape, -math.expm1(-layout.density_unit * stop.far_cell), device=where)
     moved = Appearance(

@@ -1,8 +1,8 @@
 """Lightings by name: plain arrays, for whoever renders without training.
 
 A *lighting* can be asked for by name, as a frame (`day/000012`), or as a mixture `day:night:0.3`, which is 30 % of the
-way from day to night. One that nobody filmed can be drawn at random, see `plausible.py`. To the lightings that a field
-was trained on those may be *added* that photos were fitted for, see `added.py`.
+way from day to night. One that nobody filmed can be drawn at random, see `appearance_prior.py`. To the lightings that a field
+was trained on those may be *added* that photos were fitted for, see `added_lightings.py`.
 """
 
 from collections.abc import Mapping
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import InputError
-from twin.nerf import plausible
-from twin.nerf.air import Air, mixed
+from twin.nerf import appearance_prior
+from twin.nerf.fog import Fog, mixed
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Lightings:
     frames: tuple[str, ...]
     frame_vectors: NDArray[np.float32]
     """Shape (frames, dim)."""
-    probes: plausible.Probes | None = None
+    probes: appearance_prior.Probes | None = None
     """What a random lighting is judged on; a baked field has them."""
     stale: tuple[str, ...] = ()
     """Lightings that were added to another build of the field, or by an older twin, and mean nothing to this one."""
     count_added: int = 0
     """How many of the last ones were added."""
-    airs: Mapping[str, Air] = field(default_factory=dict)
+    airs: Mapping[str, Fog] = field(default_factory=dict)
     """Of those added, by name: what was in the air when their photos were taken."""
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
@@ -56,7 +56,7 @@ class Lightings:
             )
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
 
-    def air(self, lighting: str) -> Air | None:
+    def air(self, lighting: str) -> Fog | None:
         """The air that a photo told of a lighting, or of a mixture with one; None where it is the film's.
 
         Raises:
@@ -68,29 +68,29 @@ class Lightings:
         return mixed(self.air(mixture[0]), self.air(mixture[1]), mixture[2]) if mixture else None
 
     def sample(self, rng: np.random.Generator) -> NDArray[np.float32]:
-        """The embedding of a random lighting that could have been filmed, shape (dim,); `plausible.py` has the rule.
+        """The embedding of a random lighting that could have been filmed, shape (dim,); `appearance_prior.py` has the rule.
 
         The same generator state gives the same lighting.
 
         Raises:
             InputError: there are no probes, or none of the lightings drawn was plausible.
         """
-        return plausible.sample(rng, self.judge)
+        return appearance_prior.sample(rng, self.judge)
 
     @cached_property
-    def judge(self) -> plausible.Judge:
+    def judge(self) -> appearance_prior.AppearancePrior:
         """Tells whether an embedding could have been filmed. Raises InputError where there are no probes."""
         if self.probes is None:
             raise InputError(
                 "no probes to judge a random lighting on; take the baked field, twin.load_scene(SCENE).field()"
             )
-        return plausible.Judge(self.probes, self.vectors, self.frame_vectors)
+        return appearance_prior.AppearancePrior(self.probes, self.vectors, self.frame_vectors)
 
     def added(
         self,
         more: Mapping[str, NDArray[np.float32]],
         stale: tuple[str, ...] = (),
-        airs: Mapping[str, Air] | None = None,
+        airs: Mapping[str, Fog] | None = None,
     ) -> "Lightings":
         """With more lightings, embeddings (dim,) by name, the names of those that are not to be used, and airs."""
         vectors = np.concatenate([self.vectors, *(vector[None] for vector in more.values())])

@@ -21,7 +21,7 @@ class Rendering:
     """Share of the light that is stopped, in [0, 1], shape (n, height, width)."""
 
 
-class Field(Protocol):
+class RenderableField(Protocol):
     """The part of a radiance field that needs no knowledge of its kind."""
 
     @property

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.poses import inverse_pose
-from twin.nerf.compute import parallel
-from twin.nerf.dataset import Sightings, TrainingPixels, joined
-from twin.nerf.kernels import stereo as kernels
-from twin.progress import bar
-
-Array = NDArray[np.float64]
+from twin.nerf.buffers import parallel
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, joined
+from twin.nerf.kernels import patch_match as kernels
+from twin.runtime import bar
+from twin.types import Array
 
 _GRID = 160  # cells along a frame's longer side
 _SOURCES = 4
@@ -47,7 +46,7 @@ class Geometry:
     back_shift: Array
 
 
-def stereo_sightings(pixels: TrainingPixels, seed: int, where: str) -> tuple[Sightings, dict[str, Any]]:
+def stereo_depths(pixels: TrainingPixels, seed: int, where: str) -> tuple[DepthSupervision, dict[str, Any]]:
     """Sightings of every frame that has sources, and what there is to say of them.
 
     Args:
@@ -76,7 +75,7 @@ def stereo_sightings(pixels: TrainingPixels, seed: int, where: str) -> tuple[Sig
     cells: wp.array = wp.array(shapes, dtype=wp.vec2i, device=where)
     geometry = [_geometry(pixels, i, sources[i]) for i in range(n)]
     pairs = [_pairs(g, where) for g in geometry]
-    wp.load_module("twin.nerf.kernels.stereo", device=where)
+    wp.load_module("twin.nerf.kernels.patch_match", device=where)
 
     with bar("stereo", n, "frame") as progress:
 
@@ -106,7 +105,7 @@ def stereo_sightings(pixels: TrainingPixels, seed: int, where: str) -> tuple[Sig
 
         parallel(find, range(n), where)
 
-    def check(i: int) -> tuple[Sightings, int]:
+    def check(i: int) -> tuple[DepthSupervision, int]:
         shape = tuple(int(x) for x in shapes[i])
         if not len(sources[i]):
             return none, 0
@@ -130,7 +129,9 @@ def stereo_sightings(pixels: TrainingPixels, seed: int, where: str) -> tuple[Sig
         open_ = pixels.open[pixels.start[i] + pixel[:, 1].astype(int) * pixels.width[i] + pixel[:, 0].astype(int)]
         pixel, depth = pixel[open_], 1.0 / q[row[open_], column[open_]]
         distance = depth * np.linalg.norm(unproject(pixel, pixels.intrinsics[i]), axis=1)
-        return Sightings(np.full(len(pixel), i, np.int32), pixel, distance.astype(np.float32)), shape[0] * shape[1]
+        return DepthSupervision(np.full(len(pixel), i, np.int32), pixel, distance.astype(np.float32)), shape[0] * shape[
+            1
+        ]
 
     checked = parallel(check, range(n), where)
     found = joined([s for s, _ in checked])

@@ -1,6 +1,7 @@
 """The known-truth world's verbs.
 
     python -m twin.reality film --out DIR
+    python -m twin.reality compare DIR
     python -m twin.reality drive --policy FILE... --task straight|right_turn --out results.csv
     python -m twin.reality log --out drive.csv
     python -m twin.reality onboard --out robot.mp4
@@ -17,27 +18,30 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from twin import verb
+from twin import cli
+from twin.build import publish
 from twin.config import HELD_OUT, RANDOMISED
 from twin.errors import InputError
+from twin.evaluation.statistics import MIN_TRIALS
+from twin.evaluation.trials import cells_text, tally
 from twin.files import toml_string, write_text
-from twin.reality import drive, log, onboard
+from twin.loading import load_scene
 from twin.reality import place as places
-from twin.reality.drive import TASKS
-from twin.reality.film import CAMERA_HEIGHT, Plan, depths, shoot
-from twin.reality.lighting import LIGHTINGS
-from twin.reality.truth import HALF_WIDTH, Film, Truth
-from twin.reality.weather import WEATHER
-from twin.report.statistics import MIN_TRIALS
-from twin.report.trials import cells_text, tally
+from twin.reality import real_test, recordings
+from twin.reality.comparison import compare
+from twin.reality.filming import CAMERA_HEIGHT, FilmingPlan, depths, shoot
+from twin.reality.lighting import LIGHTINGS, WEATHER
+from twin.reality.real_test import TASKS
+from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
+from twin.scene import SceneDir
 
-TINY = Plan(
+TINY = FilmingPlan(
     lightings=("sun", "overcast"), start=24.0, length=12.0, speed=2.0, fps=4, width=320, height=180, samples=2, crf=18
 )
 """A few seconds around the start of the turn, for tests."""
 
 
-def film(plan: Plan, out: Path) -> Truth:
+def film(plan: FilmingPlan, out: Path) -> Truth:
     """Films every lighting of a plan into a scene folder, with its truth.
 
     Raises:
@@ -52,14 +56,14 @@ def film(plan: Plan, out: Path) -> Truth:
     films = {}
     for lighting in plan.lightings:
         times, poses = shoot(lighting, place, plan, out / "input" / f"{lighting}.mp4")
-        films[lighting] = Film(times, poses, *depths(lighting, place, plan, poses))
+        films[lighting] = TrueFilm(times, poses, *depths(lighting, place, plan, poses))
     truth = Truth(place.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (plan.width, plan.height), films)
     truth.save(out / "truth")
     write_text(out / "scene.toml", scene_toml(plan, out.resolve().name))
     return truth
 
 
-def scene_toml(plan: Plan, name: str) -> str:
+def scene_toml(plan: FilmingPlan, name: str) -> str:
     """The scene's description, as a user would write it."""
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     lines = ["# A drive through the known-truth world, filmed by python -m twin.reality film --out THIS_FOLDER"]
@@ -79,13 +83,15 @@ def scene_toml(plan: Plan, name: str) -> str:
 
 
 def main(given: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.verb`."""
-    parser = verb.Parser(prog="python -m twin.reality", description="The known-truth world.")
+    """Runs the verb; returns the exit status, see `twin.cli`."""
+    parser = cli.Parser(prog="python -m twin.reality", description="The known-truth world.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("film", help="film the world into a scene folder")
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
     command.add_argument("--lightings", nargs="+", choices=sorted(LIGHTINGS), help="default: sun overcast night")
     command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
+    command = commands.add_parser("compare", help="a build of a filmed world against its truth, into its report")
+    command.add_argument("scene", type=Path, help="scene folder, built")
     command = commands.add_parser("drive", help="the real test: drive a policy file in weather that was not filmed")
     command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
     command.add_argument("--task", choices=TASKS, required=True)
@@ -116,21 +122,26 @@ def main(given: list[str] | None = None) -> int:
     command = commands.add_parser("photo", help="a photo by that camera in the weather of a trial, for twin.relight")
     command.add_argument("--lighting", required=True, choices=WEATHER, metavar="NAME", help=among)
     command.add_argument("--out", type=Path, required=True, help="photo.png")
-    return verb.run(parser, _main, given)
+    return cli.run(parser, _main, given)
 
 
 def _main(options: argparse.Namespace) -> None:
     if options.command == "film":
-        plan = TINY if options.tiny else Plan()
+        plan = TINY if options.tiny else FilmingPlan()
         film(replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan, options.out)
+    elif options.command == "compare":
+        scene = SceneDir(options.scene)
+        figures = compare(scene)["figures"]
+        publish(scene, load_scene(options.scene).report())
+        print("\n".join(f"{name:<32} {value:.4g}" for name, value in figures.items() if value is not None))
     elif options.command == "log":
-        log.write(options.out, log.record(options.duration))
+        recordings.log_write(options.out, recordings.record(options.duration))
     elif options.command == "onboard":
-        onboard.write(options.out)
+        recordings.write(options.out)
     elif options.command == "photo":
-        onboard.photograph(options.lighting, options.out)
+        recordings.photograph(options.lighting, options.out)
     else:
-        trials = drive.run(
+        trials = real_test.run(
             options.policy,
             options.task,
             options.lightings,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
+from twin.types import Array32
 
 
 def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, finest: float = 1.0, gain: float = 0.7):
@@ -31,7 +31,7 @@ def blend(image: NDArray, colour: tuple[float, float, float], weight: NDArray) -
     image += w * (np.asarray(colour, np.float32) - image)
 
 
-def _colour(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Image:
+def _colour(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
     image = np.asarray(base, np.float32) * (1.0 + contrast * noise[..., None].astype(np.float32))
     if tint is not None:
         image = image * (1.0 + tint[..., None] * np.array([0.10, 0.02, -0.10], np.float32))
@@ -65,7 +65,7 @@ def _speckle(
         )
 
 
-def _grains(rng: np.random.Generator, image: Image, share: float, colours: NDArray) -> None:
+def _grains(rng: np.random.Generator, image: Array32, share: float, colours: NDArray) -> None:
     """Colours single texels, `share` of them: the stones of an asphalt, in place."""
     hit = rng.random(image.shape[:2]) < share
     shade = rng.uniform(0.75, 1.15, (int(hit.sum()), 1))
@@ -87,7 +87,7 @@ def _crack(
             _crack(rng, mask, point, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.2), length * 0.35, width * 0.7)
 
 
-def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Image:
+def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Array32:
     """Asphalt: rows across (row 0 at the left edge), columns along. Lengths [m], `pixel` [m].
 
     Chips, stains, wheel tracks, patches with tarred seams, cracks, manholes, a worn centre line and edge lines.
@@ -148,7 +148,7 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
     return np.clip(image, 0.02, 1.0)
 
 
-def _markings(rng: np.random.Generator, image: Image, lateral: NDArray, pixel: float) -> None:
+def _markings(rng: np.random.Generator, image: Array32, lateral: NDArray, pixel: float) -> None:
     rows, columns = image.shape[:2]
     along = (np.arange(columns) + 0.5)[None] * pixel
     worn = np.clip(0.75 + 0.35 * fbm(rng, (rows, columns), 40, 1.5), 0.0, 1.0)
@@ -166,7 +166,7 @@ def _markings(rng: np.random.Generator, image: Image, lateral: NDArray, pixel: f
         blend(image, (0.80, 0.80, 0.76), worn * mask)
 
 
-def _manhole(image: Image, centre: tuple[int, int], radius: int) -> None:
+def _manhole(image: Array32, centre: tuple[int, int], radius: int) -> None:
     cv2.circle(image, centre, radius + 3, (0.14, 0.14, 0.14), -1)
     cv2.circle(image, centre, radius, (0.36, 0.33, 0.30), -1)
     for k in range(-radius + 4, radius - 2, 6):
@@ -175,7 +175,7 @@ def _manhole(image: Image, centre: tuple[int, int], radius: int) -> None:
     cv2.circle(image, centre, radius - 2, (0.22, 0.2, 0.19), 2)
 
 
-def _gully(image: Image, column: int, left: bool, pixel: float) -> None:
+def _gully(image: Array32, column: int, left: bool, pixel: float) -> None:
     rows = image.shape[0]
     across, along = int(0.34 / pixel), int(0.55 / pixel)
     r0 = 2 if left else rows - 2 - across
@@ -184,7 +184,7 @@ def _gully(image: Image, column: int, left: bool, pixel: float) -> None:
         image[r0 + 3 : r0 + across - 3, column + k : column + k + 4] = (0.05, 0.05, 0.05)
 
 
-def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Image:
+def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
     """Turf from above: patches, worn earth, blades, stones, fallen leaves. `pixel` [m]."""
     image = _colour((0.29, 0.38, 0.15), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8), 0.17, fbm(rng, shape, 4.0 / pixel, 10))
     blend(image, (0.44, 0.36, 0.22), np.clip(fbm(rng, shape, 1.8 / pixel, 3.0) - 1.1, 0, 0.8))
@@ -199,7 +199,7 @@ def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Ima
     return np.clip(image, 0.02, 1.0)
 
 
-def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: tuple[float, float]) -> Image:
+def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: tuple[float, float]) -> Array32:
     """Concrete paving: each slab of its own tone, joints with moss, gum, stains. `slab` is (across, along) [m]."""
     rows, columns = shape
     r, c = np.arange(rows) * pixel / slab[0], np.arange(columns) * pixel / slab[1]
@@ -214,12 +214,12 @@ def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: 
     return np.clip(image, 0.02, 1.0).astype(np.float32)
 
 
-def kerb(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Image:
+def kerb(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
     """Kerb stones a metre long; rows across the profile, columns along."""
     return slabs(rng, shape, pixel, (10.0, 0.9)) * np.float32(0.95)
 
 
-def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]) -> Image:
+def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]) -> Array32:
     """Brickwork with single bricks off colour, weathering from top to bottom."""
     image = slabs(rng, shape, pixel, (0.12, 0.36))
     grey = image.mean(-1, keepdims=True) / 0.5
@@ -229,7 +229,9 @@ def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base:
     return np.clip(tint * (1.0 + 0.10 * stains[..., None] - 0.06 * streaks[..., None]), 0.02, 1.0).astype(np.float32)
 
 
-def plaster(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]) -> Image:
+def plaster(
+    rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]
+) -> Array32:
     """Rendered wall: blotches, drip streaks, cracks, a darker plinth."""
     image = _colour(base, fbm(rng, shape, 3.0 / pixel, 1.5), 0.06, 0.5 * fbm(rng, shape, 2.0 / pixel, 8))
     streaks = np.clip(fbm(rng, (1, shape[1]), 24, 2.0), 0, 3) * np.linspace(1.0, 0.1, shape[0])[:, None]
@@ -244,14 +246,14 @@ def plaster(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base
     return np.clip(image, 0.02, 1.0)
 
 
-def weathered(image: Image, pixel: float) -> Image:
+def weathered(image: Array32, pixel: float) -> Array32:
     """A wall that is darker towards its foot and under its eaves, where less of the sky reaches it."""
     up = (image.shape[0] - np.arange(image.shape[0]))[:, None, None] * pixel
     down = image.shape[0] * pixel - up
     return (image * (1.0 - 0.35 * np.exp(-up / 0.6) - 0.30 * np.exp(-down / 0.5))).astype(np.float32)
 
 
-def window(rng: np.random.Generator, lit: bool) -> Image:
+def window(rng: np.random.Generator, lit: bool) -> Array32:
     """One window, 96 × 72: frame, glazing bars, and sky, curtains or a lit room behind the glass."""
     image = np.zeros((96, 72, 3), np.float32)
     down = np.linspace(0, 1, 96)[:, None]
@@ -279,7 +281,7 @@ def window(rng: np.random.Generator, lit: bool) -> Image:
     return np.clip(image, 0.02, 1.0)
 
 
-def bark(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
+def bark(rng: np.random.Generator, shape: tuple[int, int]) -> Array32:
     """Bark: long vertical furrows, lichen."""
     grain = fbm(rng, (shape[0] // 4, shape[1]), 24, 1.0, 0.85)
     grain = cv2.resize(grain, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
@@ -288,14 +290,14 @@ def bark(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
     return np.clip(image, 0.03, 1.0)
 
 
-def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Image:
+def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
     """A field of leaf tones, from shade (left) to light (right), from which each leaf takes a window."""
     image = _colour(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
     image *= np.linspace(0.35, 1.35, shape[1], dtype=np.float32)[None, :, None]
     return np.clip(image, 0.03, 1.0)
 
 
-def wood(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
+def wood(rng: np.random.Generator, shape: tuple[int, int]) -> Array32:
     """Weathered planks, grain along the columns."""
     grain = cv2.resize(fbm(rng, (shape[0], shape[1] // 8), 12, 1.0), shape[::-1], interpolation=cv2.INTER_LINEAR)
     image = _colour((0.50, 0.37, 0.24), grain, 0.17)
@@ -304,7 +306,7 @@ def wood(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
     return np.clip(image, 0.03, 1.0)
 
 
-def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Image:
+def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
     """Painted or galvanised metal: scratches, rust, stickers."""
     image = _colour(base, fbm(rng, shape, 40, 1.5), 0.11)
     blend(image, (0.36, 0.2, 0.1), np.clip(fbm(rng, shape, 30, 1.5) - 1.5, 0, 0.8))
@@ -318,7 +320,7 @@ def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, f
     return np.clip(image, 0.03, 1.0)
 
 
-def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float, float, float], word: str) -> Image:
+def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float, float, float], word: str) -> Array32:
     """A sign or poster: border, a word, lines of small print, a picture."""
     rows, columns = shape
     image = np.empty((rows, columns, 3), np.uint8)
@@ -340,7 +342,7 @@ def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float
 
 def stripes(
     rng: np.random.Generator, shape: tuple[int, int], a: tuple[float, ...], b: tuple[float, ...], n: int
-) -> Image:
+) -> Array32:
     """Horizontal bands, dirty: cones and barriers."""
     band = (np.arange(shape[0]) * n // shape[0]) % 2
     image = np.where(band[:, None, None] == 0, np.asarray(a, np.float32), np.asarray(b, np.float32))
@@ -348,7 +350,7 @@ def stripes(
     return np.clip(image * (1.0 + 0.12 * fbm(rng, shape, 40, 1.5)[..., None]), 0.03, 1.0)
 
 
-def resized(image: Image, shape: tuple[int, int], smooth: bool = True) -> Image:
+def resized(image: Array32, shape: tuple[int, int], smooth: bool = True) -> Array32:
     """Scaled to (rows, columns), by cubic or linear interpolation."""
     how = cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR
     return cv2.resize(image, shape[::-1], interpolation=how).astype(np.float32)

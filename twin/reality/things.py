@@ -1,18 +1,16 @@
 """The vocabulary of the place: things, their collision shapes, the atlas of small textures, and the place itself.
 
 A *thing* has a kind: `ground` is driven or walked on, `obstacle` is solid, `foliage` lets light and wind through, and
-`detail` is too small to matter. Stations and laterals are those of `route.py`.
+`detail` is too small to matter. Stations and laterals are those of `centerline.py`.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twin.reality.route import Route, ground_height
-from twin.reality.shapes import Part
-
-Array = NDArray[np.float64]
+from twin.reality.centerline import RoadLine, ground_height
+from twin.reality.primitives import MeshPart
+from twin.types import Array
 
 SEED = 20  # of everything random in the place, its textures, its sky and its films
 ATLAS_SIDE = 8  # cells per side of the atlas
@@ -47,16 +45,16 @@ class Thing:
 
     name: str
     kind: str
-    part: Part
+    part: MeshPart
     texture: str = "atlas"
     solids: tuple[Solid, ...] = ()
 
 
 @dataclass
-class Place:
+class KnownPlace:
     """The whole place: its things, and the lamps' heads [m]."""
 
-    route: Route
+    route: RoadLine
     things: list[Thing] = field(default_factory=list)
     lamp_heads: list[Array] = field(default_factory=list)
 
@@ -75,7 +73,7 @@ def up(height: float) -> Array:
     return np.array([0.0, 0.0, height])
 
 
-def cell(name: str, part: Part) -> Part:
+def cell(name: str, part: MeshPart) -> MeshPart:
     """Maps a part's texture into its cell of the atlas."""
     row, column = divmod(CELLS.index(name), ATLAS_SIDE)
     low, inset = np.array([column, row]) / ATLAS_SIDE, 1.5 / (ATLAS_SIDE * ATLAS_CELL)

@@ -1,6 +1,6 @@
 """The truth about a filmed scene: poses, a few depth maps, and the geometry, regenerated from its parameters.
 
-Written by `python -m twin.reality film` into `<scene>/truth`; only `twin/report/truth.py` and the tests may read it.
+Written by `python -m twin.reality film` into `<scene>/truth`; only `twin/reality/comparison.py` and the tests may read it.
 """
 
 from dataclasses import asdict, dataclass
@@ -14,19 +14,18 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
 from twin.files import read_json, write_json
+from twin.reality import centerline as roads
 from twin.reality import place as places
-from twin.reality import route as roads
-from twin.reality import shapes
-from twin.reality.route import Route
-from twin.reality.things import SEED, Place
-
-Array = NDArray[np.float64]
+from twin.reality import primitives
+from twin.reality.centerline import RoadLine
+from twin.reality.things import SEED, KnownPlace
+from twin.types import Array
 
 HALF_WIDTH = 1.5  # [m] the corridor around the route that nothing reaches into
 
 
 @dataclass(frozen=True)
-class Film:
+class TrueFilm:
     """True cameras of one source."""
 
     times: Array
@@ -43,7 +42,7 @@ class Film:
 class Truth:
     """Everything known about one filmed scene."""
 
-    route: Route
+    route: RoadLine
     start: float
     """Station where the films start [m]."""
     length: float
@@ -54,7 +53,7 @@ class Truth:
     """fx, fy, cx, cy [px] of every film, shape (4,)."""
     size: tuple[int, int]
     """Width, height of every film [px]."""
-    films: dict[str, Film]
+    films: dict[str, TrueFilm]
     """By source name."""
 
     def save(self, folder: Path) -> None:
@@ -76,8 +75,8 @@ class Truth:
         head = read_json(folder / "truth.json")
         with np.load(folder / "truth.npz", allow_pickle=False) as data:
             keys = ("times", "camera_to_world", "depth_frames", "depth")
-            films = {name: Film(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]}
-            route = Route(**head["route"])
+            films = {name: TrueFilm(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]}
+            route = RoadLine(**head["route"])
             size = (int(head["size"][0]), int(head["size"][1]))
             truth = Truth(route, head["start"], head["length"], head["half_width"], data["intrinsics"], size, films)
         if not np.allclose(head["fingerprint"], fingerprint(truth.place), atol=1e-4):
@@ -87,7 +86,7 @@ class Truth:
         return truth
 
     @cached_property
-    def place(self) -> Place:
+    def place(self) -> KnownPlace:
         """The place itself, built anew."""
         return places.build(self.route)
 
@@ -104,7 +103,7 @@ class Truth:
         """The surface of everything solid that stands on the ground (and of leaves, if asked for)."""
         kinds = ("obstacle", "foliage") if foliage else ("obstacle",)
         parts = [thing.part for thing in self.place.things if thing.kind in kinds]
-        whole = shapes.join(parts)
+        whole = primitives.join(parts)
         return trimesh.Trimesh(whole.vertices, whole.faces, process=False)
 
     def poses(self, source: str, times: Array) -> Array:
@@ -118,7 +117,7 @@ class Truth:
         return out
 
 
-def fingerprint(place: Place) -> list[float]:
+def fingerprint(place: KnownPlace) -> list[float]:
     """What tells one version of the place from another: counts of things and vertices, and the vertices' moments."""
     vertices = np.concatenate([thing.part.vertices for thing in place.things])
     return [len(place.things), len(vertices), *vertices.mean(0).tolist(), *vertices.std(0).tolist()]

@@ -5,17 +5,15 @@ from typing import Any
 import cv2
 import numpy as np
 from matplotlib import colormaps
-from numpy.typing import NDArray
 
 from twin.env.trust import Trust
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
-from twin.nerf.rendering import Field
-from twin.report.panels import GROUND, INK, MUTED, Picture, draw_text
+from twin.nerf.rendering import RenderableField
+from twin.report.video_layout import GROUND, INK, MUTED, draw_text
 from twin.robot import CAMERA_SIZE
-
-Array = NDArray[np.float64]
+from twin.types import Array, Image
 
 _STEP = 1.5  # [m] along the route
 _BESIDE = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # half widths of the corridor beside it, left positive
@@ -26,7 +24,7 @@ _CELL = (18, 16)  # [px] width at least, height
 _EDGE, _LAST = 26, 40  # [px] above and below; right, for the last label
 
 
-def trust_along(field: Field, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
+def trust_along(field: RenderableField, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
     """Trust of what the front camera would see, looking along the route.
 
     Returns:
@@ -61,7 +59,7 @@ def trust_metrics(s: Array, beside: Array, trust: Array) -> dict[str, Any]:
     }
 
 
-def trust_picture(s: Array, beside: Array, trust: Array) -> Picture:
+def trust_picture(s: Array, beside: Array, trust: Array) -> Image:
     """A map: along the route to the right, left of the route above; bright is to be trusted."""
     wide, high = max(2, _CELL[0] * 40 // max(len(s), 1)), _CELL[1]
     cells = (colormaps["viridis"](trust[::-1])[..., :3] * 255 + 0.5).astype(np.uint8)

@@ -30,7 +30,7 @@ _SIDE = wp.constant(float(CELLS))
 
 
 @wp.struct
-class Place:
+class BrickPosition:
     """Where a grid position falls: a slot (< 0: none), the cell's lowest corner, and how far into the cell."""
 
     slot: wp.int32
@@ -46,8 +46,10 @@ def corner(x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
 
 
 @wp.func
-def place_of(g: wp.vec3f, near_index: wp.array3d(dtype=wp.int32), far_index: wp.array3d(dtype=wp.int32)) -> Place:
-    out = Place()
+def place_of(
+    g: wp.vec3f, near_index: wp.array3d(dtype=wp.int32), far_index: wp.array3d(dtype=wp.int32)
+) -> BrickPosition:
+    out = BrickPosition()
     b = in_near_box(g)
     p = wp.vec3f(0.0, 0.0, 0.0)
     if is_near(b):
@@ -72,7 +74,7 @@ def place_of(g: wp.vec3f, near_index: wp.array3d(dtype=wp.int32), far_index: wp.
 
 
 @wp.func
-def corner_weight(place: Place, n: wp.int32) -> wp.float32:
+def corner_weight(place: BrickPosition, n: wp.int32) -> wp.float32:
     """Weight of the n-th corner of a cell, n = 4·x + 2·y + z."""
     w = float(1.0)
     w *= wp.where((n & 4) > 0, place.x, 1.0 - place.x)

@@ -43,7 +43,7 @@ _LEAST_APPROACH = wp.constant(0.5)  # of the tiles' starts [cells]
 
 
 @wp.struct
-class Film:
+class ImageBuffers:
     """Where the rays of a picture begin and end."""
 
     rotation: wp.array(dtype=wp.mat33f)
@@ -89,7 +89,7 @@ def unit_ray(k: wp.vec4f, u: wp.float32, v: wp.float32) -> wp.vec3f:
 
 
 @wp.kernel(enable_backward=False)
-def approach(bricks: Bricks, film: Film, first: wp.int32, start: wp.array2d(dtype=wp.float32)):
+def approach(bricks: Bricks, film: ImageBuffers, first: wp.int32, start: wp.array2d(dtype=wp.float32)):
     """Starts of the tiles [first, first + dim) of every camera: distances from it [m] before which there is nothing.
 
     Rays of a tile lie within a chord α of its axis, so at distance t in a ball of radius α·t around the axis.
@@ -153,7 +153,7 @@ def march(lanes: int) -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
     def march_packets(
         bricks: Bricks,
-        film: Film,
+        film: ImageBuffers,
         first: wp.int32,
         start: wp.array2d(dtype=wp.float32),
         features: wp.array3d(dtype=wp.float32),

@@ -1,0 +1,374 @@
+"""Features and matches of a capture in COLMAP's database.
+
+One database camera per source (posed input may bring one per image). A *known* camera is a given calibration, held
+fixed for good; a *prior* one has a focal length to start from; an *unknown* one has neither. A pair is *verified* when
+enough of its matches obey one two-view geometry.
+"""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.capture.camera_models import Lens
+from twin.capture.capture_data import Capture, SourceInfo
+from twin.capture.pycolmap_import import pycolmap
+from twin.capture.worker import tell
+from twin.errors import InputError
+from twin.geometry.images import write_image
+from twin.types import Array
+
+# ---- Which frames are worth matching.
+#
+# A *pair* is (i, j) with i < j, indices into the capture's frames. Frames of one source are ordered by time. Pairs come
+# from four places: *sequence* (neighbours in time), *probes* (a few far frames that look alike, or lie equally far along
+# two sources), *expansion* (what lies around a probe that held), and *nearness* (cameras found close to each other).
+
+
+Pair = tuple[int, int]
+
+SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+"""Steps in time that are matched within a source: dense nearby, and long ones that keep a drive from bending."""
+_WORDS = 32
+_SAMPLES_PER_FRAME = 150
+_PROBES_PER_SOURCE = 20
+_CROSS_OFFSETS = (-2, -1, 0, 1, 2)
+_BLIND_OFFSETS = (-3, -2, -1, 0, 1, 2, 3)
+
+
+def ordered(i: int, j: int) -> Pair:
+    return (i, j) if i < j else (j, i)
+
+
+def members(source_index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Frame indices of each source, in time order."""
+    return [np.flatnonzero(source_index == s) for s in range(int(source_index.max()) + 1)]
+
+
+def sequence_pairs(source_index: NDArray[np.int64]) -> set[Pair]:
+    """Neighbours in time within each source."""
+    pairs: set[Pair] = set()
+    for frames in members(source_index):
+        for step in SEQUENCE_STEPS:
+            pairs.update(zip(frames[:-step].tolist(), frames[step:].tolist(), strict=True))
+    return pairs
+
+
+def frame_signatures(
+    descriptors: list[NDArray[np.uint8]], source_index: NDArray[np.int64], rng: np.random.Generator
+) -> Array:
+    """One unit vector per frame that is alike where frames look alike: VLAD (Jégou et al. 2010, eq. 1).
+
+    The mean signature of each source is taken out, since it holds the lighting rather than the place.
+
+    Args:
+        descriptors: SIFT descriptors per frame, shapes (m_i, 128); m_i may be 0.
+        source_index: Source of each frame, shape (n,).
+        rng: Draws the sample that the visual words are learned from.
+
+    Returns:
+        Shape (n, 32 · 128); a frame without features has a zero row.
+    """
+    sample = np.concatenate(
+        [d[rng.permutation(len(d))[:_SAMPLES_PER_FRAME]] for d in descriptors], dtype=np.float32
+    ).reshape(-1, 128)
+    n = len(descriptors)
+    if len(sample) < _WORDS:
+        return np.zeros((n, _WORDS * 128))
+    words = sample[rng.permutation(len(sample))[:_WORDS]]
+    for _ in range(8):  # Lloyd's iterations; a few are plenty for retrieval
+        nearest = _nearest(sample, words)
+        for k in range(_WORDS):
+            if np.any(nearest == k):
+                words[k] = sample[nearest == k].mean(0)
+    signatures = np.zeros((n, _WORDS, 128))
+    for i, d in enumerate(descriptors):
+        if not len(d):
+            continue
+        features = d.astype(np.float32)
+        nearest = _nearest(features, words)
+        np.add.at(signatures[i], nearest, features - words[nearest])
+        signatures[i] /= np.maximum(np.linalg.norm(signatures[i], axis=1, keepdims=True), 1e-9)
+    flat = signatures.reshape(n, -1)
+    for frames in members(source_index):
+        flat[frames] -= flat[frames].mean(0)
+    return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+
+
+def _nearest(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+    return np.argmax(features @ words.T - 0.5 * (words**2).sum(1), axis=1)
+
+
+def probe_pairs(source_index: NDArray[np.int64], signatures: Array) -> set[Pair]:
+    """A few guesses at which far frames show the same place: across sources, and where one source comes back.
+
+    Across sources each probed frame is tried against the frame equally far along the other source and its three most
+    alike; within a source against its two most alike that the sequence does not reach.
+    """
+    similarity = signatures @ signatures.T
+    groups = members(source_index)
+    pairs: set[Pair] = set()
+    for a, first in enumerate(groups):
+        probed = np.unique(np.linspace(0, len(first) - 1, min(_PROBES_PER_SOURCE, len(first))).round().astype(int))
+        for k in probed:
+            i = int(first[k])
+            far = first[np.abs(np.arange(len(first)) - k) > SEQUENCE_STEPS[-1]]
+            pairs.update(ordered(i, int(j)) for j in far[np.argsort(-similarity[i, far])[:2]])
+            for second in groups[a + 1 :]:
+                guess = round(k * (len(second) - 1) / max(len(first) - 1, 1))
+                pairs.add(ordered(i, int(second[guess])))
+                pairs.update(ordered(i, int(j)) for j in second[np.argsort(-similarity[i, second])[:3]])
+    return pairs
+
+
+def expanded_pairs(
+    source_index: NDArray[np.int64], probes: set[Pair], inliers: dict[Pair, int], min_inliers: int
+) -> set[Pair]:
+    """What the probes that held suggest.
+
+    Across two sources the best match of each probed frame is an anchor; between anchors the position along the other
+    source is interpolated, so that films driven at different speeds are tied frame by frame. Without two anchors the
+    sources are tied by equal share of their length. Within a source a held probe ties its surroundings.
+
+    Args:
+        source_index: Source of each frame, shape (n,).
+        probes: The probed pairs.
+        inliers: Verified matches per pair.
+        min_inliers: From this many on a probe holds.
+    """
+    groups = members(source_index)
+    position = np.concatenate([np.arange(len(frames)) for frames in groups])
+    held = {pair: inliers.get(pair, 0) for pair in probes if inliers.get(pair, 0) >= min_inliers}
+    pairs: set[Pair] = set()
+    for a, first in enumerate(groups):
+        for i, j in held:
+            if source_index[i] == source_index[j] == a:
+                for di in _CROSS_OFFSETS:
+                    for dj in _CROSS_OFFSETS:
+                        p, q = position[i] + di, position[j] + dj
+                        if 0 <= p < len(first) and 0 <= q < len(first) and p != q:
+                            pairs.add(ordered(int(first[p]), int(first[q])))
+        for b in range(a + 1, len(groups)):
+            second = groups[b]
+            best: dict[int, tuple[int, int]] = {}
+            for (i, j), count in held.items():
+                if source_index[i] == a and source_index[j] == b:
+                    best[int(position[i])] = max(best.get(int(position[i]), (0, 0)), (count, int(position[j])))
+            if len(best) >= 2:
+                known = sorted(best)
+                where = np.interp(np.arange(len(first)), known, [best[p][1] for p in known])
+                # Past the outermost anchors np.interp stands still; there both films go on at their own pace.
+                pace = (len(second) - 1) / max(len(first) - 1, 1)
+                k = np.arange(len(first))
+                where += pace * (np.minimum(k - known[0], 0) + np.maximum(k - known[-1], 0))
+                offsets: tuple[int, ...] = _CROSS_OFFSETS
+            else:
+                where = np.arange(len(first)) * (len(second) - 1) / max(len(first) - 1, 1)
+                offsets = _BLIND_OFFSETS
+            for i, centre in zip(first.tolist(), np.rint(where).astype(int), strict=True):
+                pairs.update(ordered(i, int(second[centre + d])) for d in offsets if 0 <= centre + d < len(second))
+    return pairs
+
+
+def near_pairs(
+    camera_to_world: Array, frames: NDArray[np.int64], tried: set[Pair], reach: float, most: int
+) -> set[Pair]:
+    """Pairs of cameras close to each other that look the same way (within 60°) where nothing around ties them yet.
+
+    Args:
+        camera_to_world: Poses, shape (k, 4, 4).
+        frames: Frame index of each pose, shape (k,).
+        tried: Pairs matched already; a pair counts as tied if it, or one two frames off at either end, was tried.
+        reach: Largest distance of two cameras, in the unit of the poses.
+        most: Pairs per camera at most, nearest first.
+    """
+    centres, forward = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
+    tied = {
+        ordered(i + di, j + dj) for i, j in tried for di in _CROSS_OFFSETS for dj in _CROSS_OFFSETS if i + di != j + dj
+    }
+    pairs: set[Pair] = set()
+    for k in range(len(frames)):
+        distance = np.linalg.norm(centres - centres[k], axis=1)
+        usable = (distance <= reach) & (forward @ forward[k] > 0.5)
+        usable[k] = False
+        fresh = 0
+        for other in np.argsort(distance):
+            pair = ordered(int(frames[k]), int(frames[other]))
+            if not usable[other] or pair in tied:
+                continue
+            pairs.add(pair)
+            fresh += 1
+            if fresh == most:
+                break
+    return pairs
+
+
+_CHUNK_FRAMES = 16
+_CHUNK_PAIRS = 100
+_MIN_FEATURES = 50
+_UNKNOWN_MODEL = "SIMPLE_RADIAL"
+_UNKNOWN_FOCAL = 1.2  # [longer side], COLMAP's own guess
+
+
+@dataclass
+class Matcher:
+    """The database of one capture, and which pairs were tried in it."""
+
+    database: Path
+    images: Path
+    masks: Path | None
+    capture: Capture
+    image_ids: NDArray[np.int64]
+    """Database id of each frame, shape (n,)."""
+    threads: int
+    seed: int
+    tried: set[Pair]
+
+    def frame_of(self) -> dict[int, int]:
+        """Database id → frame index."""
+        return {int(image): frame for frame, image in enumerate(self.image_ids)}
+
+    def extract(self, most: int, max_size: int) -> None:
+        """Finds SIFT features in every frame, masked parts left out.
+
+        Raises:
+            InputError: a source has frames without texture.
+        """
+        options = pycolmap.FeatureExtractionOptions()
+        options.num_threads, options.max_image_size, options.use_gpu = self.threads, max_size, False
+        options.sift.max_num_features = most
+        reader = pycolmap.ImageReaderOptions()
+        if self.masks:
+            reader.mask_path = str(self.masks)
+        names = [f"{name}.png" for name in self.capture.names]
+        tell(bar="features", total=len(names))
+        for start in range(0, len(names), _CHUNK_FRAMES):
+            chunk = names[start : start + _CHUNK_FRAMES]
+            pycolmap.extract_features(
+                self.database, self.images, chunk, pycolmap.CameraMode.PER_IMAGE, reader, options, pycolmap.Device.cpu
+            )
+            tell(step=len(chunk))
+        with pycolmap.Database.open(self.database) as database:
+            counts = np.array([database.num_keypoints_for_image(int(i)) for i in self.image_ids])
+        for s, source in enumerate(self.capture.sources):
+            median = float(np.median(counts[self.capture.source_index == s]))
+            if median < _MIN_FEATURES:
+                raise InputError(
+                    f"source {source.name!r}: {median:.0f} features per frame in the median (need {_MIN_FEATURES}); "
+                    "film with more texture and light in view, in focus, or mask less"
+                )
+
+    def descriptors(self) -> list[NDArray[np.uint8]]:
+        """SIFT descriptors per frame, shapes (m, 128)."""
+        with pycolmap.Database.open(self.database) as database:
+            return [np.asarray(database.read_descriptors(int(i)).data).reshape(-1, 128) for i in self.image_ids]
+
+    def match(self, pairs: set[Pair], what: str) -> None:
+        """Matches and verifies the pairs that were not tried before."""
+        fresh = sorted(pairs - self.tried)
+        self.tried.update(fresh)
+        options = pycolmap.FeatureMatchingOptions()
+        options.num_threads, options.use_gpu = self.threads, False
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = self.seed
+        pairing = pycolmap.ImportedPairingOptions()
+        listing = self.database.with_name("pairs.txt")
+        pairing.match_list_path = str(listing)
+        tell(bar=what, total=len(fresh))
+        for start in range(0, len(fresh), _CHUNK_PAIRS):
+            chunk = fresh[start : start + _CHUNK_PAIRS]
+            names = self.capture.names
+            listing.write_text("".join(f"{names[i]}.png {names[j]}.png\n" for i, j in chunk), encoding="utf-8")
+            pycolmap.match_image_pairs(self.database, options, pairing, verification, pycolmap.Device.cpu)
+            tell(step=len(chunk))
+
+    def verified(self) -> dict[Pair, int]:
+        """Verified matches per pair of frames, where there are any."""
+        frame_of = self.frame_of()
+        with pycolmap.Database.open(self.database) as database:
+            pair_ids, counts = database.read_two_view_geometry_num_inliers()
+        pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
+        return {ordered(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
+
+
+def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, threads: int, seed: int) -> Matcher:
+    """A fresh database with the capture's frames and cameras.
+
+    Args:
+        capture: The kept frames.
+        stage: The capture stage's folder.
+        work: Where the database is made.
+        free_focal: Forget every calibration and focal prior.
+        threads: For COLMAP.
+        seed: For COLMAP's RANSAC.
+    """
+    path, images = work / "database.db", stage / "images"
+    path.unlink(missing_ok=True)
+    pycolmap.Database.open(path).close()
+    image_ids = np.zeros(len(capture.names), np.int64)
+    for s, source in enumerate(capture.sources):
+        frames = np.flatnonzero(capture.source_index == s)
+        posed = capture.camera_to_world is not None and capture.intrinsics is not None
+        one_each = posed and bool(np.ptp(capture.intrinsics[frames], axis=0).max() > 1e-9)  # type: ignore[index]
+        mode = pycolmap.CameraMode.PER_IMAGE if one_each else pycolmap.CameraMode.SINGLE
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "PINHOLE"
+        # Imported before features are found, so that ids follow the frames' order and not the threads' luck.
+        pycolmap.import_images(path, images, mode, [f"{capture.names[i]}.png" for i in frames], reader)
+        with pycolmap.Database.open(path) as database:
+            done = set()
+            for i in frames:
+                image = database.read_image_with_name(f"{capture.names[i]}.png")
+                if image is None:
+                    raise InputError(f"{images / capture.names[i]}.png: not a readable image; build again from scratch")
+                image_ids[i] = image.image_id
+                if image.camera_id not in done:
+                    done.add(image.camera_id)
+                    intrinsics = capture.intrinsics[i] if capture.intrinsics is not None and posed else None
+                    database.update_camera(_camera(source, image.camera_id, free_focal and not posed, intrinsics))
+    return Matcher(path, images, _mask_folder(capture, stage, work), capture, image_ids, threads, seed, set())
+
+
+def _camera(source: SourceInfo, camera_id: int, forget: bool, intrinsics: NDArray | None) -> pycolmap.Camera:
+    model, params = source.camera_model, source.camera_params
+    if intrinsics is not None:
+        lens = Lens(model, params, source.width, source.height) if params else None
+        if lens is None:
+            model, params = "PINHOLE", tuple(float(v) for v in intrinsics)
+        else:
+            params = lens.with_intrinsics(np.asarray(intrinsics)).params
+        forget = False
+    if not params or forget:
+        guess = _UNKNOWN_FOCAL * max(source.width, source.height)
+        camera = pycolmap.Camera.create_from_model_name(
+            camera_id, model or _UNKNOWN_MODEL, guess, source.width, source.height
+        )
+        camera.has_prior_focal_length = False
+        return camera
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=model,
+        width=source.width,
+        height=source.height,
+        params=list(params),
+        has_prior_focal_length=True,
+    )
+
+
+def _mask_folder(capture: Capture, stage: Path, work: Path) -> Path | None:
+    """The masks under the names COLMAP looks for: `a.png` has the mask `a.png.png`. None where nothing is masked."""
+    masked = {name for name in capture.names if (stage / "masks" / f"{name}.png").exists()}
+    if not masked:
+        return None
+    folder = work / "masks"
+    for name, s in zip(capture.names, capture.source_index, strict=True):
+        target = folder / f"{name}.png.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name in masked:
+            shutil.copyfile(stage / "masks" / f"{name}.png", target)
+        else:  # COLMAP finds nothing in an image whose mask is missing
+            source = capture.sources[int(s)]
+            write_image(target, np.full((source.height, source.width), 255, np.uint8))
+    return folder

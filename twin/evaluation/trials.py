@@ -1,0 +1,270 @@
+"""Tables of trials: what `twin.validate` writes, what the user brings from the road, and where they meet.
+
+A *trial* is one drive of one policy, on a task, under a lighting; it succeeds or not. A *cell* is the trials of one
+policy, task and lighting. In the twin every trial is a row of `validation/episodes.csv`; from the road come cells,
+`results.csv`:
+
+    policy,lighting,trials,successes            further columns, if wanted: task, twin_lighting
+
+`task` is needed only where a policy was validated on several. `twin_lighting` names the lighting of the twin that the
+cell is compared with, for light that the twin does not know by name: `dusk_on_monday` compared with
+`held-out+randomised`.
+"""
+
+import csv
+import difflib
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from twin.env.options import CAUSES
+from twin.errors import InputError
+from twin.evaluation.statistics import wilson
+from twin.files import read_text
+
+EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
+"""Of `validation/episodes.csv`. `trust` is the mean of the trial's pictures, empty without pictures."""
+CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
+"""Of `validation/cells.csv`: episodes summed up, with Wilson's interval."""
+RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
+"""That `results.csv` must have."""
+OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting")
+RECENT = 20
+"""Whole episodes that a success rate in training is taken over; a training on a CPU has some 40."""
+
+_MOST_COUNT, _MOST_SEED = 10**6, 2**63 - 1  # of trials and steps in a cell; of a seed
+_VALIDATE = "python -m twin.validate"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One drive in the twin."""
+
+    policy: str
+    task: str
+    lighting: str
+    seed: int
+    cause: str
+    """One of `twin.env.options.CAUSES`; only `goal` is a success."""
+    progress: float
+    """Way along the task's stretch [m]."""
+    steps: int
+    """Of control."""
+    trust: float | None = None
+    """Mean over the pictures, in [0, 1]; None without pictures."""
+
+    @property
+    def success(self) -> bool:
+        return self.cause == "goal"
+
+    def row(self) -> tuple[str, ...]:
+        """As in `EPISODE_COLUMNS`."""
+        trust = "" if self.trust is None else f"{self.trust:.4f}"
+        head = (self.policy, self.task, self.lighting, str(self.seed), str(int(self.success)), self.cause)
+        return (*head, f"{self.progress:.3f}", str(self.steps), trust)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Trials of one policy on one task under one lighting."""
+
+    policy: str
+    task: str
+    lighting: str
+    trials: int
+    successes: int
+    twin_lighting: str = ""
+    """Of a real cell: the lighting of the twin that it is compared with. Empty for a cell of the twin."""
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.policy, self.task, self.lighting
+
+    @property
+    def twin_key(self) -> tuple[str, str, str]:
+        """The twin's cell that a real cell is compared with."""
+        return self.policy, self.task, self.twin_lighting or self.lighting
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.trials
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table as CSV, with its header."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([columns, *rows])
+    return out.getvalue()
+
+
+def tally(trials: Iterable[Trial]) -> list[Cell]:
+    """Trials summed up by cell, in the order in which the cells first occur."""
+    counts: dict[tuple[str, str, str], list[int]] = {}
+    for trial in trials:
+        count = counts.setdefault((trial.policy, trial.task, trial.lighting), [0, 0])
+        count[0] += 1
+        count[1] += trial.success
+    return [Cell(*key, trials=n, successes=k) for key, (n, k) in counts.items()]
+
+
+def cells_text(cells: Iterable[Cell]) -> str:
+    """`validation/cells.csv`."""
+    rows = []
+    for c in cells:
+        low, high = wilson(c.successes, c.trials)
+        numbers = (str(c.trials), str(c.successes), f"{c.rate:.4f}", f"{low:.4f}", f"{high:.4f}")
+        rows.append((c.policy, c.task, c.lighting, *numbers))
+    return csv_text(CELL_COLUMNS, rows)
+
+
+def read_trials(path: Path) -> list[Trial]:
+    """The rows of `validation/episodes.csv`.
+
+    Raises:
+        InputError: no such file, or a row that `twin.validate` would not write; names its line.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist; drive the policies in the twin first: {_VALIDATE} SCENE --policy RUN")
+    trials, seen = [], set()
+    for where, row in _rows(path, EPISODE_COLUMNS, ()):
+        if row["cause"] not in CAUSES:
+            raise InputError(f"{where}: cause = {row['cause']!r}; expected one of {', '.join(CAUSES)}")
+        if row["success"] != str(int(row["cause"] == "goal")):
+            raise InputError(
+                f"{where}: success = {row['success']!r} with cause {row['cause']!r}; expected 1 where the cause is "
+                f"goal, else 0; run {_VALIDATE} anew"
+            )
+        trust = _real(where, row, "trust") if row["trust"] else None
+        numbers = _whole(where, row, "seed"), row["cause"], _real(where, row, "progress_m"), _whole(where, row, "steps")
+        trial = Trial(row["policy"], row["task"], row["lighting"], *numbers, trust)
+        key = (trial.policy, trial.task, trial.lighting, trial.seed)
+        if key in seen:
+            raise InputError(f"{where}: seed {trial.seed} of this policy, task and lighting is there twice; delete one")
+        seen.add(key)
+        trials.append(trial)
+    return trials
+
+
+def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
+    """The user's real trials, each cell with the twin's cell that it is compared with.
+
+    Args:
+        path: `results.csv`.
+        twin: Cells of the twin.
+
+    Raises:
+        InputError: no such file, wrong header, unknown names, impossible or duplicated counts; names the line.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
+    cells: dict[tuple[str, str, str], Cell] = {}
+    known = {cell.key for cell in twin}
+    for where, row in _rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS):
+        policy, task = _policy_and_task(where, row, twin)
+        trials, successes = _whole(where, row, "trials"), _whole(where, row, "successes")
+        if trials == 0:
+            raise InputError(f"{where}: trials = 0; expected at least 1; delete the line until there are trials")
+        if successes > trials:
+            raise InputError(f"{where}: successes = {successes} of {trials} trials; expected at most {trials}")
+        cell = Cell(policy, task, row["lighting"], trials, successes, row.get("twin_lighting") or row["lighting"])
+        if cell.twin_key not in known:
+            raise InputError(f"{where}: {_unknown_lighting(cell, known)}")
+        if cell.key in cells:
+            raise InputError(
+                f"{where}: policy {policy!r}, lighting {cell.lighting!r}, task {task!r} is there twice; "
+                "add the two lines up"
+            )
+        cells[cell.key] = cell
+    return list(cells.values())
+
+
+def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> tuple[str, str]:
+    policies = list(dict.fromkeys(cell.policy for cell in twin))
+    if row["policy"] not in policies:
+        raise InputError(f"{where}: policy {row['policy']!r} was not validated; {nearest(row['policy'], policies)}")
+    tasks = list(dict.fromkeys(cell.task for cell in twin if cell.policy == row["policy"]))
+    task = row.get("task", "")
+    if not task and len(tasks) > 1:
+        raise InputError(
+            f"{where}: policy {row['policy']!r} was validated on {' and '.join(tasks)}; say which in a column task"
+        )
+    if task and task not in tasks:
+        raise InputError(
+            f"{where}: policy {row['policy']!r} was not validated on task {task!r}; {nearest(task, tasks)}"
+        )
+    return row["policy"], task or tasks[0]
+
+
+def _unknown_lighting(cell: Cell, known: set[tuple[str, str, str]]) -> str:
+    name = cell.twin_key[2]
+    here = sorted(lighting for policy, task, lighting in known if (policy, task) == (cell.policy, cell.task))
+    if any(name == lighting for _, _, lighting in known):
+        return f"policy {cell.policy!r} was not validated under {name!r}; run {_VALIDATE} with --lightings {name}"
+    return (
+        f"lighting {name!r} is not in the twin; {nearest(name, here)}; for light the twin does not know, "
+        "name the one to compare with in a column twin_lighting"
+    )
+
+
+def nearest(name: str, valid: Sequence[str]) -> str:
+    """ "did you mean ...?", or which names there are."""
+    near = difflib.get_close_matches(name, valid, n=1)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"expected one of {', '.join(valid[:8])}{', ...' if len(valid) > 8 else ''}"
+
+
+def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
+    """Where each row stands, and its fields by column name."""
+    text = read_text(path)
+    reader = csv.reader(io.StringIO(text))
+    wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        if not header:
+            raise InputError(f"{path} is empty; its first line must be {wanted}")
+        missing = [name for name in needed if name not in header]
+        strange = [name for name in header if name not in (*needed, *optional)]
+        if missing or strange or len(set(header)) != len(header):
+            what = (
+                f"no column {missing[0]}" if missing else f"{(strange or ['a column'])[0]!r} is unknown or there twice"
+            )
+            raise InputError(f"{path}: header {','.join(header)!r}: {what}; expected {wanted}")
+        count = 0
+        for fields in reader:
+            if not any(field.strip() for field in fields):
+                continue
+            count += 1
+            where = f"{path} line {reader.line_num}"
+            if len(fields) != len(header):
+                raise InputError(f"{where}: {len(fields)} fields; expected {len(header)}, as in the header")
+            row = {name: field.strip() for name, field in zip(header, fields, strict=True)}
+            for name in ("policy", "lighting"):
+                if not row[name]:
+                    raise InputError(f"{where}: no {name}; expected a name")
+            yield where, row
+    except csv.Error as error:
+        raise InputError(f"{path} line {reader.line_num}: {error}; expected comma-separated text") from None
+    if not count:
+        raise InputError(f"{path} has a header and no rows; add one line per policy and lighting")
+
+
+def _whole(where: str, row: dict[str, str], name: str) -> int:
+    text = row[name]
+    most = _MOST_SEED if name == "seed" else _MOST_COUNT
+    if not (text.isascii() and text.isdecimal()):
+        raise InputError(f"{where}: {name} = {text!r}; expected a whole number, 0 or more")
+    if len(text) > len(str(most)) or int(text) > most:
+        raise InputError(f"{where}: {name} = {text!r}; expected at most {most:,}")
+    return int(text)
+
+
+def _real(where: str, row: dict[str, str], name: str) -> float:
+    try:
+        value = float(row[name])
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise InputError(f"{where}: {name} = {row[name]!r}; expected a number")
+    return value

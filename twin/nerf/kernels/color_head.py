@@ -1,0 +1,222 @@
+"""Shading: what was composited along a ray becomes its colour, by the head and backdrop of `network.py`.
+
+The appearance is in the first layer's *bias*, one per camera, so that every camera of a launch may have a lighting of
+its own.
+"""
+
+# Warp reads annotations as values.
+# mypy: ignore-errors
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from twin.nerf.kernels.composite import CHANNELS
+from twin.nerf.kernels.march import ImageBuffers
+from twin.nerf.kernels.vectorised import OPTIONS, exponential
+from twin.nerf.rendering import FAR
+
+HARMONICS = 16
+FEATURES = CHANNELS - 1
+LANES = {"cpu": 16, "cuda": 1}
+"""Pixels a thread; see `march.py`."""
+
+wp.set_module_options(OPTIONS)
+
+Eight = wp.types.vector(length=8, dtype=wp.float32)
+"""Weights of eight hidden units."""
+
+_HARMONICS = wp.constant(HARMONICS)
+_FEATURES = wp.constant(FEATURES)
+_INPUTS = wp.constant(FEATURES + HARMONICS)
+_FAR = wp.constant(FAR)
+
+
+@wp.func
+def sigmoid(x: wp.float32) -> wp.float32:
+    return 1.0 / (1.0 + exponential(-x))
+
+
+@cache
+def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
+    """The kernel for `lanes` neighbouring pixels a thread and so many hidden units, and the struct of the weights.
+
+    Launched over cameras and runs of pixels, from `first` up to `last`. Where the march was to stop somewhere there is
+    no backdrop, and features are scaled up to a full share: the colour is that of what was met.
+    """
+    Floats = wp.types.vector(length=lanes, dtype=wp.float32)
+    Inputs = wp.types.matrix(shape=(FEATURES + HARMONICS, lanes), dtype=wp.float32)
+    Hidden = wp.types.matrix(shape=(hidden, lanes), dtype=wp.float32)
+    Behind = wp.types.matrix(shape=(backdrop_hidden, lanes), dtype=wp.float32)
+    count = wp.constant(lanes)
+    units = wp.constant(hidden)
+    behind_units = wp.constant(backdrop_hidden)
+
+    @wp.func
+    def harmonics_of(film: ImageBuffers, camera: wp.int32, first: wp.int32, x: Inputs) -> Inputs:
+        """`network.spherical_harmonics` of the rays' directions, below the features."""
+        k = film.intrinsics[camera]
+        rotation = film.rotation[camera]
+        for j in range(count):
+            pixel = first + j
+            u = (float(pixel % film.width) + 0.5 - k[2]) / k[0]
+            v = (float(pixel // film.width) + 0.5 - k[3]) / k[1]
+            d = rotation * wp.normalize(wp.vec3f(u, v, 1.0))
+            xx = d[0] * d[0]
+            yy = d[1] * d[1]
+            zz = d[2] * d[2]
+            x[15, j] = 1.0
+            x[16, j] = d[0]
+            x[17, j] = d[1]
+            x[18, j] = d[2]
+            x[19, j] = d[0] * d[1]
+            x[20, j] = d[1] * d[2]
+            x[21, j] = 3.0 * zz - 1.0
+            x[22, j] = d[0] * d[2]
+            x[23, j] = xx - yy
+            x[24, j] = d[1] * (3.0 * xx - yy)
+            x[25, j] = d[0] * d[1] * d[2]
+            x[26, j] = d[1] * (5.0 * zz - 1.0)
+            x[27, j] = d[2] * (5.0 * zz - 3.0)
+            x[28, j] = d[0] * (5.0 * zz - 1.0)
+            x[29, j] = d[2] * (xx - yy)
+            x[30, j] = d[0] * (xx - 3.0 * yy)
+        return x
+
+    @wp.struct
+    class Weights:
+        """Matrices. Those of the head by eight hidden units, then by what else they connect; others flat, by input and
+        then output."""
+
+        head_0: wp.array(dtype=Eight)
+        head_1: wp.array(dtype=Eight)
+        head_1_bias: wp.array(dtype=Eight)
+        head_2: wp.array(dtype=Eight)
+        head_2_bias: wp.vec3f
+        backdrop_0: wp.array(dtype=wp.float32)
+        backdrop_0_bias: wp.array(dtype=wp.float32)
+        backdrop_1: wp.array(dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
+    def shade_rays(
+        weights: Weights,
+        bias: wp.array2d(dtype=Eight),
+        film: ImageBuffers,
+        first: wp.int32,
+        last: wp.int32,
+        features: wp.array3d(dtype=wp.float32),
+        depth: wp.array2d(dtype=wp.float32),
+        rgb: wp.array2d(dtype=wp.vec3f),
+        opacity: wp.array2d(dtype=wp.float32),
+    ):
+        camera, run = wp.tid()
+        start = first + run * count
+        share = Floats()
+        least = float(1.0)
+        for j in range(count):
+            share[j] = features[camera, 0, wp.min(start + j, last - 1)]
+            least = wp.min(least, share[j])
+        x = Inputs()
+        for n in range(_FEATURES):
+            for j in range(count):
+                x[n, j] = features[camera, n + 1, wp.min(start + j, last - 1)]
+        x = harmonics_of(film, camera, start, x)
+        if film.stop.shape[0] > 0:
+            for n in range(_FEATURES):
+                for j in range(count):
+                    x[n, j] = x[n, j] / wp.max(share[j], 1.0e-3)
+        elif least < 0.999:
+            g = Behind()
+            for n in range(behind_units):
+                a = Floats(weights.backdrop_0_bias[n])
+                for i in range(_HARMONICS):
+                    a += x[_FEATURES + i] * weights.backdrop_0[i * behind_units + n]
+                for j in range(count):
+                    a[j] = wp.max(a[j], 0.0) * (1.0 - share[j])
+                g[n] = a
+            for i in range(_FEATURES):
+                a = x[i]
+                for n in range(behind_units):
+                    a += g[n] * weights.backdrop_1[n * _FEATURES + i]
+                x[i] = a
+        # Eight outputs at a time: an input is read once for them all, and so many sums keep the processor's units busy.
+        h = Hidden()
+        for q in range(units // 8):
+            w = bias[camera, q]
+            s0 = Floats(w[0])
+            s1 = Floats(w[1])
+            s2 = Floats(w[2])
+            s3 = Floats(w[3])
+            s4 = Floats(w[4])
+            s5 = Floats(w[5])
+            s6 = Floats(w[6])
+            s7 = Floats(w[7])
+            for i in range(_INPUTS):
+                row = x[i]
+                w = weights.head_0[q * _INPUTS + i]
+                s0 += row * w[0]
+                s1 += row * w[1]
+                s2 += row * w[2]
+                s3 += row * w[3]
+                s4 += row * w[4]
+                s5 += row * w[5]
+                s6 += row * w[6]
+                s7 += row * w[7]
+            h[8 * q + 0] = wp.max(s0, Floats())
+            h[8 * q + 1] = wp.max(s1, Floats())
+            h[8 * q + 2] = wp.max(s2, Floats())
+            h[8 * q + 3] = wp.max(s3, Floats())
+            h[8 * q + 4] = wp.max(s4, Floats())
+            h[8 * q + 5] = wp.max(s5, Floats())
+            h[8 * q + 6] = wp.max(s6, Floats())
+            h[8 * q + 7] = wp.max(s7, Floats())
+        red = Floats(weights.head_2_bias[0])
+        green = Floats(weights.head_2_bias[1])
+        blue = Floats(weights.head_2_bias[2])
+        for q in range(units // 8):
+            w = weights.head_1_bias[q]
+            s0 = Floats(w[0])
+            s1 = Floats(w[1])
+            s2 = Floats(w[2])
+            s3 = Floats(w[3])
+            s4 = Floats(w[4])
+            s5 = Floats(w[5])
+            s6 = Floats(w[6])
+            s7 = Floats(w[7])
+            for i in range(units):
+                row = h[i]
+                w = weights.head_1[q * units + i]
+                s0 += row * w[0]
+                s1 += row * w[1]
+                s2 += row * w[2]
+                s3 += row * w[3]
+                s4 += row * w[4]
+                s5 += row * w[5]
+                s6 += row * w[6]
+                s7 += row * w[7]
+            s0 = wp.max(s0, Floats())
+            s1 = wp.max(s1, Floats())
+            s2 = wp.max(s2, Floats())
+            s3 = wp.max(s3, Floats())
+            s4 = wp.max(s4, Floats())
+            s5 = wp.max(s5, Floats())
+            s6 = wp.max(s6, Floats())
+            s7 = wp.max(s7, Floats())
+            w = weights.head_2[3 * q + 0]
+            red += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
+            red += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
+            w = weights.head_2[3 * q + 1]
+            green += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
+            green += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
+            w = weights.head_2[3 * q + 2]
+            blue += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
+            blue += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
+        for j in range(count):
+            if start + j < last:
+                pixel = start + j
+                rgb[camera, pixel] = wp.vec3f(sigmoid(red[j]), sigmoid(green[j]), sigmoid(blue[j]))
+                opacity[camera, pixel] = share[j]
+                z = depth[camera, pixel]
+                depth[camera, pixel] = wp.where(z > 0.0, wp.min(z, _FAR), _FAR)
+
+    return shade_rays, Weights

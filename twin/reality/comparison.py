@@ -1,0 +1,298 @@
+"""How far a build is from the known truth, where a scene has one.
+
+The *twin frame* is the metric frame of the build, the *true frame* that of the generated world. Everything but
+`ate_m` and `scale_error` is measured after a rigid alignment (no scale) of the twin's cameras with the true ones, since
+metres of the twin are what a robot drives in. Surfaces are compared where some camera could see them.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from twin.assets.ground import Ground
+from twin.errors import InputError
+from twin.files import write_json
+from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, scaled_intrinsics, unproject
+from twin.geometry.mesh_rays import Surface
+from twin.geometry.poses import Similarity, rotation_angle, umeyama
+from twin.nerf.baked import BakedField
+from twin.reality.truth import Truth
+from twin.scene import SceneDir, result_of
+from twin.types import Array
+
+if TYPE_CHECKING:
+    from twin.nerf.field import RadianceField
+
+
+_NEAR_ROUTE = 10.0  # [m] obstacles further from the route are not compared
+_MAX_HEIGHT = 3.0  # [m] nor what is higher above the ground
+_STANDING = 0.15  # [m] what stands less than this above the ground is ground or kerb
+_INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] above the ground where the corridor must be free
+_RAYS = (96, 54)  # per camera, to find what it sees
+_EYES = 48  # cameras that surfaces are looked at from, at most
+_DEPTH_REACH = 20.0  # [m] depth beyond is not compared
+_MESH_KEYS = (
+    *("mesh_accuracy_median_m", "mesh_accuracy_mean_m", "mesh_completeness_mean_m"),
+    *("mesh_completeness_5cm", "mesh_completeness_10cm", "mesh_chamfer_m"),
+)
+_MOST_OFF = 1.0  # [m] what is missing counts as this far off in means
+_SEEN_CELL = 0.1  # [m] seen surface is thinned to one point per cell
+
+
+def compare(scene: SceneDir) -> dict[str, Any]:
+    """Measures a build against its truth and writes the result into `build/truth.json`, where its report looks for it.
+
+    Returns:
+        What was written: `measure`'s, and `of`, the results of the stages that were compared.
+
+    Raises:
+        InputError: the scene has no truth, or is not built as far as the mesh.
+    """
+    if not (scene.truth / "truth.npz").exists():
+        raise InputError(f"{scene.root} has no truth; only scenes of `python -m twin.reality film` have one")
+    of = {stage: result_of(scene, stage) for stage in ("metric", "field", "mesh")}
+    compared = {"of": of, **measure(scene)}
+    write_json(scene.truth_json, compared)
+    return compared
+
+
+def measure(scene: SceneDir) -> dict[str, Any]:
+    """Measures a build against its truth.
+
+    Returns:
+        `figures`, and `camera_errors_m`, lists by source [m], after a similarity.
+
+        `figures`, lengths [m], angles [°]: `ate_m`, `ate_max_m` (camera positions after a similarity), `scale_error`
+        (the twin's metre over the true one, minus 1), `ate_rigid_m`, `tilt_deg` (of the twin's vertical),
+        `rotation_median_deg`, `ground_median_m`, `ground_p95_m`, `ground_bias_m` (inside the corridor),
+        `obstacle_accuracy_m` (seen surface of the convex parts to the true surface), `obstacle_completeness_m` (and
+        back), `obstacle_median_m` (the larger of the two), `corridor_intrusions`, `route_median_m` (twin's route to the
+        true centre line), `depth_median_m`, `depth_relative` (of the field, up to 20 m).
+
+        Of the visual mesh, all of it and of the true surface that cameras could see within 10 m of the route, at any
+        height: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to the true surface), `mesh_completeness_mean_m`
+        (and back), `mesh_completeness_5cm`, `mesh_completeness_10cm` (share of the true surface that has the mesh so
+        near; the latter by kind of thing, too: `_ground`, `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of
+        the two means). In the means no distance counts more than 1 m. None where a stage has made nothing to measure.
+    """
+    truth = Truth.load(scene.truth)
+    cameras = Cameras.load(scene.stage("metric"))
+    true_poses = matched_poses(truth, cameras)
+    figures: dict[str, Any] = dict(camera_errors(cameras.camera_to_world, true_poses))
+    to_truth = align_rigid(cameras.camera_to_world, true_poses)
+    mesh = scene.stage("mesh")
+    figures |= _ground_errors(mesh, truth, to_truth)
+    figures |= _surface_errors(mesh, truth, to_truth, true_poses)
+    figures |= _depth_errors(scene.stage("field"), truth, to_truth)
+    true = true_poses[:, :3, 3]
+    off = np.linalg.norm(umeyama(cameras.positions, true).points(cameras.positions) - true, axis=1)
+    by_source = {name: off[[s == name for s in cameras.sources]].tolist() for name in dict.fromkeys(cameras.sources)}
+    return {"figures": figures, "camera_errors_m": by_source}
+
+
+def matched_poses(truth: Truth, cameras: Cameras) -> Array:
+    """The true pose of every frame of a build, shape (n, 4, 4)."""
+    out = np.empty((len(cameras), 4, 4))
+    for source in sorted(set(cameras.sources)):
+        rows = np.array([s == source for s in cameras.sources])
+        lighting = next(light for light, row in zip(cameras.lightings, rows, strict=True) if row)
+        out[rows] = truth.poses(source if source in truth.films else lighting, cameras.times[rows])
+    return out
+
+
+def align_rigid(poses: Array, true_poses: Array) -> Similarity:
+    """The rigid transform that best maps cameras on to the true ones, shapes (n, 4, 4).
+
+    Each camera counts as its centre and the tips of its axes one metre long, so that a straight drive, whose centres
+    alone leave the roll about it open, is aligned as well.
+    """
+
+    def tripods(p: Array) -> Array:
+        return np.concatenate([p[:, :3, 3], *(p[:, :3, 3] + p[:, :3, k] for k in range(3))])
+
+    return umeyama(tripods(poses), tripods(true_poses), with_scale=False)
+
+
+def camera_errors(poses: Array, true_poses: Array) -> dict[str, float]:
+    """Errors of camera poses against the true ones, shapes (n, 4, 4)."""
+    centres, true_centres = poses[:, :3, 3], true_poses[:, :3, 3]
+    similarity = umeyama(centres, true_centres)
+    off = np.linalg.norm(similarity.points(centres) - true_centres, axis=1)
+    rigid = align_rigid(poses, true_poses)
+    rigid_off = np.linalg.norm(rigid.points(centres) - true_centres, axis=1)
+    turned = np.swapaxes(true_poses[:, :3, :3], 1, 2) @ rigid.poses(poses)[:, :3, :3]
+    return {
+        "frames": len(poses),
+        "ate_m": float(np.sqrt((off**2).mean())),
+        "ate_max_m": float(off.max()),
+        "scale_error": float(1.0 / similarity.scale - 1.0),
+        "ate_rigid_m": float(np.sqrt((rigid_off**2).mean())),
+        "ate_rigid_max_m": float(rigid_off.max()),
+        "rotation_median_deg": float(np.rad2deg(np.median(rotation_angle(turned)))),
+        "tilt_deg": float(np.rad2deg(np.arccos(np.clip(rigid.rotation[2, 2], -1.0, 1.0)))),
+    }
+
+
+def corridor(truth: Truth, half_width: float, step: float = 0.25) -> Array:
+    """Points of the ground within the true corridor [m], shape (m, 3)."""
+    stations = np.arange(truth.start, truth.start + truth.length + step / 2, step)
+    laterals = np.linspace(-half_width, half_width, 2 * round(half_width / step) + 1)
+    xy = truth.route.at(stations[:, None], laterals[None]).reshape(-1, 2)
+    return np.concatenate([xy, truth.ground_height(xy)[:, None]], 1)
+
+
+def _ground_errors(mesh: Path, truth: Truth, to_truth: Similarity) -> dict[str, float | None]:
+    keys = ("ground_median_m", "ground_p95_m", "ground_bias_m")
+    if not (mesh / "ground.npz").exists():
+        return dict.fromkeys(keys)
+    ground = Ground.load(mesh)
+    xy = to_truth.inverse().points(corridor(truth, truth.half_width))[:, :2]
+    twin = to_truth.points(np.concatenate([xy, ground.at(xy)[:, None]], 1))
+    error = twin[:, 2] - truth.ground_height(twin[:, :2])
+    values = (np.median(np.abs(error)), np.quantile(np.abs(error), 0.95), np.median(error))
+    return {key: float(value) for key, value in zip(keys, values, strict=True)}
+
+
+def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: Array) -> dict[str, float | int | None]:
+    out: dict[str, float | int | None] = dict.fromkeys(
+        (
+            *("obstacle_accuracy_m", "obstacle_completeness_m", "obstacle_median_m", "corridor_intrusions"),
+            *("route_median_m", *_MESH_KEYS),
+        )
+    )
+    if (mesh / "route.npz").exists():
+        with np.load(mesh / "route.npz", allow_pickle=False) as data:
+            points = to_truth.points(np.concatenate([data["xy"], data["z"][:, None]], 1))
+        out["route_median_m"] = float(np.median(np.abs(truth.route.project(points[:, :2])[1])))
+    if not (mesh / "parts.npz").exists():
+        return out
+    parts = [(to_truth.points(v), f) for v, f in load_parts(mesh)]
+    out["corridor_intrusions"] = sum(intrudes(v, f, truth) for v, f in parts)
+    eyes = true_poses[np.unique(np.linspace(0, len(true_poses) - 1, _EYES).round().astype(int))]
+    kinds = {kind: [t.part for t in truth.place.things if t.kind == kind] for kind in ("ground", "obstacle", "foliage")}
+    solid = _surface([(p.vertices, p.faces) for p in kinds["obstacle"]])
+    leafy = _surface([(p.vertices, p.faces) for p in kinds["obstacle"] + kinds["foliage"]])
+    whole = _surface([(p.vertices, p.faces) for kind in kinds.values() for p in kind])
+    sight = visible_points(whole, eyes, truth)
+    seen = _standing(sight, truth)
+    seen = seen[solid.distance(seen) < 1e-3]  # neither leaves nor ground
+    if parts and len(seen):
+        twin = _surface(parts)
+        standing = _standing(visible_points(twin, eyes, truth), truth)
+        if len(standing):
+            accuracy, completeness = np.median(leafy.distance(standing)), np.median(twin.distance(seen))
+            out["obstacle_accuracy_m"], out["obstacle_completeness_m"] = float(accuracy), float(completeness)
+            out["obstacle_median_m"] = float(max(accuracy, completeness))
+    if (mesh / "visual.npz").exists():
+        with np.load(mesh / "visual.npz", allow_pickle=False) as data:
+            visual = _surface([(to_truth.points(data["vertices"].astype(np.float64)), data["faces"])])
+        near, seen = _near(visible_points(visual, eyes, truth), truth), _near(sight, truth)
+        if len(near) and len(seen):
+            to_mesh = visual.distance(seen)
+            out |= mesh_quality(whole.distance(near), to_mesh)
+            for kind, things in kinds.items():
+                mine = _surface([(p.vertices, p.faces) for p in things]).distance(seen) < 1e-3
+                if mine.any():
+                    out[f"mesh_completeness_10cm_{kind}"] = float((to_mesh[mine] <= 0.1).mean())
+    return out
+
+
+def mesh_quality(to_true: Array, to_mesh: Array) -> dict[str, float]:
+    """What distances between a mesh and the true surface come to, by the keys of `compare`.
+
+    Args:
+        to_true: Of points of the mesh from the true surface [m], shape (n,).
+        to_mesh: Of points of the true surface from the mesh [m], shape (m,).
+    """
+    # Further off the nearest surface is another one, and how far only tells how empty the place is.
+    accuracy, completeness = (float(np.minimum(d, _MOST_OFF).mean()) for d in (to_true, to_mesh))
+    near = [float((to_mesh <= reach).mean()) for reach in (0.05, 0.1)]
+    values = (float(np.median(to_true)), accuracy, completeness, *near, 0.5 * (accuracy + completeness))
+    return dict(zip(_MESH_KEYS, values, strict=True))
+
+
+def load_parts(mesh: Path) -> list[tuple[Array, NDArray[np.int32]]]:
+    """The convex parts of a mesh stage: vertices (v, 3) [m] and faces (f, 3) of each."""
+    with np.load(mesh / "parts.npz", allow_pickle=False) as data:
+        v, f = data["vertices"].astype(np.float64), data["faces"].astype(np.int32)
+        vs, fs = data["vertex_start"], data["face_start"]
+    return [(v[vs[k] : vs[k + 1]], f[fs[k] : fs[k + 1]]) for k in range(len(vs) - 1)]
+
+
+def intrudes(vertices: Array, faces: NDArray[np.int32], truth: Truth) -> bool:
+    """Whether a convex part (true frame) reaches into the true corridor, 5 cm to 1.5 m above the ground."""
+    floor = corridor(truth, truth.half_width, 0.125)
+    low, high = vertices.min(0), vertices.max(0)
+    floor = floor[((floor[:, :2] >= low[:2]) & (floor[:, :2] <= high[:2])).all(1)]
+    if not len(floor):
+        return False
+    points = np.concatenate([floor + np.array([0.0, 0.0, h]) for h in _INTRUSION_HEIGHTS])
+    hull = trimesh.Trimesh(vertices, faces, process=False).convex_hull
+    inside = np.ones(len(points), bool)
+    for normal, origin in zip(hull.face_normals, hull.triangles[:, 0], strict=True):
+        inside[inside] = (points[inside] - origin) @ normal <= 1e-9
+    return bool(inside.any())
+
+
+def _standing(points: Array, truth: Truth) -> Array:
+    """Those points that stand on the ground near the filmed route, below the height that counts."""
+    points = _near(points, truth)
+    height = points[:, 2] - truth.ground_height(points[:, :2])
+    return points[(height > _STANDING) & (height < _MAX_HEIGHT)]
+
+
+def _near(points: Array, truth: Truth) -> Array:
+    """Those points that are near the filmed route, at any height."""
+    station, lateral = truth.route.project(points[:, :2])
+    along = (station > truth.start) & (station < truth.start + truth.length + _NEAR_ROUTE)
+    return points[along & (np.abs(lateral) < _NEAR_ROUTE)]
+
+
+def _surface(meshes: list[tuple[Array, NDArray]]) -> Surface:
+    starts = np.cumsum([0] + [len(v) for v, _ in meshes])
+    faces = [f + start for (_, f), start in zip(meshes, starts, strict=False)]
+    return Surface(np.concatenate([v for v, _ in meshes]), np.concatenate(faces))
+
+
+def visible_points(surface: Surface, eyes: Array, truth: Truth) -> Array:
+    """Points of a surface that cameras (k, 4, 4) see, thinned to one per cell, shape (m, 3)."""
+    local = unproject(pixel_grid(*_RAYS), scaled_intrinsics(truth.intrinsics, truth.size, _RAYS)).reshape(-1, 3)
+    rays = np.concatenate([local @ pose[:3, :3].T for pose in eyes])
+    origins = np.repeat(eyes[:, :3, 3], len(local), 0)
+    t = surface.cast(origins, rays)
+    points = (origins + rays * t[:, None])[t > 0.0]
+    _, first = np.unique(np.floor(points / _SEEN_CELL).astype(np.int64), axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def _depth_errors(folder: Path, truth: Truth, to_truth: Similarity) -> dict[str, float | None]:
+    if not (folder / "baked.json").exists():
+        return {"depth_median_m": None, "depth_relative": None}
+    return depth_errors(BakedField.load(folder), truth, to_truth)
+
+
+def depth_errors(
+    field: "BakedField | RadianceField", truth: Truth, to_truth: Similarity, reach: float = _DEPTH_REACH
+) -> dict[str, float | None]:
+    """A field's depth at true viewpoints against the true depth up to `reach` [m]; three frames of each film."""
+    errors, relative = [], []
+    for name, film in truth.films.items():
+        if name not in field.lightings:
+            continue
+        pick = np.unique(np.linspace(0, len(film.depth) - 1, 5).round().astype(int))[1:4]
+        poses = to_truth.inverse().poses(film.camera_to_world[film.depth_frames[pick]])
+        height, width = film.depth.shape[1:]
+        depth = field.render(Viewpoints.of(poses, truth.intrinsics, truth.size), name, (width, height)).depth
+        true_depth = film.depth[pick].astype(np.float64)
+        valid = (true_depth > 0.0) & (true_depth < reach)
+        errors.append(np.abs(depth - true_depth)[valid])
+        relative.append(errors[-1] / true_depth[valid])
+    if not errors:
+        return {"depth_median_m": None, "depth_relative": None}
+    return {
+        "depth_median_m": float(np.median(np.concatenate(errors))),
+        "depth_relative": float(np.median(np.concatenate(relative))),
+    }

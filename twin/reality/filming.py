@@ -1,0 +1,191 @@
+"""Filming the known-truth world: a camera on a cart, its exposure and noise, and a video file.
+
+A *film* is a list of frames at a fixed rate under one lighting; its poses are the truth. Every film has its own speed,
+lateral wander and shake, so that no two films share a viewpoint.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import av
+import mujoco
+import mujoco_warp
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from twin.geometry.cameras import opencv_to_mujoco
+from twin.reality import true_world
+from twin.reality.centerline import RoadLine, ground_height
+from twin.reality.lighting import LIGHTINGS, Lighting, hazed
+from twin.reality.things import SEED, KnownPlace
+from twin.runtime import track
+from twin.types import Array
+
+CAMERA_HEIGHT = 1.2  # [m] lens above the ground, on average and within a centimetre
+_PITCH = np.deg2rad(8.0)  # downwards
+_HFOV = np.deg2rad(85.0)
+
+
+@dataclass(frozen=True)
+class FilmingPlan:
+    """What is filmed and how."""
+
+    lightings: tuple[str, ...] = ("sun", "overcast", "night")
+    start: float = 0.0
+    """Station of the first frame [m]."""
+    length: float = 60.0
+    """[m] along the centre line."""
+    speed: float = 2.0
+    """Mean speed [m/s]."""
+    fps: int = 4
+    width: int = 640
+    height: int = 360
+    samples: int = 2
+    """Rays per pixel and axis."""
+    crf: int = 29
+    """Quality of the H.264 film; lower is better."""
+
+    @property
+    def intrinsics(self) -> Array:
+        """fx, fy, cx, cy [px], shape (4,)."""
+        focal = self.width / 2 / np.tan(_HFOV / 2)
+        return np.array([focal, focal, self.width / 2, self.height / 2])
+
+
+def smooth_noise(rng: np.random.Generator, times: Array, period: float) -> Array:
+    """A sum of three sines about a period [s], unit deviation; shape as `times`."""
+    rates = 2 * np.pi / (period * rng.uniform(0.6, 1.7, 3))
+    return np.sin(times[:, None] * rates + rng.uniform(0, 2 * np.pi, 3)).sum(1) / np.sqrt(1.5)
+
+
+def trajectory(plan: FilmingPlan, route: RoadLine, lighting: str) -> tuple[Array, Array]:
+    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of one film."""
+    rng = np.random.default_rng([SEED, 11, sum(map(ord, lighting))])
+    speed = plan.speed * rng.uniform(0.93, 1.07)
+    frames = round(plan.length / speed * plan.fps) + 1
+    times = np.arange(frames) / plan.fps
+    progress = times / times[-1]
+    station = plan.start + plan.length * progress + 0.18 * smooth_noise(rng, times, 6.0) * np.sin(np.pi * progress)
+    lateral = np.clip(rng.uniform(-0.12, 0.12) + 0.12 * smooth_noise(rng, times, 9.0), -0.3, 0.3)
+    xy = route.at(station, lateral)
+    lift = 0.004 * smooth_noise(rng, times, 1.1)
+    position = np.concatenate([xy, (ground_height(route, xy) + CAMERA_HEIGHT + lift)[:, None]], 1)
+    # The cart points where it is heading: the centre line's direction turned by the wander's slope.
+    drift = np.gradient(lateral, station)
+    yaw = route.heading(station + 0.6) + np.arctan(drift) + np.deg2rad(0.9) * smooth_noise(rng, times, 2.3)
+    pitch = _PITCH + np.deg2rad(0.5) * smooth_noise(rng, times, 1.3)
+    roll = np.deg2rad(0.6) * smooth_noise(rng, times, 1.7)
+    return times, np.stack([_pose(p, a, b, c) for p, a, b, c in zip(position, yaw, pitch, roll, strict=True)])
+
+
+def _pose(position: Array, yaw: float, pitch: float, roll: float) -> Array:
+    """camera_to_world of a camera that looks along `yaw`, `pitch` downwards, rolled clockwise [rad]."""
+    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    down = np.cross(forward, right)
+    pose = np.eye(4)
+    c, s = np.cos(roll), np.sin(roll)
+    pose[:3, :3] = np.stack([c * right + s * down, -s * right + c * down, forward], 1)
+    pose[:3, 3] = position
+    return pose
+
+
+class Renderer:
+    """Renders the place under one lighting; the camera goes anywhere."""
+
+    def __init__(self, lighting: str, place: KnownPlace, plan: FilmingPlan) -> None:
+        spec = true_world.spec(lighting, place)
+        camera = spec.camera("film")
+        camera.fovy = float(np.rad2deg(2 * np.arctan(plan.height / 2 / plan.intrinsics[1])))
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        self._size = (plan.width, plan.height)
+        with wp.ScopedDevice("cpu"):
+            self._model = mujoco_warp.put_model(model)
+            self._data = mujoco_warp.put_data(model, data)
+            self._context = mujoco_warp.create_render_context(
+                model,
+                cam_res=self._size,
+                render_rgb=True,
+                render_depth=True,
+                render_seg=False,
+                use_shadows=any(shadow for _, _, shadow in LIGHTINGS[lighting].suns),
+                enabled_geom_groups=[0, 1],
+                render_skybox=True,
+                enable_backface_culling=False,
+                shadow_light_fraction=0.0,
+                samples_per_pixel=plan.samples,
+                enable_specular=False,
+            )
+
+    def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] (0 = sky, of the first sample) for an OpenCV pose."""
+        pose = opencv_to_mujoco(camera_to_world)
+        width, height = self._size
+        with wp.ScopedDevice("cpu"):
+            self._data.cam_xpos.assign(pose[None, None, :3, 3].astype(np.float32))
+            self._data.cam_xmat.assign(pose[None, None, :3, :3].astype(np.float32))
+            mujoco_warp.render(self._model, self._data, self._context)
+            rgb = wp.zeros((1, height, width), dtype=wp.vec3)
+            mujoco_warp.get_rgb(self._context, 0, rgb)
+            depth = self._context.depth_data.numpy().reshape(height, width).copy()
+        return rgb.numpy()[0].astype(np.float32), depth
+
+
+def develop(
+    rng: np.random.Generator, light: NDArray[np.float32], lighting: Lighting, exposure: float
+) -> NDArray[np.uint8]:
+    """What the sensor makes of the light: vignetting, exposure, a shoulder for highlights, noise, eight bits."""
+    height, width = light.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
+    signal = light * (lighting.exposure * exposure * (1.0 - 0.16 * radius2))[..., None] * np.asarray(lighting.gain)
+    knee = 0.75  # above it, highlights are rolled off towards 1
+    over = np.maximum(signal - knee, 0.0)
+    signal = np.minimum(signal, knee) + (1.0 - knee) * (1.0 - np.exp(-over / (1.0 - knee)))
+    sigma = lighting.noise * np.sqrt(0.35 + 1.3 * signal)
+    signal = signal + sigma * rng.standard_normal(signal.shape)
+    return (np.clip(signal, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def exposures(lighting: str, times: Array) -> Array:
+    """Relative exposure of each frame: it drifts slowly, as automatic exposure does."""
+    rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting))])
+    return np.exp(LIGHTINGS[lighting].drift * smooth_noise(rng, times, 11.0))
+
+
+def shoot(lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path) -> tuple[Array, Array]:
+    """Films one lighting into a video file; returns its times and poses."""
+    times, poses = trajectory(plan, place.route, lighting)
+    gains = exposures(lighting, times)
+    rng = np.random.default_rng([SEED, 13, sum(map(ord, lighting))])
+    render = Renderer(lighting, place, plan)
+    steps = track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame")
+    light = LIGHTINGS[lighting]
+    encode((develop(rng, hazed(*render(pose), light), light, float(gain)) for pose, gain in steps), plan, path)
+    return times, poses
+
+
+def encode(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Path) -> None:
+    """Writes RGB frames (h, w, 3) as H.264; the same frames give the same file."""
+    # x264's fast paths depend on the processor and even on memory alignment; these settings make its file repeat.
+    options = {"crf": str(plan.crf), "preset": "slower", "threads": "1", "x264-params": "cpu-independent=1"}
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=plan.fps, options=options)
+        stream.width, stream.height, stream.pix_fmt = plan.width, plan.height, "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def depths(
+    lighting: str, place: KnownPlace, plan: FilmingPlan, poses: Array
+) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
+    """Depth at a quarter of the film's size [m] of about ten frames: their indices (k,) and maps (k, h / 4, w / 4)."""
+    small = replace(plan, width=plan.width // 4, height=plan.height // 4, samples=1)
+    frames = np.unique(np.linspace(0, len(poses) - 1, 10).round().astype(np.int64))
+    render = Renderer(lighting, place, small)
+    return frames, np.stack([render(poses[k])[1] for k in frames]).astype(np.float16)

@@ -1,0 +1,141 @@
+"""Textured triangle meshes of simple things, in world coordinates [m].
+
+A *part* is one piece of surface with one texture; `uv` is (column, row) in [0, 1] of its texture, row 0 at the top.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.types import Array
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """A mesh of n vertices and m triangles."""
+
+    vertices: Array
+    """Shape (n, 3) [m]."""
+    faces: NDArray[np.int32]
+    """Shape (m, 3)."""
+    uv: Array
+    """Shape (n, 2)."""
+
+    def in_window(self, low: Array, high: Array) -> "MeshPart":
+        """The same surface with its [0, 1]² texture squeezed into a window of an atlas."""
+        return replace(self, uv=low + np.clip(self.uv, 0.0, 1.0) * (np.asarray(high) - low))
+
+    def moved(self, origin: Array, yaw: float = 0.0) -> "MeshPart":
+        """Turned about z by `yaw` [rad], then shifted to `origin`."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return replace(self, vertices=self.vertices @ turn.T + origin)
+
+
+def join(parts: list[MeshPart]) -> MeshPart:
+    """One mesh of several."""
+    starts = np.cumsum([0] + [len(p.vertices) for p in parts])
+    return MeshPart(
+        np.concatenate([p.vertices for p in parts]),
+        np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)]).astype(np.int32),
+        np.concatenate([p.uv for p in parts]),
+    )
+
+
+def grid(points: Array, uv: Array) -> MeshPart:
+    """A surface through a lattice of points, shapes (rows, columns, 3) and (rows, columns, 2).
+
+    Faces up where rows run to the right of columns (as rows across a road from its left edge, columns along it).
+    """
+    rows, columns = points.shape[:2]
+    i = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return MeshPart(points.reshape(-1, 3), faces.astype(np.int32), uv.reshape(-1, 2))
+
+
+def quad(corners: Array) -> MeshPart:
+    """A rectangle from its corners: top left, bottom left, bottom right, top right; shape (4, 3)."""
+    uv = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
+    return MeshPart(np.asarray(corners, float), np.array([[0, 1, 2], [0, 2, 3]], np.int32), uv)
+
+
+def box(size: tuple[float, float, float], base: float = 0.0) -> MeshPart:
+    """A box of full sizes (x, y, z) standing on z = `base`, each face the whole texture."""
+    x, y, z0, z1 = size[0] / 2, size[1] / 2, base, base + size[2]
+    ring = [(-x, -y), (x, -y), (x, y), (-x, y)]
+    sides = []
+    for (ax, ay), (bx, by) in zip(ring, ring[1:] + ring[:1], strict=True):
+        sides.append(quad(np.array([[ax, ay, z1], [ax, ay, z0], [bx, by, z0], [bx, by, z1]])))
+    top = quad(np.array([[-x, y, z1], [-x, -y, z1], [x, -y, z1], [x, y, z1]]))
+    bottom = quad(np.array([[-x, -y, z0], [-x, y, z0], [x, y, z0], [x, -y, z0]]))
+    return join([*sides, top, bottom])
+
+
+def walls(width: float, depth: float, low: float, high: float) -> MeshPart:
+    """Four walls around a rectangle of x `width` and y `depth`; the texture runs once around, from corner (−x, −y)."""
+    x, y = width / 2, depth / 2
+    ring = np.array([(-x, -y), (x, -y), (x, y), (-x, y), (-x, -y)])
+    along = np.cumsum([0.0, width, depth, width, depth]) / (2 * (width + depth))
+    parts = []
+    for k in range(4):
+        (ax, ay), (bx, by) = ring[k], ring[k + 1]
+        part = quad(np.array([[ax, ay, high], [ax, ay, low], [bx, by, low], [bx, by, high]]))
+        parts.append(
+            replace(part, uv=np.stack([np.where(part.uv[:, 0] > 0, along[k + 1], along[k]), part.uv[:, 1]], 1))
+        )
+    return join(parts)
+
+
+def tube(
+    bottom: Array, top: Array, radius_bottom: float, radius_top: float, sides: int = 10, capped: bool = True
+) -> MeshPart:
+    """A truncated cone between two points [m]; the texture wraps once around it."""
+    axis = np.asarray(top, float) - bottom
+    length = np.linalg.norm(axis)
+    axis = axis / length
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    e1 = np.cross(axis, helper)
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(axis, e1)
+    angle = np.linspace(0.0, 2 * np.pi, sides + 1)
+    ring = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
+    points = np.stack([top + radius_top * ring, bottom + radius_bottom * ring])
+    u, v = np.meshgrid(np.linspace(0, 1, sides + 1), [0.0, 1.0])
+    side = grid(points, np.stack([u, v], -1))
+    if not capped:
+        return side
+    lids = []
+    for centre, radius in ((np.asarray(top, float), radius_top), (np.asarray(bottom, float), radius_bottom)):
+        rim = centre + radius * ring[:-1]
+        fan = np.array([[0, 1 + k, 1 + (k + 1) % sides] for k in range(sides)], np.int32)
+        rim_uv = 0.5 + 0.5 * np.stack([np.cos(angle[:-1]), np.sin(angle[:-1])], 1)
+        lids.append(MeshPart(np.vstack([centre, rim]), fan, np.vstack([[0.5, 0.5], rim_uv])))
+    return join([side, *lids])
+
+
+def leaves(
+    rng: np.random.Generator, centres: Array, size: tuple[float, float], light: Array, uv_size: float = 0.08
+) -> MeshPart:
+    """Small bent rhombi around given centres, shape (n, 3): foliage with gaps that light passes through.
+
+    Each leaf shows its own window of the texture, `uv_size` wide: from its left where `light` is 0, to its right where
+    it is 1, shape (n,).
+    """
+    n = len(centres)
+    long, short = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    long[:, 2] *= 0.6  # leaves hang rather flat
+    long /= np.linalg.norm(long, axis=1, keepdims=True)
+    short -= (short * long).sum(1, keepdims=True) * long
+    short /= np.linalg.norm(short, axis=1, keepdims=True)
+    half = 0.5 * rng.uniform(*size, (n, 1))
+    droop = np.cross(long, short) * half * 0.25
+    tips = [centres - half * long, centres + 0.55 * half * short + droop, centres + half * long]
+    tips.append(centres - 0.55 * half * short + droop)
+    corner = rng.uniform(0.0, 1.0 - uv_size, (n, 1, 2))
+    corner[:, 0, 0] = np.clip(light + rng.normal(0.0, 0.1, n), 0.0, 1.0) * (1.0 - uv_size)
+    window = corner + uv_size * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    base = 4 * np.arange(n)[:, None]
+    faces = (base[:, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3).astype(np.int32)
+    return MeshPart(np.stack(tips, 1).reshape(-1, 3), faces, window.reshape(-1, 2))

@@ -1,0 +1,119 @@
+"""ROS 2 bags as tables, through `rosbags` (the extra `ros`; no ROS installation is needed).
+
+Topics are found by the type of their messages and what they hold: commands are geometry_msgs/Twist or TwistStamped;
+wheel speeds are sensor_msgs/JointState with joints named like a Husky's wheels; poses are nav_msgs/Odometry,
+geometry_msgs/PoseStamped or PoseWithCovarianceStamped (with several, the one whose topic does not come from the wheels:
+no `platform` or `wheel` in its name); accelerations are sensor_msgs/Imu. A row is made at every joint state, with the
+newest of everything else.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin.errors import InputError
+from twin.robot import WHEELS
+from twin.types import Array
+
+_TWIST = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
+_POSE = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+_JOINTS, _IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
+_FROM_WHEELS = ("platform", "wheel", "velocity_controller")
+
+
+def read_bag(path: Path) -> dict[str, Array]:
+    """Columns of `twin.sysid.logs`. Raises InputError: no reader, no bag, a kind of message is missing."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise InputError(f"{path}: reading a ROS 2 bag needs rosbags; pip install 'twin[ros]'") from None
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            chosen = _choose(reader.connections, path)
+            rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
+            kinds = {connection.id: kind for kind, connection in chosen.items()}
+            begin = reader.start_time  # [ns]; taken off while still a whole number, for a float would round to 0.2 µs
+            for connection, stamp, raw in reader.messages(connections=list(chosen.values())):
+                kind = kinds[connection.id]
+                values = _VALUES[kind](reader.deserialize(raw, connection.msgtype))
+                if values is not None:
+                    rows[kind].append(((stamp - begin) * 1e-9, *values))
+    except InputError:
+        raise
+    except Exception as error:  # the reader's own errors: not a bag, a broken one, unknown messages
+        raise InputError(f"{path}: not a readable ROS 2 bag: {error}; record it anew or give a .csv") from None
+    empty = [kind for kind, values in rows.items() if not values]
+    if empty:
+        raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected some; record those topics")
+    tables = {kind: np.array(values) for kind, values in rows.items()}
+    return _columns(tables)
+
+
+def _choose(connections: Any, path: Path) -> dict[str, Any]:
+    wanted = {"commands": _TWIST, "wheels": (_JOINTS,), "poses": _POSE, "imu": (_IMU,)}
+    chosen = {}
+    for kind, types in wanted.items():
+        found = [c for c in connections if c.msgtype in types and c.msgcount]
+        if kind == "commands":  # the controller's own input rather than one of the multiplexer's
+            found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
+        elif kind == "poses":
+            found.sort(key=lambda c: (any(word in c.topic for word in _FROM_WHEELS), -c.msgcount))
+        else:
+            found.sort(key=lambda c: -c.msgcount)
+        if found:
+            chosen[kind] = found[0]
+        elif kind != "imu":
+            raise InputError(
+                f"{path}: no topic with {kind} ({' or '.join(types)}) among "
+                f"{', '.join(sorted({c.topic for c in connections})) or 'none'}; record it"
+            )
+    return chosen
+
+
+def _twist(message: Any) -> tuple[float, ...]:
+    twist = getattr(message, "twist", message)
+    return twist.linear.x, twist.angular.z
+
+
+def _wheels(message: Any) -> tuple[float, ...] | None:
+    speeds = dict(zip(message.name, message.velocity, strict=False))
+    sides = [[v for name, v in speeds.items() for w in WHEELS[i::2] if name.startswith(w)] for i in (0, 1)]
+    return tuple(float(np.mean(side)) for side in sides) if all(sides) else None
+
+
+def _pose(message: Any) -> tuple[float, ...]:
+    pose = message.pose
+    pose = getattr(pose, "pose", pose)
+    p, q = pose.position, pose.orientation
+    return p.x, p.y, float(np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
+
+
+def _imu(message: Any) -> tuple[float, ...]:
+    return message.linear_acceleration.x, message.linear_acceleration.y
+
+
+_VALUES = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
+_NAMES = {
+    "commands": ("cmd_v", "cmd_yaw_rate"),
+    "wheels": ("left_wheel_vel", "right_wheel_vel"),
+    "poses": ("x", "y", "yaw"),
+    "imu": ("acceleration_x", "acceleration_y"),
+}
+
+
+def _columns(tables: dict[str, Array]) -> dict[str, Array]:
+    """One row per joint state from when everything has been heard of once."""
+    begin = max(table[0, 0] for table in tables.values())
+    time = np.unique(tables["wheels"][:, 0])
+    time = time[time >= begin]
+    columns = {"time": time - (time[0] if len(time) else 0.0)}
+    for kind, table in tables.items():
+        newest = np.searchsorted(table[:, 0], time, side="right") - 1
+        columns |= {name: table[newest, i + 1] for i, name in enumerate(_NAMES[kind])}
+    return columns
