@@ -1,6 +1,9 @@
-"""What a row of the acceptance table is, and what it is measured on.
+"""Acceptance table of the Husky model: rows of measured numbers with limits, and wrong models that must fail them.
 
-A *row* is one number and the limits it must keep. A *subject* is a robot, right or deliberately wrong.
+*Subject*: a robot to measure, correct or deliberately wrong. *Edit*: a change to the `MjSpec` before it is compiled,
+which makes a wrong model. Letters of the ids: A composition, B scrubbing on a plane, C friction at rest, D driving,
+E ground from the pipeline, P convex parts. Read chi together with B4 to B6: a hopping model can have a plausible chi,
+and a pyramidal cone has the right chi with a torque 21 % too low.
 """
 
 import math
@@ -15,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from twin.assets.ground import KINDS, Ground, HeightData, low_passed
+from twin.assets.ground import DATA_KINDS, Ground, HeightData, fit_low_passed
 from twin.config import MeshConfig, MjcfConfig
 from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.mjcf.husky import add_husky, center_of_mass, coulomb_track_ratio, set_options
@@ -34,10 +37,7 @@ from twin.robot import (
 )
 from twin.types import Array
 
-# ---- Driving a Husky by its two actuators and `mj_step`, and recording what it does at every small step.
-#
-# Where it drives: on a plane, on a height field as the mjcf stage writes it, or on what a test adds. *Edit*: a change to
-# the `MjSpec` before it is compiled, so that wrong models can be measured like the right one.
+# ---- drives and recordings
 
 
 Edit = Callable[[mujoco.MjSpec], None]
@@ -46,7 +46,7 @@ SETTLE_TIME = 0.5  # [s] at rest before a drive
 
 
 def on_plane(params: HuskyParams | None = None, edit: Edit | None = None) -> mujoco.MjModel:
-    """The Husky on an endless plane."""
+    """Model of the Husky on a plane."""
     spec = mujoco.MjSpec()
     set_options(spec, params)
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1))
@@ -63,7 +63,7 @@ def on_ground(
     start: tuple[float, float, float] = (0.0, 0.0, 0.0),
     cell: float = MjcfConfig.hfield_cell,
 ) -> mujoco.MjModel:
-    """The Husky on a height field, at x, y [m] and yaw [rad]."""
+    """Model of the Husky on a height field as the mjcf stage writes it, starting at x, y [m] and yaw [rad]."""
     spec = mujoco.MjSpec()
     set_options(spec, params)
     with tempfile.TemporaryDirectory(prefix="twin-ground-") as folder:
@@ -78,7 +78,7 @@ def on_ground(
 
 @dataclass(frozen=True)
 class Recording:
-    """n small steps. Arrays per wheel are ordered as `twin.robot.WHEELS`, per side as `SIDES`."""
+    """n physics steps. Arrays per wheel are ordered as `twin.robot.WHEELS`, per side as `SIDES`."""
 
     timestep: float
     """[s]"""
@@ -93,18 +93,18 @@ class Recording:
     camera_z: Array
     """Height of the front camera [m], shape (n,)."""
     loaded: NDArray[np.int64]
-    """Tyres that touch something, shape (n,)."""
+    """Number of tires in contact, shape (n,)."""
     dissipated: Array
-    """What the contacts dissipate by sliding, rolling and spinning [W], shape (n,)."""
+    """Power dissipated by the contacts [W], shape (n,)."""
 
     @property
     def wheel_difference(self) -> float:
-        """Mean speed of the right wheels less that of the left ones [m/s]."""
+        """Mean speed of the right wheels minus that of the left wheels [m/s]."""
         return float((self.wheel @ [-0.5, 0.5, -0.5, 0.5]).mean() * WHEEL_RADIUS)
 
     @property
     def yaw_rate(self) -> float:
-        """Mean [rad/s]."""
+        """Mean yaw rate [rad/s]."""
         return float((self.pose[-1, 3] - self.pose[0, 3]) / (self.timestep * (len(self.pose) - 1)))
 
     @property
@@ -123,14 +123,14 @@ class Recording:
         return float(np.diff(self.camera_z, 2).std() / self.timestep**2)
 
     def per_frame(self, values: Array, rate: float = 30.0) -> Array:
-        """Changes of a series (n,) from picture to picture at `rate` [1/s]."""
+        """Changes of a series (n,) between frames at `rate` [1/s]."""
         every = 1.0 / (rate * self.timestep)
         steps = np.arange(0.0, len(values) - 1, every)
         return np.diff(np.interp(steps, np.arange(len(values)), values))
 
 
 def start_of(model: mujoco.MjModel) -> mujoco.MjData:
-    """The robot at rest."""
+    """State of the robot at rest."""
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, round(SETTLE_TIME / model.opt.timestep))
     return data
@@ -144,21 +144,16 @@ def record(
     params: HuskyParams | None = None,
     data: mujoco.MjData | None = None,
 ) -> Recording:
-    """Drives by commands through the robot's controller.
+    """Drives the robot through its controller for `seconds`, and records each physics step after the first `skip` [s].
 
-    Args:
-        model: With a Husky.
-        commands: v [m/s], ω [rad/s] wanted at a time [s], asked for every 0.1 s; None = no command.
-        seconds: To drive.
-        skip: The first of them are not recorded [s].
-        params: The controller's.
-        data: To go on from (and is moved on); by default the robot at rest.
+    `commands` maps the time [s] to v [m/s] and ω [rad/s], every 0.1 s; None = no command. `params` are those of the
+    controller. `data` is the initial state (by default the robot at rest) and is changed in place.
     """
     data = start_of(model) if data is None else data
     controller = Controller(params)
     actuators = [model.actuator(side).id for side in SIDES]
     dofs = [model.joint(f"{name}_wheel").dofadr[0] for name in WHEELS]
-    tyres = np.array([model.geom(f"{name}_tyre").id for name in WHEELS])
+    tires = np.array([model.geom(f"{name}_tyre").id for name in WHEELS])
     base, camera = model.body("base_link").id, model.camera("front").id
     rows: list[tuple] = []
     per_control = round(CONTROL_PERIOD / model.opt.timestep)
@@ -181,7 +176,7 @@ def record(
                     [*data.xpos[base], np.arctan2(axes[3], axes[0]), -np.arcsin(axes[6])],
                     data.qvel[[0, 1, 5]],
                     data.cam_xpos[camera, 2],
-                    np.isin(tyres, data.contact.geom).sum(),
+                    np.isin(tires, data.contact.geom).sum(),
                     dissipation(model, data),
                 )
             )
@@ -198,12 +193,12 @@ def drive(
     seconds: float = 1.5,
     params: HuskyParams | None = None,
 ) -> Recording:
-    """A constant command from rest: `seconds` are recorded after `skip` [s]."""
+    """Drives with a constant command from rest; records `seconds` after `skip` [s]."""
     return record(model, lambda _: (v, yaw_rate), skip + seconds, skip, params)
 
 
 def dissipation(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """What all contacts dissipate: Σ −(friction · slip velocity + rolling and spinning moments · spin) [W]."""
+    """Power dissipated by all contacts: Σ −(friction · slip velocity + rolling and spinning moments · spin) [W]."""
     total, wrench, velocity = 0.0, np.zeros(6), np.zeros((2, 6))
     for i in range(data.ncon):
         contact = data.contact[i]
@@ -218,13 +213,16 @@ def dissipation(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     return total
 
 
+# ---- rows and subjects
+
+
 GRAVITY = 9.81  # [m/s²]
 MASS = CHASSIS_MASS + 4 * WHEEL_MASS  # [kg] without payload
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measured number."""
+    """A measured number and its limits."""
 
     id: str
     quantity: str
@@ -244,74 +242,71 @@ class Subject:
 
     params: HuskyParams = field(default_factory=HuskyParams)
     edit: Edit | None = None
-    """Makes the model a wrong one."""
+    """Makes the model wrong."""
 
     def plane(self, **changes: Any) -> mujoco.MjModel:
-        """On a plane, some parameters changed."""
+        """Model on a plane, with changed parameters."""
         return on_plane(replace(self.params, **changes), self.edit)
 
     def turn(
         self, yaw_rate: float = 1.0, v: float = 0.0, skip: float = 1.5, seconds: float = 1.0, **changes: Any
     ) -> Recording:
-        """Turning on a plane: ω [rad/s], v [m/s], `seconds` recorded after `skip` [s], some parameters changed."""
+        """Turns on a plane at ω [rad/s] and v [m/s] with changed parameters; records `seconds` after `skip` [s]."""
         return drive(self.plane(**changes), v, yaw_rate, skip, seconds, replace(self.params, **changes))
 
 
-# ---- Ground to judge the Husky on: what the pipeline makes of a road whose true shape is known, and how rough it is.
-#
-# *Relief*: true height [m] of points (k, 2). *Reconstructed*: noisy data of the relief, fitted and low-passed by
-# `twin.assets.ground` as in a build. *Correlation length*: the distance over which the autocorrelation of the heights
-# along x falls to 1/e.
+# ---- test grounds
 
 
-_SPACING = 0.25  # [m] between data, as `ground_fit` thins them
-_FIELD_NOISE, _PATH_NOISE = (
-    0.03,
-    0.012,
-)  # [m] of a rendered height and of a steady camera's, as `ground_fit` weighs them
-_BESIDE = np.array([-0.6, -0.3, 0.0, 0.3, 0.6])  # [m] of the path
+_SPACING = 0.25  # [m] between data, as in `twin.assets.ground`
+_FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of rendered heights and of a steady camera, as in `twin.assets.ground`
+_LATERAL_OFFSETS = np.array([-0.6, -0.3, 0.0, 0.3, 0.6])  # [m] from the path
 
 
 def level(height: float = 0.0, half: float = 8.0, cell: float = 0.1) -> Ground:
-    """Exactly level ground around the origin, `half` [m] to each side."""
+    """Level ground around the origin, `half` [m] to each side."""
     n = round(2 * half / cell) + 1
-    return _grey(np.full((n, n), height), np.array([-half, -half]), cell)
+    return _gray(np.full((n, n), height), np.array([-half, -half]), cell)
 
 
 def random_relief(rms: float, length: float, rng: np.random.Generator, half: float = 9.0) -> Callable[[Array], Array]:
-    """Isotropic Gaussian bumps of an rms [m] and a length [m] (σ of the kernel), around the origin."""
+    """Isotropic Gaussian bumps around the origin: maps points (k, 2) to height; `length` [m] is the σ of the kernel."""
     cell = length / 4
     n = round(2 * half / cell) + 1
     height = gaussian_filter(rng.normal(size=(n, n)), length / cell)
-    bumps = _grey(height * rms / height.std(), np.array([-half, -half]), cell)
+    bumps = _gray(height * rms / height.std(), np.array([-half, -half]), cell)
     return bumps.at
 
 
 def reconstructed(
     rng: np.random.Generator, relief: Callable[[Array], Array] | None = None, size: tuple[float, float] = (8.0, 4.0)
 ) -> Ground:
-    """A road along x, `size` [m] to each side of the origin, as the mesh stage would find it. Level by default."""
+    """Ground fitted as in a build to noisy data of a road along x, `size` [m] to each side of the origin.
+
+    `relief` maps points (k, 2) to the true height [m]; level by default.
+    """
     relief = relief or (lambda xy: np.zeros(len(xy)))
     high = np.array(size)
     x, y = (np.arange(-h + _SPACING / 2, h, _SPACING) for h in size)
     field = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    # A hand's wavering moves what is beside the path along with it.
-    waver = np.repeat(rng.normal(0.0, _PATH_NOISE, len(x)), len(_BESIDE))
-    path = np.stack(np.meshgrid(x, _BESIDE, indexing="ij"), -1).reshape(-1, 2)
+    # The sway of a hand-held camera shifts the data beside the path, too.
+    sway = np.repeat(rng.normal(0.0, _PATH_NOISE, len(x)), len(_LATERAL_OFFSETS))
+    path = np.stack(np.meshgrid(x, _LATERAL_OFFSETS, indexing="ij"), -1).reshape(-1, 2)
     data = HeightData.join(
         [
             _data(field, relief(field) + rng.normal(0.0, _FIELD_NOISE, len(field)), _FIELD_NOISE, "field"),
-            _data(path, relief(path) + waver, _PATH_NOISE, "path"),
+            _data(path, relief(path) + sway, _PATH_NOISE, "path"),
         ]
     )
-    height, grid, _ = low_passed(data, -high, high, MeshConfig())
-    return _grey(height, grid.origin, grid.cell)
+    height, grid, _ = fit_low_passed(data, -high, high, MeshConfig())
+    return _gray(height, grid.origin, grid.cell)
 
 
 def roughness(ground: Ground, line: Array) -> tuple[float, float]:
-    """Rms [m] and correlation length [m] of the heights along a polyline (m, ≥2), its slow rise taken out.
+    """Rms [m] and correlation length [m] of the heights along a polyline (m, ≥2).
 
-    The rise is a straight line per 8 m, which is far longer than a robot.
+    A straight line is subtracted per 8 m, which is much longer than the robot. The autocorrelation falls to 1/e at the
+    correlation length.
     """
     step = ground.cell / 2
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))])
@@ -322,27 +317,28 @@ def roughness(ground: Ground, line: Array) -> tuple[float, float]:
     for start in range(0, len(z) - window + 1, window):
         at = s[start : start + window]
         parts.append(z[start : start + window] - np.polyval(np.polyfit(at, z[start : start + window], 1), at))
-    rest = np.array(parts)
-    variance = float((rest**2).mean())
+    residuals = np.array(parts)
+    variance = float((residuals**2).mean())
     for lag in range(1, window // 2):
-        if (rest[:, lag:] * rest[:, :-lag]).mean() < variance / np.e:
+        if (residuals[:, lag:] * residuals[:, :-lag]).mean() < variance / np.e:
             return float(np.sqrt(variance)), lag * step
     return float(np.sqrt(variance)), window // 2 * step
 
 
 def _data(xy: Array, z: Array, sigma: float, kind: str) -> HeightData:
-    return HeightData(np.column_stack([xy, z]), np.full(len(xy), sigma), np.full(len(xy), KINDS.index(kind), np.int8))
+    kinds = np.full(len(xy), DATA_KINDS.index(kind), np.int8)
+    return HeightData(np.column_stack([xy, z]), np.full(len(xy), sigma), kinds)
 
 
-def _grey(height: Array, origin: Array, cell: float) -> Ground:
+def _gray(height: Array, origin: Array, cell: float) -> Ground:
     return Ground(height, origin, cell, np.ones(height.shape, bool), np.full((*height.shape, 3), 90, np.uint8))
 
 
-# ---- Rows E and P: the same robot on ground from the shipped pipeline, and on convex parts.
+# ---- rows E and P: ground from the pipeline, and convex parts
 
 
 def flat_ground(subject: Subject) -> list[Row]:
-    """E1 and E2 on a height field without relief, and on what the pipeline makes of noisy data of a flat road."""
+    """E1 and E2 on a level height field, and on a flat road reconstructed from noisy data."""
     rows = []
     turn, straight = subject.turn(), drive(subject.plane(), 1.0, 0.0, 1.0, 1.0, subject.params)
     for label, ground in (
@@ -354,8 +350,8 @@ def flat_ground(subject: Subject) -> list[Row]:
         arc = drive(model, 0.5, 0.5, 1.5, 2.0, subject.params)
         spot = drive(model, 0.0, 1.0, 1.5, 1.5, subject.params)
         pitching = math.degrees(_rms(run.per_frame(run.pose[:, 4])))
-        more, more_straight = spot.power.mean() - turn.power.mean(), run.power.mean() - straight.power.mean()
-        share = float(spot.power.mean() / turn.power.mean())
+        extra, extra_straight = spot.power.mean() - turn.power.mean(), run.power.mean() - straight.power.mean()
+        ratio = float(spot.power.mean() / turn.power.mean())
         rows += [
             Row("E1", f"{label}: jolt straight, 1 m/s", run.jolt, 0.0, 1.0, "m/s²"),
             Row("E1", f"{label}: jolt on R = 1 m", arc.jolt, 0.0, 1.0, "m/s²"),
@@ -363,22 +359,22 @@ def flat_ground(subject: Subject) -> list[Row]:
             Row("E1", f"{label}: dz per frame", 1000 * _rms(run.per_frame(run.camera_z)), 0.0, 0.3, "mm rms"),
             Row("E1", f"{label}: dpitch per frame", pitching, 0.0, 0.05, "° rms"),
             Row("E2", f"{label}: chi / plane's", spot.chi / turn.chi, 0.95, 1.05),
-            Row("E2", f"{label}: turning power / plane's", share, 0.95, 1.05),
-            Row("E2", f"{label}: turning, more than on the plane", float(more), -math.inf, 10.0, "W"),
-            Row("E2", f"{label}: straight, more than on the plane", float(more_straight), -math.inf, 10.0, "W"),
+            Row("E2", f"{label}: turning power / plane's", ratio, 0.95, 1.05),
+            Row("E2", f"{label}: turning, more than on the plane", float(extra), -math.inf, 10.0, "W"),
+            Row("E2", f"{label}: straight, more than on the plane", float(extra_straight), -math.inf, 10.0, "W"),
         ]
     return rows
 
 
 def reconstructed_ground(subject: Subject) -> list[Row]:
-    """E3 on the roughest road the pipeline makes: bumps of 3 cm rms and 0.5 m, low-passed."""
+    """E3 on the roughest road that the pipeline produces: bumps of 3 cm rms and 0.5 m, low-passed."""
     rng = np.random.default_rng(1)
     ground = reconstructed(rng, random_relief(0.03, 0.5, rng))
     return chi_on(subject, ground, (-4.0, 0.0, 0.1), np.array([[-7.0, 0.0], [7.0, 0.0]]), "reconstructed bumps")
 
 
 def chi_on(subject: Subject, ground: Ground, start: tuple[float, float, float], line: Array, label: str) -> list[Row]:
-    """Row E3 on any ground: the robot starts at x, y [m], yaw [rad]; `line` (m, ≥2) is where roughness is measured."""
+    """E3 on any ground from x, y [m] and yaw [rad]; the roughness is measured along `line` (m, ≥2)."""
     rms, length = roughness(ground, line)
     model = on_ground(ground, subject.params, subject.edit, start)
     turn = drive(model, 0.0, 1.0, 1.5, 2.0 * math.pi, subject.params)
@@ -410,7 +406,7 @@ def halved_step(subject: Subject) -> list[Row]:
 
 
 def plates(subject: Subject) -> list[Row]:
-    """Convex parts side by side, flush as what was cut in two is: 0.3 m long, seams across and along the way."""
+    """P1: flush convex parts, 0.3 m long, with seams across and along the way, as where a mesh was cut in two."""
 
     def lay(spec: mujoco.MjSpec) -> None:
         if subject.edit is not None:
@@ -431,7 +427,7 @@ def plates(subject: Subject) -> list[Row]:
 
 
 def ramp(subject: Subject) -> list[Row]:
-    """A wedge that rises by 10° to a platform of 0.35 m, both convex meshes, as kerbs and ramps come out of a build."""
+    """P2: a wedge that rises by 10° to a platform of 0.35 m, both convex meshes, as curbs and ramps of a build."""
     height, run_up = 0.35, 0.35 / math.tan(math.radians(10.0))
 
     def put(spec: mujoco.MjSpec) -> None:
@@ -472,20 +468,20 @@ def _rms(values: Array) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-# ---- Rows A to D: what the model is made of, scrubbing and friction on a plane, and driving straight.
+# ---- rows A to D: composition, scrubbing and friction on a plane, driving straight
 
 
 _TURNS = (0.3, 1.0, 1.8)  # [rad/s] commanded
 
 
-def made_of(subject: Subject) -> list[Row]:
-    """A1, counted: free joint, four hinges, motors on wheels only, no helping hand."""
+def composition(subject: Subject) -> list[Row]:
+    """A1: violations of free joint, four hinges, motors on the wheels only, no artificial aids."""
     model = subject.plane()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     moment = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    tyres = [model.geom(f"{name}_tyre").id for name in WHEELS]
+    tires = [model.geom(f"{name}_tyre").id for name in WHEELS]
     hinges = [model.joint(f"{name}_wheel") for name in WHEELS]
     solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) & (model.geom_bodyid > 0))
     chassis = [model.geom("chassis_0").id, model.geom("chassis_1").id]
@@ -495,17 +491,17 @@ def made_of(subject: Subject) -> list[Row]:
         "mocap": model.nmocap > 0,
         "equalities": (model.eq_type != mujoco.mjtEq.mjEQ_JOINT).any(),
         "wheels": any(joint.bodyid[0] != model.body(joint.name).id for joint in hinges),
-        "casters": set(solid) != {*tyres, *chassis} or (model.geom_friction[tyres, 0] < 0.1).any(),
+        "casters": set(solid) != {*tires, *chassis} or (model.geom_friction[tires, 0] < 0.1).any(),
         "gravity": bool(model.body_gravcomp.any()),
-        "tyres": (model.geom_type[tyres] == mujoco.mjtGeom.mjGEOM_MESH).any(),
+        "tyres": (model.geom_type[tires] == mujoco.mjtGeom.mjGEOM_MESH).any(),
         "flags": model.opt.disableflags != 0 or model.opt.enableflags != 0,
     }
-    found = [name for name, wrong in violations.items() if wrong]
-    return [Row("A1", f"what does not belong: {', '.join(found) or 'nothing'}", float(len(found)), 0.0, 0.0)]
+    violated = [name for name, wrong in violations.items() if wrong]
+    return [Row("A1", f"what does not belong: {', '.join(violated) or 'nothing'}", float(len(violated)), 0.0, 0.0)]
 
 
 def measures(subject: Subject) -> list[Row]:
-    """A2: the five measures that differ most."""
+    """A2: largest relative error of five measures."""
     model = subject.plane(payload_mass=10.0)
     hubs = np.array([model.body(f"{name}_wheel").pos for name in WHEELS])
     size = model.geom("front_left_tyre").size
@@ -521,7 +517,7 @@ def measures(subject: Subject) -> list[Row]:
 
 
 def track_ratios(subject: Subject) -> list[Row]:
-    """B1, centred and rear-heavy."""
+    """B1: chi of a centered and of a rear-heavy robot."""
     rows = []
     for label, center, bound in (("centred", HuskyParams.center_of_mass, 0.03), ("rear-heavy", REAR_HEAVY, 0.10)):
         changed = replace(subject.params, center_of_mass=center)
@@ -535,13 +531,13 @@ def track_ratios(subject: Subject) -> list[Row]:
 
 
 def friction_spread(subject: Subject) -> list[Row]:
-    """B2."""
+    """B2: spread of chi over friction."""
     ratios = [subject.turn(friction=mu).chi for mu in (0.35, 0.7, 1.0)]
     return [Row("B2", "spread of chi over friction .35, .7, 1", 100 * np.ptp(ratios) / np.mean(ratios), 0.0, 2.0, "%")]
 
 
 def arcs(subject: Subject) -> list[Row]:
-    """B3, at 0.4 m/s."""
+    """B3: chi on arcs at 0.4 m/s."""
     on_the_spot = subject.turn().chi
     rows = []
     for radius in (0.5, 1.0, 2.0):
@@ -551,7 +547,7 @@ def arcs(subject: Subject) -> list[Row]:
 
 
 def scrubbing(subject: Subject) -> list[Row]:
-    """B4 and B5 at 1 rad/s."""
+    """B4 and B5: torque and power of a point turn at 1 rad/s."""
     turn = subject.turn()
     load = MASS * GRAVITY / 4
     arm = WHEEL_RADIUS * math.sin(math.atan(WHEELBASE / TRACK))
@@ -564,10 +560,10 @@ def scrubbing(subject: Subject) -> list[Row]:
 
 
 def quiet(subject: Subject) -> list[Row]:
-    """B6 and B7."""
+    """B6 and B7: jolt and loaded wheels in point turns."""
     rows, loaded = [], []
     for rate, friction in (*((rate, subject.params.friction) for rate in _TURNS), (1.8, 1.0)):
-        # Flutter takes seconds to build up; the fastest, grippiest turn is where it would show.
+        # Flutter takes seconds to build up, and shows first in the fastest turn at the highest friction.
         turn = subject.turn(rate, skip=5.0 if friction == 1.0 else 1.5, friction=friction)
         loaded.append(float((turn.loaded == 4).mean()))
         rows.append(Row("B6", f"jolt at {rate:g} rad/s, friction {friction:g}", turn.jolt, 0.0, 0.2, "m/s²"))
@@ -575,26 +571,26 @@ def quiet(subject: Subject) -> list[Row]:
 
 
 def drift(subject: Subject) -> list[Row]:
-    """B8."""
+    """B8: drift in a point turn."""
     turn = subject.turn(skip=0.1, seconds=3.0)
     away = 1000 * float(np.linalg.norm(turn.pose[-1, :2] - turn.pose[0, :2]))
     return [Row("B8", "drift in a 3 s point turn", away, 0.0, 5.0, "mm")]
 
 
-def pushed(subject: Subject) -> list[Row]:
-    """A sideways force at the centre of mass of the parked robot, for a second."""
+def push(subject: Subject) -> list[Row]:
+    """C1: a sideways force at the center of mass of the parked robot for 1 s."""
     values = []
-    for share in (0.7, 1.3):
+    for ratio in (0.7, 1.3):
         model = subject.plane()
         data = start_of(model)
         base, mass = model.body("base_link").id, float(model.body_mass.sum())
-        force = np.array([0.0, share * subject.params.friction * mass * GRAVITY, 0.0])
+        force = np.array([0.0, ratio * subject.params.friction * mass * GRAVITY, 0.0])
         data.xfrc_applied[base] = [*force, *np.cross(data.subtree_com[base] - data.xipos[base], force)]
         steps = round(0.5 / model.opt.timestep)
         mujoco.mj_step(model, data, steps)
         before = data.qvel[1]
         mujoco.mj_step(model, data, steps)
-        excess = (share - 1.0) * subject.params.friction * GRAVITY
+        excess = (ratio - 1.0) * subject.params.friction * GRAVITY
         values.append((1000 * abs(float(data.qvel[1])), float(data.qvel[1] - before) / 0.5 / excess))
     return [
         Row("C1", "speed under a push of 0.7 μmg", values[0][0], 0.0, 3.0, "mm/s"),
@@ -603,7 +599,7 @@ def pushed(subject: Subject) -> list[Row]:
 
 
 def slopes(subject: Subject) -> list[Row]:
-    """C2: gravity is tilted rather than the plane, which is the same slope in the robot's own frame."""
+    """C2: creep and sliding on slopes; gravity is tilted instead of the plane, which is equivalent."""
     rows = []
     limit = math.degrees(math.atan(subject.params.friction))
     for steeper, low, high in ((-2.0, 0.0, 10.0), (2.0, 500.0, math.inf)):
@@ -622,7 +618,7 @@ def slopes(subject: Subject) -> list[Row]:
 
 
 def stall(subject: Subject) -> list[Row]:
-    """C3."""
+    """C3: yaw rate with limited motor torque."""
     free = subject.turn().yaw_rate
     weak, strong = (subject.turn(skip=2.0, motor_torque=2 * cap).yaw_rate for cap in (10.0, 12.0))
     return [
@@ -632,7 +628,7 @@ def stall(subject: Subject) -> list[Row]:
 
 
 def straight(subject: Subject) -> list[Row]:
-    """D1, D2, D3 and D5 over 10 m at 1 m/s."""
+    """D1, D2, D3 and D5: 10 m straight at 1 m/s."""
     run = drive(subject.plane(), 1.0, 0.0, skip=1.0, seconds=10.0, params=subject.params)
     speed = float((run.pose[-1, 0] - run.pose[0, 0]) / (run.timestep * (len(run.pose) - 1)))
     rolled = float(run.wheel.mean() * WHEEL_RADIUS)
@@ -648,7 +644,7 @@ def straight(subject: Subject) -> list[Row]:
 
 
 def stops(subject: Subject) -> list[Row]:
-    """D4."""
+    """D4: stopping distances."""
     model = subject.plane()
     rows = []
     for label, ramp, low, high in (("3 m/s² ramp", True, 0.12, 0.20), ("instant zero", False, 0.065, 0.13)):
@@ -657,7 +653,7 @@ def stops(subject: Subject) -> list[Row]:
         controller = Controller(subject.params)
         controller.command(0.0, 1.0, 0.0)
         for _ in range(4):
-            controller.update(0.0)  # brings its own limits up to 1 m/s
+            controller.update(0.0)  # ramps its own command up to 1 m/s
         x = float(data.qpos[0])
         for k in range(10):
             controller.command(k * 0.1, 0.0, 0.0)
@@ -672,21 +668,17 @@ def stops(subject: Subject) -> list[Row]:
 
 
 def overshoot(subject: Subject) -> list[Row]:
-    """D6, after a step command of 1 rad/s."""
+    """D6: overshoot after a step command of 1 rad/s."""
     turn = subject.turn(skip=0.0, seconds=2.0)
     rate = turn.velocity[:, 2]
     return [Row("D6", "yaw rate overshoot", 100 * float(rate.max() / rate[-250:].mean() - 1.0), 0.0, 10.0, "%")]
 
 
-# ---- The whole table, and the wrong robots that must not pass it.
-#
-# Ids: A what it is made of, B scrubbing on a plane, C friction at rest, D driving, E ground from the shipped pipeline; P
-# goes beyond. Judge chi together with B4 to B6: a hopping model can read a plausible chi, and a pyramidal cone reads the
-# right chi with a torque 21 % too low.
+# ---- table and negative controls
 
 
 MEASURES: dict[str, Callable[[Subject], list[Row]]] = {
-    "A1": made_of,
+    "A1": composition,
     "A2": measures,
     "B1": track_ratios,
     "B2": friction_spread,
@@ -694,7 +686,7 @@ MEASURES: dict[str, Callable[[Subject], list[Row]]] = {
     "B4 B5": scrubbing,
     "B6 B7": quiet,
     "B8": drift,
-    "C1": pushed,
+    "C1": push,
     "C2": slopes,
     "C3": stall,
     "D1 D2 D3 D5": straight,
@@ -706,23 +698,23 @@ MEASURES: dict[str, Callable[[Subject], list[Row]]] = {
     "P1": plates,
     "P2": ramp,
 }
-"""What measures which rows."""
+"""Measuring function of each group of rows."""
 
 
 @dataclass(frozen=True)
 class Control:
-    """A model that is wrong in a known way."""
+    """A negative control: a model that is wrong in a known way."""
 
     name: str
     subject: Subject
     fails: tuple[str, ...]
-    """Keys of MEASURES, each of which must have a row that it fails."""
+    """Keys of MEASURES; the model must fail at least one row of each."""
 
 
 def _default_contacts(spec: mujoco.MjSpec) -> None:
     for name in WHEELS:
-        tyre = spec.geom(f"{name}_tyre")
-        tyre.solref, tyre.solimp = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
+        tire = spec.geom(f"{name}_tyre")
+        tire.solref, tire.solimp = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
 
 
 def _pyramidal_cone(spec: mujoco.MjSpec) -> None:
@@ -735,14 +727,14 @@ def _mesh_tyres(spec: mujoco.MjSpec) -> None:
     mesh = spec.add_mesh(name="polygon")
     mesh.uservert = (np.concatenate([np.stack(ring, 1) for ring in rings]) * [1.0, WHEEL_WIDTH, 1.0]).ravel()
     for name in WHEELS:
-        tyre = spec.geom(f"{name}_tyre")
-        tyre.type, tyre.meshname = mujoco.mjtGeom.mjGEOM_MESH, "polygon"
+        tire = spec.geom(f"{name}_tyre")
+        tire.type, tire.meshname = mujoco.mjtGeom.mjGEOM_MESH, "polygon"
 
 
 def _casters(spec: mujoco.MjSpec) -> None:
     for name in WHEELS[2:]:
-        tyre = spec.geom(f"{name}_tyre")
-        tyre.condim, tyre.friction = 1, (0.0, 0.0, 0.0)
+        tire = spec.geom(f"{name}_tyre")
+        tire.condim, tire.friction = 1, (0.0, 0.0, 0.0)
 
 
 CONTROLS = (

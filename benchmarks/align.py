@@ -19,7 +19,7 @@ import motor_currents
 from record import add_record_options, save
 
 from twin import runtime
-from twin.align import run, summary
+from twin.align import align_to_log, summary
 from twin.robot import REAR_HEAVY, HuskyParams
 
 _DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -82,7 +82,7 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         work = options.work or Path(scratch)
-        result, folder = run("husky", options.data / _LOG, work)
+        result, folder = align_to_log("husky", options.data / _LOG, work)
         figures = json.loads((folder / "alignment" / "align.json").read_text(encoding="utf-8"))
     print(summary(result))
     print("MJCF against the kinematic baseline, pose after 2 s, median over windows not fitted to:")
@@ -90,7 +90,7 @@ def main() -> int:
     rows = judged(figures)
     for name, value, target, met in rows:
         print(f"{name:28} {value:8.4f}   wanted {target:.4f}   {'met' if met else 'missed'}")
-    runtime.say("currents on asphalt")
+    runtime.log_line("currents on asphalt")
     asphalt = efforts(options.data)
     print(f"\n{'a turn against driving straight':64} outer  inner   mean")
     for name, e in asphalt.items():

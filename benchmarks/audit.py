@@ -1,13 +1,13 @@
-"""Looks for what a learning policy would exploit: physics that can be cheated, in episodes and beyond them.
+"""Audit of a scene for physics and task rules that a learning policy could exploit.
 
-Two *explorers* drive. The *random* one wanders; the *greedy* one wants something: in an episode a short cut to the
-goal, outside of one a solid part to run into, at full speed. In *episodes* the task's own rules end the drive; while
-*roaming* nothing does, so that walls are pushed, slid along and climbed for as long as an explorer likes.
+Two *explorers* drive: the *random* one wanders; the *greedy* one takes short cuts to the goal in episodes and rams
+convex parts at full speed while roaming. *Episodes* end by the task's rules; *roaming* has no task, so walls can be
+pushed, slid along and climbed at length.
 
-*Tunnelling*: a part penetrated deeper than `_TUNNEL`. *Climbing*: the base higher above the ground than it can stand,
-by more than `_CLIMB`. *Wall sliding*: moving along while touching a part, faster than `_SLIDE`; while roaming it is
-physics, in an episode it would be a hole in the rules. *Gap*: the visual mesh, as seen, reaches into the robot's body
-and nothing was touched. A *false success* is an episode that ended at its goal after any of these.
+*Tunnelling*: a part is penetrated deeper than `_TUNNEL_DEPTH`. *Climbing*: the base is more than `_CLIMB_HEIGHT` above
+its standing height. *Wall sliding*: the robot touches a part and moves faster than `_SLIDE_SPEED`; legitimate while
+roaming, a flaw of the rules in an episode. *Gap*: the visual mesh is inside the robot's body without a contact. A
+*false success* is an episode that reached its goal after any of these.
 """
 
 import time
@@ -19,87 +19,82 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
+from twin.env.dm import control
 from twin.env.episode_model import episode_spec
 from twin.env.obstacles import ground_height
-from twin.env.options import control
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.env.suite import EnvFactory
-from twin.mjcf.world import PART_GROUP, World, heading_error, nearest, point_at
+from twin.mjcf.world import PART_GROUP, World, heading_error, nearest_on_route, point_at
 from twin.robot import BASE_HEIGHT
 from twin.runtime import bar
 from twin.types import Array
 
 EVENTS = ("tunnelling", "climbing", "wall_sliding", "gap")
 
-_TUNNEL = 0.05  # [m]
-_CLIMB = 0.08  # [m]
-_SLIDE = 0.2  # [m/s]
-_BODY = ((-0.40, 0.40), (-0.22, 0.22), (0.02, 0.20))  # [m] of the base, well within its collision boxes
+_TUNNEL_DEPTH = 0.05  # [m]
+_CLIMB_HEIGHT = 0.08  # [m]
+_SLIDE_SPEED = 0.2  # [m/s]
+_BODY = ((-0.40, 0.40), (-0.22, 0.22), (0.02, 0.20))  # [m] x, y, z ranges in the base, well inside its collision boxes
 _ROAM_WIDTH = 6.0  # [m] from the route
-_ROAM_TIME = 20.0  # [s] before it is put elsewhere
-_PERIOD = 0.1  # [s]
-_PUSH_STEPS, _BACK_STEPS = 60, 15  # control steps at one part, and away from it
+_ROAM_TIME = 20.0  # [s] before the robot is moved elsewhere
+_CONTROL_PERIOD = 0.1  # [s]
+_PUSH_STEPS, _BACK_STEPS = 60, 15  # control steps towards a part, and away from it
 
 
 @dataclass
 class Findings:
-    """What came up."""
+    """Results of an audit."""
 
     seconds: float = 0.0
-    """Simulated."""
+    """Simulated time."""
     episodes: Counter = field(default_factory=Counter)
-    """Ends of episodes by cause."""
+    """Number of episodes by cause of their end."""
     touching: int = 0
-    """Control steps with a touch."""
+    """Control steps with a contact."""
     events: Counter = field(default_factory=Counter)
-    """Control steps with an event, by its name; `episode_` before it if in an episode."""
+    """Control steps with an event, by its name; in an episode with the prefix `episode_`."""
     places: dict[str, list[list[float]]] = field(default_factory=dict)
-    """x, y [m] of the first of each kind."""
+    """x, y [m] of the first 20 of each event."""
     false_successes: int = 0
     wall_seconds: float = 0.0
 
     def note(self, name: str, xy: Array) -> None:
+        """Counts an event at x, y [m]."""
         self.events[name] += 1
         if len(self.places.setdefault(name, [])) < 20:
             self.places[name].append([round(float(v), 2) for v in xy])
 
     def summary(self) -> dict[str, Any]:
-        """JSON-able."""
-        every = [*(f"episode_{name}" for name in EVENTS), *EVENTS]
+        """Results for JSON."""
+        names = [*(f"episode_{name}" for name in EVENTS), *EVENTS]
         return {
             "simulated_s": round(self.seconds, 1),
             "wall_s": round(self.wall_seconds, 1),
             "episodes": dict(sorted(self.episodes.items())),
             "steps_touching": self.touching,
-            "steps_with": {name: self.events[name] for name in every},
+            "steps_with": {name: self.events[name] for name in names},
             "false_successes": self.false_successes,
             "places": self.places,
         }
 
 
-def audit(stage: EnvFactory, hours: float = 1.0, seed: int = 0) -> Findings:
-    """Drives for some simulated time, half of it in episodes, half of it roaming; each half by both explorers.
-
-    Args:
-        stage: Scene and task.
-        hours: Of simulated time.
-        seed: Of explorers and episodes.
-    """
+def audit(factory: EnvFactory, hours: float = 1.0, seed: int = 0) -> Findings:
+    """Drives for `hours` of simulated time, half in episodes and half roaming, each half with both explorers."""
     findings, begin = Findings(), time.perf_counter()
-    seen = Seen(stage.world)
-    share = hours * 3600.0 / 4.0
-    with bar("audit", round(4 * share), "s") as progress:
+    visual_mesh = VisualMesh(factory.world)
+    seconds = hours * 3600.0 / 4.0
+    with bar("audit", round(4 * seconds), "s") as progress:
         for greedy in (False, True):
             rng = np.random.default_rng([seed, greedy])
-            _episodes(stage, findings, seen, greedy, share, rng, progress)
-            _roam(stage, findings, seen, greedy, share, rng, progress)
+            _episodes(factory, findings, visual_mesh, greedy, seconds, rng, progress)
+            _roam(factory, findings, visual_mesh, greedy, seconds, rng, progress)
     findings.wall_seconds = time.perf_counter() - begin
     return findings
 
 
-class Seen:
-    """The visual mesh above the ground."""
+class VisualMesh:
+    """Vertices of the visual mesh."""
 
     def __init__(self, world: World) -> None:
         spec = mujoco.MjSpec.from_file(str(world.model_path))
@@ -111,7 +106,7 @@ class Seen:
         self._tree = cKDTree(self._points[:, :2]) if len(self._points) else None
 
     def inside(self, base_to_world: Array) -> bool:
-        """Whether a vertex is within the robot's body at a pose (4, 4)."""
+        """True if a vertex is inside the robot's body at a pose (4, 4)."""
         if self._tree is None:
             return False
         near = self._tree.query_ball_point(base_to_world[:2, 3], 0.5)
@@ -120,54 +115,54 @@ class Seen:
         return bool(((local > low) & (local < high)).all(1).any())
 
 
-class Examiner:
-    """Looks at a robot after every control step."""
+class EventDetector:
+    """Detects events of a robot after each control step."""
 
-    def __init__(self, physics: HuskyPhysics, seen: Seen) -> None:
-        self._physics, self._seen = physics, seen
+    def __init__(self, physics: HuskyPhysics, visual_mesh: VisualMesh) -> None:
+        self._physics, self._visual_mesh = physics, visual_mesh
         model = physics.model
         body = model.body("base_link").id
         self._robot = model.body_rootid[model.geom_bodyid] == body
         self._solid = ~self._robot & (np.arange(model.ngeom) != model.geom("ground").id)
 
     def events(self) -> list[str]:
-        """What is wrong just now."""
+        """Names of the current events."""
         physics, found = self._physics, []
         contact = physics.data.contact
         pairs = contact.geom
         hit = (self._robot[pairs[:, ::-1]] & self._solid[pairs]).any(1) if len(pairs) else np.zeros(0, bool)
-        if hit.any() and contact.dist[hit].min() < -_TUNNEL:
+        if hit.any() and contact.dist[hit].min() < -_TUNNEL_DEPTH:
             found.append("tunnelling")
         base = physics.base_to_world
         if self._climbed(base):
             found.append("climbing")
-        if hit.any() and abs(physics.speed) > _SLIDE:
+        if hit.any() and abs(physics.speed) > _SLIDE_SPEED:
             found.append("wall_sliding")
-        if not physics.touched and self._seen.inside(base):
+        if not physics.touched and self._visual_mesh.inside(base):
             found.append("gap")
         return found
 
     def _climbed(self, base: Array) -> bool:
         ground = ground_height(self._physics.model, base[0, 3], base[1, 3])
-        return bool(base[2, 3] - ground > BASE_HEIGHT + _CLIMB)
+        return bool(base[2, 3] - ground > BASE_HEIGHT + _CLIMB_HEIGHT)
 
 
 def _episodes(
-    stage: EnvFactory,
+    factory: EnvFactory,
     findings: Findings,
-    seen: Seen,
+    visual_mesh: VisualMesh,
     greedy: bool,
     seconds: float,
     rng: np.random.Generator,
     progress: Any,
 ) -> None:
-    physics, task = stage.drive(int(rng.integers(2**31)))
+    physics, task = factory.make_env(int(rng.integers(2**31)))
     environment = control.Environment(physics, task, control_timestep=task.options.control_timestep)
     done = 0.0
     while done < seconds:
         environment.reset()
-        examiner = Examiner(physics.robot, seen)
-        explorer = _ShortCut(task.world, task.stretch, rng) if greedy else _Wanderer(rng)
+        detector = EventDetector(physics.robot, visual_mesh)
+        explorer = _ShortCut(task.world, task.segment, rng) if greedy else _Wanderer(rng)
         suspicious = False
         while True:
             v, yaw_rate = explorer.command(physics.planar_pose)
@@ -175,9 +170,9 @@ def _episodes(
             last = environment.step(action).last()
             done += task.options.control_timestep
             progress.update(task.options.control_timestep)
-            events = examiner.events()
+            events = detector.events()
             findings.touching += bool(physics.touched)
-            # A touch ends the episode, so sliding along in its last step gains nothing.
+            # A contact ends the episode, so sliding in its last step gains nothing.
             for name in events if task.cause != "collision" else [e for e in events if e != "wall_sliding"]:
                 findings.note(f"episode_{name}", physics.planar_pose[:2])
                 suspicious = True
@@ -189,41 +184,41 @@ def _episodes(
 
 
 def _roam(
-    stage: EnvFactory,
+    factory: EnvFactory,
     findings: Findings,
-    seen: Seen,
+    visual_mesh: VisualMesh,
     greedy: bool,
     seconds: float,
     rng: np.random.Generator,
     progress: Any,
 ) -> None:
-    world, stretch = stage.world, stage.stretch
-    model = episode_spec(world, stretch.start, stretch.end, _ROAM_WIDTH + 1.0).compile()
+    world, segment = factory.world, factory.segment
+    model = episode_spec(world, segment.start, segment.end, _ROAM_WIDTH + 1.0).compile()
     robot = HuskyPhysics(model, world.robot)
-    examiner = Examiner(robot, seen)
+    detector = EventDetector(robot, visual_mesh)
     done = 0.0
     while done < seconds:
-        s = rng.uniform(stretch.start, stretch.end)
+        s = rng.uniform(segment.start, segment.end)
         x, y = point_at(world.route[:, :2], s)
-        robot.place(float(x), float(y), float(rng.uniform(-np.pi, np.pi)))
+        robot.set_pose(float(x), float(y), float(rng.uniform(-np.pi, np.pi)))
         explorer = _Rammer(model, rng) if greedy else _Wanderer(rng, reverse=True)
         until = done + _ROAM_TIME
         while done < until:
             robot.command(*explorer.command(robot.planar_pose))
-            robot.step(_PERIOD)
-            done += _PERIOD
-            progress.update(_PERIOD)
+            robot.step(_CONTROL_PERIOD)
+            done += _CONTROL_PERIOD
+            progress.update(_CONTROL_PERIOD)
             findings.touching += bool(robot.touched)
-            for name in examiner.events():
+            for name in detector.events():
                 findings.note(name, robot.planar_pose[:2])
-            _, off = nearest(world.route, robot.planar_pose[:2])
+            _, off = nearest_on_route(world.route, robot.planar_pose[:2])
             if abs(float(off)) > _ROAM_WIDTH or robot.uprightness < 0.3:
                 break
     findings.seconds += done
 
 
 class _Wanderer:
-    """Turns and speeds that change little from one step to the next."""
+    """Commands from a random walk of speed and yaw rate."""
 
     def __init__(self, rng: np.random.Generator, reverse: bool = False) -> None:
         self._rng, self._lowest, self._v, self._yaw_rate = rng, -1.0 if reverse else 0.0, 0.5, 0.0
@@ -235,20 +230,20 @@ class _Wanderer:
 
 
 class _ShortCut:
-    """Makes straight for a point of the route some way ahead."""
+    """Drives straight at a point of the route 1 to 12 m ahead."""
 
-    def __init__(self, world: World, stretch: RouteSegment, rng: np.random.Generator) -> None:
-        self._route, self._s = world.route[:, :2], stretch.start
+    def __init__(self, world: World, segment: RouteSegment, rng: np.random.Generator) -> None:
+        self._route, self._s = world.route[:, :2], segment.start
         self._ahead = rng.uniform(1.0, 12.0)
 
     def command(self, pose: Array) -> tuple[float, float]:
-        foot, _ = nearest(self._route, pose[:2], (self._s - 1.0, self._s + 3.0))
+        foot, _ = nearest_on_route(self._route, pose[:2], (self._s - 1.0, self._s + 3.0))
         self._s = max(self._s, float(foot))
         return _toward(pose, point_at(self._route, self._s + self._ahead))
 
 
 class _Rammer:
-    """Runs into one solid part after the other, and pushes."""
+    """Drives into one convex part after the other, and pushes."""
 
     def __init__(self, model: mujoco.MjModel, rng: np.random.Generator) -> None:
         parts = np.flatnonzero(model.geom_group == PART_GROUP)
@@ -259,7 +254,7 @@ class _Rammer:
         if not self._left:
             near = np.argsort(np.linalg.norm(self._targets - pose[:2], axis=1))[:20]
             self._target = self._targets[self._rng.choice(near)] if len(near) else pose[:2] + self._rng.normal(0, 3, 2)
-            self._target = self._target + self._rng.normal(0.0, 0.4, 2)  # to graze it, too
+            self._target = self._target + self._rng.normal(0.0, 0.4, 2)  # so that some are only grazed
             self._left = _PUSH_STEPS + _BACK_STEPS
         self._left -= 1
         if self._left < _BACK_STEPS:
@@ -269,7 +264,7 @@ class _Rammer:
 
 
 def _toward(pose: Array, target: Array) -> tuple[float, float]:
-    """Full speed at a point, turning on the spot where it is far to the side."""
+    """Command at full speed towards a point, turning on the spot if it is far to the side."""
     x, y = target - pose[:2]
     error = float(heading_error(np.arctan2(y, x), pose[2]))
     return (1.0 if abs(error) < 1.0 else 0.0), float(np.clip(2.0 * error, -1.0, 1.0))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from record import add_record_options, save
 
-from twin.env.domain_randomization import ANOTHER_DAY, UNTOLD, RandomizationSample
+from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, RandomizationSample
 from twin.env.mujoco_renderer import camera_intrinsics
 from twin.env.weather import Weather
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
@@ -37,7 +37,7 @@ STRAIGHT = 4  # of them, where policies of the straight road drive
 SIZE = (160, 90)
 DRAWS = 8  # of the weather, per day
 RESAMPLED = 500  # times, for intervals of 90 %
-SCALES = (1.0, 0.8, 0.7, UNTOLD, 0.5)  # of another day's sun and shadows
+SCALES = (1.0, 0.8, 0.7, KNOWN_WEATHER_FRACTION, 0.5)  # of another day's sun and shadows
 
 Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 
@@ -46,13 +46,13 @@ def real(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
     """Pictures of every day at every station, and the camera's poses there, (stations, 4, 4), in the true world."""
     line, rows, poses = RoadLine(), [], np.zeros((len(STATIONS), 4, 4))
     for light in track([WEATHER[name] for name in days], "pictures of days", unit="day"):
-        road, eye = recordings._camera(light)
+        road, camera = recordings._road_and_camera(light)
         row = []
         for k, station in enumerate(STATIONS):
             x, y = line.at(station).tolist()
-            road.physics.robot.place(x, y, float(line.heading(station)))
+            road.physics.robot.set_pose(x, y, float(line.heading(station)))
             poses[k] = road.physics.camera_to_world
-            row.append(np.asarray(resize(eye.look(poses[k], 0.0), *SIZE), np.float32) / 255.0)
+            row.append(np.asarray(resize(camera.capture(poses[k], 0.0), *SIZE), np.float32) / 255.0)
         rows.append(row)
     return np.array(rows), poses
 
@@ -108,7 +108,7 @@ def main() -> int:
     clear = [field.render(views, name) for name in given.days]
     depth = clear[0].depth
     hazed = np.array(
-        [field.air(name).over(one.rgb, depth * lengths) for name, one in zip(given.days, clear, strict=True)]
+        [field.fog(name).apply(one.rgb, depth * lengths) for name, one in zip(given.days, clear, strict=True)]
     )
     filmed = [field.render(views, name).rgb for name in field.lightings_by_name.filmed().names]
     figures: dict[str, float] = {}
@@ -118,28 +118,28 @@ def main() -> int:
         print(f"{name:44} {value:8.3f}", flush=True)
 
     for i, name in enumerate(given.days):
-        tell(f"day.extinction.{name}", field.air(name).extinction)
+        tell(f"day.extinction.{name}", field.fog(name).extinction)
         for what, many in (("filmed", filmed), ("photo", [hazed[i]])):
             means = [np.mean([psnr(a, b) for a, b in zip(p[1:], shown[i, 1:], strict=True)]) for p in many]
             tell(f"day.psnr.{what}.{name}", max(means))
 
     rng = np.random.default_rng(0)
-    drawn = [[ANOTHER_DAY.draw(rng) for _ in given.days] for _ in range(DRAWS)]
+    drawn = [[EVALUATION_RANGES.sample(rng) for _ in given.days] for _ in range(DRAWS)]
     seeds = rng.integers(2**31, size=(DRAWS, len(given.days)))
 
     def weathered(scale: float, days: list[RandomizationSample], numbers: NDArray) -> Pictures:
         rows = []
         for i, (name, draw, number) in enumerate(zip(given.days, days, numbers, strict=True)):
             weaker = RandomizationSample(sunlight=scale * draw.sunlight, shade=scale * draw.shade)
-            weather = Weather(weaker, np.random.default_rng(number), field.air(name))
+            weather = Weather(weaker, np.random.default_rng(number), field.fog(name))
             seen = zip(clear[i].rgb, depth, poses, strict=True)
-            rows.append([weather.over(rgb, far, rays, pose) for rgb, far, pose in seen])
+            rows.append([weather.apply(rgb, far, rays, pose) for rgb, far, pose in seen])
         return np.array(rows)
 
     pictures = {scale: [weathered(scale, *one) for one in zip(drawn, seeds, strict=True)] for scale in SCALES}
     if given.pictures:
         for i, name in enumerate(given.days):
-            both = np.hstack([np.vstack(p[i]) for p in (shown, hazed, pictures[UNTOLD][0])])
+            both = np.hstack([np.vstack(p[i]) for p in (shown, hazed, pictures[KNOWN_WEATHER_FRACTION][0])])
             write_image(given.pictures / f"{name}.png", (np.clip(both, 0.0, 1.0) * 255.0).astype(np.uint8))
     gaps: list[NDArray] = []
     moves: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}

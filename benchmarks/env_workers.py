@@ -18,11 +18,11 @@ _STEPS = 60  # per timed run
 
 def standard_tasks(scene: Path) -> list[str]:
     """The standard tasks that a scene has, `right_turn` last; `route` where it has none."""
-    from twin.env.route_segments import STANDARD, tasks
+    from twin.env.route_segments import STANDARD_TASKS, scene_tasks
     from twin.loading import load_scene
 
-    there = tasks(load_scene(scene).world())
-    return [name for name in STANDARD if name in there] or ["route"]
+    there = scene_tasks(load_scene(scene).world())
+    return [name for name in STANDARD_TASKS if name in there] or ["route"]
 
 
 def one_obstacle(scene: Path) -> dict[str, Any]:
@@ -230,7 +230,7 @@ def host(scene: Path, count: int) -> dict[str, Any]:
         blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
 
     def show(field: BakedField, cameras: Any, lighting: Any, take: Any) -> None:
-        field._biases(lighting, len(cameras.camera_to_world))  # as `show` does, on the host
+        field._head_biases(lighting, len(cameras.camera_to_world))  # as `render_on_device` does, on the host
         take(*blank)
 
     GpuSimulation._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]

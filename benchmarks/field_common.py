@@ -40,7 +40,7 @@ def load_field(scene: Path) -> Any:
     """The radiance field of a built scene, as it was trained (torch)."""
     from twin.loading import load_scene
 
-    return load_scene(scene).radiance_field()
+    return load_scene(scene).radiance_field("cpu")
 
 
 def load_baked(place: Path, where: str = "cpu") -> Any:
@@ -69,7 +69,7 @@ def worker(*arguments: str | Path | int, environment: dict[str, str] | None = No
     """
     command = [sys.executable, str(_HERE / "field_workers.py"), *map(str, arguments)]
     path = os.pathsep.join(filter(None, [str(_HERE.parent), os.environ.get("PYTHONPATH", "")]))
-    settings = os.environ | {"TWIN_DEVICE": "cpu", "PYTHONPATH": path} | (environment or {})
+    settings = os.environ | {"PYTHONPATH": path} | (environment or {})
     done = subprocess.run(command, env=settings, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{' '.join(map(str, arguments))}:\n{done.stderr[-3000:]}")
@@ -83,11 +83,11 @@ def route_views(bench: Bench) -> Path:
     """
     file = bench.work / "views.npz"
     if not file.exists():
-        from twin.env.drivers import follow
         from twin.env.physics import HuskyPhysics
+        from twin.env.route_follower import follow_route
         from twin.loading import load_scene
 
         world = load_scene(bench.scene).world()
-        drive = follow(world, HuskyPhysics(world.model(), world.robot), 1.0)
+        drive = follow_route(world, HuskyPhysics(world.model(), world.robot), 1.0)
         np.savez(file, poses=drive.camera_to_world, intrinsics=world.intrinsics)
     return file

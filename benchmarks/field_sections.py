@@ -4,10 +4,7 @@
 to the finished field, reading the frames and stereo included; what is compiled once per machine is compiled before.
 """
 
-import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,12 +37,14 @@ class Pace:
         return max(1, int(((1.0 - _MARGIN) * budget - self.overhead) / self.step))
 
 
-def timed_fit(cameras: Cameras, points: SparsePoints, config: NerfConfig, steps: int) -> tuple[Any, float, Pace]:
+def timed_fit(
+    cameras: Cameras, points: SparsePoints, config: NerfConfig, steps: int, device: str = "cpu"
+) -> tuple[Any, float, Pace]:
     """The field after so many steps, the wall seconds of the whole call, and its pace."""
     from twin.nerf.trainer import train_field
 
     began = time.perf_counter()
-    field, metrics, _ = train_field(cameras, points, replace(config, steps=steps))
+    field, metrics, _ = train_field(cameras, points, replace(config, steps=steps), device=device)
     wall = time.perf_counter() - began
     return field, wall, Pace(wall - metrics["seconds_train"], metrics["seconds_train"] / steps)
 
@@ -77,18 +76,23 @@ def _fox_scene(bench: Bench) -> tuple[Cameras, SparsePoints]:
 
 
 def _within_budgets(
-    bench: Bench, cameras: Cameras, points: SparsePoints, config: NerfConfig, budgets: tuple[int, ...]
+    bench: Bench,
+    cameras: Cameras,
+    points: SparsePoints,
+    config: NerfConfig,
+    budgets: tuple[int, ...],
+    device: str = "cpu",
 ) -> Figures:
     from twin.nerf.dataset import load_frame
     from twin.nerf.evaluate import evaluate
 
-    timed_fit(cameras, points, config, 2)  # compiles kernels and reads the files once
-    _, _, pace = timed_fit(cameras, points, config, bench.pick(_PROBE_STEPS, 20))
+    timed_fit(cameras, points, config, 2, device)  # compiles kernels and reads the files once
+    _, _, pace = timed_fit(cameras, points, config, bench.pick(_PROBE_STEPS, 20), device)
     found: Figures = {"overhead_s": pace.overhead, "step_s": pace.step}
     found["frame_size"] = "{1}x{0}".format(*load_frame(cameras, 0, config.max_width)[1].shape)
     for budget in budgets:
         steps = pace.steps(budget)
-        field, wall, pace = timed_fit(cameras, points, config, steps)
+        field, wall, pace = timed_fit(cameras, points, config, steps, device)
         scores = evaluate(field, cameras, config.max_width, max_frames=len(cameras))
         (name,) = field.lightings
         found |= {
@@ -138,9 +142,9 @@ def _bake(bench: Bench, field: Any) -> tuple[Any, Figures, float]:
     config = load_config(scene.config_file, ())
     cameras, points = Cameras.load(scene.stage("metric")), SparsePoints.load(scene.stage("metric"))
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
-    wp.load_module("twin.nerf.kernels.bricks", device=field.where)
+    wp.load_module("twin.nerf.kernels.bricks", device=field.device)
     began = time.perf_counter()
-    baked, about = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "most_bricks": 1500}))
+    baked, about = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "max_bricks": 1500}))
     seconds = time.perf_counter() - began
     folder = bench.work / "baked"
     folder.mkdir(exist_ok=True)
@@ -163,7 +167,7 @@ def speed(bench: Bench) -> Figures:
     place, views = baked_place(bench), route_views(bench)
     count, repeats = bench.pick((60, 5), (4, 1))
     found: Figures = {}
-    for used in (1, 2)[: buffers.cores()]:
+    for used in (1, 2)[: buffers.available_cores()]:
         row = worker("frames", place, views, used, count, repeats)
         found |= {f"render.{key}_{used}core": value for key, value in row.items()}
     row = worker("ratio", place, views, bench.pick(SIZE[0], 16), bench.pick(3, 1))
@@ -221,12 +225,10 @@ def gpu(bench: Bench) -> Figures:
     if not (torch.cuda.is_available() and wp.is_cuda_available()):
         return {"gpu.none": "no CUDA device here; nothing of this section was measured"}
     found: Figures = {"gpu.device": torch.cuda.get_device_name()}
-    with _device("cuda"):
-        cameras, points = _fox_scene(bench)
-        config = replace(NerfConfig(), max_width=bench.pick(960, 96))
-        budget = bench.pick(60, 10)
-        row = _within_budgets(bench, cameras, points, config, (budget,))
-        found |= {f"gpu.fox.{key}": value for key, value in row.items()}
+    cameras, points = _fox_scene(bench)
+    config = replace(NerfConfig(), max_width=bench.pick(960, 96))
+    row = _within_budgets(bench, cameras, points, config, (bench.pick(60, 10),), "cuda")
+    found |= {f"gpu.fox.{key}": value for key, value in row.items()}
     if bench.scene is None:
         return found
     place, views = baked_place(bench), route_views(bench)
@@ -249,20 +251,6 @@ def gpu(bench: Bench) -> Figures:
         "gpu.cpu_difference_max": float(apart.max()),
         "gpu.cpu_difference_mean": float(apart.mean()),
     }
-
-
-@contextmanager
-def _device(name: str) -> Iterator[None]:
-    """TWIN_DEVICE for a while."""
-    former = os.environ.get("TWIN_DEVICE")
-    os.environ["TWIN_DEVICE"] = name
-    try:
-        yield
-    finally:
-        if former is None:
-            del os.environ["TWIN_DEVICE"]
-        else:
-            os.environ["TWIN_DEVICE"] = former
 
 
 SECTIONS = {"fox": fox, "bake": bake, "render": speed, "depth": depth, "train": train, "gpu": gpu}

@@ -157,7 +157,7 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     chosen = np.resize(np.arange(len(cameras)), int(count))  # the points know the frames by index, so no sorting
     height = constant_height(read_json(paths.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     trained, _, _ = train_field(
-        cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height
+        cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height, "cpu"
     )
     shown = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
     return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(shown).tolist()}

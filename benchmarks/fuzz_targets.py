@@ -220,7 +220,7 @@ def _overrides(case: Case) -> None:
 
 
 def _transforms(case: Case) -> None:
-    from twin.capture.formats import files_named, read_transforms
+    from twin.capture.formats import listed_files, read_transforms
 
     pose = np.eye(4).tolist()
     table = {
@@ -244,7 +244,7 @@ def _transforms(case: Case) -> None:
         (case.folder / f"{k}.png").write_bytes(case.stuff.images[".png"])
     path = case.folder / "transforms.json"
     path.write_bytes(mangled_text(case.rng, json_text(spoiled(case.rng, table))))
-    (files_named if case.rng.random() < 0.1 else read_transforms)(path)
+    (listed_files if case.rng.random() < 0.1 else read_transforms)(path)
 
 
 _CAMERAS_TXT = "# cameras\n1 PINHOLE 32 24 30 30 16 12\n2 OPENCV 32 24 30 30 16 12 0.1 0 0 0\n"
@@ -633,14 +633,14 @@ def _zip(case: Case) -> None:
 
 def _lighting(case: Case) -> None:
     import twin
-    from twin.scene import result_of
+    from twin.scene import stage_result
 
     root = case.folder / "scene"
     (root / "lightings").mkdir(parents=True)
     shutil.copyfile(case.stuff.twin / "scene.toml", root / "scene.toml")
     (root / "build").symlink_to(case.stuff.twin / "build")
     scene = twin.load_scene(root).scene
-    table = {"format": 2, "name": "dusk", "embedding": [0.1, 0.2, 0.3, 0.4], "field": result_of(scene, "field")}
+    table = {"format": 2, "name": "dusk", "embedding": [0.1, 0.2, 0.3, 0.4], "field": stage_result(scene, "field")}
     table |= {"air": {"extinction": 0.01, "airlight": [0.5, 0.5, 0.5]}, "photo": "a.jpg", "figures": {"psnr": 20.0}}
     text = mangled_text(case.rng, json_text(spoiled(case.rng, table)))
     name = case.rng.choice(("dusk", "dusk", "day", "training", "a b", "a:b", "+randomised"))
@@ -653,7 +653,7 @@ _STAGES = ("2_metric", "3_field", "4_mesh", "5_mjcf")
 
 def _damage_stage(rng: Random, root: Path, good: Path, sealed: bool) -> str:
     """A copy of a built scene (its whole stages are links) in which one file is damaged; returns the stage's folder."""
-    from twin.scene import seal
+    from twin.scene import write_stamp
 
     (root / "build").mkdir(parents=True)
     shutil.copyfile(good / "scene.toml", root / "scene.toml")
@@ -675,7 +675,7 @@ def _damage_stage(rng: Random, root: Path, good: Path, sealed: bool) -> str:
     if rng.random() < 0.05:
         path.unlink()
     if sealed:
-        seal(folder, {"2_metric": "metric", "3_field": "field", "4_mesh": "mesh", "5_mjcf": "mjcf"}[stage])
+        write_stamp(folder, {"2_metric": "metric", "3_field": "field", "4_mesh": "mesh", "5_mjcf": "mjcf"}[stage])
     return stage
 
 
@@ -714,9 +714,9 @@ def _built(case: Case) -> None:
     elif stage == "5_mjcf":
         scene.world()
     else:
-        from twin.scene import finished
+        from twin.scene import require_stage
 
-        Ground.load(finished(scene.scene, "mesh"))
+        Ground.load(require_stage(scene.scene, "mesh"))
 
 
 def _parts(case: Case) -> None:
@@ -760,7 +760,7 @@ def _forecast(case: Case) -> None:
 
 def _noted(case: Case) -> None:
     """JSON beside runs and validations."""
-    from twin.evaluation.training_curves import CHOICE, success_curve, trainings
+    from twin.evaluation.training_curves import CHOICE_FILE, training_summaries, write_success_curve
     from twin.learn import checkpoint, training
     from twin.scene import digest_file
 
@@ -777,7 +777,7 @@ def _noted(case: Case) -> None:
         (root / "validation").mkdir()
         text = json_text(spoiled(rng, noted) if rng.random() < 0.5 else noted)
         (root / "validation" / "validated.json").write_bytes(mangled_text(rng, text))
-        trainings(root, ["ahead", "left", "ahead/100", rng.choice(("", "..", "/", "a" * 300, "../ahead"))])
+        training_summaries(root, ["ahead", "left", "ahead/100", rng.choice(("", "..", "/", "a" * 300, "../ahead"))])
     elif which < 0.6:
         root.mkdir()
         said = {"road": "x", "steps": 100, "seed": 0, "task": "ahead"}
@@ -795,8 +795,8 @@ def _noted(case: Case) -> None:
         (root / "episodes.csv").write_text(TRAINING_CSV)
         one = {"step": 100, "trials": 8, "successes": 4, "reward": 1.0}
         choice = {"steps": 200, "candidates": [one, one | {"step": 150}], "chosen": one | {"trials": 20}}
-        (root / CHOICE).write_bytes(mangled_text(rng, json_text(spoiled(rng, choice))))
-        success_curve(root)
+        (root / CHOICE_FILE).write_bytes(mangled_text(rng, json_text(spoiled(rng, choice))))
+        write_success_curve(root)
 
 
 # ---- keywords and actions
@@ -953,7 +953,7 @@ def _readers(stuff: Stuff) -> list[tuple[str, Callable[[Path], Any]]]:
         ("cameras.json", lambda p: Cameras.load(p.parent)),
         ("world.json", lambda p: World.load(p.parent)),
         ("baked.json", lambda p: BakedField.load(p.parent)),
-        ("stamp.json", lambda p: Stamp.checked(p.parent)),
+        ("stamp.json", lambda p: Stamp.verified(p.parent)),
     ]
 
 

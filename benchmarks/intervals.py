@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from scipy.special import expit
 
-from twin.config import RANDOMISED
-from twin.evaluation.bootstrap import Paired, Rates, interval, resample, seen
-from twin.evaluation.prediction_powered import Correction, left_out_predictions, powered_mean
-from twin.evaluation.statistics import mmrv_rows, pearson_rows, spearman_rows, winner_rows
+from twin.config import RANDOMIZED
+from twin.evaluation.bootstrap import PairedCells, Rates, bootstrap_interval, observed_rates, resample
+from twin.evaluation.prediction_powered import LinearCorrection, leave_one_group_out, prediction_powered_mean
+from twin.evaluation.statistics import mmrv_batched, pearson_batched, spearman_batched, winner_batched
 from twin.files import read_json
 
 _MEAN_OVER = 3000  # experiments, for what an interval aims at
@@ -36,14 +36,16 @@ WORLDS = {
 }
 
 
-def world(rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, spread: float, noise: float) -> Paired:
+def world(
+    rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, spread: float, noise: float
+) -> PairedCells:
     """One experiment."""
     quality = rng.normal(0.0, spread, (n, 1)) + rng.normal(0.0, 0.3, (n, 2))
     twin = expit(quality + 0.5 + rng.normal(0.0, noise, (n, 1)))
     trials = np.full((n, 2), twin_trials), np.full((n, 2), real_trials)
     won = rng.binomial(trials[0], twin), rng.binomial(trials[1], expit(quality))
     of = np.broadcast_to(np.arange(2), (n, 2))
-    return Paired(trials[0], won[0], of, trials[1], won[1], np.ones((n, 2)), (np.arange(n),))
+    return PairedCells(trials[0], won[0], of, trials[1], won[1], np.ones((n, 2)), (np.arange(n),))
 
 
 RECORDED = {
@@ -53,23 +55,23 @@ RECORDED = {
 """Worlds of a record: each policy's trials are driven again at the rates seen, on its days or on days drawn of them."""
 
 
-def recorded(path: Path) -> Paired:
+def recorded(path: Path) -> PairedCells:
     """An experiment as `benchmarks/table1` records it, by a photo of each day; policies by task."""
     read: list[tuple[str, list[list[int]]]] = []
     for run in read_json(path)["runs"]:
         for policy in run["policies"]:
             twin, real = policy["validate_by_photo"]["by_lighting"], policy["real"]["by_lighting"]
-            sides = [[twin[f"{day}{RANDOMISED}"], real[day]] for day in real]
+            sides = [[twin[f"{day}{RANDOMIZED}"], real[day]] for day in real]
             read.append((run["task"], [[c["trials"] for c in s] + [c["successes"] for c in s] for s in sides]))
     counts = np.array([cells for _, cells in read])
     task = np.array([name for name, _ in read])
     of = np.broadcast_to(np.arange(counts.shape[1]), counts.shape[:2])
     strata = tuple(np.flatnonzero(task == name) for name in dict.fromkeys(task))
     weight = np.ones(counts.shape[:2])
-    return Paired(counts[..., 0], counts[..., 2], of, counts[..., 1], counts[..., 3], weight, strata)
+    return PairedCells(counts[..., 0], counts[..., 2], of, counts[..., 1], counts[..., 3], weight, strata)
 
 
-def again(rng: np.random.Generator, record: Paired, days_anew: bool) -> Paired:
+def again(rng: np.random.Generator, record: PairedCells, days_anew: bool) -> PairedCells:
     """One experiment with policies drawn with replacement from the record's, task by task, and maybe with its days."""
     policies = np.concatenate([rng.choice(members, len(members)) for members in record.strata])
     strata = tuple(np.split(np.arange(len(policies)), np.cumsum([len(m) for m in record.strata])[:-1]))
@@ -78,19 +80,19 @@ def again(rng: np.random.Generator, record: Paired, days_anew: bool) -> Paired:
     twin_trials, real_trials = record.twin_trials[chosen], record.real_trials[chosen]
     twin = rng.binomial(twin_trials, record.twin_successes[chosen] / twin_trials)
     real = rng.binomial(real_trials, record.real_successes[chosen] / real_trials)
-    return Paired(twin_trials, twin, record.twin_of, real_trials, real, record.weight, strata)
+    return PairedCells(twin_trials, twin, record.twin_index, real_trials, real, record.weight, strata)
 
 
 def statistics(rates: Rates) -> dict[str, np.ndarray]:
     """Those with a bootstrap interval."""
-    agreement, regret = winner_rows(twin=rates.twin, real=rates.real)
+    agreement, regret = winner_batched(twin=rates.twin, real=rates.real)
     return {
-        "Pearson": pearson_rows(twin=rates.twin, real=rates.real),
-        "Spearman": spearman_rows(twin=rates.twin, real=rates.real),
-        "MMRV": mmrv_rows(twin=rates.twin, real=rates.real),
+        "Pearson": pearson_batched(twin=rates.twin, real=rates.real),
+        "Spearman": spearman_batched(twin=rates.twin, real=rates.real),
+        "MMRV": mmrv_batched(twin=rates.twin, real=rates.real),
         "winner": agreement,
         "regret": regret,
-        "cells agree": rates.inside,
+        "cells agree": rates.compatible,
         "bias": rates.difference,
     }
 
@@ -105,33 +107,33 @@ def coverage(settings: tuple[int, int, int, float, float], experiments: int, see
         data = world(rng, *settings)
         for name, hit in hits(data, rng, aims).items():
             held[name].append(hit)
-        further = seen(world(rng, 2 * n, *settings[1:]))
+        further = observed_rates(world(rng, 2 * n, *settings[1:]))
         driven, others = slice(0, n), slice(n, 2 * n)
         f, y = further.twin, further.real
-        _, low, high = Correction.fit(twin=f[driven], real=y[driven]).predict(f[others])
+        _, low, high = LinearCorrection.fit(twin=f[driven], real=y[driven]).predict(f[others])
         held["predicted"].append(float(np.mean((low <= y[others]) & (y[others] <= high))))
         if n > 5:
-            _, low, high = left_out_predictions(twin=f[driven], real=y[driven], groups=range(n))
+            _, low, high = leave_one_group_out(twin=f[driven], real=y[driven], groups=range(n))
             held["left out"].append(float(np.mean((low <= y[driven]) & (y[driven] <= high))))
-        mean = powered_mean(twin=f[driven], real=y[driven], twin_only=f[others])
+        mean = prediction_powered_mean(twin=f[driven], real=y[driven], twin_only=f[others])
         held["mean on the road"].append(mean.low <= 0.5 <= mean.high)  # one half, by symmetry
     return {name: float(np.mean(each)) if each else float("nan") for name, each in held.items()}
 
 
-def aimed_at(experiment: Callable[[], Paired]) -> dict[str, float]:
+def aimed_at(experiment: Callable[[], PairedCells]) -> dict[str, float]:
     """Mean of each statistic over many experiments."""
-    many = [statistics(seen(experiment())) for _ in range(_MEAN_OVER)]
+    many = [statistics(observed_rates(experiment())) for _ in range(_MEAN_OVER)]
     return {name: float(np.nanmean([one[name] for one in many])) for name in many[0]}
 
 
-def hits(data: Paired, rng: np.random.Generator, aims: dict[str, float]) -> dict[str, bool]:
+def hits(data: PairedCells, rng: np.random.Generator, aims: dict[str, float]) -> dict[str, bool]:
     """Whether one experiment's bootstrap intervals hold what they aim at, where there are intervals."""
-    own, repeated = statistics(seen(data)), statistics(resample(data, rng, _DRAWS))
-    ends = {name: interval(float(own[name]), repeated[name]) for name in aims}
+    own, repeated = statistics(observed_rates(data)), statistics(resample(data, rng, _DRAWS))
+    ends = {name: bootstrap_interval(float(own[name]), repeated[name]) for name in aims}
     return {name: end[0] - 1e-9 <= aims[name] <= end[1] + 1e-9 for name, end in ends.items() if end}
 
 
-def recorded_coverage(record: Paired, days_anew: bool, experiments: int, seed: int = 0) -> dict[str, float]:
+def recorded_coverage(record: PairedCells, days_anew: bool, experiments: int, seed: int = 0) -> dict[str, float]:
     """`coverage` in worlds resampled from a record."""
     rng = np.random.default_rng(seed)
     aims = aimed_at(lambda: again(rng, record, days_anew))

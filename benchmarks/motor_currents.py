@@ -1,9 +1,9 @@
-"""What turning costs a motor against driving straight: measured currents and simulated torques side by side.
+"""Motor effort of turning relative to driving straight: measured currents against simulated torques.
 
-*Steady*: both sides hold their speeds for a second, forward. *Straight* and *turning*: by the difference of the sides.
-In a turn the *outer* side pushes and the *inner* one is dragged along. Currents in the logs have no sign and read zero
-where a motor brakes, so simulated torques below zero count as zero, too. Torque per ampere is not published and cancels
-in ratios; without poses nothing else can be compared.
+*Steady*: both sides drive forward at constant speed for 1 s. *Straight*, *turning*: by the speed difference of the
+sides. In a turn the *outer* side pushes and the *inner* side is dragged along. Currents in the logs are unsigned and
+zero when a motor brakes, so negative simulated torques count as zero. Torque per ampere is not published but cancels in
+the ratios; without poses nothing else can be compared.
 """
 
 from dataclasses import dataclass, replace
@@ -15,38 +15,38 @@ from scipy.optimize import brentq
 
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
-from twin.sysid.drivetrain import AHEAD, STEP
-from twin.sysid.logs import PERIOD, SAMPLES, _read_npz
-from twin.sysid.rollout import BEFORE, COARSE, drive
+from twin.sysid.drivetrain import CONTROL_STEP, EXTRA_SAMPLES
+from twin.sysid.logs import PERIOD, SAMPLES, read_npz
+from twin.sysid.rollout import COARSE_TIMESTEP, LEAD_SAMPLES, simulate_windows
 from twin.types import Array
 
 COLUMNS = ("time", "curL", "curR", "velL", "velR")
-"""[s], [A], [A], [m/s], [m/s] of the wheels' circumference."""
+"""[s], [A], [A], [m/s], [m/s]; speeds are those of the wheel circumference."""
 
 _HALF_WINDOW = 0.5  # [s]
-_SAME = 0.06  # [m/s] over which a steady side may vary; the encoders resolve 0.016
-_SLOWEST = 0.1  # [m/s]
-_STRAIGHT, _TURNING = 0.04, 0.08  # [m/s] difference of the sides below, above which
-_FEWEST = 30  # samples of either kind
-_MOST = 150  # turning samples simulated
+_MAX_VARIATION = 0.06  # [m/s] range of the speed of a steady side; the encoders resolve 0.016
+_MIN_SPEED = 0.1  # [m/s]
+_MAX_STRAIGHT, _MIN_TURNING = 0.04, 0.08  # [m/s] largest and smallest speed difference of the sides
+_MIN_SAMPLES = 30  # steady samples of each kind
+_MAX_SIMULATED = 150  # turning samples simulated
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Mean current or torque of a side against that of one driving straight."""
+    """Mean current or torque of a side in turns / mean when driving straight."""
 
     outer: float
     inner: float
 
     @property
     def total(self) -> float:
-        """Of both sides together."""
+        """Mean of both sides."""
         return (self.outer + self.inner) / 2
 
 
 @dataclass(frozen=True)
-class Steady:
-    """Steady samples of logs."""
+class SteadySamples:
+    """SteadySamples samples of logs."""
 
     speeds: Array
     """Left and right [m/s], shape (n, 2)."""
@@ -55,18 +55,18 @@ class Steady:
 
     @property
     def straight(self) -> NDArray[np.bool_]:
-        return np.abs(self.speeds[:, 1] - self.speeds[:, 0]) < _STRAIGHT
+        return np.abs(self.speeds[:, 1] - self.speeds[:, 0]) < _MAX_STRAIGHT
 
     @property
     def turning(self) -> NDArray[np.bool_]:
-        return np.abs(self.speeds[:, 1] - self.speeds[:, 0]) > _TURNING
+        return np.abs(self.speeds[:, 1] - self.speeds[:, 0]) > _MIN_TURNING
 
 
-def read_currents(paths: list[Path]) -> Steady:
-    """Steady samples of .npz logs with `COLUMNS`. Raises InputError: columns missing, too little of either kind."""
+def read_currents(paths: list[Path]) -> SteadySamples:
+    """SteadySamples samples of .npz logs with `COLUMNS`. Raises InputError: columns are missing, too few samples."""
     speeds, currents = [], []
     for path in paths:
-        columns = _read_npz(path)
+        columns = read_npz(path)
         missing = [name for name in COLUMNS if name not in columns]
         if missing:
             raise InputError(f"{path}: no column {', '.join(missing)}; expected {', '.join(COLUMNS)}")
@@ -78,54 +78,57 @@ def read_currents(paths: list[Path]) -> Steady:
         for i, (a, b) in enumerate(zip(first, last, strict=True)):
             near = speed[a:b]
             whole = time[i] - time[0] >= _HALF_WINDOW and time[-1] - time[i] >= _HALF_WINDOW
-            if whole and np.ptp(near, axis=0).max() <= _SAME and near.min() > _SLOWEST:
+            if whole and np.ptp(near, axis=0).max() <= _MAX_VARIATION and near.min() > _MIN_SPEED:
                 speeds.append(near.mean(0))
                 currents.append(current[i])
-    steady = Steady(np.array(speeds).reshape(-1, 2), np.array(currents).reshape(-1, 2))
+    steady = SteadySamples(np.array(speeds).reshape(-1, 2), np.array(currents).reshape(-1, 2))
     for kind, count in (("straight", steady.straight.sum()), ("turning", steady.turning.sum())):
-        if count < _FEWEST:
-            raise InputError(f"{int(count)} samples of steady {kind} driving; expected {_FEWEST}; give longer logs")
+        if count < _MIN_SAMPLES:
+            raise InputError(
+                f"{int(count)} samples of steady {kind} driving; expected {_MIN_SAMPLES}; give longer logs"
+            )
     return steady
 
 
-def measured_effort(steady: Steady) -> Effort:
-    """Of currents."""
+def measured_effort(steady: SteadySamples) -> Effort:
+    """Effort from measured currents."""
     return _effort(steady.speeds[steady.turning], steady.currents[steady.turning], steady.currents[steady.straight])
 
 
-def simulated_effort(steady: Steady, params: HuskyParams) -> Effort:
-    """Of torques at the same wheel speeds on a plane."""
+def simulated_effort(steady: SteadySamples, params: HuskyParams) -> Effort:
+    """Effort from simulated torques at the same wheel speeds on a plane."""
     turning = steady.speeds[steady.turning]
-    turning = turning[:: max(1, len(turning) // _MOST)]
+    turning = turning[:: max(1, len(turning) // _MAX_SIMULATED)]
     straight = steady.speeds[steady.straight]
     straight = straight[:: max(1, len(straight) // 20)]
     both = np.concatenate([turning, straight]) / WHEEL_RADIUS
-    steps = round((SAMPLES + AHEAD) * PERIOD / STEP)
-    told, before = (np.repeat(both[:, None], count, 1) for count in (steps, BEFORE + 2))
-    out = drive(replace(params, servo_lag=0.0), told, before, np.zeros((len(both), 2)), COARSE)
+    steps = round((SAMPLES + EXTRA_SAMPLES) * PERIOD / CONTROL_STEP)
+    commands, preceding = (np.repeat(both[:, None], count, 1) for count in (steps, LEAD_SAMPLES + 2))
+    out = simulate_windows(
+        replace(params, servo_lag=0.0), commands, preceding, np.zeros((len(both), 2)), COARSE_TIMESTEP
+    )
     torque = np.maximum(out.torques[:, SAMPLES // 2 :].mean(1), 0.0)
     return _effort(turning, torque[: len(turning)], torque[len(turning) :])
 
 
-def rolling_resistance_of(steady: Steady, params: HuskyParams) -> float:
-    """The rolling resistance, losses of gear and belt included, with which turning costs what it does in the logs.
+def rolling_resistance_of(steady: SteadySamples, params: HuskyParams) -> float:
+    """Rolling resistance, including gear and belt losses, at which the simulated effort equals the measured one.
 
-    Raises:
-        InputError: none between 0.002 and 0.4 does.
+    Raises InputError: there is none between 0.002 and 0.4.
     """
-    wanted = measured_effort(steady).total
+    target = measured_effort(steady).total
 
-    def miss(log: float) -> float:
-        return simulated_effort(steady, replace(params, rolling_resistance=float(np.exp(log)))).total - wanted
+    def residual(log: float) -> float:
+        return simulated_effort(steady, replace(params, rolling_resistance=float(np.exp(log)))).total - target
 
     low, high = np.log(0.002), np.log(0.4)
-    at_low, at_high = miss(low), miss(high)
+    at_low, at_high = residual(low), residual(high)
     if at_low * at_high > 0:
         raise InputError(
-            f"turning takes {wanted:.2f} times the current of driving straight; expected {at_high:.2f} to {at_low:.2f} "
+            f"turning takes {target:.2f} times the current of driving straight; expected {at_high:.2f} to {at_low:.2f} "
             f"with friction {params.friction:g}; give the friction of that ground"
         )
-    return float(np.exp(brentq(miss, low, high, xtol=0.02)))
+    return float(np.exp(brentq(residual, low, high, xtol=0.02)))
 
 
 def _effort(speeds: Array, turning: Array, straight: Array) -> Effort:

@@ -25,7 +25,7 @@ from record import add_record_options, save
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
 from twin.env.mujoco_renderer import camera_pose
-from twin.env.obstacle_models import ObstacleModel, add_shape
+from twin.env.obstacle_models import ObstacleModel, add_obstacle_geoms
 from twin.env.obstacles import add_obstacles, place
 from twin.geometry.cameras import Cameras, opencv_to_mujoco
 from twin.geometry.poses import Similarity
@@ -33,7 +33,7 @@ from twin.loading import load_scene
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.reality import true_world as reality
 from twin.reality.comparison import align_rigid, matched_poses
-from twin.reality.filming import develop
+from twin.reality.filming import sensor_image
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import Truth
 
@@ -62,10 +62,10 @@ class TrueWorld:
     """The known-truth world under one lighting, with one obstacle of every kind that can be put anywhere."""
 
     def __init__(self, truth: Truth, lighting: str, intrinsics: np.ndarray) -> None:
-        spec = reality.spec(lighting, truth.place)
+        spec = reality.world_spec(lighting, truth.place)
         for kind in KINDS:
             body = spec.worldbody.add_body(name=f"added_{kind}", mocap=True, pos=(0, 0, -100.0))
-            add_shape(ObstacleModel(spec, body, group=1, solid=False), kind)
+            add_obstacle_geoms(ObstacleModel(spec, body, group=1, solid=False), kind)
         height = SIZE[1]
         spec.camera("film").fovy = float(np.rad2deg(2 * np.arctan(height / 2 / intrinsics[1])))
         self.model = spec.compile()
@@ -113,7 +113,7 @@ class TrueWorld:
             packed = self.contexts[0].rgb_data.numpy()[0].reshape(SIZE[::-1])
             depth = self.contexts[1].depth_data.numpy()[0].reshape(SIZE[::-1]).copy()
         light = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], -1).astype(np.float32) / 255.0
-        return develop(np.random.default_rng(0), light, self.light, 1.0) / 255.0, np.where(depth > 0.0, depth, 1e4)
+        return sensor_image(np.random.default_rng(0), light, self.light, 1.0) / 255.0, np.where(depth > 0.0, depth, 1e4)
 
 
 def robot_at(world: World, model: mujoco.MjModel, data: mujoco.MjData, station: float) -> np.ndarray:
@@ -232,16 +232,16 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
 def seen_touched(scene_path: Path) -> dict[str, Any]:
     """`seen_touched.*` of `twin.report.visual_vs_collision`, along a drive of the scripted follower."""
     from twin.assets.ground import Ground
-    from twin.env.drivers import follow
     from twin.env.physics import HuskyPhysics
+    from twin.env.route_follower import follow_route
     from twin.mjcf.scene_xml import Parts
-    from twin.report.visual_vs_collision import along_the_drive, compare, look
+    from twin.report.visual_vs_collision import compare_geometry, render_views, view_poses
 
     scene = load_scene(scene_path)
     world, field, mesh = scene.world(), scene.field(), scene.scene.stage("mesh")
-    drive = follow(world, HuskyPhysics(world.model(), world.robot))
-    looks = look(field, world, along_the_drive(drive.camera_to_world), field.lightings[0])
-    found = compare(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
+    looks = render_views(field, world, view_poses(drive.camera_to_world), field.lightings[0])
+    found = compare_geometry(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
     return {f"seen_touched.{name}": value for name, value in found.items() if name != "along"}
 
 

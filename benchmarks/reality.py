@@ -22,12 +22,12 @@ from record import add_record_options, save
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
-from twin.mjcf.world import nearest
+from twin.mjcf.world import nearest_on_route
 from twin.reality import filming, true_world
 from twin.reality import place as places
 from twin.reality.comparison import align_rigid, matched_poses
-from twin.reality.rasterizer import Raster
-from twin.reality.real_robot import route
+from twin.reality.rasterizer import Rasterizer
+from twin.reality.real_robot import true_route
 from twin.reality.truth import Truth
 
 _LIGHTINGS = ("sun", "overcast", "night")
@@ -40,7 +40,7 @@ def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
     place, large = places.build(), filming.FilmingPlan()
     small = replace(large, width=160, height=90)
     for lighting in _LIGHTINGS:
-        raster = Raster(true_world.spec(lighting, place).compile(), small.intrinsics, (160, 90))
+        raster = Rasterizer(true_world.world_spec(lighting, place).compile(), small.intrinsics, (160, 90))
         renderer, renderer_small = filming.Renderer(lighting, place, large), filming.Renderer(lighting, place, small)
         poses = filming.trajectory(large, place.route, lighting)[1][::_EVERY]
         raster(poses[0])
@@ -68,7 +68,7 @@ def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
     truth = Truth.load(twin.scene.truth)
     cameras = Cameras.load(twin.scene.stage("metric"))
     to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
-    station, lateral = nearest(route(), to_truth.points(twin.world().route)[:, :2])
+    station, lateral = nearest_on_route(true_route(), to_truth.points(twin.world().route)[:, :2])
     yield "reality.route_off_max_m", float(np.abs(lateral).max())
     yield "reality.route_off_mean_m", float(np.abs(lateral).mean())
     yield "reality.route_begins_later_m", float(station[0])

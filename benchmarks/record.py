@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from twin.errors import InputError, refuse
+from twin.errors import InputError, print_error
 from twin.files import read_json, write_json
 
 _NAMES = ("id", "quantity", "task", "setup", "seed", "policy", "name")
@@ -129,7 +129,7 @@ def save(path: Path | None, record: dict[str, Any], replace: bool = False) -> in
         if path:
             write_record(path, record, replace)
     except (InputError, OSError) as error:
-        return refuse(error)
+        return print_error(error)
     return 0
 
 

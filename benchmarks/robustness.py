@@ -420,10 +420,10 @@ def _on_full(mounted: Path, leave: int, command: list[str], root: Path) -> str:
 _VERB_TRAIN = _TRAIN.replace(
     "train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)",
     """
-from twin import verb
+from twin import cli
 def work(options):
     train(twin.load_scene(sys.argv[1]), Path(sys.argv[1]) / "runs" / sys.argv[2], small)
-sys.exit(verb.run(verb.Parser(), work, []))
+sys.exit(cli.run(cli.Parser(), work, []))
 """,
 )
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.files import write_json
-from twin.geometry.cameras import Cameras, Posed, SparsePoints, pixel_grid, resized, unproject
+from twin.geometry.cameras import Cameras, PosedCameras, SparsePoints, intrinsics_for_size, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.types import Array
 
@@ -100,10 +100,10 @@ class AnalyticField:
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         return np.full(32, float(self.lightings.index(lighting)), np.float32)
 
-    def render(self, cameras: Posed, lighting: object, size: tuple[int, int] | None = None) -> Rendering:
+    def render(self, cameras: PosedCameras, lighting: object, size: tuple[int, int] | None = None) -> Rendering:
         """Exact depth; colours by what was hit."""
         camera_to_world = cameras.camera_to_world
-        intrinsics, (width, height) = resized(cameras, size)
+        intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         n = len(camera_to_world)
         rgb = np.zeros((n, height, width, 3), np.float32)
         depth = np.full((n, height, width), FAR, np.float32)

@@ -11,13 +11,13 @@ import pytest
 from drive_logs import SOFT, columns, windows_of
 
 from twin.align import main, summary
-from twin.config_file import parse, read_robot
+from twin.config_file import parse_table, read_robot
 from twin.env.controller import Controller
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 from twin.sysid import drivetrain, kinematics, logs, rollout
 from twin.sysid.estimation import Fit
-from twin.sysid.identification import Alignment, align, robot_toml
-from twin.sysid.kinematics import Icr, Prediction
+from twin.sysid.identification import Identification, identify, robot_toml
+from twin.sysid.kinematics import IcrModel, Prediction
 
 
 def test_arc_in_closed_form():
@@ -37,7 +37,7 @@ def test_arc_in_closed_form():
 
 def test_icr_of_icr_motion_is_found():
     rng = np.random.default_rng(0)
-    truth = Icr(0.93, 0.97, 0.55, -0.62, -0.08)
+    truth = IcrModel(0.93, 0.97, 0.55, -0.62, -0.08)
     wheels = np.repeat(rng.uniform(-6, 6, (60, 1, 2)), logs.SAMPLES, 1)
     poses = kinematics.predict(truth, windows_of(wheels))[:, : logs.SAMPLES + 1]
     poses[::7] = rng.normal(0.0, 1e-3, poses[::7].shape)  # the robot stuck in every seventh window
@@ -53,8 +53,8 @@ def test_kinematics_begin_with_the_wheels_of_before():
     wheels = np.stack([4 + 2 * np.sin(time), 4 - 2 * np.sin(1.7 * time)], -1).reshape(n, logs.SAMPLES, 2)
     whole = kinematics.integrate(kinematics.NOMINAL.motion(wheels.reshape(1, -1, 2)))[0]
     seen = [np.maximum(0, i * logs.SAMPLES + np.arange(logs.SAMPLES + 1) + 5) // age * age - 5 for i in range(n)]
-    windows = replace(windows_of(wheels, logs.relative(whole[np.maximum(0, seen)])), follows=np.arange(n) > 0)
-    assert windows.measured[1:, 0] == pytest.approx(-0.25)
+    windows = replace(windows_of(wheels, logs.relative_poses(whole[np.maximum(0, seen)])), follows=np.arange(n) > 0)
+    assert windows.measurement_times[1:, 0] == pytest.approx(-0.25)
     distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
     assert distance[1:].max() < 0.005
     assert angle[1:].max() < 0.2
@@ -75,7 +75,7 @@ def test_commands_become_the_controllers_wheel_speeds():
             rows.append(told)
         speeds.append(rows)
     windows = windows_of(np.zeros((1, logs.SAMPLES, 2)), commands=np.full((1, logs.SAMPLES, 2), request), twist=True)
-    told, _ = drivetrain.targets(drivetrain.Drivetrain.of(params, True), windows)
+    told, _ = drivetrain.simulate_drivetrain(drivetrain.Drivetrain.from_robot(params, True), windows)
     mean = np.mean(speeds, 0)
     assert np.abs(told[0, :200] - mean).max() < 0.3  # of 6 rad/s; the ramp's ends are rounder in the mean
     assert np.abs(told[0, 190:200] - mean[190:]).max() < 1e-6
@@ -90,20 +90,24 @@ def test_a_ramp_goes_on_from_window_to_window():
     wheels = np.repeat(lagged[:, None], 2, 1).reshape(3, logs.SAMPLES, 2)
     asked = np.full((3, logs.SAMPLES, 2), 8.0)
     windows = replace(windows_of(wheels, commands=asked, twist=False), follows=np.arange(3) > 0)
-    told, turned = drivetrain.targets(drive, windows)
-    step = drive.mean_acceleration * drivetrain.STEP
+    told, turned = drivetrain.simulate_drivetrain(drive, windows)
+    step = drive.mean_acceleration * drivetrain.CONTROL_STEP
     assert told[1:, :25] == pytest.approx(told[:-1, 200:])
     assert told[:, 100, 0] == pytest.approx(drive.mean_acceleration * (2.0 * np.arange(3) + 0.8), abs=1.01 * step)
-    assert drivetrain.sampled(turned) == pytest.approx(wheels, abs=step)
+    assert drivetrain.at_samples(turned) == pytest.approx(wheels, abs=step)
 
 
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])
 def test_late_poses_are_those_of_before(late):
     """A robot that speeds up along a straight line, and one that goes on around a circle."""
-    time = (np.arange(rollout.BEFORE + logs.SAMPLES + drivetrain.AHEAD) - rollout.BEFORE) * logs.PERIOD
+    time = (
+        np.arange(rollout.LEAD_SAMPLES + logs.SAMPLES + drivetrain.EXTRA_SAMPLES) - rollout.LEAD_SAMPLES
+    ) * logs.PERIOD
     line = np.stack([(time + 1.0) ** 2, 0 * time, 0 * time], -1)
     circle = np.stack([np.sin(time), 1 - np.cos(time), time], -1)
-    told = logs.retimed(np.stack([line, circle]), np.array([late, late]), rollout.BEFORE)[:, : logs.SAMPLES + 2]
+    told = logs.resample_poses(np.stack([line, circle]), np.array([late, late]), rollout.LEAD_SAMPLES)[
+        :, : logs.SAMPLES + 2
+    ]
     t = np.arange(told.shape[1]) * logs.PERIOD
     assert len(t) == logs.SAMPLES + 2
     np.testing.assert_allclose(told[0, :, 0], (t - late + 1) ** 2 - (1 - late) ** 2, atol=1e-3)
@@ -151,8 +155,8 @@ def test_grip_grows_with_slip_over_rolling_speed(speed, share):
 @pytest.mark.slow
 def test_a_known_robot_is_recovered(drive, tmp_path):
     """Drive with known parameters, fit, and get them back; held-out windows are met far better than by kinematics."""
-    windows = logs.cut(drive, "log")
-    result = align(windows, HuskyParams())
+    windows = logs.cut_windows(drive, "log")
+    result = identify(windows, HuskyParams())
     found = result.identified
     for name, tolerance in {
         "command_latency": 0.05,
@@ -176,25 +180,25 @@ def test_a_known_robot_is_recovered(drive, tmp_path):
     # What is written is read back by the scene.
     path = tmp_path / "robot.toml"
     path.write_text(robot_toml(result, {"camera_pitch": 7.0, "friction": 0.1}, "log"), encoding="utf-8")
-    robot = parse(HuskyParams, read_robot(path), "robot.toml")
+    robot = parse_table(HuskyParams, read_robot(path), "robot.toml")
     assert robot.camera_pitch == 7.0
     assert robot.friction == pytest.approx(result.robot.friction, rel=1e-4)
     assert robot.center_of_mass == pytest.approx(result.robot.center_of_mass, abs=1e-4)
 
 
-def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) -> Alignment:
+def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) -> Identification:
     """An alignment that nothing was fitted for: a robot, and standard errors by parameter."""
     params = HuskyParams(**robot)
     wheels = np.random.default_rng(0).uniform(1, 5, (40, logs.SAMPLES, 2))
-    gone = kinematics.predict(kinematics.Icr(y_left=0.6, y_right=-0.6), windows_of(wheels))[:, : logs.SAMPLES + 1]
+    gone = kinematics.predict(kinematics.IcrModel(y_left=0.6, y_right=-0.6), windows_of(wheels))[:, : logs.SAMPLES + 1]
     windows = windows_of(wheels, gone, twist=twist)
-    drive = drivetrain.Drivetrain.of(params, twist)
+    drive = drivetrain.Drivetrain.from_robot(params, twist)
     prediction = Prediction("made up", windows, kinematics.predict(kinematics.NOMINAL, windows), wheels + 0.1)
     fits = [
         Fit({}, drive_errors or {}, {}, 0.0),
         Fit({"pose_x": 0.0, "pose_y": 0.0, "pose_late": 0.0}, ground_errors or {}, {}, 0.0),
     ]
-    return Alignment(windows, kinematics.NOMINAL, drive, *fits, params, *[prediction] * 4)
+    return Identification(windows, kinematics.NOMINAL, drive, *fits, params, *[prediction] * 4)
 
 
 @pytest.mark.parametrize("twist", [True, False])
@@ -230,9 +234,10 @@ def test_a_log_that_shows_nothing_is_said_to():
 
 
 def test_a_scene_that_overrules_what_was_fitted_is_warned_of(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("twin.align.align", lambda *_: aligned(ground_errors={"friction": 0.01, "spin_friction": 0.01}))
+    errors = {"friction": 0.01, "spin_friction": 0.01}
+    monkeypatch.setattr("twin.align.identify", lambda *_: aligned(ground_errors=errors))
     monkeypatch.setattr("twin.align.check", lambda *_: None)
-    monkeypatch.setattr("twin.sysid.plots.draw", lambda *_: None)
+    monkeypatch.setattr("twin.sysid.plots.write_plots", lambda *_: None)
     scene, log = tmp_path / "x", tmp_path / "log.npz"
     scene.mkdir()
     (scene / "scene.toml").write_text(
@@ -241,9 +246,9 @@ def test_a_scene_that_overrules_what_was_fitted_is_warned_of(tmp_path, monkeypat
     np.savez(log, **columns(HuskyParams(), 4.0, seed=0))
     for target in (scene, scene / "scene.toml", scene / "robot.toml"):  # the last one written by the first
         assert main([str(target), str(log)]) == 0
-        assert "overrules what was fitted: friction;" in capsys.readouterr().out, target
+        assert "overrides fitted values: friction;" in capsys.readouterr().out, target
     assert main([str(scene), str(log), "--out", str(tmp_path / "out")]) == 0
-    assert "overrules what was fitted" not in capsys.readouterr().out  # what lies there is not the scene's
+    assert "overrides fitted values" not in capsys.readouterr().out  # what lies there is not the scene's
 
 
 @pytest.mark.parametrize("out", ["file/out", "taken"])
@@ -251,7 +256,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_fit(out, drive, t
     def never(*_):
         raise AssertionError("fitted before the folder was made")
 
-    monkeypatch.setattr("twin.align.align", never)
+    monkeypatch.setattr("twin.align.identify", never)
     (tmp_path / "file").write_text("")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "alignment").write_text("")
@@ -279,7 +284,7 @@ def test_effort_of_motors():
     """Made-up currents: the right side, outer in a left turn, takes three times a straight drive's, the left half."""
     speeds = np.concatenate([np.full((50, 2), 0.5), np.full((50, 2), [0.4, 0.6])])
     amps = np.concatenate([np.full((50, 2), 2.0), np.full((50, 2), [1.0, 6.0])])
-    effort = motor_currents.measured_effort(motor_currents.Steady(speeds, amps))
+    effort = motor_currents.measured_effort(motor_currents.SteadySamples(speeds, amps))
     assert (effort.outer, effort.inner, effort.total) == pytest.approx((3.0, 0.5, 1.75))
 
 
@@ -288,10 +293,10 @@ def test_rolling_resistance_that_currents_show_is_found():
     turning = rng.uniform(0.25, 0.4, (40, 1)) + np.array([[-0.06, 0.06]])
     speeds = np.concatenate([np.full((40, 2), 0.6), turning])
     truth = HuskyParams(rolling_resistance=0.05)
-    steady = motor_currents.Steady(speeds, np.ones_like(speeds))
+    steady = motor_currents.SteadySamples(speeds, np.ones_like(speeds))
     effort = motor_currents.simulated_effort(steady, truth)
     amps = np.concatenate([np.ones((40, 2)), np.full((40, 2), [effort.inner, effort.outer])])
-    found = motor_currents.rolling_resistance_of(motor_currents.Steady(speeds, amps), HuskyParams())
+    found = motor_currents.rolling_resistance_of(motor_currents.SteadySamples(speeds, amps), HuskyParams())
     assert found == pytest.approx(0.05, rel=0.05)
 
 

@@ -7,14 +7,14 @@ import sys
 import pytest
 
 from twin.errors import InputError
-from twin.runtime import alone
+from twin.runtime import exclusive_lock
 
 
 def test_the_lock_names_its_holder_and_goes_with_it(tmp_path):
     path = tmp_path / "new" / ".lock"
     code = (
-        "import sys; from pathlib import Path; from twin.runtime import alone\n"
-        "with alone(Path(sys.argv[1]), 'x'): print('held', flush=True); sys.stdin.read()\n"
+        "import sys; from pathlib import Path; from twin.runtime import exclusive_lock\n"
+        "with exclusive_lock(Path(sys.argv[1]), 'x'): print('held', flush=True); sys.stdin.read()\n"
     )
     other = subprocess.Popen(
         [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -22,12 +22,12 @@ def test_the_lock_names_its_holder_and_goes_with_it(tmp_path):
     try:
         assert other.stdout.readline() == "held\n"
         held = pytest.raises(InputError, match=f"the table is being written by process {other.pid}; wait for it")
-        with held, alone(path, "the table is being written"):
+        with held, exclusive_lock(path, "the table is being written"):
             raise AssertionError("two at once")
     finally:
         other.kill()
         other.wait()
-    with alone(path, "the table is being written"):
+    with exclusive_lock(path, "the table is being written"):
         assert path.read_text() == str(os.getpid())
-    with alone(path, "the table is being written"):
+    with exclusive_lock(path, "the table is being written"):
         pass

@@ -11,7 +11,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.nerf.baked import BakedField
-from twin.nerf.brick_layout import BrickLayout, brick_indices, leaps
+from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
 from twin.nerf.kernels import bricks
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import FAR
@@ -74,7 +74,7 @@ def baked(raw, layout: BrickLayout = LAYOUT) -> BakedField:
         **networks(np.random.default_rng(0)),
     }
     names = Lightings(("day", "night"), np.eye(2, 4, dtype=np.float32), ("day/0",), np.ones((1, 4), np.float32))
-    return BakedField(layout, names, arrays | leaps(layout, arrays))
+    return BakedField(layout, names, arrays | skip_distances(layout, arrays))
 
 
 def looking(eye=(-3.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> np.ndarray:
@@ -153,7 +153,7 @@ def test_the_march_equals_a_slow_one():
     field = baked(blobs)
     pose = looking((-3.5, 0.5, 0.3))
     out = field.render(Viewpoints.of(pose, K[None], SIZE), "day")
-    features = field._picture(1, *SIZE, False).features.numpy()[0].T
+    features = field._target(1, *SIZE, False).features.numpy()[0].T
     directions = unproject(pixel_grid(*SIZE), K).reshape(-1, 3)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ pose[0, :3, :3].T
     slow = slow_march(field, pose[0, :3, 3], directions, 0.005)
@@ -169,7 +169,7 @@ def test_a_leap_never_passes_a_filled_block():
     sparse["features"] = np.zeros_like(sparse["features"])
     for _ in range(6):
         sparse["features"][rng.integers(len(sparse["near"])), rng.integers(729), 0] = 255
-    near, far = leaps(LAYOUT, sparse).values()
+    near, far = skip_distances(LAYOUT, sparse).values()
     filled = np.argwhere(near == 0)
     assert len(filled) > 0
     for block in np.argwhere(near > 1)[::97]:
@@ -192,8 +192,11 @@ def test_one_camera_or_many_are_the_same(monkeypatch):
 def test_a_picture_does_not_depend_on_the_lights_beside_it():
     """To the last bit: or an episode would end otherwise beside others than alone."""
     field = baked(wall(1.0, 2.0))
-    rng, hidden = np.random.default_rng(0), len(field._bias_of[0])
-    field._bias_of = field._bias_of[0], rng.normal(0, 0.1, (32, hidden)).astype(np.float32)  # as wide as a real one's
+    rng, hidden = np.random.default_rng(0), len(field._first_bias[0])
+    field._first_bias = (
+        field._first_bias[0],
+        rng.normal(0, 0.1, (32, hidden)).astype(np.float32),
+    )  # as wide as a real one's
     lights = rng.normal(0, 1, (16, 32)).astype(np.float32)
     for n in (2, 3, 8, 16):
         together = field.render(Viewpoints.of(np.tile(looking(), (n, 1, 1)), K, SIZE), lights[:n])

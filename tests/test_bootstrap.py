@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from twin.evaluation.bootstrap import Paired, Rates, by_task, interval, paired, resample, seen
-from twin.evaluation.statistics import mmrv_rows, pearson_rows, spearman_rows, winner_rows
+from twin.evaluation.bootstrap import (
+    PairedCells,
+    Rates,
+    bootstrap_interval,
+    mean_over_tasks,
+    observed_rates,
+    pair_cells,
+    resample,
+)
+from twin.evaluation.statistics import mmrv_batched, pearson_batched, spearman_batched, winner_batched
 from twin.evaluation.trials import Cell
 
 TWIN = [
@@ -24,19 +32,19 @@ REAL = [
 
 
 def test_scores_are_means_over_real_cells_and_the_twins_cells_beside_them() -> None:
-    data = paired(REAL, TWIN)
+    data = pair_cells(REAL, TWIN)
     assert (data.policies, data.cells) == (3, 5)
     assert [list(members) for members in data.strata] == [[0, 1], [2]]  # b and a on straight, a on the turn
-    own = seen(data)
+    own = observed_rates(data)
     assert np.allclose(own.twin, [0.1, (0.5 + 0.5 + 0.9) / 3, 0.4])
     assert np.allclose(own.real, [0.25, (0.2 + 0.4 + 1.0) / 3, 0.25])
     differences = [0.15, -0.3, -0.1, 0.1, -0.15]
     assert float(own.difference) == pytest.approx(np.mean(differences))
-    assert float(own.inside) == 1.0
+    assert float(own.compatible) == 1.0
 
 
 def test_policies_are_drawn_within_their_task() -> None:
-    rates = resample(paired(REAL, [*TWIN]), np.random.default_rng(0), 500)
+    rates = resample(pair_cells(REAL, [*TWIN]), np.random.default_rng(0), 500)
     assert rates.twin.shape == rates.real.shape == (500, 3)
     # The turn has one policy, of 10 trials at about 0.4: no value of the others' 20 or 3-cell means need appear.
     assert np.allclose(rates.twin[:, 2] * 10, np.round(rates.twin[:, 2] * 10))
@@ -46,7 +54,7 @@ def test_policies_are_drawn_within_their_task() -> None:
 def test_trials_are_driven_anew() -> None:
     """One policy with one cell: what varies is binomial, at the rate shrunk by half a trial."""
     cells = [Cell("a", "t", "sun", 30, 6)]
-    rates = resample(paired(cells, cells), np.random.default_rng(0), 20_000)
+    rates = resample(pair_cells(cells, cells), np.random.default_rng(0), 20_000)
     rate = 6.5 / 31
     for drawn in (rates.twin, rates.real):
         assert drawn.mean() == pytest.approx(rate, abs=0.003)
@@ -56,28 +64,28 @@ def test_trials_are_driven_anew() -> None:
 
 def test_the_same_seed_gives_the_same_and_certain_rates_are_not_certain() -> None:
     cells = [Cell(name, "t", "sun", 10, 10) for name in "abcde"]
-    one, two = (resample(paired(cells, cells), np.random.default_rng(3), 50) for _ in range(2))
-    assert np.array_equal(one.twin, two.twin) and np.array_equal(one.inside, two.inside)
+    one, two = (resample(pair_cells(cells, cells), np.random.default_rng(3), 50) for _ in range(2))
+    assert np.array_equal(one.twin, two.twin) and np.array_equal(one.compatible, two.compatible)
     assert 0.9 < one.real.mean() < 1.0
 
 
 def test_the_interval_holds_what_was_seen() -> None:
     again = np.linspace(0.0, 1.0, 101)
-    assert interval(0.5, again) == pytest.approx((0.05, 0.95))
-    assert interval(0.99, again) == pytest.approx((0.05, 0.99))
-    assert interval(0.5, np.where(again < 0.4, np.nan, again)) == pytest.approx((0.43, 0.97))
-    assert interval(0.5, np.where(again < 0.6, np.nan, again)) is None
+    assert bootstrap_interval(0.5, again) == pytest.approx((0.05, 0.95))
+    assert bootstrap_interval(0.99, again) == pytest.approx((0.05, 0.99))
+    assert bootstrap_interval(0.5, np.where(again < 0.4, np.nan, again)) == pytest.approx((0.43, 0.97))
+    assert bootstrap_interval(0.5, np.where(again < 0.6, np.nan, again)) is None
 
 
 def test_statistics_within_tasks_are_averaged() -> None:
     rates = Rates(
         twin=np.array([0.9, 0.1, 0.2, 0.3]),
         real=np.array([0.5, 0.8, 0.1, 0.4]),
-        inside=np.array(0.0),
+        compatible=np.array(0.0),
         difference=np.array(0.0),
         strata=(np.array([0, 1]), np.array([2, 3])),
     )
-    agreement, regret = by_task(winner_rows, rates)
+    agreement, regret = mean_over_tasks(winner_batched, rates)
     assert float(agreement) == 0.5 and float(regret) == pytest.approx(0.15)
 
 
@@ -88,7 +96,9 @@ _LEAST = 0.80 - 3 * np.sqrt(0.9 * 0.1 / _EXPERIMENTS)
 """The least that was found in worlds of all kinds is 0.80; below that, three times the Monte-Carlo error."""
 
 
-def world(rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, noise: float, spread: float) -> Paired:
+def world(
+    rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, noise: float, spread: float
+) -> PairedCells:
     """Policies of varied quality under two lightings, in a twin that promises too much and judges with some noise."""
     quality = rng.normal(0.0, spread, (n, 1)) + rng.normal(0.0, 0.3, (n, 2))
     real = expit(quality)
@@ -96,18 +106,18 @@ def world(rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, 
     trials = np.full((n, 2), twin_trials), np.full((n, 2), real_trials)
     of = np.broadcast_to(np.arange(2), (n, 2))
     won = rng.binomial(trials[0], twin), rng.binomial(trials[1], real)
-    return Paired(trials[0], won[0], of, trials[1], won[1], np.ones((n, 2)), (np.arange(n),))
+    return PairedCells(trials[0], won[0], of, trials[1], won[1], np.ones((n, 2)), (np.arange(n),))
 
 
 def statistics(rates: Rates) -> dict[str, np.ndarray]:
-    agreement, regret = winner_rows(twin=rates.twin, real=rates.real)
+    agreement, regret = winner_batched(twin=rates.twin, real=rates.real)
     return {
-        "pearson": pearson_rows(twin=rates.twin, real=rates.real),
-        "spearman": spearman_rows(twin=rates.twin, real=rates.real),
-        "mmrv": mmrv_rows(twin=rates.twin, real=rates.real),
+        "pearson": pearson_batched(twin=rates.twin, real=rates.real),
+        "spearman": spearman_batched(twin=rates.twin, real=rates.real),
+        "mmrv": mmrv_batched(twin=rates.twin, real=rates.real),
         "agreement": agreement,
         "regret": regret,
-        "coverage": rates.inside,
+        "coverage": rates.compatible,
         "bias": rates.difference,
     }
 
@@ -122,14 +132,14 @@ def test_intervals_hold_the_mean_over_experiments(
 ) -> None:
     rng = np.random.default_rng(n + real_trials)
     settings = (n, twin_trials, real_trials, noise, spread)
-    many = [statistics(seen(world(rng, *settings))) for _ in range(700)]
+    many = [statistics(observed_rates(world(rng, *settings))) for _ in range(700)]
     mean = {name: float(np.nanmean([one[name] for one in many])) for name in many[0]}
     held: dict[str, list[bool]] = {name: [] for name in mean}
     for _ in range(_EXPERIMENTS):
         data = world(rng, *settings)
-        own, again = statistics(seen(data)), statistics(resample(data, rng, _DRAWS))
+        own, again = statistics(observed_rates(data)), statistics(resample(data, rng, _DRAWS))
         for name, aim in mean.items():
-            ends = interval(float(own[name]), again[name])
+            ends = bootstrap_interval(float(own[name]), again[name])
             assert ends is not None
             held[name].append(ends[0] - 1e-9 <= aim <= ends[1] + 1e-9)
     coverage = {name: float(np.mean(hits)) for name, hits in held.items()}

@@ -86,7 +86,7 @@ def test_a_field_is_made_anew_where_a_drive_becomes_none():
     (stage,) = (one for one in verb.PIPELINE if one.name == "field")
     stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
     drive, object_filmed, wider = (
-        verb.key_of(verb._depends(stage, SceneConfig(mjcf=mjcf), {}, stamps))
+        verb.stage_key(verb._depends(stage, SceneConfig(mjcf=mjcf), {}, stamps))
         for mjcf in (MjcfConfig(), MjcfConfig(route=False), MjcfConfig(half_width=2.0))
     )
     assert drive != object_filmed and drive == wider
@@ -99,7 +99,7 @@ def test_refinement_makes_a_field_anew_and_fields_of_before_stay():
         verb._depends(stage, SceneConfig(nerf=NerfConfig(refine_cameras=on)), {}, stamps) for on in (False, True)
     )
     assert "refine_cameras" not in plain["config"]["nerf"]  # as keys were before there was such a setting
-    assert verb.key_of(plain) != verb.key_of(refined)
+    assert verb.stage_key(plain) != verb.stage_key(refined)
 
 
 def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):

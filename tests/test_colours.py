@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from twin.learn.replay_buffer import augmented_colors
+from twin.learn.replay_buffer import augment_colors
 
 
 def stacks(count: int = 6) -> np.ndarray:
@@ -14,12 +14,12 @@ def stacks(count: int = 6) -> np.ndarray:
 
 def test_strength_nought_changes_nothing():
     before = stacks()
-    np.testing.assert_array_equal(augmented_colors(before, 0.0, np.random.default_rng(1)), before)
+    np.testing.assert_array_equal(augment_colors(before, 0.0, np.random.default_rng(1)), before)
 
 
 def test_pictures_of_a_stack_change_alike_and_samples_do_not():
     before = stacks()
-    after = augmented_colors(before, 1.0, np.random.default_rng(1))
+    after = augment_colors(before, 1.0, np.random.default_rng(1))
     assert after.shape == before.shape and after.dtype == np.uint8
     for stack in after:
         for later in stack.reshape(4, 3, 18, 32)[1:]:
@@ -30,8 +30,8 @@ def test_pictures_of_a_stack_change_alike_and_samples_do_not():
 
 def test_drawn_around_what_was_there_and_by_the_seed():
     before = stacks(200)
-    after = augmented_colors(before, 1.0, np.random.default_rng(2))
-    np.testing.assert_array_equal(after, augmented_colors(before, 1.0, np.random.default_rng(2)))
+    after = augment_colors(before, 1.0, np.random.default_rng(2))
+    np.testing.assert_array_equal(after, augment_colors(before, 1.0, np.random.default_rng(2)))
     means = after.reshape(200, 4, 3, -1).mean((1, 3))
     assert abs(means.mean() - before.mean()) < 0.15 * before.mean()
     assert 10.0 < means.mean(1).std() < 60.0  # brightness differs
@@ -43,7 +43,7 @@ def test_rectangles_of_one_colour_cover_some():
     picture = np.random.default_rng(3).integers(60, 190, (3, 45, 80), np.uint8)
     before = np.repeat(np.tile(picture, (4, 1, 1))[None], 200, 0)
     shares = []
-    for stack in augmented_colors(before, 1.0, np.random.default_rng(4)):
+    for stack in augment_colors(before, 1.0, np.random.default_rng(4)):
         pixels = stack[:3].reshape(3, -1).T
         pixels = pixels[((pixels > 0) & (pixels < 255)).all(1)]  # not what is merely too dark or too bright
         _, counts = np.unique(pixels, axis=0, return_counts=True)

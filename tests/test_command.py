@@ -5,14 +5,15 @@ import sys
 
 import pytest
 
-from twin.__main__ import VERBS, main
+from twin.__main__ import main
+from twin.commands import VERBS
 
 
 def test_the_map_has_every_verb(capsys):
     for arguments in ([], ["--help"]):
         assert main(arguments) == 0
         shown = capsys.readouterr().out
-        assert all(f"\n  {name} " in shown and what in shown for name, what in VERBS.items())
+        assert all(f"\n  {name} " in shown and verb.summary in shown for name, verb in VERBS.items())
 
 
 def test_an_unknown_verb_is_one_line(capsys):
@@ -27,13 +28,61 @@ def test_every_verb_is_reached(verb, capsys):
     with pytest.raises(SystemExit) as end:
         main([verb, "--help"])
     assert end.value.code == 0
-    assert f"python -m twin.{verb}" in capsys.readouterr().out
+    assert f"usage: twin {verb}" in capsys.readouterr().out
 
 
-def test_the_map_imports_nothing_heavy():
-    code = "import sys, twin.__main__; twin.__main__.main([]); print(sorted(sys.modules), file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not [name for name in ("torch", "warp", "mujoco", "scipy", "dm_control") if f"'{name}'" in done.stderr]
+@pytest.mark.parametrize("arguments", [[], *([verb, "--help"] for verb in VERBS)], ids=str)
+def test_help_imports_nothing_heavy(arguments):
+    code = (
+        "import sys, twin.__main__\ntry: twin.__main__.main(sys.argv[1:])\nexcept SystemExit: pass\n"
+        "print(sorted(sys.modules), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    heavy = ("torch", "warp", "mujoco", "scipy", "dm_control", "matplotlib", "cv2", "pycolmap", "trimesh")
+    assert not [name for name in heavy if f"'{name}'" in done.stderr]
+
+
+def _help(capsys, *arguments):
+    with pytest.raises(SystemExit):
+        main([*arguments, "--help"])
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_help_of_train_states_its_defaults(capsys):
+    from twin.learn.train_config import PRESETS, TrainConfig
+
+    shown, plain = _help(capsys, "train"), TrainConfig()
+    for name in ("task", "observe", "preset"):
+        assert f"(default: {getattr(plain, name, 'cpu')})" in shown
+    for name in ("steps", "worlds"):
+        assert f"(default: {getattr(plain, name)}; gpu: {PRESETS['gpu'][name]})" in shown
+    for name in ("updates", "steering", "entropy", "colours", "seed"):
+        option = shown[shown.index(f"--{name} {name.upper()} ") :]
+        assert option[option.index("(default: ") :].startswith(f"(default: {getattr(plain, name)})"), name
+        assert PRESETS["gpu"].get(name, getattr(plain, name)) == getattr(plain, name)
+    assert f"default: {plain.action}" in shown and f"default: {plain.lighting}," in shown
+    assert plain.randomise and plain.privileged
+
+
+def test_help_agrees_with_what_the_verbs_take(capsys):
+    from twin.align import PUBLISHED_ROBOT, RESULT_FOLDER
+    from twin.evaluation.statistics import MIN_TRIALS
+    from twin.evaluation.trials import RESULT_COLUMNS
+    from twin.reality.real_test import TASKS
+    from twin.validate import DEFAULT_LIGHTINGS
+
+    assert ",".join(RESULT_COLUMNS) in _help(capsys, "forecast")
+    assert f"`{PUBLISHED_ROBOT}`" in _help(capsys, "align") and RESULT_FOLDER in _help(capsys, "align")
+    drive = _help(capsys, "reality", "drive")
+    assert f"{{{','.join(TASKS)}}}" in drive and f"default: {MIN_TRIALS}" in drive
+    assert f"(default: {' '.join(DEFAULT_LIGHTINGS)})" in _help(capsys, "validate")
+
+
+def test_a_lighting_that_reality_does_not_have_is_one_line(tmp_path, capsys):
+    for given in (["film", "--lightings", "noon"], ["photo", "--lighting", "noon"]):
+        assert main(["reality", *given, "--out", str(tmp_path / "out")]) == 2
+        told = capsys.readouterr().err
+        assert told.startswith("error: no lighting 'noon'") and told.count("\n") == 1
 
 
 def test_a_training_in_a_scene_that_is_not_built_leaves_nothing(tmp_path, capsys):

@@ -58,7 +58,7 @@ def test_nested_table_and_integer_for_float(tmp_path):
         (_MINIMAL + 'path = "a\\u0000.mp4"\n'.replace("path", "mask"), "no NUL"),
         (_MINIMAL + '[cameras]\nmapper = "incremntal"\n', "cameras.mapper = 'incremntal'; did you mean 'incremental'"),
         (_SOURCE + '[metric]\ncamera_height = 1\nup = ""\n', "metric.up = ''; expected ground, cameras or poses"),
-        (_MINIMAL + 'lighting = "training"\n', "a light drawn at random"),
+        (_MINIMAL + 'lighting = "training"\n', "a lighting sampled at random"),
         (_MINIMAL + 'lighting = "a/b"\n', "choose a plain name"),
         (_MINIMAL + f'lighting = "{"x" * 90}"\n', "at most 80 characters"),
         (_MINIMAL + 'lighting = ".."\n', "no dot to begin with"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.env.controller import CONTROL_PERIOD, Controller, commanded_motion, limited_command, wheel_speeds
+from twin.env.controller import CONTROL_PERIOD, Controller, limit_command, wheel_speeds, wheel_speeds_to_twist
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 
 _PARAMS = HuskyParams()
@@ -17,16 +17,16 @@ def drive(controller: Controller, command, start: float, steps: int) -> list[np.
         if command is not None:
             controller.command(time, *command)
         controller.update(time + controller.phase)
-        out.append(controller.carried_out)
+        out.append(controller.limited_command)
     return out
 
 
 def test_limits():
-    assert limited_command(np.array([5.0, -9.0]), np.array([1.0, -2.0]), _PARAMS).tolist() == [1.0, -2.0]
-    np.testing.assert_allclose(limited_command(np.array([1.0, 2.0]), np.zeros(2), _PARAMS), [0.3, 0.6])
+    assert limit_command(np.array([5.0, -9.0]), np.array([1.0, -2.0]), _PARAMS).tolist() == [1.0, -2.0]
+    np.testing.assert_allclose(limit_command(np.array([1.0, 2.0]), np.zeros(2), _PARAMS), [0.3, 0.6])
     slow = HuskyParams(max_speed=0.5, max_acceleration=1.0)
-    np.testing.assert_allclose(limited_command(np.array([1.0, 0.0]), np.array([0.45, 0.0]), slow), [0.5, 0.0])
-    np.testing.assert_allclose(limited_command(np.array([1.0, 0.0]), np.zeros(2), slow), [0.1, 0.0])
+    np.testing.assert_allclose(limit_command(np.array([1.0, 0.0]), np.array([0.45, 0.0]), slow), [0.5, 0.0])
+    np.testing.assert_allclose(limit_command(np.array([1.0, 0.0]), np.zeros(2), slow), [0.1, 0.0])
 
 
 def test_a_step_command_is_a_ramp():
@@ -39,7 +39,7 @@ def test_sides_differ_by_the_multiplied_track():
     left, right = wheel_speeds(np.array([0.2, 0.3]), _PARAMS) * WHEEL_RADIUS
     assert (left + right) / 2 == pytest.approx(0.2)
     assert right - left == pytest.approx(0.3 * 1.875 * TRACK)
-    np.testing.assert_allclose(commanded_motion(wheel_speeds(np.array([0.2, 0.3]), _PARAMS), _PARAMS), [0.2, 0.3])
+    np.testing.assert_allclose(wheel_speeds_to_twist(wheel_speeds(np.array([0.2, 0.3]), _PARAMS), _PARAMS), [0.2, 0.3])
 
 
 def test_both_sides_shrink_alike():
@@ -48,7 +48,7 @@ def test_both_sides_shrink_alike():
     slow = wheel_speeds(np.array([0.1, 0.1]), _PARAMS) * WHEEL_RADIUS
     np.testing.assert_allclose(fast / fast.max(), slow / slow.max())  # the curve stays the same
     # On the spot the controller believes in no more than 1.87 rad/s.
-    _, yaw_rate = commanded_motion(wheel_speeds(np.array([0.0, 2.0]), _PARAMS), _PARAMS)
+    _, yaw_rate = wheel_speeds_to_twist(wheel_speeds(np.array([0.0, 2.0]), _PARAMS), _PARAMS)
     assert yaw_rate == pytest.approx(2 / (1.875 * TRACK)) == pytest.approx(1.87, abs=0.01)
 
 
@@ -58,7 +58,7 @@ def test_a_command_lapses_after_a_quarter_second():
     carried_out = []
     for time in (0.0, 0.1, 0.2, 0.3, 0.4):
         controller.update(time)
-        carried_out.append(controller.carried_out[0])
+        carried_out.append(controller.limited_command[0])
     assert carried_out == pytest.approx([0.3, 0.3, 0.3, 0.0, 0.0])
 
 
@@ -77,7 +77,7 @@ def test_the_newest_command_counts():
     controller.command(0.05, 0.2, 0.0)
     controller.command(0.15, 0.3, 0.0)  # not there yet
     controller.update(0.1)
-    assert controller.carried_out[0] == pytest.approx(0.2)
+    assert controller.limited_command[0] == pytest.approx(0.2)
     controller.reset()
     controller.update(0.2)
-    assert not controller.carried_out.any()
+    assert not controller.limited_command.any()

@@ -12,13 +12,13 @@ from twin.assets.convex import (
     decompose,
     half_spaces,
     inside_hull,
+    split_to_bound,
     surface_samples,
-    uncovered,
+    uncovered_fraction,
     winding_number,
-    within_bound,
 )
 from twin.assets.ground import Ground
-from twin.assets.solids import HEADROOM, Corridor, clear_corridor, cut
+from twin.assets.solids import HEADROOM, Corridor, clear_corridor, clip_part
 from twin.geometry.route import distance_to_route
 
 BOUND = 0.2  # [m]
@@ -90,33 +90,33 @@ def test_samples_are_on_the_surface_and_no_further_apart_than_asked():
 
 
 def test_the_hull_of_an_ell_sticks_out_as_far_as_geometry_says():
-    piece = SolidPiece.of(*_ell())
+    piece = SolidPiece.from_mesh(*_ell())
     hull = ConvexPart.hull(piece.vertices)
     assert hull is not None
     # The middle of the hull's slanted face is 0.7 m from either arm.
     assert piece.protrusion(hull) == pytest.approx(0.7, abs=0.05)
     assert piece.protrusion(_box((0, 0, 0), (2, 0.6, 1))) == 0.0
     assert piece.protrusion(_box((1, 0, 0), (2, 0.9, 1))) == pytest.approx(0.3, abs=0.05)
-    assert uncovered(piece, [hull], 0.01) == 0.0
-    assert 0.2 < uncovered(piece, [_box((0, 0, 0), (2, 0.6, 1))], 0.05) < 0.6
+    assert uncovered_fraction(piece, [hull], 0.01) == 0.0
+    assert 0.2 < uncovered_fraction(piece, [_box((0, 0, 0), (2, 0.6, 1))], 0.05) < 0.6
 
 
 def test_halving_alone_comes_close_and_tells_how_close():
-    piece = SolidPiece.of(*_ell())
+    piece = SolidPiece.from_mesh(*_ell())
     hull = ConvexPart.hull(piece.vertices)
     assert hull is not None
-    halves = within_bound(hull, piece, BOUND)
+    halves = split_to_bound(hull, piece, BOUND)
     assert len(halves) > 1
     for part, protrusion in halves:
         truth = _outside_ell(surface_samples(part.vertices, part.faces, 0.05)).max()
         # Less than the spacing of the samples is not told from touching.
         assert truth - 0.07 <= protrusion < 0.5 * piece.protrusion(hull)
-    assert uncovered(piece, [part for part, _ in halves], BOUND) < 0.08
+    assert uncovered_fraction(piece, [part for part, _ in halves], BOUND) < 0.08
 
 
 def test_decomposition_covers_its_pieces_within_the_bound_and_is_remembered(tmp_path: Path):
     crate = _box((5, 5, 0), (6, 6, 1))
-    pieces = [SolidPiece.of(crate.vertices, crate.faces), SolidPiece.of(*_ell())]
+    pieces = [SolidPiece.from_mesh(crate.vertices, crate.faces), SolidPiece.from_mesh(*_ell())]
     made = decompose(pieces, BOUND, tmp_path, seed=0)
     assert made.failed == 0 and made.cached == 0 and made.uncovered < 0.01
     assert (made.piece == 0).sum() == 1 and (made.piece == 1).sum() >= 2
@@ -135,12 +135,12 @@ def test_decomposition_covers_its_pieces_within_the_bound_and_is_remembered(tmp_
 def test_a_cut_keeps_exactly_its_side():
     part = _box((0, 0, 0), (1, 1, 1))
     normal = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-    corner = cut(part, normal, 0.5 / np.sqrt(2))
+    corner = clip_part(part, normal, 0.5 / np.sqrt(2))
     assert corner is not None
     assert _volume(corner) == pytest.approx(0.125)
     assert (corner.vertices @ normal).max() <= 0.5 / np.sqrt(2) + 1e-9
-    assert cut(part, normal, 2.0) is part
-    assert cut(part, normal, -0.1) is None
+    assert clip_part(part, normal, 2.0) is part
+    assert clip_part(part, normal, -0.1) is None
 
 
 def test_the_corridor_is_cleared_and_the_rest_stays():

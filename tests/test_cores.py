@@ -9,7 +9,7 @@ from twin import runtime
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    monkeypatch.setattr(runtime, "_most", None)
+    monkeypatch.setattr(runtime, "_core_limit", None)
     monkeypatch.setattr(os, "sched_getaffinity", lambda who: set(range(8)), raising=False)
     runtime._quota.cache_clear()
     yield
@@ -24,9 +24,9 @@ def test_a_container_may_have_fewer(tmp_path, monkeypatch, said, wanted):
     if said:
         file.write_text(said + "\n")
     monkeypatch.setattr(runtime, "_QUOTA", file)
-    assert runtime.cores() == wanted
+    assert runtime.available_cores() == wanted
 
 
 def test_one_of_several_processes_uses_its_share():
-    runtime.use(3)
-    assert runtime.cores() == min(3, runtime._quota() or 3)
+    runtime.limit_cores(3)
+    assert runtime.available_cores() == min(3, runtime._quota() or 3)

@@ -24,12 +24,12 @@ def test_many_controllers_do_what_each_does_alone(period):
         return HuskyPhysics(model, replace(PARAMS, command_latency=latencies[i]))
 
     robots = [husky(i) for i in range(n)]
-    many = VectorController(PARAMS, n, period, model.opt.timestep, robots[0].look_steps)
+    many = VectorController(PARAMS, n, period, model.opt.timestep, robots[0].check_steps)
 
     def begin(which: np.ndarray) -> None:
         for i in which:
             robots[i] = husky(i)
-        until = np.array([robots[i].until_update for i in which])
+        until = np.array([robots[i].steps_to_update for i in which])
         many.begin(which, latencies[which], until)
 
     begin(np.arange(n))
@@ -39,15 +39,15 @@ def test_many_controllers_do_what_each_does_alone(period):
             begin(np.array([0, 2]))
         which = np.arange(n) if k % 4 else np.array([1, 2, 5])  # the others' time stands still
         commands = rng.uniform([-1.0, -2.0], [1.0, 2.0], (len(which), 2))
-        told = many.courses(which, commands)
+        told = many.schedules(which, commands)
         for i, command in zip(which, commands, strict=True):
             robot = robots[i]
             robot.command(*command)
-            course, done = robot.course(period), 0
+            course, done = robot.schedule(period), 0
             for p, (some, speeds) in enumerate(course):
                 np.testing.assert_array_equal(told.speeds[p, i], speeds)
-                assert (told.piece[done : done + some, i] == p).all()
-                assert told.looks[done : done + some, i].tolist() == [0] * (some - 1) + [1]
+                assert (told.segment[done : done + some, i] == p).all()
+                assert told.checks[done : done + some, i].tolist() == [0] * (some - 1) + [1]
                 done += some
                 robot.data.time += some * model.opt.timestep
                 assert told.times[p, i] == robot.data.time

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_review import ChequeredField, make_cameras
 
-from twin.geometry.cameras import Posed
-from twin.nerf.evaluate import cross_lighting, mean_colour
+from twin.geometry.cameras import PosedCameras
+from twin.nerf.evaluate import cross_lighting, mean_color
 from twin.nerf.rendering import Rendering
 from twin.runtime import set_quiet
 
@@ -22,14 +22,14 @@ def quiet():
 class Stubborn(ChequeredField):
     """Shows its first lighting whatever it is asked for, and stands further away in the second one."""
 
-    def render(self, cameras: Posed, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
+    def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
         seen = super().render(cameras, self.lightings[0], size)
         return Rendering(seen.rgb, seen.depth + 0.25 * (lighting != self.lightings[0]), seen.opacity)
 
 
 def test_colour_follows_the_light_where_only_brightness_differs(tmp_path: Path) -> None:
     field = ChequeredField({"day": 1.0, "night": 0.3})
-    found = cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field), most=10)
+    found = cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field), max_poses=10)
     assert found is not None and found["poses"] == 10
     assert found["colour_follows"] == {"day": 1.0, "night": 1.0}
     assert found["follows_by_pair"] == {"day": {"night": 1.0}, "night": {"day": 1.0}}
@@ -63,4 +63,4 @@ def test_one_lighting_has_nothing_to_cross(tmp_path: Path) -> None:
 def test_masked_pixels_have_no_colour() -> None:
     image = np.zeros((2, 2, 3))
     image[0, 0] = 1.0
-    assert np.array_equal(mean_colour(image, image[..., 0] == 0), np.zeros(3))
+    assert np.array_equal(mean_color(image, image[..., 0] == 0), np.zeros(3))

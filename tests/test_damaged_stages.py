@@ -9,7 +9,7 @@ from tiny_twin import tiny_twin
 from twin.assets.ground import Ground
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.errors import InputError
-from twin.evaluation.training_curves import read_episodes, trainings
+from twin.evaluation.training_curves import read_episodes, training_summaries
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
@@ -111,8 +111,8 @@ def test_episodes_of_a_training_that_are_damaged(tmp_path, line):
 
 def test_what_was_noted_of_a_validation(tmp_path):
     (tmp_path / "validation").mkdir()
-    assert trainings(tmp_path, ["x" * 300, "a\x00b"]) == {}  # a table may have any name
+    assert training_summaries(tmp_path, ["x" * 300, "a\x00b"]) == {}  # a table may have any name
     for text in ("[]", "{}", '{"policies": 3}', "{"):
         (tmp_path / "validation" / "validated.json").write_text(text)
         with pytest.raises(InputError, match=r"validated\.json"):
-            trainings(tmp_path, ["a"])
+            training_summaries(tmp_path, ["a"])

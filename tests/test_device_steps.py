@@ -12,9 +12,9 @@ import twin
 from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraOptions
+from twin.env.dm import control
 from twin.env.domain_randomization import Ranges
 from twin.env.observation import GpuPixelObserver, PixelObserver
-from twin.env.options import control
 from twin.env.suite import EnvFactory
 from twin.env.vector_env_gpu import GpuVectorEnv
 from twin.env.vector_env_local import LocalVectorEnv
@@ -50,11 +50,11 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
         np.testing.assert_array_equal(a.over, b.over)
         np.testing.assert_allclose(a.reward, b.reward, atol=0.02)
         # What is known of all worlds at once is what each of them says.
-        poses, times = device._device.eyes(np.arange(3))
-        motion = device._device.motion(np.arange(3))
+        poses, times = device._simulation.camera_poses(np.arange(3))
+        motion = device._simulation.motion(np.arange(3))
         for i, (physics, task) in enumerate(zip(device.physics, device.tasks, strict=True)):
             np.testing.assert_allclose(poses[i], physics.camera_to_world, atol=1e-7)
-            assert times[i] == pytest.approx(physics.seen.time, abs=1e-9) and motion.time[i] == physics.time()
+            assert times[i] == pytest.approx(physics.delayed_data.time, abs=1e-9) and motion.time[i] == physics.time()
             np.testing.assert_allclose(motion.pose[i], physics.planar_pose, atol=1e-9)
             said = motion.speed[i], motion.yaw_rate[i], motion.uprightness[i]
             np.testing.assert_allclose(said, (physics.speed, physics.yaw_rate, physics.uprightness), atol=1e-9)
@@ -68,7 +68,9 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
         np.testing.assert_allclose(one.robot.wheel_velocity, other.robot.wheel_velocity, atol=0.3)
         np.testing.assert_allclose(one.data.act, other.data.act, atol=1e-4)
         np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=4e-3)
-        assert one.seen.time == pytest.approx(one.time() - 0.07) and other.seen.time == pytest.approx(one.seen.time)
+        assert one.delayed_data.time == pytest.approx(one.time() - 0.07) and other.delayed_data.time == pytest.approx(
+            one.delayed_data.time
+        )
         np.testing.assert_allclose(one.data.mocap_pos, other.data.mocap_pos, atol=1e-9)
         assert one.speed > 0.1
     assert all(task.progress > 0.1 for task in device.tasks)
@@ -112,17 +114,17 @@ def test_what_worlds_on_a_device_see(scene, obstacles):
 def test_what_goes_wrong_on_a_device_is_said(scene):
     worlds = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
     worlds.begin([0])  # the other world lies where the model has it, and is nobody's concern
-    device = worlds._device
+    device = worlds._simulation
     device._advance = lambda: None
     device._data.overflow.assign([0, int(mjw.OverflowType.NEFC)])
-    device._send = lambda: None
+    device._upload = lambda: None
     worlds.step(np.zeros((1, 2)), [0])
     device._data.overflow.assign([int(mjw.OverflowType.NEFC), 0])
-    with pytest.raises(RuntimeError, match=r"worlds \[0\]: more than .* no room; use device='cpu'"):
+    with pytest.raises(RuntimeError, match=r"environments \[0\]: more than .* no room; use device='cpu'"):
         worlds.step(np.zeros((1, 2)), [0])
     device._data.overflow.zero_()
     device._data.qvel.assign(np.full(device._data.qvel.shape, np.nan, np.float32))
-    with pytest.raises(control.PhysicsError, match=r"worlds \[0\]"):
+    with pytest.raises(control.PhysicsError, match=r"environments \[0\]"):
         worlds.step(np.zeros((1, 2)), [0])
     worlds.close()
 
@@ -152,9 +154,9 @@ def test_pictures_on_a_device_are_those_on_the_host(scene, latency, monkeypatch)
     )
     robot = replace(stage.world.robot, camera_latency=latency)
     stage = replace(stage, world=replace(stage.world, robot=robot))
-    parts = [stage.drive(seed) for seed in range(3)]
+    parts = [stage.make_env(seed) for seed in range(3)]
     monkeypatch.setattr(stage.trust, "offset", lambda poses: np.zeros(len(poses)))  # so that the picture decides
-    host, device = stage.pixels(parts), GpuPixelObserver(stage.field, stage.trust, stage.options, parts)
+    host, device = stage.make_observer(parts), GpuPixelObserver(stage.field, stage.trust, stage.options, parts)
     for physics, task in parts:
         task.initialize_episode(physics)
     before = None
@@ -164,7 +166,7 @@ def test_pictures_on_a_device_are_those_on_the_host(scene, latency, monkeypatch)
             parts[i][1].before_step([1.0, 0.3 * i], parts[i][0])
             parts[i][0].step(50)
         for pixels in (host, device):
-            (pixels.begin if k in (0, 4) else pixels.look)(which)
+            (pixels.begin if k in (0, 4) else pixels.observe)(which)
         np.testing.assert_array_equal(device.stacks, host.stacks)
         np.testing.assert_allclose(device.trust, host.trust, atol=1e-5)
         assert device.info(0)["lighting"] == host.info(0)["lighting"]
@@ -177,7 +179,7 @@ def test_only_bare_pictures_stay_on_the_device(scene):
     def kind(**options) -> type:
         stage = EnvFactory.open(scene, "bend", {"obstacles": (), **SMALL, **options})
         stage = replace(stage, options=replace(stage.options, device="cuda"))  # the field stays on the CPU
-        return type(stage.pixels([stage.drive(0)]))
+        return type(stage.make_observer([stage.make_env(0)]))
 
     assert kind() is GpuPixelObserver
     assert kind(randomise=True) is kind(obstacles=1) is kind(camera=CameraOptions(vibration=0.1)) is PixelObserver

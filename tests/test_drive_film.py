@@ -8,11 +8,11 @@ import pytest
 from test_review import ChequeredField, make_cameras
 from tqdm import tqdm
 
-from twin.env.drivers import FollowedDrive
+from twin.env.route_follower import RecordedDrive
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.report.chase_camera import frame_indices
-from twin.report.review_chapters import drive_metrics, film_drive, speeds, stride, trace
+from twin.report.review_chapters import drive_metrics, drive_trace, frame_timing, smoothed_speed, write_drive_chapter
 from twin.report.review_studio import Studio
 from twin.report.video_layout import FrameLayout, MapView
 from twin.report.video_writer import VideoWriter, read_frames
@@ -21,13 +21,13 @@ from twin.robot import PixelCamera
 
 def drive_along(
     x: np.ndarray, y: np.ndarray, yaw: np.ndarray, outcome: str = "goal", touched: tuple = ()
-) -> FollowedDrive:
+) -> RecordedDrive:
     """A drive through given places, one per 0.1 s, its camera half a metre up."""
     base = np.tile(np.eye(4), (len(x), 1, 1))
     base[:, 0, 0], base[:, 0, 1], base[:, 1, 0], base[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
     base[:, 0, 3], base[:, 1, 3] = x, y
     eyes = [look_at(p[:3, 3] + [0, 0, 0.5], p[:3, 3] + p[:3, 0] * 5) for p in base]
-    return FollowedDrive(
+    return RecordedDrive(
         times=0.1 * np.arange(len(x)),
         base_to_world=base,
         camera_to_world=np.array(eyes),
@@ -40,7 +40,7 @@ def drive_along(
     )
 
 
-def straight(k: int = 101) -> FollowedDrive:
+def straight(k: int = 101) -> RecordedDrive:
     x = np.linspace(0.0, 0.1 * (k - 1), k)
     return drive_along(x, 0.2 * np.sin(x), np.zeros(k))
 
@@ -63,19 +63,19 @@ def test_speed_is_that_of_the_base() -> None:
     drive = straight()
     drive.cross_track[:] = 0
     steady = drive_along(drive.progress, np.zeros(101), np.zeros(101))
-    assert speeds(steady).shape == (101,)
-    assert speeds(steady)[5:] == pytest.approx(1.0)
+    assert smoothed_speed(steady).shape == (101,)
+    assert smoothed_speed(steady)[5:] == pytest.approx(1.0)
 
 
 def test_a_trace_keeps_both_ends_and_is_short() -> None:
-    thin = trace(straight(1001))
+    thin = drive_trace(straight(1001))
     assert {len(v) for v in thin.values()} == {200}
     assert thin["progress_m"][0] == 0.0 and thin["progress_m"][-1] == pytest.approx(100.0)
 
 
 @pytest.mark.parametrize(("instants", "fps"), [(101, 10), (601, 10), (3001, 10), (601, 30), (101, 30)])
 def test_a_long_drive_is_shown_faster(instants: int, fps: int) -> None:
-    every, hold = stride(straight(instants), fps)
+    every, hold = frame_timing(straight(instants), fps)
     seconds = len(frame_indices(instants, every)) * hold / fps
     assert 5.0 < seconds < 17.0
     assert every >= 1 and hold >= 1
@@ -100,10 +100,10 @@ def test_the_drive_is_filmed_within_its_budget(tmp_path: Path, outcome: str, ins
     route = world.route[:, :2]
     with VideoWriter(tmp_path / "film.mp4", layout.size, 5) as writer, tqdm(file=io.StringIO()) as progress:
         studio = Studio("place", field, cameras, layout, writer, tmp_path, 48, route)
-        indices = frame_indices(instants, stride(drive, 5)[0])
+        indices = frame_indices(instants, frame_timing(drive, 5)[0])
         chase = [np.full((layout.panel[1], layout.panel[0], 3), i % 256, np.uint8) for i in indices]
-        film_drive(studio, MapView.draw((200, 60), route), world, drive, chase, 12, progress)
+        write_drive_chapter(studio, MapView.draw((200, 60), route), world, drive, chase, 12, progress)
     assert 0 < studio.renders <= 12
     assert field.asked[0] == "day" and field.asked[-1] == ("night" if instants > 1 else "day")
     assert len(list(read_frames(tmp_path / "film.mp4"))) == writer.frames > len(indices)
-    assert {picture.section for picture in studio.kept} == {"poster", "review"}
+    assert {picture.section for picture in studio.pictures} == {"poster", "review"}

@@ -130,12 +130,12 @@ def test_the_benchmark_of_the_field_runs(built, tmp_path):
 def test_it_is_driven_by_what_it_sees(built, tmp_path):
     """The environment on a real build: pictures that are those of the field, the goal reached, a film."""
     from twin.env.drivers import RouteDriver
-    from twin.env.episode import record
+    from twin.env.episode import record_episode
 
     root, _ = built
     environment = twin.load(root, "route", 0, lighting="overcast")
     seen = []
-    episode = record(environment, RouteDriver(), lambda step: seen.append(step.observation["pixels"][-1]))
+    episode = record_episode(environment, RouteDriver(), lambda step: seen.append(step.observation["pixels"][-1]))
     assert episode.success and episode.trust.min() > 0.5
     field, world = twin.load_scene(root).field(), environment.task.world
     view = twin.Viewpoints.of(environment.physics.camera_to_world, world.intrinsics, (160, 90))

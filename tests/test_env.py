@@ -128,7 +128,7 @@ def test_one_world_of_many_is_the_single_environment(scene, name):
             np.testing.assert_array_equal(worlds.pixels.stacks[1].transpose(0, 2, 3, 1), step.observation["pixels"])
         else:
             np.testing.assert_array_equal(worlds.observation()[1], np.concatenate(list(step.observation.values())))
-        actions = rng.uniform(-1, 1, (3, worlds.actions))
+        actions = rng.uniform(-1, 1, (3, worlds.action_size))
         out = worlds.step(actions)
         step = single.step(spec.minimum + (actions[1] + 1) / 2 * (spec.maximum - spec.minimum))
         assert out.reward[1] == step.reward and out.over[1] == step.last()
@@ -254,7 +254,7 @@ def test_starts_are_spread_as_stated(scene):
 def test_every_second_episode_may_start_on_the_way(scene):
     plain = twin.load(scene, "route", pixels=False)
     environment = twin.load(scene, "route", pixels=False, start_along=0.6)
-    length = environment.task.stretch.length
+    length = environment.task.segment.length
     starts = []
     for seed in range(80):
         for one in (plain, environment):
@@ -300,7 +300,7 @@ def test_scene_obstacles_are_there_and_move(tmp_path):
 
 
 def test_what_cannot_be_had_is_an_input_error(scene):
-    with pytest.raises(InputError, match=r"'straight': the route .* no such stretch of 30 m; .* there are .*bend \(10"):
+    with pytest.raises(InputError, match=r"'straight': the route .* no such segment of 30 m; .* there are .*bend \(10"):
         twin.load(scene, "straight")
     with pytest.raises(InputError, match="did you mean 'lighting'"):
         twin.load(scene, "bend", lightning="day")

@@ -7,21 +7,21 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from audit import EVENTS, Findings, Seen, audit
+from audit import EVENTS, Findings, VisualMesh, audit
 from tiny_twin import tiny_field, tiny_twin
 from tiny_world import tiny_world
 
 import twin
 from twin import runtime
 from twin.config import HELD_OUT, TRAINING, TaskConfig
-from twin.env.domain_randomization import ANOTHER_DAY, Nominal, RandomizationSample, Ranges
+from twin.env.domain_randomization import EVALUATION_RANGES, NominalModel, RandomizationSample, Ranges
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
-from twin.env.episode import Episode, record
+from twin.env.episode import Episode, record_episode
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.episode_model import episode_spec
 from twin.env.options import parse_options
 from twin.env.physics import HuskyPhysics
-from twin.env.route_segments import find_task, tasks
+from twin.env.route_segments import find_task, scene_tasks
 from twin.env.suite import EnvFactory
 from twin.env.trust import Trust
 from twin.env.vector_env import make_vector_env
@@ -31,7 +31,7 @@ from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
-from twin.report.video_writer import describe
+from twin.report.video_writer import video_info
 from twin.robot import TRACK, HuskyParams
 
 SMALL = {"size": (32, 18)}
@@ -64,7 +64,7 @@ def route_world(*pieces: tuple[float, float]) -> World:
 
 def test_standard_tasks_are_found_where_they_are():
     world = route_world((20.0, 1.2), (40.0, 0.0), (12.0, -np.pi / 2), (40.0, 0.0))
-    found = tasks(world)
+    found = scene_tasks(world)
     assert set(found) == {"route", "straight", "right_turn"}
     assert 14.0 < found["straight"].start < 30.0 and found["straight"].length == 30.0
     turn = found["right_turn"]
@@ -74,7 +74,7 @@ def test_standard_tasks_are_found_where_they_are():
 
 def test_a_left_turn_is_no_right_turn_and_it_says_what_there_is():
     world = route_world((20.0, 0.0), (12.0, np.pi / 2), (40.0, 0.0))
-    with pytest.raises(InputError, match=r"'right_turn': .*no such stretch of 60 m; there are .*straight \(30.0 m"):
+    with pytest.raises(InputError, match=r"'right_turn': .*no such segment of 60 m; there are .*straight \(30.0 m"):
         find_task("right_turn", world)
     short = route_world((17.0, 0.0))
     with pytest.raises(InputError, match=r"the longest is 17.0 m from 0.0 m; there are route"):
@@ -100,7 +100,7 @@ def test_training_and_held_out_lights_never_mix(field):
             assert sets.set_of(sets.sample(which, rng)) == which
     assert all(sets.set_of(field.embedding(name)) == TRAINING for name in field.lightings)
     # Nearer to each other than to their own set is nobody.
-    train, held = ([sets._picture(sets.sample(w, rng)) for _ in range(15)] for w in (TRAINING, HELD_OUT))
+    train, held = ([sets._probe_colors(sets.sample(w, rng)) for _ in range(15)] for w in (TRAINING, HELD_OUT))
     gap = min(float(np.sqrt(((a - b) ** 2).mean())) for a in train for b in held)
     assert gap > 0.0
 
@@ -109,7 +109,7 @@ def test_lights_of_rare_anchors_are_drawn_as_often_as_others(field):
     sets, rng = LightingSets(field), np.random.default_rng(3)
     for which, held_out in ((TRAINING, False), (HELD_OUT, True)):
         own = set(np.flatnonzero(sets.anchors.held_out == held_out))
-        near = [sets._place_of(sets.sample(which, rng))[1] for _ in range(40 * len(own))]
+        near = [sets._set_and_anchor(sets.sample(which, rng))[1] for _ in range(40 * len(own))]
         assert set(near) == own
         assert min(near.count(anchor) for anchor in own) > 20
 
@@ -142,8 +142,8 @@ def test_lights_are_drawn_as_asked(field):
 
 def test_a_draw_does_to_the_model_what_it_says(scene):
     stage = EnvFactory.open(scene, "bend", {"pixels": False})
-    physics, _ = stage.drive(0)
-    model, nominal = physics.model.ptr, Nominal(stage.model)
+    physics, _ = stage.make_env(0)
+    model, nominal = physics.model.ptr, NominalModel(stage.model)
     plain = model.geom_size[model.geom("front_left_tyre").id].copy()
     draw = RandomizationSample(1.2, 12.0, 0.05, (0.01, 0.0, -0.01), (0.0, 2.0, 0.0), 0.97)
     nominal.apply(draw, model)
@@ -222,16 +222,18 @@ def test_ranges_that_make_no_sense_are_refused():
 
 def test_what_is_known_of_the_robot_is_held_where_policies_are_judged():
     robot = HuskyParams(friction=0.6, wheel_radius=(0.162, 0.163), center_of_mass=(-0.05, 0.0, 0.06))
-    draws = [ANOTHER_DAY.for_robot(robot).draw(np.random.default_rng(k)) for k in range(9)]
+    draws = [EVALUATION_RANGES.for_robot(robot).sample(np.random.default_rng(k)) for k in range(9)]
     assert {(d.friction, d.wheel_radius, d.wheel_difference, d.payload) for d in draws} == {(1.0, 1.0, 0.0, 0.0)}
-    others = [ANOTHER_DAY.draw(np.random.default_rng(k)) for k in range(9)]
+    others = [EVALUATION_RANGES.sample(np.random.default_rng(k)) for k in range(9)]
     for name in ("latency", "camera_shift", "camera_turn", "sunlight", "shade", "extinction", "bystanders"):
         assert [getattr(d, name) for d in draws] == [getattr(d, name) for d in others]
     assert len({d.latency for d in draws}) == 9
-    seen = [ANOTHER_DAY.for_robot(HuskyParams(camera_height=0.59, camera_yaw=0.4)).draw(np.random.default_rng(1))]
-    seen.append(ANOTHER_DAY.for_robot(HuskyParams(camera_height=0.59)).draw(np.random.default_rng(1)))
+    seen = [
+        EVALUATION_RANGES.for_robot(HuskyParams(camera_height=0.59, camera_yaw=0.4)).sample(np.random.default_rng(1))
+    ]
+    seen.append(EVALUATION_RANGES.for_robot(HuskyParams(camera_height=0.59)).sample(np.random.default_rng(1)))
     assert [any(d.camera_shift) for d in seen] == [False, False] and [any(d.camera_turn) for d in seen] == [False, True]
-    assert ANOTHER_DAY.for_robot(HuskyParams()) == ANOTHER_DAY  # nothing is known of it
+    assert EVALUATION_RANGES.for_robot(HuskyParams()) == EVALUATION_RANGES  # nothing is known of it
     assert Ranges().for_robot(robot) == Ranges()  # training goes on drawing it
 
 
@@ -245,7 +247,7 @@ def test_leaving_out_what_is_out_of_reach_changes_no_number(tmp_path):
     small = HuskyPhysics(spec.compile())
     assert small.model.ngeom < whole.model.ngeom and small.model.ntex == 0
     for physics in (whole, small):
-        physics.place(0.0, 0.1, 0.05)
+        physics.set_pose(0.0, 0.1, 0.05)
         for _ in range(20):
             physics.command(0.8, 0.1)
             physics.step()
@@ -291,7 +293,7 @@ def test_trust_falls_with_distance_turn_and_missing_road():
 
 def test_an_episode_comes_back_from_its_files(scene, tmp_path):
     environment = twin.load(scene, "ahead", 0, obstacles=0, lighting="night", **SMALL)
-    episode = record(environment, RouteDriver())
+    episode = record_episode(environment, RouteDriver())
     assert episode.success and episode.lighting == "night" and episode.progress[-1] == pytest.approx(3.5, abs=0.15)
     assert len(episode.times) == len(episode.actions) == len(episode.trust)
     assert episode.rewards.sum() == pytest.approx(0.1 * (len(episode.times) - 1))
@@ -310,11 +312,11 @@ def test_a_policy_is_a_function_by_name(scene, tmp_path, monkeypatch):
     )
     monkeypatch.chdir(tmp_path)
     environment = twin.load(scene, "bend", 0, **SMALL)
-    episode = record(environment, PolicyDriver(find_callable("my_policy:act")), most=5)
+    episode = record_episode(environment, PolicyDriver(find_callable("my_policy:act")), max_steps=5)
     np.testing.assert_array_equal(episode.actions[:5], np.tile([1.0, 0.0], (5, 1)))
     assert episode.cause == ""
     with pytest.raises(InputError, match="expected 2 numbers"):
-        record(environment, PolicyDriver(find_callable("my_policy:bad")), most=1)
+        record_episode(environment, PolicyDriver(find_callable("my_policy:bad")), max_steps=1)
     for name in ("my_policy", "my_policy:nothing", "no_such_module:act"):
         with pytest.raises(InputError):
             find_callable(name)
@@ -327,7 +329,7 @@ def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
     arguments = [str(scene.scene.root), "--task", "ahead", "--lighting", "night", "--out", str(out)]
     assert main(arguments) == 0
     assert "goal after 3." in capsys.readouterr().out
-    told = describe(out)
+    told = video_info(out)
     assert told["codec"] == "h264" and 20 < told["frames"] < 60
     assert main([str(scene.scene.root), "--task", "moon", "--quiet"]) == 2
     assert "task 'moon': unknown; there are route" in capsys.readouterr().err
@@ -361,7 +363,7 @@ def test_the_audit_finds_holes_and_finds_none_where_there_are_none(scene, tmp_pa
     # A visual mesh across the road that nothing solid stands for is a gap.
     import audit as module
 
-    seen = Seen(stage.world)
+    seen = VisualMesh(stage.world)
     seen._points = np.array([[3.0, y, z] for y in np.arange(-2, 2, 0.1) for z in np.arange(0.3, 1.0, 0.05)])
     seen._tree = module.cKDTree(seen._points[:, :2])
     holes = Findings()
@@ -370,21 +372,21 @@ def test_the_audit_finds_holes_and_finds_none_where_there_are_none(scene, tmp_pa
 
 
 def test_the_examiner_knows_tunnelling_climbing_and_sliding(scene):
-    from audit import Examiner
+    from audit import EventDetector
 
     stage = EnvFactory.open(scene, "bend", {"pixels": False})
     robot = HuskyPhysics(episode_spec(stage.world, 0.0, 10.0, 5.0).compile(), stage.world.robot)
-    examiner = Examiner(robot, Seen(stage.world))
-    robot.place(1.0, 0.0, 0.0)
-    assert examiner.events() == []
+    detector = EventDetector(robot, VisualMesh(stage.world))
+    robot.set_pose(1.0, 0.0, 0.0)
+    assert detector.events() == []
     robot.data.qpos[2] += 0.15
     mujoco.mj_forward(robot.model, robot.data)
-    assert examiner.events() == ["climbing"]
-    robot.place(3.0, 1.5, 0.0)
+    assert detector.events() == ["climbing"]
+    robot.set_pose(3.0, 1.5, 0.0)
     robot.data.qpos[1] += 0.3  # into the box beside the road
     robot.data.qvel[0] = 0.5
     mujoco.mj_forward(robot.model, robot.data)
-    assert {"tunnelling", "wall_sliding"} <= set(examiner.events())
+    assert {"tunnelling", "wall_sliding"} <= set(detector.events())
 
 
 _NO_ACTIONS = [

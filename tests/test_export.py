@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from twin import export
-from twin.assets.splats import Gaussians, gaussians_of_views, sharpest
+from twin.assets.splats import Gaussians, gaussians_of_views, select_sharpest
 from twin.assets.views import Views
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.poses import look_at
@@ -52,10 +52,10 @@ def test_gaussians_are_flat_disks_on_the_surface() -> None:
 
 def test_of_points_in_one_cell_the_sharpest_stays() -> None:
     points = np.array([[0.001, 0, 0], [0.002, 0, 0], [0.004, 0.001, 0], [0.5, 0, 0]])
-    assert sharpest(points, np.array([0.009, 0.005, 0.03, 0.03])).tolist() == [1, 3]
+    assert select_sharpest(points, np.array([0.009, 0.005, 0.03, 0.03])).tolist() == [1, 3]
     rng = np.random.default_rng(0)
     points, width = rng.uniform(0, 0.3, (3000, 3)), rng.uniform(0.005, 0.08, 3000)
-    kept = sharpest(points, width)
+    kept = select_sharpest(points, width)
     level = np.maximum(np.ceil(np.log2(width / 0.01)), 0)
     for n in range(4):
         cells = np.floor((points[kept] - points.min(0)) / (0.01 * 2**n)).astype(int)[level[kept] <= n]
@@ -118,7 +118,7 @@ def _read(ply: bytes) -> Gaussians:
 
 def test_vertices_have_the_colours_of_what_is_seen_there() -> None:
     vertices = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [0.3, 0.31, -0.5]])
-    colours = export.vertex_colours(_views(EYES), vertices)
+    colours = export.vertex_colors(_views(EYES), vertices)
     assert np.abs(colours[:3].astype(int) - _colour(vertices[:3])).max() <= 1
     assert (colours[3] == colours[0]).all()  # hidden below the floor: as the nearest seen
 

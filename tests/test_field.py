@@ -13,14 +13,14 @@ from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import (
     CameraArrays,
     Layout,
-    Space,
+    NearBox,
     Workspace,
     level_cells,
     level_shapes,
+    near_box_of_cameras,
     opacity_grids,
-    space_of_cameras,
 )
-from twin.nerf.field import RadianceField, untrained
+from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid
 from twin.nerf.kernels.space import contract_points
@@ -36,7 +36,7 @@ def field() -> RadianceField:
     frames = ("day/000000", "day/000001", "night/000000")
     appearance = initial_appearance(("day", "night"), frames, np.array([0, 0, 1]), 32, seed=3)
     appearance.residuals.normal_(generator=torch.Generator().manual_seed(0))
-    return untrained(LAYOUT, appearance, seed=1, where="cpu")
+    return untrained_field(LAYOUT, appearance, seed=1, device="cpu")
 
 
 def random_samples(field: RadianceField, rays: int, samples: int, seed: int = 0) -> Workspace:
@@ -54,7 +54,7 @@ def random_samples(field: RadianceField, rays: int, samples: int, seed: int = 0)
 
 def slow_encode(field: RadianceField, table: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
     """Trilinear hash features by the book, differentiable, shape (n, levels · FEATURES)."""
-    cells = level_cells(field.layout.space, field.layout.levels, field.layout.growth)
+    cells = level_cells(field.layout.near_box, field.layout.levels, field.layout.growth)
     shapes = level_shapes(cells, field.layout.log2_table)
     columns = []
     for level in range(field.layout.levels):
@@ -76,7 +76,7 @@ def slow_encode(field: RadianceField, table: torch.Tensor, positions: torch.Tens
 
 
 def test_some_level_is_dense_and_some_is_hashed(field):
-    shapes = level_shapes(level_cells(LAYOUT.space, 3, 2.0), LAYOUT.log2_table)
+    shapes = level_shapes(level_cells(LAYOUT.near_box, 3, 2.0), LAYOUT.log2_table)
     assert set(shapes[:, 3]) == {0, 1}
 
 
@@ -174,14 +174,14 @@ def test_trunk_gradient_equals_autograd(field):
 def test_contraction_keeps_the_near_box_and_holds_all_of_space():
     points = np.array([[1.0, -2.0, 0.5], [9.0, -2.0, 0.5], [1.0 + 16.0, -2.0, 0.5], [1e9, -2.0, 0.5]], np.float32)
     out = wp.zeros(4, dtype=wp.vec3f, device="cpu")
-    space = LAYOUT.space
+    box = LAYOUT.near_box
     wp.launch(
         contract_points,
         4,
         [
             wp.array(points, dtype=wp.vec3f, device="cpu"),
-            wp.vec3f(*space.centre),
-            wp.vec3f(*(1 / np.array(space.half))),
+            wp.vec3f(*box.center),
+            wp.vec3f(*(1 / np.array(box.half))),
         ],
         [0, out],
         device="cpu",
@@ -194,7 +194,7 @@ def test_contraction_keeps_the_near_box_and_holds_all_of_space():
 def solid_below(field: RadianceField, height: float) -> None:
     """Makes everything below z = height [m] opaque for sampling."""
     near, far = field.grids
-    stop = opacity_grids(field.layout.space)
+    stop = opacity_grids(field.layout.near_box)
     low, high = field.bounds[:, 2]
     z = low + (np.arange(stop.near_shape[2]) + 0.5) / stop.near_shape[2] * (high - low)
     near[:] = torch.from_numpy(np.where(z < height, 0.99, 0.0).astype(np.float32))
@@ -249,8 +249,8 @@ def test_a_sighting_draws_samples_to_it(field):
 def make_ground(field: RadianceField, height: float) -> None:
     """A field that is opaque below z = height and empty above: feature 0 of the dense level is the depth below it."""
     solid_below(field, height)
-    cells = level_cells(field.layout.space, field.layout.levels, field.layout.growth)[0]
-    n = level_shapes(level_cells(field.layout.space, 3, 2.0), field.layout.log2_table)[0]
+    cells = level_cells(field.layout.near_box, field.layout.levels, field.layout.growth)[0]
+    n = level_shapes(level_cells(field.layout.near_box, 3, 2.0), field.layout.log2_table)[0]
     vertex = np.arange(n[0] * n[1] * n[2]) // (n[0] * n[1])
     z = field.layout.centre[2] + (vertex / cells[2] - 0.5) * 4.0 * field.layout.half[2]
     field.table.zero_()
@@ -327,11 +327,11 @@ def test_embeddings_by_name_by_frame_and_mixed(field):
 
 def test_near_box_holds_the_cameras_and_what_lies_ahead():
     poses = np.stack([look_at(np.array([x, 0.0, 1.0]), np.array([x + 1.0, 0.0, 1.0])) for x in (0.0, 10.0, 20.0)])
-    low, high = space_of_cameras(poses).bounds
+    low, high = near_box_of_cameras(poses).bounds
     assert (low < [0.0, 0.0, 0.0]).all() and high[0] > 30.0
-    cube = space_of_cameras(poses, 50.0)
+    cube = near_box_of_cameras(poses, 50.0)
     np.testing.assert_allclose(cube.bounds, [[-40.0, -50.0, -49.0], [60.0, 50.0, 51.0]])
-    assert Space((0.0, 0.0, 0.0), (2.0, 3.0, 1.0)).scale == 3.0
+    assert NearBox((0.0, 0.0, 0.0), (2.0, 3.0, 1.0)).scale == 3.0
 
 
 def test_pixel_rays_are_the_cameras_own(field):

@@ -71,9 +71,9 @@ def every_figure() -> dict[str, figures.Figure]:
         "ground": figures.ground_map(ground, route, route, 1.0, parts),
         "bare ground": figures.ground_map(ground, route, None, 0.0, []),
         "training": figures.training_curve([0, 10, 20], [10.0, 15.0, 17.0], "PSNR [dB]"),
-        "bars": figures.bars({"day": 23.44, "night": 17.0}, {"day": 7}, "dB", "PSNR [dB]"),
+        "bars": figures.bar_chart({"day": 23.44, "night": 17.0}, {"day": 7}, "dB", "PSNR [dB]"),
         "histogram": figures.histogram(rng.gamma(2.0, 0.3, 500), "error [px]", 4.0),
-        "along": figures.along_the_path([0, 1, 2], {"x": [0.0, 0.1, 0.2], "y": [0.1, 0.1, 0.1]}, "off [m]", 1.0),
+        "along": figures.curves_along_path([0, 1, 2], {"x": [0.0, 0.1, 0.2], "y": [0.1, 0.1, 0.1]}, "off [m]", 1.0),
         "groups": figures.errors_by_group({"day": [0.1, 0.2], "night": [0.3]}, "off [m]"),
     }
 
@@ -112,7 +112,7 @@ def test_bars_say_their_values_and_counts(drawn: dict[str, str]) -> None:
 
 
 def test_names_from_files_are_text() -> None:
-    svg = figures.svg(figures.bars({"<b>&$x_1$": 20.0}, {}, "dB", "PSNR"))
+    svg = figures.svg(figures.bar_chart({"<b>&$x_1$": 20.0}, {}, "dB", "PSNR"))
     assert "<b>" not in svg
     assert "<b>&$x_1$" in parsed(svg).text
 
@@ -133,5 +133,5 @@ def test_the_corridor_is_as_wide_as_it_says() -> None:
 
 
 def test_bounds_hold_the_path() -> None:
-    low, high = figures.bounds_of(np.array([[0.0, 5.0], [3.0, -2.0]]), 1.0)
+    low, high = figures.map_bounds(np.array([[0.0, 5.0], [3.0, -2.0]]), 1.0)
     assert low.tolist() == [-1.0, -3.0] and high.tolist() == [4.0, 6.0]

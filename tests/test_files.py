@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from twin import files
 from twin.errors import InputError
 from twin.evaluation.trials import Cell, read_results, read_trials
-from twin.scene import SceneDir, check_name, finished, run_folder, seal
+from twin.scene import SceneDir, check_name, require_stage, run_folder, write_stamp
 from twin.sysid.logs import read_log
 
 _DEEP = 100_000
@@ -119,7 +119,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path):
     files.write_json(path, 1)
     with pytest.raises(ValueError):
         files.write_json(path, float("nan"))
-    with pytest.raises(KeyError), files.aside(path) as partial:
+    with pytest.raises(KeyError), files.atomic_path(path) as partial:
         partial.write_text("half")
         raise KeyError
     assert files.read_json(path) == 1 and [one.name for one in tmp_path.iterdir()] == ["a.json"]
@@ -154,9 +154,9 @@ def test_a_damaged_stage_names_its_file(tmp_path):
     (folder / "world.json").write_text("{}")
     (folder / "assets" / "ground.bin").write_bytes(bytes(100))
     with pytest.raises(InputError, match=r"twin\.build"):
-        finished(scene, "mjcf")
-    seal(folder, "mjcf")
-    assert finished(scene, "mjcf") == folder
+        require_stage(scene, "mjcf")
+    write_stamp(folder, "mjcf")
+    assert require_stage(scene, "mjcf") == folder
     for damaged, content in (
         ("assets/ground.bin", bytes(99) + b"\1"),
         ("assets/ground.bin", b""),
@@ -167,20 +167,20 @@ def test_a_damaged_stage_names_its_file(tmp_path):
         seal_again = (folder / "stamp.json").read_bytes()
         (folder / "stamp.json").write_bytes(seal_again)  # another time: a process looks once at what does not change
         with pytest.raises(InputError, match=f"{damaged} is damaged.*build the scene again"):
-            finished(scene, "mjcf")
+            require_stage(scene, "mjcf")
         (folder / damaged).write_bytes(before)
     stamp = (folder / "stamp.json").read_text()
     for changed in (stamp.replace('"mjcf"', '"mjcg"'), stamp[:-30], "[]", "1" * 6000, json.dumps({"stage": 1})):
         (folder / "stamp.json").write_text(changed)
         with pytest.raises(InputError, match=r"stamp\.json"):
-            finished(scene, "mjcf")
+            require_stage(scene, "mjcf")
     old = {name: value for name, value in json.loads(stamp).items() if name not in ("sha256", "itself")}
     (folder / "stamp.json").write_text(json.dumps(old))  # as it was written before digests of files
-    assert finished(scene, "mjcf") == folder
+    assert require_stage(scene, "mjcf") == folder
     (folder / "world.json").write_text("[]")
     (folder / "stamp.json").write_text(json.dumps(old, indent=1))
     with pytest.raises(InputError, match="damaged"):
-        finished(scene, "mjcf")
+        require_stage(scene, "mjcf")
 
 
 @pytest.mark.parametrize("count", ["9223372036854775808", "9" * 5000, "1000001", "-1", "1.5", "٣"])

@@ -21,7 +21,7 @@ from twin.nerf.buffers import CameraArrays, single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
-from twin.nerf.trainer import Trainer, bending, constant_height, free_segments, run, train_field
+from twin.nerf.trainer import Trainer, constant_height, free_segments, plane_loss, run, train_field
 from twin.runtime import set_quiet
 from twin.scene import SceneDir
 
@@ -31,8 +31,7 @@ CONFIG = NerfConfig(steps=6, rays=128, samples=8, levels=3, log2_table=10, max_w
 
 
 @pytest.fixture(autouse=True)
-def quiet(monkeypatch):
-    monkeypatch.setenv("TWIN_DEVICE", "cpu")
+def quiet():
     set_quiet(True)
     yield
     set_quiet(False)
@@ -91,7 +90,7 @@ def cameras(tmp_path) -> Cameras:
 def test_held_out_frames_are_not_among_the_training_pixels(cameras):
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     assert set(pixels.cameras.names) == {n for n, h in zip(cameras.names, cameras.held_out, strict=True) if not h}
-    assert len(pixels.colours) == (~cameras.held_out).sum() * WIDTH * HEIGHT
+    assert len(pixels.colors) == (~cameras.held_out).sum() * WIDTH * HEIGHT
 
 
 def test_nothing_to_train_on_is_an_input_error(cameras):
@@ -119,7 +118,7 @@ def test_a_batch_holds_what_the_pictures_show(cameras):
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     batch = pixels.batch(np.random.default_rng(0), 4, 3, 16, 0)
     assert len(batch.frame) == 4 * (3 * 3 + 16)
-    for f, (u, v), colour in zip(batch.frame, batch.pixel, batch.colour, strict=True):
+    for f, (u, v), colour in zip(batch.frame, batch.pixel, batch.color, strict=True):
         image, _, _ = load_frame(pixels.cameras, int(f), WIDTH)
         np.testing.assert_allclose(colour, image[int(v), int(u)] / 255.0, atol=1e-6)
     triples = batch.pixel.reshape(4, 25, 2)[:, :9].reshape(-1, 3, 2)
@@ -143,12 +142,12 @@ def test_a_plane_does_not_bend_and_an_edge_in_colour_may():
     line = np.stack([pixel - step, pixel, pixel + step], 1)
     inverse = torch.from_numpy((0.3 * line[..., 0] + 0.7 * line[..., 1] + 0.2).ravel()).float()
     grey = torch.full((30, 3), 0.5)
-    assert bending(inverse, grey) < 1e-6
+    assert plane_loss(inverse, grey) < 1e-6
     bent = inverse.clone()
     bent[1::3] += 0.05
     striped = grey.clone()
     striped[1::3] = 1.0
-    assert bending(bent, striped) < 0.01 * bending(bent, grey)
+    assert plane_loss(bent, striped) < 0.01 * plane_loss(bent, grey)
 
 
 def test_free_space_follows_the_path_but_not_jumps(cameras):
@@ -170,7 +169,7 @@ def test_camera_height_counts_only_where_known_and_constant():
 
 
 def trained(cameras: Cameras, config: NerfConfig) -> RadianceField:
-    trainer = Trainer(cameras, floor_points(cameras), config, seed=5, where="cpu", camera_height=1.5)
+    trainer = Trainer(cameras, floor_points(cameras), config, seed=5, device="cpu", camera_height=1.5)
     with single_threaded_torch():
         while not trainer.done:
             trainer.step()
@@ -179,7 +178,7 @@ def trained(cameras: Cameras, config: NerfConfig) -> RadianceField:
 
 def test_two_runs_are_equal_bit_by_bit_on_any_number_of_cores(cameras, monkeypatch):
     first = trained(cameras, CONFIG)
-    monkeypatch.setattr(buffers, "cores", lambda: 1)
+    monkeypatch.setattr(buffers, "available_cores", lambda: 1)
     second = trained(cameras, CONFIG)
     assert torch.equal(first.table, second.table)
     assert all(torch.equal(a, b) for a, b in zip(first.grids, second.grids, strict=True))
@@ -196,7 +195,7 @@ def test_another_seed_is_another_field(cameras):
 
 def test_it_learns_the_floor_and_both_lightings(cameras):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, metrics, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    field, metrics, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
     metrics |= evaluate(field, cameras, WIDTH)
     assert metrics["n"] == {"day": 1, "night": 1}
     assert metrics["train_psnr"] > 17.0
@@ -212,7 +211,7 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
     assert np.median(np.abs(result.depth[0, lower] / floor_depth - 1.0)) < 0.2
 
     picture = ground_picture(cameras.camera_to_world[i], 0.7)
-    one = CameraArrays(cameras.camera_to_world[i : i + 1], K[None], field.where)
+    one = CameraArrays(cameras.camera_to_world[i : i + 1], K[None], field.device)
     pixels = np.stack([column.ravel() + 0.5 for column in np.mgrid[:HEIGHT, :WIDTH][::-1]], -1)
     features, harmonics, _, _ = field.trace(one, np.zeros(len(pixels), int), pixels)
     colours = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
@@ -245,15 +244,15 @@ def bricks(facts) -> int:
 
 def test_a_baked_field_shows_what_the_field_shows(cameras, monkeypatch):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, _, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5)
+    field, _, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
-    baked, facts = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
-    again, _ = bake(field, pixels, seed=1, steps=60, most_bricks=1500)
+    baked, facts = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
+    again, _ = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
     assert 100 < bricks(facts) <= 1500
     # Where cells come out large there may be more of them.
-    _, coarse = bake(field, pixels, seed=1, steps=1, most_bricks=150)
-    monkeypatch.setattr("twin.nerf.bake._COARSE", 0.0)
-    _, finer = bake(field, pixels, seed=1, steps=1, most_bricks=150)
+    _, coarse = bake(field, pixels, seed=1, steps=1, max_bricks=150)
+    monkeypatch.setattr("twin.nerf.bake._LARGE_CELL", 0.0)
+    _, finer = bake(field, pixels, seed=1, steps=1, max_bricks=150)
     assert finer["cell_m"] < coarse["cell_m"] and bricks(coarse) < bricks(finer) <= 209
     assert facts["bytes"] < 30e6
     held_out = cameras.select(np.flatnonzero(cameras.held_out))
@@ -267,10 +266,10 @@ def test_a_baked_field_shows_what_the_field_shows(cameras, monkeypatch):
         assert np.array_equal(other.rgb, again.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), name).rgb)
     probes, day = baked.lightings_by_name.probes, field.embedding("day")
     rays = torch.from_numpy(probes.features), torch.from_numpy(probes.harmonics)
-    assert np.allclose(probes.picture(day), field.colour(*rays, day), atol=1e-5)
+    assert np.allclose(probes.picture(day), field.color(*rays, day), atol=1e-5)
     assert np.ptp(probes.picture(day).mean(1)) > 0.1
     drawn = baked.sample_lighting(np.random.default_rng(0))
-    assert not baked.lightings_by_name.judge.faults(drawn)
+    assert not baked.lightings_by_name.prior.violations(drawn)
     scores = evaluate(field, cameras, WIDTH, baked=baked)
     assert all(scores["psnr_baked"][name] > scores["psnr_unfitted"][name] - 1.0 for name in ("day", "night"))
 
@@ -278,13 +277,12 @@ def test_a_baked_field_shows_what_the_field_shows(cameras, monkeypatch):
 @pytest.mark.parametrize(("value", "message"), [("tpu", "cpu or cuda"), ("cuda", "no CUDA device")])
 def test_a_device_that_is_not_there_is_an_input_error(monkeypatch, value, message):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setenv("TWIN_DEVICE", value)
     with pytest.raises(InputError, match=message):
-        buffers.device()
+        buffers.resolve_device(value)
 
 
 def test_a_field_that_no_camera_sees_is_not_baked(cameras):
     config = replace(CONFIG, steps=2, near_plane=100.0)  # [m] everything is nearer
-    field, _, _ = train_field(cameras, floor_points(cameras), config)
+    field, _, _ = train_field(cameras, floor_points(cameras), config, device="cpu")
     with pytest.raises(InputError, match=r"nothing to bake.*near_plane"):
         bake(field, TrainingPixels(cameras, SparsePoints.empty(), WIDTH), steps=1)

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from tiny_world import tiny_config, tiny_scene, tiny_world
 
-from twin.env.drivers import follow, pursuit_curvature
 from twin.env.physics import HuskyPhysics
+from twin.env.route_follower import follow_route, pursuit_curvature
 from twin.geometry.cameras import project
 from twin.geometry.poses import inverse_pose
 from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
-from twin.report.chase_camera import SceneCamera, chase_poses, frame_indices, overlay
+from twin.report.chase_camera import SceneCamera, blend_parts, chase_poses, frame_indices
 from twin.robot import REAR_HEAVY, HuskyParams
 
 
@@ -25,7 +25,7 @@ def world(tmp_path_factory) -> World:
 
 @pytest.fixture(scope="module")
 def drive(world):
-    return follow(world, HuskyPhysics(world.model(), world.robot))
+    return follow_route(world, HuskyPhysics(world.model(), world.robot))
 
 
 def on_a_plane(params: HuskyParams | None = None) -> HuskyPhysics:
@@ -66,7 +66,7 @@ def test_front_camera_looks_ahead_and_upright(drive):
 
 
 def test_same_drive_twice(world, drive):
-    again = follow(world, HuskyPhysics(world.model(), world.robot))
+    again = follow_route(world, HuskyPhysics(world.model(), world.robot))
     np.testing.assert_array_equal(again.qpos, drive.qpos)
 
 
@@ -79,7 +79,7 @@ def test_rear_heavy_robot_is_followed_too(tmp_path):
     world = World.load(out)
     assert world.robot.center_of_mass == REAR_HEAVY
     assert world.model().body("base_link").ipos[0] == pytest.approx(-0.085)
-    drive = follow(world, HuskyPhysics(world.model(), world.robot))
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
     assert drive.reached_goal and drive.max_cross_track < 0.2
 
 
@@ -89,7 +89,7 @@ def test_an_obstacle_on_the_road_ends_the_drive(tmp_path):
     out.mkdir()
     run(scene, tiny_config(), out)
     world = World.load(out)
-    drive = follow(world, HuskyPhysics(world.model(), world.robot))
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "touched" and drive.touched == ("part_0001",)
     # The bumper of the chassis is 0.49 m ahead of the base, the box begins at 3.2 m.
     assert drive.base_to_world[-1, 0, 3] == pytest.approx(3.2 - 0.4937, abs=0.12)
@@ -97,12 +97,12 @@ def test_an_obstacle_on_the_road_ends_the_drive(tmp_path):
 
 def test_leaving_the_corridor_ends_the_drive(world):
     narrow = replace(world, half_width=0.002)
-    drive = follow(narrow, HuskyPhysics(world.model(), world.robot))
+    drive = follow_route(narrow, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "off_corridor" and drive.max_cross_track > 0.002
 
 
 def test_time_limit(world):
-    drive = follow(world, HuskyPhysics(world.model(), world.robot), timeout=1.0)
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot), timeout=1.0)
     assert drive.outcome == "timeout" and drive.times[-1] == pytest.approx(1.1, abs=0.11)
 
 
@@ -162,7 +162,7 @@ def test_overlay_hides_what_is_hidden():
     identity = np.full((4, 6), -1)
     identity[:, 2:4], identity[:, 4:] = 7, 8
     part_depth = np.where(np.arange(6) < 4, 4.0, 9.0) * np.ones((4, 1))
-    out = overlay(rgb, depth, part, part_depth, identity)
+    out = blend_parts(rgb, depth, part, part_depth, identity)
     assert (out[:, :2] == 100).all() and (out[:, 4:] == 100).all()  # nothing there, or behind the wall
     assert (out[:, 3] > 100).all()
     assert (out[1:, 2] < out[1:, 3]).all()  # the outline is dark
@@ -245,13 +245,13 @@ def test_all_that_is_seen_is_of_the_same_past():
                 physics.step(step if physics is not coarse else 50 * step)
         past.append(prompt.data.qpos.copy())
         then = max(0, len(past) - 1 - round(latency / step))
-        np.testing.assert_array_equal(fine.seen.qpos, past[then])
-        assert fine.seen.time == pytest.approx(step * then, abs=1e-9)
+        np.testing.assert_array_equal(fine.delayed_data.qpos, past[then])
+        assert fine.delayed_data.time == pytest.approx(step * then, abs=1e-9)
         if k % 50 == 49:
-            np.testing.assert_allclose(coarse.seen.qpos, past[then], atol=2e-4)
-            assert coarse.seen.time == pytest.approx(step * then, abs=1e-9)
-    assert np.linalg.norm(fine.seen.qpos[:2] - fine.data.qpos[:2]) > 0.02
-    assert prompt.seen is prompt.data
+            np.testing.assert_allclose(coarse.delayed_data.qpos, past[then], atol=2e-4)
+            assert coarse.delayed_data.time == pytest.approx(step * then, abs=1e-9)
+    assert np.linalg.norm(fine.delayed_data.qpos[:2] - fine.data.qpos[:2]) > 0.02
+    assert prompt.delayed_data is prompt.data
 
 
 @pytest.mark.parametrize("latency", [0.03, 0.113])
@@ -268,13 +268,13 @@ def test_what_moves_is_seen_where_it_was(latency):
         physics.data.mocap_pos[0] = 3.0 + 2.0 * time, 1.0, 0.0
 
     walk(0.0)
-    physics.surroundings = walk
+    physics.move_obstacles = walk
     physics.begin()
     for k in range(5):
         physics.step()
         time = max(0.0, 0.1 * (k + 1) - latency)
-        assert physics.seen.time == pytest.approx(time, abs=1e-9)
-        np.testing.assert_allclose(physics.seen.body("walker").xpos, [3.0 + 2.0 * time, 1.0, 0.0])
+        assert physics.delayed_data.time == pytest.approx(time, abs=1e-9)
+        np.testing.assert_allclose(physics.delayed_data.body("walker").xpos, [3.0 + 2.0 * time, 1.0, 0.0])
 
 
 def test_no_latency_is_now():

@@ -16,18 +16,18 @@ from twin.evaluation.statistics import mmrv, pearson, spearman, wilson
 from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
 from twin.report import forecast_report
-from twin.report.forecast_report import columns_of, forecast_page
+from twin.report.forecast_report import forecast_page, lighting_labels
 from twin.report.forecast_summary import (
     CSV_COLUMNS,
-    NOMINAL,
+    NOMINAL_INTERVALS,
     STATISTICS,
     candidates_csv,
-    show,
-    summary,
-    unknowns,
+    format_estimate,
+    limitations,
+    summary_text,
     verdicts,
 )
-from twin.report.html import LONG
+from twin.report.html import MAX_TABLE_ROWS
 
 LIGHTS = ("held-out", "sun")
 
@@ -176,8 +176,8 @@ def refused(made: Forecast) -> str:
         estimate = getattr(group, name)
         assert estimate.value is estimate.low is estimate.high is None and estimate.missing
     assert all(c.corrected.value is None for c in made.candidates)
-    assert not re.search(r"Spearman [−\d]|Spearman +[−\d]", summary(made) + Text(forecast_page(made)).text)
-    assert any("no correlation is given" in caution.what for caution in unknowns(made))
+    assert not re.search(r"Spearman [−\d]|Spearman +[−\d]", summary_text(made) + Text(forecast_page(made)).text)
+    assert any("no correlation is given" in caution.what for caution in limitations(made))
     return "; ".join(group.missing)
 
 
@@ -205,15 +205,15 @@ def test_rates_that_are_all_the_same_have_no_correlation_but_a_bias() -> None:
     assert group.spearman.value is None and "all rates on the road are 1" in group.spearman.missing
     assert group.bias.value is not None and group.winner_regret.value == 0.0
     assert verdicts(made)[0].mood == "bad" and "cannot be compared" in verdicts(made)[0].text
-    assert "nan" not in forecast_page(made) + summary(made) + candidates_csv(made)
+    assert "nan" not in forecast_page(made) + summary_text(made) + candidates_csv(made)
 
 
 def test_without_real_trials_it_says_what_it_cannot_know() -> None:
     made = make_forecast("road", cells()[0], [])
     assert made.groups == made.pairs == made.left_out == ()
     text = Text(forecast_page(made)).text
-    assert "Nothing is known yet about the road" in text and "What this cannot know" in text
-    assert any("Whether the road ranks" in caution.what for caution in unknowns(made))
+    assert "Nothing is known yet about the road" in text and "Limitations" in text
+    assert any("Whether the road ranks" in caution.what for caution in limitations(made))
     (plan,) = made.plans
     assert plan.basis == "twin" and plan.more_for_winner is not None and plan.more_for_winner > 0
 
@@ -221,7 +221,7 @@ def test_without_real_trials_it_says_what_it_cannot_know() -> None:
 def test_uneven_lightings_are_told() -> None:
     twin, real = cells(n=8)
     twin = [c for c in twin if c.key != ("p7", "straight", "sun")]
-    told = [caution.what for caution in unknowns(make_forecast("road", twin, real[1:]))]
+    told = [caution.what for caution in limitations(make_forecast("road", twin, real[1:]))]
     assert any("validated under the same lightings (p7 differ)" in what for what in told)
     assert any("driven on the road under the same lightings" in what for what in told)
 
@@ -239,11 +239,11 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
     few, many = (
         make_forecast("road", *cells(n=6, driven=6, tasks=tasks)) for tasks in (("straight",), ("a", "b", "c"))
     )
-    assert len(few.pairs) <= LONG < len(many.pairs)
+    assert len(few.pairs) <= MAX_TABLE_ROWS < len(many.pairs)
     short, long = (html[html.index('<section id="cells"') :] for html in map(forecast_page, (few, many)))
     assert "<svg" not in short and "<details" not in short
     assert long.count("<svg") == 3 * len(many.tasks) and long.count("<details") == 1
-    candidates, pairs = many.of("b"), [pair for pair in many.pairs if pair.task == "b"]
+    candidates, pairs = many.candidates_of("b"), [pair for pair in many.pairs if pair.task == "b"]
     assert {p.lighting for p in pairs} == {"sun", "dusk"} and {p.twin_lighting for p in pairs} == {"sun", "held-out"}
     twin, road, off = (
         {(p.policy, light(p)): value(p) for p in pairs}
@@ -253,30 +253,30 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
             (lambda p: p.lighting, lambda p: p.bias.value),
         )
     )
-    for figure, wanted in ((forecast_report.twin_cells, twin), (forecast_report.road_cells, road)):
+    for figure, wanted in ((forecast_report.twin_heatmap, twin), (forecast_report.road_heatmap, road)):
         assert tile_texts(figure(candidates, pairs)) == {key: f"{100 * rate:.0f}" for key, rate in wanted.items()}
-    figure = forecast_report.road_minus_twin(candidates, pairs)
+    figure = forecast_report.difference_heatmap(candidates, pairs)
     told = tile_texts(figure)
     assert {key: int(text.replace("−", "-")) for key, text in told.items()} == {
         key: round(100 * bias) for key, bias in off.items()
     }
     alpha = dict(zip(told, figure.axes[0].collections[0].get_facecolor()[:, 3].tolist(), strict=True))
     assert {(p.policy, p.lighting) for p in pairs if p.within_chance} == {k for k, v in alpha.items() if v < 0.1}
-    assert columns_of(["sun+randomised", "any+randomised"]) == (["sun", "any"], "lights, all of them +randomised")
-    assert columns_of(["sun", "sun+randomised"]) == (["sun", "sun+randomised"], "")
+    assert lighting_labels(["sun+randomised", "any+randomised"]) == (["sun", "any"], "lights, all of them +randomised")
+    assert lighting_labels(["sun", "sun+randomised"]) == (["sun", "sun+randomised"], "")
 
 
 def test_ranks_that_are_hardly_possible_have_no_tile() -> None:
     made = make_forecast("road", *cells(n=8))
     ranks = np.array([c.twin_ranks for c in made.candidates])
     assert (ranks < 0.005).sum() > 0
-    told, names = tile_texts(forecast_report.rank_chances(made.candidates)), [c.policy for c in made.candidates]
+    told, names = tile_texts(forecast_report.rank_heatmap(made.candidates)), [c.policy for c in made.candidates]
     assert told == {(names[i], str(k + 1)): f"{100 * ranks[i, k]:.0f}" for i, k in np.argwhere(ranks > 0.005).tolist()}
 
 
 def test_one_policy_alone() -> None:
     made = make_forecast("road", [Cell("p", "straight", "sun", 10, 5)], [])
-    assert "one policy; there is nothing to rank" in summary(made)
+    assert "one policy; there is nothing to rank" in summary_text(made)
     assert Text(forecast_page(made)).text
 
 
@@ -291,9 +291,11 @@ def test_the_papers_table_has_training_twin_and_road_of_every_policy() -> None:
     for task, rows in parts:
         told = [row.split("<td>")[1:] for row in rows.split("<tr>")[2:]]
         assert len(told) == 7
-        for row, c in zip(told, made.of(task), strict=True):
+        for row, c in zip(told, made.candidates_of(task), strict=True):
             policy, *cells_ = (Text(cell).text.strip() for cell in (part.split("</td>")[0] for part in row))
-            assert policy == c.policy and cells_ == [show(e, percent=True) for e in (c.trained, c.twin, c.real)]
+            assert policy == c.policy and cells_ == [
+                format_estimate(e, percent=True) for e in (c.trained, c.twin, c.real)
+            ]
             assert (cells_[0] == "97% (93% to 99%)") == ((policy, task) == ("p0", "straight"))
             assert (cells_[2] == "–") == (policy == "p6")
     assert candidates_csv(made).count("0.97,0.93,0.99") == 1
@@ -335,7 +337,7 @@ def test_the_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = Text((root / "forecast" / "forecast.html").read_text(encoding="utf-8"))
     made = Forecast.load(root / "forecast")
     assert all(verdict.text in page.text for verdict in verdicts(made))
-    assert f"Spearman {show(made.groups[0].spearman)}" in page.text and "these 7 policies" in page.text
+    assert f"Spearman {format_estimate(made.groups[0].spearman)}" in page.text and "these 7 policies" in page.text
     assert {link for link in page.links if not link.startswith(("#", "data:"))} == {"forecast.json", "forecast.csv"}
     assert "http" not in (root / "forecast" / "forecast.html").read_text(encoding="utf-8")
     table = (root / "forecast" / "forecast.csv").read_text().splitlines()
@@ -387,18 +389,20 @@ def test_names_from_files_are_text() -> None:
 def test_the_intervals_coverage_stands_beside_them() -> None:
     twin, real = cells()
     made = make_forecast("road", twin, real)
-    assert all(word in NOMINAL for word in ("nominal", "60% (Spearman)", "70% (Pearson)", "50% (MMRV)", "days"))
+    assert all(
+        word in NOMINAL_INTERVALS for word in ("nominal", "60% (Spearman)", "70% (Pearson)", "50% (MMRV)", "days")
+    )
     page = forecast_page(made)
     road = page[page.index('<section id="road"') : page.index('<section id="stages"')]
-    assert NOMINAL in Text(road).text and NOMINAL in " ".join(summary(made).split())
-    told = page + summary(made)
+    assert NOMINAL_INTERVALS in Text(road).text and NOMINAL_INTERVALS in " ".join(summary_text(made).split())
+    told = page + summary_text(made)
     assert "drive more policies" not in told and "in a repetition" not in told
     for alone in (make_forecast("road", twin, []), make_forecast("road", *cells(driven=4))):  # no intervals there
-        assert NOMINAL not in " ".join((forecast_page(alone) + summary(alone)).split())
+        assert NOMINAL_INTERVALS not in " ".join((forecast_page(alone) + summary_text(alone)).split())
 
 
 def test_numbers_are_shown_with_their_interval() -> None:
-    assert show(Estimate(0.934, 0.81, 0.97, 12)) == "0.93 (0.81 to 0.97)"
-    assert show(Estimate(-0.104, -0.2, 0.001, 12), percent=True) == "−10% (−20% to 0%)"
-    assert show(Estimate(-0.001, None, None, 1), percent=True) == "0%"
-    assert show(Estimate(missing="too few")) == "–"
+    assert format_estimate(Estimate(0.934, 0.81, 0.97, 12)) == "0.93 (0.81 to 0.97)"
+    assert format_estimate(Estimate(-0.104, -0.2, 0.001, 12), percent=True) == "−10% (−20% to 0%)"
+    assert format_estimate(Estimate(-0.001, None, None, 1), percent=True) == "0%"
+    assert format_estimate(Estimate(missing="too few")) == "–"

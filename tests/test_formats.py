@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
-from twin.capture.camera_models import Lens, checked_lens, flattened, same_aspect
+from twin.capture.camera_models import Lens, checked_lens, same_aspect, undistorted
 from twin.capture.formats import (
     detect_kind,
     natural_key,
@@ -21,7 +21,7 @@ from twin.capture.formats import (
     read_transforms,
     rotation_from_quaternion,
 )
-from twin.capture.photos import focal_from_exif, photo_facts
+from twin.capture.photos import focal_from_exif, read_exif
 from twin.errors import InputError
 from twin.geometry.images import write_image
 from twin.geometry.poses import inverse_pose, look_at
@@ -280,7 +280,7 @@ def test_exif_gives_focal_length_place_and_time(tmp_path: Path) -> None:
     gps[ExifTags.GPS.GPSLongitudeRef], gps[ExifTags.GPS.GPSLongitude] = "E", (151.0, 12.0, 0.0)
     gps[ExifTags.GPS.GPSAltitudeRef], gps[ExifTags.GPS.GPSAltitude] = b"\x01", 4.5
     Image.new("RGB", (400, 300)).save(tmp_path / "a.jpg", exif=exif)
-    facts = photo_facts(tmp_path / "a.jpg")
+    facts = read_exif(tmp_path / "a.jpg")
     assert facts.orientation == 6
     np.testing.assert_allclose(facts.gps, (-33.86, 151.2, -4.5))
     assert facts.time is not None and facts.time % 60 == pytest.approx(30.25)
@@ -298,7 +298,7 @@ def test_exif_focal_length_from_the_pitch_of_the_sensor() -> None:
 
 def test_a_photo_without_a_header_knows_nothing(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
-    facts = photo_facts(tmp_path / "a.png")
+    facts = read_exif(tmp_path / "a.png")
     assert (facts.focal, facts.time, facts.orientation) == (None, None, 1) and all(map(math.isnan, facts.gps))
 
 
@@ -337,7 +337,7 @@ def test_a_flattened_picture_is_what_a_pinhole_sees() -> None:
     u, v = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
     pixels = np.stack([u, v], -1).reshape(-1, 2)
     seen = pattern(np.asarray(lens.camera.cam_from_img(pixels)).reshape(120, 160, 2))
-    flat, pinhole = flattened(seen, lens)
+    flat, pinhole = undistorted(seen, lens)
     assert pinhole.model == "PINHOLE"
     expected = pattern(np.asarray(pinhole.camera.cam_from_img(pixels)).reshape(120, 160, 2))
     assert np.abs(flat.astype(int) - expected).max() <= 4

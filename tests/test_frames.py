@@ -12,16 +12,16 @@ from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views, wall
 
 from twin.capture.frames import held_out_frames, source_names
 from twin.capture.video import (
-    FilmCount,
-    FilmFacts,
+    FilmStatistics,
+    FilmTiming,
+    apply_display_matrix,
     decode,
-    index_of,
+    frame_index,
+    is_static,
     median_motion,
-    oriented,
     probe,
     sharpness,
     slot_of,
-    stands_still,
     upright,
 )
 from twin.config import CalibrationConfig, SourceConfig
@@ -79,7 +79,7 @@ def test_slots_follow_the_clock_of_a_film_with_a_variable_rate(tmp_path: Path) -
 
 @pytest.mark.parametrize("slots", [1, 3, 7, 20, 80])
 def test_every_frame_has_one_slot_and_slots_are_in_order(slots: int) -> None:
-    facts = FilmFacts(np.round(np.arange(80) / 15.0, 3), 0.0, 80)  # millisecond stamps, as Matroska has them
+    facts = FilmTiming(np.round(np.arange(80) / 15.0, 3), 0.0, 80)  # millisecond stamps, as Matroska has them
     found = [slot_of(i, float(t), facts, slots) for i, t in enumerate(facts.times)]
     assert found == sorted(found) and set(found) == set(range(slots))
     counts = np.bincount(found)
@@ -87,9 +87,9 @@ def test_every_frame_has_one_slot_and_slots_are_in_order(slots: int) -> None:
 
 
 def test_damaged_frames_leave_gaps_in_the_index() -> None:
-    facts = FilmFacts(np.arange(10) / 10.0, 0.0, 10)
-    assert [index_of(t, facts, last) for t, last in ((0.0, -1), (0.301, 0), (0.5, 3), (None, 5))] == [0, 3, 5, 6]
-    assert index_of(0.5, facts, 7) == 8  # a clock that stutters never gives an index twice
+    facts = FilmTiming(np.arange(10) / 10.0, 0.0, 10)
+    assert [frame_index(t, facts, last) for t, last in ((0.0, -1), (0.301, 0), (0.5, 3), (None, 5))] == [0, 3, 5, 6]
+    assert frame_index(0.5, facts, 7) == 8  # a clock that stutters never gives an index twice
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_damaged_frames_leave_gaps_in_the_index() -> None:
 )
 def test_a_display_matrix_turns_the_picture(matrix: list, expected: Any) -> None:
     image = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(oriented(image, np.array(matrix, float)), expected(image))
+    np.testing.assert_array_equal(apply_display_matrix(image, np.array(matrix, float)), expected(image))
 
 
 def test_a_film_held_upright_comes_out_upright(tmp_path: Path) -> None:
@@ -208,10 +208,10 @@ def test_a_film_cut_off_gives_the_frames_it_still_has(tmp_path: Path, capsys: py
 def test_no_frame_predicted_from_a_damaged_one_is_used(tmp_path: Path) -> None:
     path = film(tmp_path / "a.mp4", views([7 * i for i in range(60)]), gop="12")
 
-    def decoded() -> tuple[dict[int, np.ndarray], FilmCount]:
-        facts, count, index, pictures = probe(path), FilmCount(), -1, {}
+    def decoded() -> tuple[dict[int, np.ndarray], FilmStatistics]:
+        facts, count, index, pictures = probe(path), FilmStatistics(), -1, {}
         for stamp, frame in decode(path, count):
-            index = index_of(None if stamp is None else stamp - facts.start, facts, index)
+            index = frame_index(None if stamp is None else stamp - facts.start, facts, index)
             pictures[index] = upright(frame)
         return pictures, count
 
@@ -271,9 +271,9 @@ def test_sources_have_unique_plain_names() -> None:
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        (SourceConfig(path="a.mp4", lighting="training"), "'training' has a meaning of its own"),
-        (SourceConfig(path="input/held-out.mp4"), "'held-out' has a meaning of its own"),
-        (SourceConfig(path="any"), "'any' has a meaning of its own"),
+        (SourceConfig(path="a.mp4", lighting="training"), "'training' is reserved"),
+        (SourceConfig(path="input/held-out.mp4"), "'held-out' is reserved"),
+        (SourceConfig(path="any"), "'any' is reserved"),
         (SourceConfig(path="a.mp4", lighting="day:night"), "choose a plain name"),
         (SourceConfig(path="a.mp4", lighting="day+randomised"), "choose a plain name"),
     ],
@@ -289,9 +289,9 @@ def test_flow_measures_a_known_shift_and_blur_is_not_exposure() -> None:
     moved = median_motion(grey[0], grey[1])  # type: ignore[arg-type]
     assert moved is not None and abs(moved - 3.0) < 0.1
     flat = np.full((HEIGHT, WIDTH), 90, np.uint8)
-    assert median_motion(flat, flat) is None and stands_still(flat, flat, 1.0)
+    assert median_motion(flat, flat) is None and is_static(flat, flat, 1.0)
     ramp = np.tile(np.linspace(60, 120, WIDTH), (HEIGHT, 1)).astype(np.uint8)
-    assert not stands_still(ramp, ramp[:, ::-1].copy(), 1.0)
+    assert not is_static(ramp, ramp[:, ::-1].copy(), 1.0)
     dark = (grey[0] * 0.5).astype(np.uint8)
     assert sharpness(dark) == pytest.approx(sharpness(grey[0]), rel=0.1)  # type: ignore[arg-type]
     assert sharpness(cv2.GaussianBlur(grey[0], (0, 0), 2.0)) < 0.5 * sharpness(grey[0])  # type: ignore[arg-type]

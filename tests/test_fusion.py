@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.assets.tsdf import LOOK_THROUGH, fuse
+from twin.assets.tsdf import FREE_SPACE_REACH, fuse
 from twin.assets.views import Views
 
 BAND, FAR = 0.3, 10.0
@@ -44,4 +44,4 @@ def test_free_space_is_believed_further_out_than_surfaces():
     near, free = vote(1.5 * FAR, (3.0 * FAR, 1.0))[1:]
     assert near == 0.0 and free > 0.0
     assert vote(1.5 * FAR, (1.55 * FAR, 1.0))[2] == 0.0  # too near to the surface to be told from it
-    assert vote(1.01 * LOOK_THROUGH * FAR, (9.0 * FAR, 1.0))[2] == 0.0
+    assert vote(1.01 * FREE_SPACE_REACH * FAR, (9.0 * FAR, 1.0))[2] == 0.0

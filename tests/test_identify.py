@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from twin.sysid.estimation import Fit, Parameter, fit, negative_log_likelihood, search
+from twin.sysid.estimation import Fit, Parameter, fit_parameters, maximize_posterior, negative_log_likelihood
 
 ONE = (0,)
 
@@ -27,7 +27,7 @@ def test_identified_are_what_misses_move(guess):
     def misses(v: dict[str, float]) -> np.ndarray:
         return (v["slope"] * x + v["offset"] + 0 * v["nothing"] - y)[:, None, None]
 
-    found = fit(table, misses, ONE, np.arange(400), {p.name: 0.0 for p in table})
+    found = fit_parameters(table, misses, ONE, np.arange(400), {p.name: 0.0 for p in table})
     assert found.values["slope"] == pytest.approx(2.0, abs=0.03)
     for name, shown in {"slope": (x**2).sum(), "offset": 400}.items():
         assert found.errors[name] == pytest.approx(1.08 * 0.1 / np.sqrt(shown), rel=0.1)
@@ -54,7 +54,7 @@ def test_errors_are_how_far_fits_scatter(noise, freedom):
         def misses(values: dict[str, float], slopes=slopes, off=off) -> np.ndarray:
             return off + slopes @ np.array([values["a"], values["b"]])
 
-        one = fit(table, misses, (0, 0, 1), np.arange(150) // 3, {"a": 0.2 * noise, "b": 0.2 * noise})
+        one = fit_parameters(table, misses, (0, 0, 1), np.arange(150) // 3, {"a": 0.2 * noise, "b": 0.2 * noise})
         found.append([one.values[name] for name in "ab"])
         told.append([one.errors[name] for name in "ab"])
     ratio = np.sqrt(np.square(found).mean() / np.square(told).mean())
@@ -67,7 +67,7 @@ def slope_through(y: np.ndarray, x: np.ndarray, groups: np.ndarray, looks: int =
     def misses(v: dict[str, float]) -> np.ndarray:
         return np.repeat((v["slope"] * x - y)[:, None, None], looks, 1)
 
-    return fit([Parameter("slope", None, 1.0, -10, 10, 1.0, "")], misses, ONE, groups, {"slope": 0.0})
+    return fit_parameters([Parameter("slope", None, 1.0, -10, 10, 1.0, "")], misses, ONE, groups, {"slope": 0.0})
 
 
 @pytest.mark.parametrize("looks", [1, 40])
@@ -99,7 +99,7 @@ def test_impossible_windows_do_not_decide_from_far_away():
     noise = 0.01 * rng.normal(size=(200, 1, 1))
     noise[::8] = -40.0
     table = [Parameter("a", None, 1.0, -1e3, 1e3, 0.0, "")]
-    found = fit(table, lambda v: (v["a"] - 3.0) * x + noise, ONE, np.arange(200), {"a": 600.0})
+    found = fit_parameters(table, lambda v: (v["a"] - 3.0) * x + noise, ONE, np.arange(200), {"a": 600.0})
     assert found.values["a"] == pytest.approx(3.0, abs=0.005)
 
 
@@ -113,7 +113,7 @@ def test_nothing_is_asked_twice():
         return (x[0] * v["a"] + x[1] * v["b"] - noise)[:, None, None]
 
     table = [Parameter(name, 0.0, 1.0, -10, 10, 0.0, "") for name in "ab"]
-    fit(table, misses, ONE, np.arange(100), {"a": 1.0, "b": 1.0})
+    fit_parameters(table, misses, ONE, np.arange(100), {"a": 1.0, "b": 1.0})
     assert len(set(asked)) == len(asked) > 6
 
 
@@ -126,7 +126,7 @@ def test_reach_is_the_scale_of_the_first_step(reach):
         asked.append(v["a"])
         return (v["a"] - 500.0) * x + 0.1 * x**2
 
-    search([Parameter("a", None, 1.0, -1e3, 1e3, 0.0, "")], misses, ONE, {"a": 0.0}, reach)
+    maximize_posterior([Parameter("a", None, 1.0, -1e3, 1e3, 0.0, "")], misses, ONE, {"a": 0.0}, reach)
     assert asked[2] == pytest.approx(reach * np.sqrt(1e3 / reach), rel=0.1)  # after the beginning, and the slope there
 
 
@@ -140,7 +140,7 @@ def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():
     def misses(v: dict[str, float]) -> np.ndarray:
         return (shown @ [v["a"] - 1, v["b"] - 1] + noise)[:, None, None]
 
-    found = fit(table, misses, ONE, np.arange(2 * count), {"a": 5.0, "b": 5.0})
+    found = fit_parameters(table, misses, ONE, np.arange(2 * count), {"a": 5.0, "b": 5.0})
     assert found.values == pytest.approx({"a": 8 / 9, "b": 1.0}, abs=0.01)
     assert found.errors["a"] == pytest.approx(1 / 3, rel=0.05)
 
@@ -149,10 +149,10 @@ def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():
 def test_nothing_identified_is_a_fit_too(guess):
     table = [Parameter(name, guess, 1.0, -10, 10, 7.0, "") for name in ("a", "b")]
     noise = np.random.default_rng(0).normal(size=(50, 1, 1))
-    found = fit(table, lambda v: noise + 0 * (v["a"] + v["b"]), ONE, np.arange(50), {"a": 3.0, "b": 3.0})
+    found = fit_parameters(table, lambda v: noise + 0 * (v["a"] + v["b"]), ONE, np.arange(50), {"a": 3.0, "b": 3.0})
     assert found.values == {"a": 7.0, "b": 7.0}
     assert not found.errors and set(found.refused) == {"a", "b"}
-    assert found.unlikelihood == negative_log_likelihood(noise, ONE)
+    assert found.negative_log_likelihood == negative_log_likelihood(noise, ONE)
 
 
 @pytest.mark.parametrize("kept", [0, 1])
@@ -169,7 +169,7 @@ def test_parameters_may_go_one_by_one(kept):
         off = (np.array([v[name] for name in names]) - 1.0) * shown
         return (off @ x + noise)[:, None, None]
 
-    found = fit(table, misses, ONE, np.arange(400), dict.fromkeys(names, 1.0))
+    found = fit_parameters(table, misses, ONE, np.arange(400), dict.fromkeys(names, 1.0))
     assert set(found.errors) == set(names[:kept]) and set(found.refused) == set(names[kept:])
     if kept:
         assert found.values["a"] == pytest.approx(1.0, abs=0.03)
@@ -186,6 +186,6 @@ def test_two_that_do_the_same_are_not_both_identified(guess):
     def misses(v: dict[str, float]) -> np.ndarray:
         return ((v["a"] + v["b"] - 1.0) * x + noise)[:, None, None]
 
-    found = fit(table, misses, ONE, np.arange(200), begin)
+    found = fit_parameters(table, misses, ONE, np.arange(200), begin)
     assert len(found.errors) == 1
     assert sum(found.values.values()) == pytest.approx(1.0, abs=0.1)

@@ -10,16 +10,16 @@ from twin.nerf import buffers, kernels
 from twin.nerf.kernels import color_head, march
 
 _ARCH = 90  # sm_90: Hopper
-_SLOW = {"stereo"}
+_SLOW = {"patch_match"}
 """Unrolled windows make it 20 s of compiling to machine code; to PTX, which a driver takes on, it is half of that."""
 _MADE = {
     "many worlds' steps": lambda: import_module("twin.env.vector_env_gpu"),
     "many worlds' pictures": lambda: import_module("twin.env.observation"),
-    "march of one lane": lambda: march.march(march.LANES["cuda"]).module,
-    "shade of one lane": lambda: color_head.shade(color_head.LANES["cuda"], 64, 32)[0].module,
+    "march of one lane": lambda: march.march_kernel(march.LANES["cuda"]).module,
+    "color head of one lane": lambda: color_head.color_head_kernel(color_head.LANES["cuda"], 64, 32)[0].module,
 }
 """Those elsewhere; and kernels that are made for a number of lanes, which are in modules of their own."""
-_NO_KERNEL = {"lookup", "shade", "vectorised"}
+_NO_KERNEL = {"lookup", "color_head", "vectorized"}
 
 
 @pytest.mark.parametrize(

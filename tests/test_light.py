@@ -9,7 +9,7 @@ from test_overlay import SIZE, K, nothing
 
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor, ContactShadows
-from twin.env.irradiance import SIDES, Irradiance, IrradianceEstimator, harmonics
+from twin.env.irradiance import SIDE_DIRECTIONS, Irradiance, IrradianceEstimator, spherical_harmonics_numpy
 from twin.env.obstacles import add_obstacles
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.poses import look_at
@@ -24,7 +24,7 @@ def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Irradiance:
     rise = 0.625  # of upright surfaces under such a sky
     a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
     toward = np.array([np.cos(a), np.sin(a), 0.0])
-    sides = share / np.tan(e) * np.maximum(SIDES @ toward, 0.0)
+    sides = share / np.tan(e) * np.maximum(SIDE_DIRECTIONS @ toward, 0.0)
     growing = np.concatenate([[(1.0 - share) * rise], sides])[:, None] * np.ones(3)
     spots = np.random.default_rng(0).uniform(-5, 5, (200, 2))
     return Irradiance(spots, np.full((200, 3), level), np.zeros((5, 3)), growing)
@@ -33,16 +33,18 @@ def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Irradiance:
 def test_harmonics_are_the_networks_own():
     d = np.random.default_rng(0).normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    assert np.allclose(harmonics(d), spherical_harmonics(torch.as_tensor(d)).numpy())
+    assert np.allclose(spherical_harmonics_numpy(d), spherical_harmonics(torch.as_tensor(d)).numpy())
 
 
 def test_what_faces_up_has_the_level_of_its_place():
     mine = light(share=0.4)
-    level = mine.level(np.array([[0.0, 0.0], [50.0, 0.0]]))
+    level = mine.ground(np.array([[0.0, 0.0], [50.0, 0.0]]))
     assert np.allclose(level, 0.8)
     assert np.allclose(mine.irradiance(level, np.array([[0.0, 0.0, 1.0]] * 2)), 0.8)
-    spotty = Irradiance(np.array([[0.0, 0.0], [6.0, 0.0]]), np.array([[1.0] * 3, [0.2] * 3]), mine.steady, mine.growing)
-    assert spotty.level(np.array([[0.2, 0.0], [6.1, 0.3], [3.0, 0.0]]))[:, 0] == pytest.approx(
+    spotty = Irradiance(
+        np.array([[0.0, 0.0], [6.0, 0.0]]), np.array([[1.0] * 3, [0.2] * 3]), mine.constant, mine.proportional
+    )
+    assert spotty.ground(np.array([[0.2, 0.0], [6.1, 0.3], [3.0, 0.0]]))[:, 0] == pytest.approx(
         [1.0, 0.2, 0.6], abs=0.01
     )
 
@@ -123,17 +125,17 @@ def test_a_darker_lighting_is_darker_light():
 
     field = BakedField(field.layout, field.lightings_by_name, dim)
     found = IrradianceEstimator(field, ROUTE)
-    day, night = found.under("day"), found.under("night")
+    day, night = found.estimate("day"), found.estimate("night")
     here = np.array([[0.0, 0.0]])
-    assert (night.level(here) < 0.6 * day.level(here)).all() and bias.shape == (3,)
+    assert (night.ground(here) < 0.6 * day.ground(here)).all() and bias.shape == (3,)
     up, side = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, -1.0, 0.0]])
     for mine in (day, night):
-        level = mine.level(here)
+        level = mine.ground(here)
         assert np.allclose(mine.irradiance(level, up), level)
         assert (mine.irradiance(level, side) >= 0.0).all()
-    assert found.under("day") is day
-    mixed = found.under("day:night:0.5").level(here)
-    assert ((night.level(here) < mixed) & (mixed < day.level(here))).all()
+    assert found.estimate("day") is day
+    mixed = found.estimate("day:night:0.5").ground(here)
+    assert ((night.ground(here) < mixed) & (mixed < day.ground(here))).all()
 
 
 def test_an_obstacle_is_darker_where_the_field_is():

@@ -82,7 +82,7 @@ def test_bad_logs_get_one_line(kind, drive, tmp_path, capsys):
 def test_too_few_turns(tmp_path):
     table = columns(HuskyParams(), 130.0, seed=2, strong=False)
     with pytest.raises(InputError, match=r"0 windows turn left and 0 right .*drive more turns"):
-        check(logs.cut(table, "log"), "log")
+        check(logs.cut_windows(table, "log"), "log")
 
 
 def test_csv_and_npz_are_the_same_log(drive, tmp_path):
@@ -103,7 +103,7 @@ def test_nothing_in_an_npz_runs_code(tmp_path):
 
 def test_gaps_are_left_out(drive):
     keep = (drive["time"] < 20.0) | (drive["time"] > 23.0)
-    windows = logs.cut({name: column[keep] for name, column in drive.items()}, "log")
+    windows = logs.cut_windows({name: column[keep] for name, column in drive.items()}, "log")
     assert len(windows) == 74 - 3
     assert (~windows.follows).sum() == 2  # the first, and the first after the gap
 
@@ -117,7 +117,7 @@ def test_windows_without_poses_are_left_out(drive):
         table[name][resting] = table[name][resting][0]
     for name in logs.WHEEL_SPEEDS:
         table[name][resting] = 0.0
-    windows = logs.cut(table, "log")
+    windows = logs.cut_windows(table, "log")
     assert len(windows) == 74 - 3
     assert np.flatnonzero(~windows.follows).tolist() == [0, 10]
 
@@ -129,21 +129,21 @@ def test_windows_in_which_the_robot_stands_are_left_out(drive):
     parked["time"] = np.arange(len(parked["time"])) * 0.05
     for name in (*logs.TWIST, *logs.WHEEL_SPEEDS):
         parked[name][begins:] = 0.0
-    whole = logs.cut(drive, "log")
-    windows = logs.cut(parked, "log")
+    whole = logs.cut_windows(drive, "log")
+    windows = logs.cut_windows(parked, "log")
     assert len(windows) in (len(whole), len(whole) + 1)  # the last one may have begun before
     np.testing.assert_array_equal(windows.wheels[: len(whole)], whole.wheels)
     assert windows.follows[: len(whole)].tolist() == whole.follows.tolist()
     parked["cmd_v"][begins:] = 0.5
-    assert len(logs.cut(parked, "log")) >= len(whole) + 199
+    assert len(logs.cut_windows(parked, "log")) >= len(whole) + 199
 
 
 def test_a_gap_costs_nothing(drive):
     """One row before the clock was set: two seconds of the log are lost to the grid at most, and no memory."""
     late = {name: np.concatenate([column[:1], column]) for name, column in drive.items()}
     late["time"][1:] += 1.7e9
-    windows = logs.cut(late, "log")
-    whole = logs.cut(drive, "log")
+    windows = logs.cut_windows(late, "log")
+    whole = logs.cut_windows(drive, "log")
     assert len(windows) == len(whole)
     np.testing.assert_allclose(windows.wheels, whole.wheels, atol=1e-9)
     assert windows.follows.tolist() == whole.follows.tolist()
@@ -156,7 +156,7 @@ def test_bag_is_the_same_log(drive, tmp_path):
 
     rows = {name: column[:900] for name, column in drive.items()}
     bag = logs.read_log(write_bag(tmp_path / "bag", rows))
-    table = logs.cut(rows, "log")
+    table = logs.cut_windows(rows, "log")
     assert len(bag) == len(table)
     for name in ("commands", "wheels", "poses", "acceleration"):
         assert getattr(bag, name) == pytest.approx(getattr(table, name), abs=1e-6), name

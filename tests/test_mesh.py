@@ -9,7 +9,7 @@ from analytic import AnalyticField, Box, Post, drive
 
 from twin.assets.convex import ConvexPart, inside_hull
 from twin.assets.ground import Ground
-from twin.assets.mesh import make
+from twin.assets.mesh import build_assets
 from twin.assets.solids import HEADROOM
 from twin.config import MeshConfig, MetricConfig, MjcfConfig, SceneConfig, SourceConfig
 from twin.geometry.cameras import SparsePoints
@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory):
     )
     out = root / "4_mesh"
     out.mkdir()
-    facts = make(PLACE, cameras, SparsePoints.load(root / "2_metric"), config, out, root / "cache")
+    facts = build_assets(PLACE, cameras, SparsePoints.load(root / "2_metric"), config, out, root / "cache")
     return out, facts
 
 

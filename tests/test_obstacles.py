@@ -9,10 +9,10 @@ import pytest
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.config_file import load_config
 from twin.env import obstacles as module
-from twin.env.obstacles import add_obstacles, bystanders, ground_height, place, pose_at, random_obstacles
+from twin.env.obstacles import add_obstacles, ground_height, obstacle_pose, place, random_distractors, random_obstacles
 from twin.errors import InputError
 from twin.mjcf.husky import add_husky, set_options
-from twin.mjcf.world import World, arc_lengths, nearest
+from twin.mjcf.world import World, arc_lengths, nearest_on_route
 
 ANGLE = np.linspace(0, np.pi / 2, 60)
 BEND = np.concatenate(
@@ -52,7 +52,7 @@ def test_an_obstacle_stands_where_it_is_told_to_on_the_ground(world):
     mujoco.mj_forward(model, data)
     for one, name in zip(told, ("obstacle_a", "obstacle_b"), strict=True):
         position = data.body(name).xpos
-        s, lateral = nearest(ROUTE, position[:2])
+        s, lateral = nearest_on_route(ROUTE, position[:2])
         assert (s, lateral) == (pytest.approx(one.station, abs=0.02), pytest.approx(one.lateral, abs=0.02))
         assert position[2] == pytest.approx(0.02 * position[0], abs=0.02)
     assert data.body("obstacle_b").xmat.reshape(3, 3)[1, 0] == pytest.approx(np.sin(np.deg2rad(30)), abs=1e-3)
@@ -71,7 +71,7 @@ def test_the_ground_is_as_high_as_a_ray_finds_it(world):
 
 def test_it_walks_to_and_fro_at_its_speed():
     across = ObstacleConfig("p", "pedestrian", 5.0, -2.0, to=(5.0, 2.0), speed=1.25, delay=0.4)
-    poses = np.array([pose_at(across, ROUTE, t) for t in np.arange(0.0, 8.0, 0.1)])
+    poses = np.array([obstacle_pose(across, ROUTE, t) for t in np.arange(0.0, 8.0, 0.1)])
     assert np.abs(poses[:, 0] - 5.0).max() < 0.01
     assert poses[0, 1] == pytest.approx(-1.5) and poses[:, 1].max() <= 2.0 and poses[:, 1].min() >= -2.0
     steps = np.abs(np.diff(poses[:, 1]))
@@ -79,8 +79,8 @@ def test_it_walks_to_and_fro_at_its_speed():
     facing = np.sign(np.diff(poses[:, 1]))
     assert np.allclose(np.sin(poses[:-1, 2])[steps > 0.12], facing[steps > 0.12], atol=1e-6)
     along = ObstacleConfig("c", "cyclist", 2.0, 0.5, to=(20.0, 0.5), speed=4.0)
-    x, y, yaw = pose_at(along, ROUTE, 3.0)
-    s, lateral = nearest(ROUTE, np.array([x, y]))
+    x, y, yaw = obstacle_pose(along, ROUTE, 3.0)
+    s, lateral = nearest_on_route(ROUTE, np.array([x, y]))
     assert (s, lateral) == (pytest.approx(14.0, abs=0.05), pytest.approx(0.5, abs=0.05))
     assert yaw == pytest.approx((14.0 - 10.0) / 9.0, abs=0.1)  # it faces along the bend
 
@@ -147,11 +147,15 @@ def test_bystanders_stand_where_no_robot_in_the_corridor_can_touch_them(world):
     tight = np.column_stack([3.0 * np.sin(bend), 3.0 - 3.0 * np.cos(bend), 0.0 * bend])  # the inside has no room
     for route in (world.route, tight):
         there = replace(world, route=route)
-        drawn = bystanders(there, np.random.default_rng(3), 6)
-        assert drawn == bystanders(there, np.random.default_rng(3), 6) != bystanders(there, np.random.default_rng(4), 6)
+        drawn = random_distractors(there, np.random.default_rng(3), 6)
+        assert (
+            drawn
+            == random_distractors(there, np.random.default_rng(3), 6)
+            != random_distractors(there, np.random.default_rng(4), 6)
+        )
         for seed in range(40):
-            for one in bystanders(there, np.random.default_rng(seed), 6):
-                x, y, _ = module.pose_at(one, route, 0.0)
+            for one in random_distractors(there, np.random.default_rng(seed), 6):
+                x, y, _ = module.obstacle_pose(one, route, 0.0)
                 free = np.hypot(*(route[:, :2] - (x, y)).T).min() - module.RADIUS[one.kind]
                 assert there.half_width + 0.6 <= free + 1e-9 and free < there.half_width + 3.2
 

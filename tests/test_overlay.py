@@ -6,7 +6,7 @@ import pytest
 from test_baked import LOW, baked, wall
 
 from twin.config import ObstacleConfig
-from twin.env.camera_noise import CameraNoise, CameraOptions, rolled_off
+from twin.env.camera_noise import CameraNoise, CameraOptions, soft_clip
 from twin.env.compositor import Compositor
 from twin.env.mujoco_renderer import ObjectRenderer, camera_intrinsics, camera_pose
 from twin.env.obstacles import add_obstacles
@@ -161,14 +161,14 @@ def test_many_worlds_are_as_each_alone(box):
     datas = [put(model, mujoco.MjData(model), x, y, -0.5) for x, y in ((0.0, 0.0), (1.0, 0.6), (-9.0, 0.0))]
     field = baked(hall)
     lightings = ["day", "night", field.embedding("day:night:0.5")]
-    together = Compositor(model, field, SIZE, worlds=3).render(datas, lightings)
+    together = Compositor(model, field, SIZE, max_envs=3).render(datas, lightings)
     single = Compositor(model, field, SIZE)
     for k, (data, lighting) in enumerate(zip(datas, lightings, strict=True)):
         alone = single.render([data], lighting)
         for name in ("rgb", "depth", "opacity"):
             assert np.array_equal(getattr(alone, name)[0], getattr(together, name)[k]), name
     with pytest.raises(InputError, match="at most 3"):
-        Compositor(model, field, SIZE, worlds=3).render([*datas, datas[0]], "day")
+        Compositor(model, field, SIZE, max_envs=3).render([*datas, datas[0]], "day")
 
 
 def test_the_camera_of_the_model_is_that_of_the_pictures():
@@ -190,7 +190,7 @@ def test_the_robot_does_not_see_itself_in_its_usual_camera():
     index = model.camera("front").id
     view = ObjectRenderer(model, index, (160, 90))
     assert len(view.geoms) > 20
-    assert view.in_view(data, camera_pose(data, index)) is None
+    assert view.visible_mask(data, camera_pose(data, index)) is None
 
 
 def test_a_perfect_camera_changes_nothing_and_the_same_seed_repeats(box):
@@ -214,18 +214,18 @@ def test_a_perfect_camera_changes_nothing_and_the_same_seed_repeats(box):
 
 
 def test_a_turning_camera_smears_along_its_turn():
-    from twin.env.camera_noise import smeared
+    from twin.env.camera_noise import motion_blur
     from twin.geometry.cameras import pixel_grid, unproject
 
     rays = unproject(pixel_grid(*SIZE), K)
     rgb, depth = np.zeros((SIZE[1], SIZE[0], 3), np.float32), np.full((SIZE[1], SIZE[0]), 5.0, np.float32)
     rgb[18, 32] = 1.0
-    still = smeared(rgb, depth, np.eye(4), np.eye(4), 0.5, rays, K, 5)
+    still = motion_blur(rgb, depth, np.eye(4), np.eye(4), 0.5, rays, K, 5)
     assert np.allclose(still, rgb, atol=1e-5)
     angle = 8.0 / FOCAL  # about 8 px
     before = np.eye(4)
     before[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    out = smeared(rgb, depth, np.eye(4), before, 0.5, rays, K, 9)
+    out = motion_blur(rgb, depth, np.eye(4), before, 0.5, rays, K, 9)
     lit = np.flatnonzero(out[18, :, 0] > 0.02)
     assert 3 <= np.ptp(lit) <= 6  # half of the way
     assert out.sum() == pytest.approx(rgb.sum(), rel=0.1)
@@ -234,5 +234,5 @@ def test_a_turning_camera_smears_along_its_turn():
 
 def test_highlights_roll_off_instead_of_being_cut():
     bright = np.array([0.0, 0.5, 0.75, 1.0, 3.0], np.float32)
-    out = rolled_off(bright)
+    out = soft_clip(bright)
     assert np.array_equal(out[:3], bright[:3]) and (np.diff(out) > 0).all() and out[-1] < 1.0

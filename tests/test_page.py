@@ -16,22 +16,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from twin.build import summary
+from twin.errors import join_names
 from twin.files import write_json
 from twin.geometry.images import write_image
 from twin.report import build_report as report_page
 from twin.report import build_sections, visual_vs_collision
 from twin.report import build_sections as section_words
 from twin.report.build_report import page, write_page
-from twin.report.build_sections import SECTIONS, cautions, sections, summed_up, truth_section
+from twin.report.build_sections import SECTIONS, cautions, headline_sections, sections, truth_section
 from twin.report.html import (
     NOT_MEASURED,
     Caution,
     Html,
     duration,
     element,
-    flat,
+    flatten,
     follower_verdict,
-    listing,
     number,
     pick,
     table,
@@ -163,9 +163,9 @@ def test_every_missing_key_is_tolerated(scene: SceneDir) -> None:
         for key in REPORT[stage]:
             report = copy.deepcopy(REPORT)
             del report[stage][key]
-            SECTIONS[stage](report), summed_up(report)
+            SECTIONS[stage](report), headline_sections(report)
             report[stage][key] = None
-            SECTIONS[stage](report), summed_up(report)
+            SECTIONS[stage](report), headline_sections(report)
     for key in REPORT:
         read(page(scene, {k: v for k, v in REPORT.items() if k != key}))
 
@@ -213,10 +213,10 @@ def test_without_a_film_none_is_offered(scene: SceneDir) -> None:
     [
         ({"reached_goal": True, "touched": []}, "from start to end and touched nothing but the ground.", "good"),
         ({"reached_goal": True, "touched": ["tree"]}, "from start to end and touched tree.", "mixed"),
-        ({"reached_goal": True}, "and what it touched was not measured.", "mixed"),
+        ({"reached_goal": True}, "and its contacts were not measured.", "mixed"),
         (
             {"reached_goal": False, "touched": ["a", "b"], "distance_m": 23.06},
-            "did not reach the end of the 59.8 m route: it came 23.1 m far and touched a and b.",
+            "did not reach the end of the 59.8 m route: it drove 23.1 m and touched a and b.",
             "bad",
         ),
     ],
@@ -262,8 +262,13 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("review", "review.follower.reached_goal", False, "did not reach the goal"),
     ("review", "review.follower.touched", ["part_0001"], "It touched part_0001."),
     ("seen_touched", "seen_touched.median_m", 0.052, "differ: 0.052 m"),
-    ("seen_touched", "seen_touched.corridor_leak_m", 0.3, "seen but not solid: 0.300 m"),
-    ("seen_touched", "seen_touched.corridor_ghost_m", 0.23, "Solid things in the corridor are not seen: 0.230 m"),
+    ("seen_touched", "seen_touched.corridor_leak_m", 0.3, "has no collision geometry: 0.300 m"),
+    (
+        "seen_touched",
+        "seen_touched.corridor_ghost_m",
+        0.23,
+        "Collision geometry in the corridor is not visible: 0.230 m",
+    ),
     ("seen_touched", "seen_touched.unfilmed_ghost_m", 1.53, "1.530 m"),
     ("truth", "truth.ate_m", 0.2, "The camera path: 0.200 m off"),
     ("truth", "truth.scale_error", -0.05, "The scale: 5.0% off"),
@@ -289,7 +294,7 @@ def header_of(html: str) -> str:
 
 def test_nothing_wrong_gives_no_caution() -> None:
     assert cautions(REPORT) == [] and cautions({}) == []
-    assert {section.headline.mood for section in summed_up(REPORT) if section.headline} == {"good"}
+    assert {section.headline.mood for section in headline_sections(REPORT) if section.headline} == {"good"}
     assert "caution" not in summary(REPORT)
 
 
@@ -366,7 +371,7 @@ def test_no_summary_is_greener_than_its_sections(
         if path != "peak_memory_bytes":
             report = changed(path, value, report)
     below = [(section, caution) for section in sections(report) for caution in section.cautions]
-    above = {section.name: section for section in summed_up(report)}
+    above = {section.name: section for section in headline_sections(report)}
     for section, _ in below:
         headline = above[section.name].headline
         assert headline is not None and headline.mood in ("mixed", "bad") and headline.word in ("caution", "bad")
@@ -416,10 +421,10 @@ def test_small_words() -> None:
     assert number(None) == number(True) == number("x") == NOT_MEASURED
     assert number(2, "{:.1f} m") == "2.0 m"
     assert duration(8.24) == "8.2 s" and duration(59.96) == "1 min 00 s" and duration(None) == NOT_MEASURED
-    assert listing([]) == "none" and listing(["a"]) == "a" and listing("abc") == "a, b and c"
-    assert listing("abcdef") == "a, b, c and 3 more"
+    assert join_names([]) == "none" and join_names(["a"]) == "a" and join_names("abc") == "a, b and c"
+    assert join_names("abcdef") == "a, b, c and 3 more"
     assert pick({"a": {"b": 1}}, "a.b") == 1 and pick({"a": 2}, "a.b") is None and pick(None, "a") is None
-    assert flat({"a": {"b": 1.5, "c": [1, 2]}, "d": list(range(99)), "e": None, "f": True}) == [
+    assert flatten({"a": {"b": 1.5, "c": [1, 2]}, "d": list(range(99)), "e": None, "f": True}) == [
         ("a.b", "1.5"),
         ("a.c", "1, 2"),
         ("d", "99 values"),

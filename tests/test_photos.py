@@ -9,7 +9,7 @@ import pytest
 from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views
 from PIL import ExifTags, Image
 
-from twin.capture.photos import photo_times, regular_choice
+from twin.capture.photos import evenly_spaced, photo_times
 from twin.config import SourceConfig
 from twin.geometry.images import read_image, write_image
 
@@ -107,7 +107,7 @@ def test_photo_times_need_a_clock_that_rises() -> None:
 
 
 def test_a_regular_choice_has_both_ends() -> None:
-    assert regular_choice(10, 4).tolist() == [0, 3, 6, 9] and regular_choice(3, 4).tolist() == [0, 1, 2]
+    assert evenly_spaced(10, 4).tolist() == [0, 3, 6, 9] and evenly_spaced(3, 4).tolist() == [0, 1, 2]
 
 
 @pytest.mark.realdata

@@ -11,7 +11,7 @@ import twin
 from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
-from twin.env.domain_randomization import Nominal, RandomizationSample, Ranges
+from twin.env.domain_randomization import NominalModel, RandomizationSample, Ranges
 from twin.env.mujoco_renderer import SceneRenderer, camera_pose
 from twin.env.options import NERF, SIMULATOR
 from twin.env.suite import DriveEnvironment, EnvFactory
@@ -33,8 +33,8 @@ def film(scene, latency: float, steps: int, **options) -> np.ndarray:
     """Newest pictures (steps + 1, height, width, 3) of one drive."""
     stage = EnvFactory.open(scene, "bend", {"size": SIZE, "stack": 1, "time_limit": 60.0, **options})
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=latency)))
-    physics, task = stage.drive(3)
-    environment = DriveEnvironment(physics, task, stage.pixels([(physics, task)]))
+    physics, task = stage.make_env(3)
+    environment = DriveEnvironment(physics, task, stage.make_observer([(physics, task)]))
     rng = np.random.default_rng(0)
     pictures = [environment.reset().observation["pixels"][0]]
     for _ in range(steps):
@@ -62,14 +62,16 @@ def test_a_late_picture_is_the_picture_of_then(scene, observe, period, late):
 
 def views(stage: EnvFactory, shaded: bool = False) -> tuple[Compositor, SceneRenderer]:
     simulated = replace(stage, field=None, options=replace(stage.options, observe=SIMULATOR))
-    return Compositor(stage.model, stage.field, SIZE, shaded=shaded), simulated.pixels([stage.drive(0)])._overlay  # type: ignore
+    return Compositor(stage.model, stage.field, SIZE, shaded=shaded), simulated.make_observer(
+        [stage.make_env(0)]
+    )._renderer  # type: ignore
 
 
 def standing(stage: EnvFactory, draw: RandomizationSample) -> mujoco.MjData:
     """The robot at the start, as drawn."""
-    physics, task = stage.drive(0)
+    physics, task = stage.make_env(0)
     task.initialize_episode(physics)
-    Nominal(stage.model).apply(draw, physics.model.ptr)
+    NominalModel(stage.model).apply(draw, physics.model.ptr)
     mujoco.mj_forward(physics.model.ptr, physics.data.ptr)
     return physics.data.ptr
 
@@ -80,9 +82,9 @@ def test_no_camera_sees_its_own_housing(scene, ranges):
     overlay, simulator = views(stage)
     rng = np.random.default_rng(1)
     data = standing(stage, RandomizationSample())
-    model, nominal = data.model, Nominal(stage.model)
+    model, nominal = data.model, NominalModel(stage.model)
     for _ in range(100):
-        nominal.apply(ranges.draw(rng), model)
+        nominal.apply(ranges.sample(rng), model)
         mujoco.mj_forward(model, data)
         depth = simulator.render([data]).depth
         assert depth[depth > 0.0].min() > 0.3  # the road
@@ -106,7 +108,9 @@ def test_the_rest_of_the_robot_is_seen_where_in_view(scene):
 
 def test_another_robot_keeps_its_camera(scene):
     stage = EnvFactory.open(scene, "bend", {"size": SIZE, "obstacles": (OTHER,)})
-    names = {stage.model.geom(int(i)).name for i in Compositor(stage.model, stage.field, SIZE)._painters[0].view.geoms}
+    names = {
+        stage.model.geom(int(i)).name for i in Compositor(stage.model, stage.field, SIZE)._workers[0].renderer.geoms
+    }
     assert {name for name in names if "camera" in name} == {
         f"obstacle_other_camera_{part}" for part in ("bracket", "housing", "lens_left", "lens_right")
     }

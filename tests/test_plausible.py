@@ -5,7 +5,7 @@ import pytest
 
 from twin.errors import InputError
 from twin.nerf import appearance_prior
-from twin.nerf.appearance_prior import AppearancePrior, Probes, numbers
+from twin.nerf.appearance_prior import AppearancePrior, Probes, picture_statistics
 from twin.nerf.lightings import Lightings
 
 _LIFT = 20.0  # keeps the rectifiers of the made-up head open, so that it is linear
@@ -46,7 +46,7 @@ DAY_AND_DUSK = [[0.8, 0.0, 0.0, 0.0], [-0.8, 0.4, 0.0, 0.0]]
 def test_whatever_was_filmed_is_plausible():
     mine = lightings(DAY_AND_DUSK)
     for vector in (*mine.vectors, *mine.frame_vectors):
-        assert mine.judge.faults(vector) == []
+        assert mine.prior.violations(vector) == []
 
 
 def test_samples_obey_the_rule_and_vary():
@@ -54,12 +54,12 @@ def test_samples_obey_the_rule_and_vary():
     drawn = [mine.sample(np.random.default_rng(i)) for i in range(40)]
     pictures = np.array([mine.probes.picture(e) for e in drawn])
     for picture in pictures:
-        off = mine.judge.off(picture)
+        off = mine.prior.color_error(picture)
         assert np.sqrt((off**2).mean()) <= 0.06
         assert (off > 0.2).mean() <= 0.02
-    filmed = np.array([numbers(mine.probes.picture(v)) for v in (*mine.vectors, *mine.frame_vectors)])
+    filmed = np.array([picture_statistics(mine.probes.picture(v)) for v in (*mine.vectors, *mine.frame_vectors)])
     margin = 0.02 + 0.1 * np.ptp(filmed, axis=0)
-    got = np.array([numbers(picture) for picture in pictures])
+    got = np.array([picture_statistics(picture) for picture in pictures])
     assert (got >= filmed.min(0) - margin - 1e-6).all()
     assert (got <= filmed.max(0) + margin + 1e-6).all()
     brightness = np.ptp([mine.probes.picture(v).mean() for v in mine.vectors])
@@ -77,16 +77,16 @@ def test_samples_obey_the_rule_and_vary():
     ],
 )
 def test_what_nobody_could_have_filmed_is_rejected(embedding, fault):
-    assert any(fault in found for found in lightings(DAY_AND_DUSK).judge.faults(np.array(embedding)))
+    assert any(fault in found for found in lightings(DAY_AND_DUSK).prior.violations(np.array(embedding)))
 
 
 def test_light_adds():
     """A longer exposure and both lights at once are sums of lights; the probes' colours in another order are none."""
     mine = lightings(DAY_AND_DUSK)
     day, dusk = (mine.probes.picture(v) ** 2.2 for v in mine.vectors)
-    assert mine.judge.off((0.3 * day + 0.9 * dusk) ** (1 / 2.2)).max() < 1e-3
-    assert mine.judge.off((0.25 * day) ** (1 / 2.2)).max() < 1e-3
-    assert np.sqrt((mine.judge.off(day[::-1] ** (1 / 2.2)) ** 2).mean()) > 0.1
+    assert mine.prior.color_error((0.3 * day + 0.9 * dusk) ** (1 / 2.2)).max() < 1e-3
+    assert mine.prior.color_error((0.25 * day) ** (1 / 2.2)).max() < 1e-3
+    assert np.sqrt((mine.prior.color_error(day[::-1] ** (1 / 2.2)) ** 2).mean()) > 0.1
 
 
 def test_the_same_seed_gives_the_same_lighting():
@@ -108,9 +108,9 @@ def test_one_lighting_varies_as_its_frames_do():
 
 def test_it_gives_up_with_a_reason(monkeypatch):
     mine = lightings(DAY_AND_DUSK)
-    monkeypatch.setattr(AppearancePrior, "faults", lambda self, embedding: ["brightness 9 (filmed: 0 to 1)"])
+    monkeypatch.setattr(AppearancePrior, "violations", lambda self, embedding: ["brightness 9 (filmed: 0 to 1)"])
     with pytest.raises(
-        InputError, match=rf"among {appearance_prior._TRIES} drawn; the last is brightness 9 .*nerf\.steps"
+        InputError, match=rf"among {appearance_prior._MAX_TRIES} sampled; the last is brightness 9 .*nerf\.steps"
     ):
         mine.sample(np.random.default_rng(0))
 

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from twin.errors import InputError
 from twin.learn.policy import JSON, ONNX, WEIGHTS, Control, load_policy, save_policy
-from twin.learn.policy_network import Architecture, normalized, onnx_bytes, prepared, shrink
+from twin.learn.policy_network import Architecture, average_pool, normalize_colors, onnx_bytes, preprocess
 
 SMALL = Architecture(convolutions=((8, 4, 4), (8, 3, 2)), features=16, hidden=(32, 32))
 
@@ -89,8 +89,8 @@ def test_what_actions_mean():
 def test_shrinking_is_the_mean_rounded_half_up():
     some = pictures(2)
     mean = some.reshape(2, 12, 45, 2, 80, 2).astype(float).mean((3, 5))
-    np.testing.assert_array_equal(shrink(some, 2), np.floor(mean + 0.5))
-    assert shrink(np.array([[[0, 0], [1, 1]]], np.uint8), 2).item() == 1
+    np.testing.assert_array_equal(average_pool(some, 2), np.floor(mean + 0.5))
+    assert average_pool(np.array([[[0, 0], [1, 1]]], np.uint8), 2).item() == 1
 
 
 def test_levelled_pictures_do_not_depend_on_exposure_contrast_or_white_balance():
@@ -98,20 +98,20 @@ def test_levelled_pictures_do_not_depend_on_exposure_contrast_or_white_balance()
     road = np.clip(rng.normal(110.0, 30.0, (3, 40, 60)), 30, 220)
     other = np.array([0.55, 0.5, 0.35])[:, None, None] * road + np.array([20.0, 12.0, 30.0])[:, None, None]
     as_bytes = [np.round(one).astype(np.uint8) for one in (road, other)]
-    first, second = (normalized(one).astype(int) for one in as_bytes)
+    first, second = (normalize_colors(one).astype(int) for one in as_bytes)
     assert np.abs(as_bytes[0].astype(int) - as_bytes[1]).mean() > 20
     assert np.abs(first - second).mean() < 6 and np.abs(first - second).max() < 25
     ground = first[:, 20:].reshape(3, -1)
     np.testing.assert_allclose(ground.mean(1), 128, atol=1)
     assert (ground.std(1) > 38).all() and (ground.std(1) < 48).all()
-    assert (normalized(np.full((3, 4, 4), 77, np.uint8)) == 128).all()
+    assert (normalize_colors(np.full((3, 4, 4), 77, np.uint8)) == 128).all()
     # Noise where there is nothing else is not made into a picture.
-    assert normalized(rng.integers(9, 11, (3, 40, 60), np.uint8)).std() < 8
+    assert normalize_colors(rng.integers(9, 11, (3, 40, 60), np.uint8)).std() < 8
 
 
 def test_preparing_is_shrinking_and_then_levelling():
     some = pictures(2)
-    np.testing.assert_array_equal(prepared(some, 2), normalized(shrink(some, 2)))
+    np.testing.assert_array_equal(preprocess(some, 2), normalize_colors(average_pool(some, 2)))
 
 
 def test_neither_torch_nor_sb3_is_needed(folder, tmp_path):
@@ -150,7 +150,7 @@ DAMAGE = {
     "weights gone": (lambda f: (f / WEIGHTS).unlink(), "is missing"),
     "json cut": (lambda f: (f / JSON).write_text((f / JSON).read_text()[:90]), "no valid JSON|no UTF-8"),
     "json binary": (lambda f: (f / JSON).write_bytes(b"\xff\xfe\x00"), "no valid JSON|no UTF-8"),
-    "json gone": (lambda f: (f / JSON).unlink(), "holds no policy.json"),
+    "json gone": (lambda f: (f / JSON).unlink(), "has no policy.json"),
     "json of others": (lambda f: (f / JSON).write_text("[1, 2]"), "not a policy of twin"),
     "later version": (lambda f: edit(f, version=3), "version 3"),
     "another shape": (lambda f: edit(f, network__hidden=[32, 33]), "expected float32"),
@@ -276,7 +276,7 @@ def test_an_sb3_zip_needs_trust(tmp_path):
     stacks = np.random.default_rng(0).integers(0, 256, (2, 12, 36, 64), np.uint8)
     np.testing.assert_allclose(policy.actions(stacks), model.predict(stacks, deterministic=True)[0], atol=1e-6)
     (tmp_path / "no.zip").write_bytes(b"PK nothing")
-    with pytest.raises(InputError, match="no SAC"):
+    with pytest.raises(InputError, match="not a SAC"):
         load_policy(tmp_path / "no.zip", trust=True)
 
 
@@ -345,7 +345,7 @@ def test_weights_in_other_files_are_found_wherever_they_are_named(tmp_path, plac
     model = onnx.load(foreign(tmp_path / "a.onnx"))
     _hidden_tensors()[place](model)
     (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(InputError, match="keeps its weights in other files"):
+    with pytest.raises(InputError, match="its weights are in other files"):
         load_policy(tmp_path / "a.onnx")
 
 
@@ -354,5 +354,5 @@ def test_an_onnx_file_that_asks_for_huge_pictures_is_refused(tmp_path):
     for axis in (2, 3):
         model.graph.input[0].type.tensor_type.shape.dim[axis].dim_value = 100_000
     (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(InputError, match=r"100000 × 100000 px|is no ONNX file"):
+    with pytest.raises(InputError, match=r"100000 × 100000 px|not an ONNX file"):
         load_policy(tmp_path / "a.onnx")

@@ -42,13 +42,13 @@ def test_they_are_as_in_one_process(scene, options):
     seeds = [5, 6, 7]
     here = LocalVectorEnv(EnvFactory.open(scene, "bend", options), seeds)
     there = ProcessVectorEnv(scene, "bend", options, seeds, 2)
-    assert (len(there), there.actions, there.states) == (len(here), here.actions, here.states)
+    assert (len(there), there.action_size, there.state_size) == (len(here), here.action_size, here.state_size)
     rng, over = np.random.default_rng(0), 0
     for worlds in (here, there):
         worlds.begin(range(3))
     for k in range(30):
         which = [[2, 1, 0], [1], [0, 2]][k % 3]
-        actions = rng.uniform(-1, 1, (len(which), here.actions))
+        actions = rng.uniform(-1, 1, (len(which), here.action_size))
         a, b = (worlds.step(actions, which) for worlds in (here, there))
         for name in ("reward", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
@@ -79,7 +79,7 @@ def test_tasks_are_asked_where_they_are(spread):
     spread.set(1, "episode_seed", 77)
     assert spread.info(1)["episode_seed"] == 77 and spread.get(-1, "time_limit") == before + 1.0  # and it goes on
     with pytest.raises(IndexError):
-        spread.step(np.zeros((1, spread.actions)), [3])
+        spread.step(np.zeros((1, spread.action_size)), [3])
 
 
 class _Foreign:
@@ -107,20 +107,20 @@ def test_a_process_that_dies_is_an_error_with_a_cure(spread):
     spread.begin(range(3))
     os.kill(spread._children[1].process.pid, signal.SIGKILL)
     with pytest.raises(InputError, match=r"exit status -9.*fewer processes"):
-        spread.step(np.zeros((3, spread.actions)))
-    with pytest.raises(InputError, match="make them anew"):
+        spread.step(np.zeros((3, spread.action_size)))
+    with pytest.raises(InputError, match="make a new one"):
         spread.begin(range(3))
 
 
 def test_a_step_that_was_interrupted_is_never_heard_later(spread):
     """As by Ctrl-C in a notebook: what children then say would answer the next request."""
     spread.begin(range(3))
-    hear = _Child.hear
+    receive = _Child.receive
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(_Child, "hear", lambda child: (_ for _ in ()).throw(KeyboardInterrupt))
-        spread.step(np.zeros((3, spread.actions)))
-    assert _Child.hear is hear
-    with pytest.raises(InputError, match="make them anew"):
+        patch.setattr(_Child, "receive", lambda child: (_ for _ in ()).throw(KeyboardInterrupt))
+        spread.step(np.zeros((3, spread.action_size)))
+    assert _Child.receive is receive
+    with pytest.raises(InputError, match="make a new one"):
         spread.begin(range(3))
     spread.close()
 
@@ -131,15 +131,15 @@ def test_interrupts_are_the_parents(spread):
     for child in spread._children:
         assert os.getpgid(child.process.pid) != os.getpgid(0)
         os.kill(child.process.pid, signal.SIGTERM)
-    assert np.isfinite(spread.step(np.zeros((3, spread.actions))).reward).all()
+    assert np.isfinite(spread.step(np.zeros((3, spread.action_size))).reward).all()
 
 
 def test_they_end_with_their_parent(scene):
     """However it ends, and though its script has no `if __name__ == "__main__"`."""
     script = f"""
         import os, signal
-        from twin.env.vector_env_processes import ProcessWorlds
-        worlds = ProcessWorlds({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
+        from twin.env.vector_env_processes import ProcessVectorEnv
+        worlds = ProcessVectorEnv({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
         worlds.begin([0, 1])
         fork = os.fork()
         if not fork:  # has the sockets, too, and outlives us
@@ -177,7 +177,7 @@ def test_nobody_is_left_when_they_are_dropped(scene):
 
 
 def test_few_worlds_stay_here(scene, monkeypatch):
-    monkeypatch.setattr("twin.env.vector_env_local.cores", lambda: 4)
+    monkeypatch.setattr("twin.env.vector_env.available_cores", lambda: 4)
     options = {"pixels": False}
     for count, processes, kind in (
         (1, None, LocalVectorEnv),

@@ -6,18 +6,18 @@ from scipy import stats
 
 from twin.evaluation.ranking import (
     MARGIN,
-    SURE,
-    Tallies,
-    expected_after,
+    SETTLED_PROBABILITY,
+    TrialCounts,
+    expected_confidence,
     rank_interval,
     rank_probabilities,
-    trials_to_settle,
+    trials_needed,
 )
 
 
-def of(*counts: tuple[int, int]) -> Tallies:
+def of(*counts: tuple[int, int]) -> TrialCounts:
     """One cell per policy: successes and trials."""
-    return Tallies.of([[one] for one in counts])
+    return TrialCounts.from_rows([[one] for one in counts])
 
 
 def test_two_policies_as_by_integration() -> None:
@@ -36,8 +36,8 @@ def test_every_policy_has_a_rank_and_every_rank_a_policy() -> None:
 
 
 def test_a_score_is_the_mean_over_cells_whatever_their_trials() -> None:
-    tallies = Tallies.of([[(100, 100), (0, 10)], [(60, 100)]])
-    assert np.allclose(tallies.mean(tallies.successes / np.maximum(tallies.trials, 1)), [0.5, 0.6])
+    tallies = TrialCounts.from_rows([[(100, 100), (0, 10)], [(60, 100)]])
+    assert np.allclose(tallies.scores(tallies.successes / np.maximum(tallies.trials, 1)), [0.5, 0.6])
     assert rank_probabilities(tallies, np.random.default_rng(2))[1, 0] > 0.9
 
 
@@ -66,7 +66,7 @@ def test_rank_intervals_hold() -> None:
 
 def test_more_trials_make_surer() -> None:
     tallies = of((8, 10), (6, 10), (3, 10))
-    sure = [expected_after(tallies, more, 0) for more in (0, 20, 100, 500)]
+    sure = [expected_confidence(tallies, more, 0) for more in (0, 20, 100, 500)]
     assert [s.winner for s in sure] == sorted(s.winner for s in sure)
     assert [s.order for s in sure] == sorted(s.order for s in sure)
     assert sure[-1].winner > 0.95 > sure[0].winner
@@ -75,30 +75,34 @@ def test_more_trials_make_surer() -> None:
 def test_now_is_what_the_posterior_says() -> None:
     """With no further trials the leader is fixed: it is within the margin of the best as often as in the posterior."""
     tallies = of((8, 10), (6, 10), (3, 10))
-    draws = tallies.mean(tallies.posterior(np.random.default_rng(9), 100_000))
-    assert expected_after(tallies, 0, 0, draws=50_000).winner == pytest.approx(
+    draws = tallies.scores(tallies.sample_posterior(np.random.default_rng(9), 100_000))
+    assert expected_confidence(tallies, 0, 0, samples=50_000).winner == pytest.approx(
         np.mean(draws[:, 0] >= draws.max(1) - MARGIN), abs=0.01
     )
 
 
 def test_without_trials_so_far_nothing_is_known() -> None:
     tallies = of((80, 100), (50, 100), (20, 100), (10, 100))
-    nothing = expected_after(tallies, 0, 0, so_far=False)
+    nothing = expected_confidence(tallies, 0, 0, so_far=False)
     assert nothing.winner == pytest.approx(0.25, abs=0.01) and nothing.order == 0.5
-    assert expected_after(tallies, 0, 0).winner > 0.99
+    assert expected_confidence(tallies, 0, 0).winner > 0.99
 
 
 def test_trials_to_settle_is_the_least_that_does() -> None:
     tallies = of((16, 20), (13, 20), (5, 20))
-    more = trials_to_settle(tallies, "winner", 0)
+    more = trials_needed(tallies, "winner", 0)
     assert more is not None and more % 5 == 0 and more > 0
-    assert expected_after(tallies, more, 0).winner >= SURE > expected_after(tallies, more - 5, 0).winner
-    assert trials_to_settle(of((100, 100), (1, 100)), "winner", 0) == 0
-    assert trials_to_settle(of((100, 100), (1, 100)), "order", 0) == 0
+    assert (
+        expected_confidence(tallies, more, 0).winner
+        >= SETTLED_PROBABILITY
+        > expected_confidence(tallies, more - 5, 0).winner
+    )
+    assert trials_needed(of((100, 100), (1, 100)), "winner", 0) == 0
+    assert trials_needed(of((100, 100), (1, 100)), "order", 0) == 0
 
 
 def test_equals_need_no_order() -> None:
     """Rates that differ by less than the margin are equally good: any may win."""
     same = of((5000, 10_000), (5020, 10_000))
-    assert trials_to_settle(same, "winner", 0) == 0
-    assert expected_after(same, 0, 0).order == 1.0
+    assert trials_needed(same, "winner", 0) == 0
+    assert expected_confidence(same, 0, 0).order == 1.0

@@ -15,7 +15,7 @@ from twin.geometry.mesh_rays import Surface
 from twin.reality import filming, true_world
 from twin.reality import place as places
 from twin.reality.centerline import ground_height
-from twin.reality.rasterizer import SAMPLES, Raster, ShadowMap, draw, flatten, in_light
+from twin.reality.rasterizer import SAMPLES, Rasterizer, ShadowMap, flatten, render_shadow_map, sun_visibility
 
 PLAN = replace(filming.FilmingPlan(), width=160, height=90)
 
@@ -27,7 +27,7 @@ def campus():
 
 @pytest.fixture(scope="module")
 def sunny(campus):
-    return true_world.spec("sun", campus).compile()
+    return true_world.world_spec("sun", campus).compile()
 
 
 def robot_poses(campus, lighting="sun", every=40):
@@ -39,7 +39,7 @@ def robot_poses(campus, lighting="sun", every=40):
 
 def test_depth_is_that_of_rays(campus, sunny):
     """The first sample of every pixel is as far as a ray through it goes, and sky where a ray meets nothing."""
-    raster, flat = Raster(sunny, PLAN.intrinsics, (160, 90)), flatten(sunny)
+    raster, flat = Rasterizer(sunny, PLAN.intrinsics, (160, 90)), flatten(sunny)
     surface = Surface(flat.corners.reshape(-1, 3).astype(float), np.arange(3 * len(flat.corners)).reshape(-1, 3))
     first = (pixel_grid(160, 90) - 0.5 + 0.5 / SAMPLES).reshape(-1, 2)
     for pose in robot_poses(campus):
@@ -55,7 +55,7 @@ def test_depth_is_that_of_rays(campus, sunny):
 @wp.kernel
 def _ask(shadows: ShadowMap, points: wp.array[wp.vec3], out: wp.array[float]):
     i = wp.tid()
-    out[i] = in_light(shadows, points[i], wp.vec3(0.0, 0.0, 1.0))
+    out[i] = sun_visibility(shadows, points[i], wp.vec3(0.0, 0.0, 1.0))
 
 
 def test_shadows_are_where_rays_to_the_sun_are_blocked(campus, sunny):
@@ -63,25 +63,27 @@ def test_shadows_are_where_rays_to_the_sun_are_blocked(campus, sunny):
     station, lateral = np.meshgrid(np.linspace(0, 60, 400), np.linspace(-7.0, 7.0, 80))
     xy = campus.route.at(station, lateral).reshape(-1, 2)
     ground = np.column_stack([xy, ground_height(campus.route, xy)])
-    shadows = draw(wp.array(flat.corners, dtype=wp.vec3, device="cpu"), flat)
+    shadows = render_shadow_map(wp.array(flat.corners, dtype=wp.vec3, device="cpu"), flat)
     out = wp.zeros(len(ground), dtype=float, device="cpu")
     points = wp.array((ground + np.array([0.0, 0.0, 0.01])).astype(np.float32), dtype=wp.vec3, device="cpu")
     wp.launch(_ask, len(ground), [shadows, points, out], device="cpu")
     surface = Surface(flat.corners.reshape(-1, 3).astype(float), np.arange(3 * len(flat.corners)).reshape(-1, 3))
-    free = surface.openness(ground + np.array([0.0, 0.0, 0.02]), -flat.sun_rays[shadows.sun][None].astype(float), 100.0)
+    free = surface.openness(
+        ground + np.array([0.0, 0.0, 0.02]), -flat.sun_directions[shadows.sun][None].astype(float), 100.0
+    )
     right = np.abs(out.numpy() - free) < 0.5
     assert 0.2 < free.mean() < 0.9  # there is both
     assert right[free > 0.5].mean() > 0.98 and right[free < 0.5].mean() > 0.92  # shadows of leaves are ragged
 
 
 def test_no_sun_casts_no_shadow(campus):
-    flat = flatten(true_world.spec("overcast", campus).compile())
-    assert draw(wp.array(flat.corners[:1], dtype=wp.vec3, device="cpu"), flat).sun == -1
+    flat = flatten(true_world.world_spec("overcast", campus).compile())
+    assert render_shadow_map(wp.array(flat.corners[:1], dtype=wp.vec3, device="cpu"), flat).sun == -1
 
 
 def test_pictures_repeat(campus, sunny):
     pose = robot_poses(campus)[0]
-    one, other = (Raster(sunny, PLAN.intrinsics, (160, 90)) for _ in range(2))
+    one, other = (Rasterizer(sunny, PLAN.intrinsics, (160, 90)) for _ in range(2))
     assert np.array_equal(one(pose)[0], other(pose)[0])
 
 
@@ -89,8 +91,8 @@ def test_pictures_repeat(campus, sunny):
 @pytest.mark.parametrize(("lighting", "least"), [("sun", 30.0), ("night", 35.0)])
 def test_pictures_look_like_the_film(campus, lighting, least):
     """Against frames of the film's renderer in the film's size, shrunk: nearer than its own small ones."""
-    model = true_world.spec(lighting, campus).compile()
-    raster = Raster(model, PLAN.intrinsics, (160, 90))
+    model = true_world.world_spec(lighting, campus).compile()
+    raster = Rasterizer(model, PLAN.intrinsics, (160, 90))
     large, small = filming.Renderer(lighting, campus, filming.FilmingPlan()), filming.Renderer(lighting, campus, PLAN)
     for pose in robot_poses(campus, lighting)[:2]:
         wanted = cv2.resize(large(pose)[0], (160, 90), interpolation=cv2.INTER_AREA)

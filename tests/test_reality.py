@@ -16,7 +16,7 @@ from twin.geometry.poses import Similarity, umeyama
 from twin.reality import centerline, filming, place, true_world
 from twin.reality.centerline import RoadLine
 from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, measure, mesh_quality
-from twin.reality.lighting import LIGHTINGS, sky
+from twin.reality.lighting import LIGHTINGS, sky_cube_map
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
 from twin.scene import SceneDir
 
@@ -70,25 +70,25 @@ def test_ground_is_gentle_but_not_flat():
 
 
 def test_nothing_solid_in_the_corridor(campus):
-    for thing in campus.things:
-        if thing.kind not in ("obstacle", "foliage"):
+    for obj in campus.objects:
+        if obj.kind not in ("obstacle", "foliage"):
             continue
-        mesh = trimesh.Trimesh(thing.part.vertices, thing.part.faces, process=False)
+        mesh = trimesh.Trimesh(obj.part.vertices, obj.part.faces, process=False)
         points = np.concatenate([mesh.vertices, mesh.triangles_center])
         station, lateral = campus.route.project(points[:, :2])
         low = points[:, 2] - centerline.ground_height(campus.route, points[:, :2]) < 2.2
         inside = low & (np.abs(lateral) < 1.6) & (station > -2.0) & (station < 65.0)
-        assert not inside.any(), thing.name
+        assert not inside.any(), obj.name
 
 
 def test_what_blocks_is_solid(campus):
     """Each obstacle of a size that stops a robot brings a collision shape around where it is."""
-    for thing in campus.things:
-        if thing.kind != "obstacle" or thing.name.endswith(("_trim", "_glass", "_day", "_lit")):
+    for obj in campus.objects:
+        if obj.kind != "obstacle" or obj.name.endswith(("_trim", "_glass", "_day", "_lit")):
             continue
-        assert thing.solids, thing.name
-        centre = np.mean([s.centre for s in thing.solids], 0)
-        assert np.linalg.norm(centre[:2] - thing.part.vertices[:, :2].mean(0)) < 1.6, thing.name
+        assert obj.solids, obj.name
+        center = np.mean([s.center for s in obj.solids], 0)
+        assert np.linalg.norm(center[:2] - obj.part.vertices[:, :2].mean(0)) < 1.6, obj.name
 
 
 def test_trajectories_are_what_a_cart_does():
@@ -113,7 +113,7 @@ def test_trajectories_are_what_a_cart_does():
 
 
 def test_sky_is_seamless_and_brighter_by_day():
-    day, night = (sky(LIGHTINGS[name], 1, 64).reshape(6, 64, 64, 3).astype(float) for name in ("sun", "night"))
+    day, night = (sky_cube_map(LIGHTINGS[name], 1, 64).reshape(6, 64, 64, 3).astype(float) for name in ("sun", "night"))
     assert day.mean() > 2 * night.mean()
     # +X and −Z share an edge of the cube map (columns), up to one texel's difference.
     assert np.abs(day[0][:, -1] - day[5][:, 0]).mean() < 12.0
@@ -121,7 +121,7 @@ def test_sky_is_seamless_and_brighter_by_day():
 
 def test_one_drives_on_the_true_ground(campus):
     """A ball dropped on the road comes to rest on the height field, which is the true ground."""
-    spec = true_world.solids(campus)
+    spec = true_world.collision_spec(campus)
     xy = campus.route.at(np.array([12.3, 36.4, 55.1]), np.array([0.2, -0.9, 1.1]))
     for k, point in enumerate(xy):
         body = spec.worldbody.add_body(
@@ -173,14 +173,14 @@ def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) ->
         scene.stage("mesh")
     )
     hulls = []
-    for thing in truth.place.things:
-        for solid in thing.solids:
+    for obj in truth.place.objects:
+        for solid in obj.solids:
             if solid.kind == "box":
                 hull = trimesh.creation.box(2 * np.array(solid.half))
             else:
                 hull = trimesh.creation.cylinder(solid.half[0], 2 * solid.half[1], sections=16)
             hull.apply_transform(trimesh.transformations.rotation_matrix(solid.yaw, [0, 0, 1]))
-            hulls.append((warp.points(hull.vertices + solid.centre), hull.faces))
+            hulls.append((warp.points(hull.vertices + solid.center), hull.faces))
     np.savez(
         scene.stage("mesh") / "parts.npz",
         vertices=np.concatenate([v for v, _ in hulls]).astype(np.float32),
@@ -235,7 +235,7 @@ def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(trut
     found = []
     for name, kinds in (("all", {"ground", "obstacle", "foliage"}), ("flat", {"ground"})):
         scene = fake_build(truth, tmp_path / name, Similarity.identity())
-        parts = [t.part for t in truth.place.things if t.kind in kinds]
+        parts = [t.part for t in truth.place.objects if t.kind in kinds]
         starts = np.cumsum([0] + [len(p.vertices) for p in parts])
         np.savez(
             scene.stage("mesh") / "visual.npz",
@@ -269,10 +269,10 @@ def test_rigid_alignment_holds_on_a_straight_drive(truth):
 
 @pytest.mark.parametrize(("lateral", "height", "expected"), [(0.0, 0.3, True), (2.2, 0.3, False), (1.6, 0.3, True)])
 def test_intrusion(truth, lateral, height, expected):
-    centre = truth.route.at(20.0, lateral)
+    center = truth.route.at(20.0, lateral)
     block = trimesh.creation.box([0.3, 0.3, height])
-    base = float(truth.ground_height(centre))
-    vertices = np.asarray(block.vertices) + np.append(centre, base + height / 2)
+    base = float(truth.ground_height(center))
+    vertices = np.asarray(block.vertices) + np.append(center, base + height / 2)
     assert intrudes(vertices, np.asarray(block.faces, np.int32), truth) is expected
     assert not intrudes(vertices - [0.0, 0.0, height - 0.03], np.asarray(block.faces, np.int32), truth)
 
@@ -294,7 +294,7 @@ def test_frames_are_true_and_rich(campus, lighting):
     error = points[road][:, 2] - centerline.ground_height(campus.route, points[road][:, :2])
     assert road.sum() > 20_000
     assert np.quantile(np.abs(error), 0.99) < 0.004
-    image = filming.develop(np.random.default_rng(0), light, LIGHTINGS[lighting], 1.0)
+    image = filming.sensor_image(np.random.default_rng(0), light, LIGHTINGS[lighting], 1.0)
     keypoints = cv2.SIFT_create(contrastThreshold=0.02).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
     at = np.array([k.pt for k in keypoints]).astype(int)
     on_road = road[at[:, 1].clip(0, 359), at[:, 0].clip(0, 639)].sum()
@@ -314,7 +314,9 @@ def test_the_demo_is_this_world(campus):
         times, poses = filming.trajectory(plan, campus.route, name)
         assert np.allclose(poses, truth.films[name].camera_to_world, atol=1e-9)
         light, _ = filming.Renderer(name, campus, plan)(poses[0])
-        frame = filming.develop(np.random.default_rng(0), light, LIGHTINGS[name], filming.exposures(name, times)[0])
+        frame = filming.sensor_image(
+            np.random.default_rng(0), light, LIGHTINGS[name], filming.exposures(name, times)[0]
+        )
         error = cv2.GaussianBlur(frame.astype(float) - shipped, (0, 0), 2.0)
         assert np.sqrt((error**2).mean()) < 4.0
 
@@ -327,5 +329,5 @@ def test_films_repeat_byte_for_byte(tmp_path):
     frames = [np.clip(picture[:, 5 * k : 5 * k + 320] + noise[k], 0, 255).astype(np.uint8) for k in range(12)]
     plan = filming.FilmingPlan(width=320, height=180)
     for name in ("a.mp4", "b.mp4", "c.mp4"):
-        filming.encode(iter(frames), plan, tmp_path / name)
+        filming.write_video(iter(frames), plan, tmp_path / name)
     assert len({(tmp_path / name).read_bytes() for name in ("a.mp4", "b.mp4", "c.mp4")}) == 1

@@ -11,15 +11,10 @@ from test_fit import CONFIG, floor_points, make_cameras
 from twin.geometry.cameras import Cameras
 from twin.nerf.buffers import single_threaded_torch
 from twin.nerf.kernels import space
-from twin.nerf.pose_refinement import Refinement, corrected
+from twin.nerf.pose_refinement import PoseRefinement, apply_corrections
 from twin.nerf.trainer import Trainer, train_field
 
 REFINING = replace(CONFIG, refine_cameras=True)
-
-
-@pytest.fixture(autouse=True)
-def on_cpu(monkeypatch):
-    monkeypatch.setenv("TWIN_DEVICE", "cpu")
 
 
 @pytest.fixture
@@ -32,7 +27,7 @@ def test_a_correction_turns_a_camera_about_its_centre_and_shifts_it():
     pose[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
     turn = torch.tensor([[0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.0]], dtype=torch.float64)
     shift = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], dtype=torch.float64)
-    out = corrected(pose, turn, shift).numpy()
+    out = apply_corrections(pose, turn, shift).numpy()
     np.testing.assert_allclose(out[0, :3, 0], [0.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(out[:, :3, 3], [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0]])
 
@@ -56,7 +51,7 @@ def test_gradients_are_those_of_finite_differences(cameras):
         """Of every ray, shape (n,)."""
         metres = (origin[:, None] + ws.distances[..., None] * direction[:, None]).reshape(-1, 3).contiguous()
         points = wp.from_torch(metres, dtype=wp.vec3f)
-        wp.launch(space.contract_points, rows, [points, field.centre, field.inverse_half, 0], [ws.w_positions])
+        wp.launch(space.contract_points, rows, [points, field.center, field.inverse_half, 0], [ws.w_positions])
         field.query(ws, 0, rows)
         return (ws.features[:rows].double() * weights).sum(1).view(ws.rays, -1).sum(1)
 
@@ -97,11 +92,11 @@ def test_frames_that_were_turned_find_back_in_a_field_that_is_right(cameras, mon
         still.setattr(Trainer, "_refines", False)
         while not trainer.done:
             trainer.step()
-    refinement._given = corrected(torch.as_tensor(given), turn, torch.zeros_like(turn))
-    refinement.arrays.set_poses(refinement._given.numpy())
+    refinement._initial = apply_corrections(torch.as_tensor(given), turn, torch.zeros_like(turn))
+    refinement.arrays.set_poses(refinement._initial.numpy())
     wrong = error()
     monkeypatch.setattr(trainer, "_update", lambda *_: None)  # the field stays
-    monkeypatch.setattr(trainer.optimiser, "step", lambda: None)
+    monkeypatch.setattr(trainer.optimizer, "step", lambda: None)
     monkeypatch.setattr(trainer, "rate", lambda: 0.5)
     with single_threaded_torch():
         errors = [trainer.step() for _ in range(150)]
@@ -110,19 +105,19 @@ def test_frames_that_were_turned_find_back_in_a_field_that_is_right(cameras, mon
 
 
 def test_cameras_stay_where_no_refinement_is_asked_for(cameras):
-    _, metrics, same = train_field(cameras, floor_points(cameras), CONFIG, camera_height=1.5)
+    _, metrics, same = train_field(cameras, floor_points(cameras), CONFIG, camera_height=1.5, device="cpu")
     assert metrics["cameras_moved"] is None and same is cameras
-    _, metrics, moved = train_field(cameras, floor_points(cameras), REFINING, camera_height=1.5)
+    _, metrics, moved = train_field(cameras, floor_points(cameras), REFINING, camera_height=1.5, device="cpu")
     assert metrics["cameras_moved"]["most_m"] > 0.0 and moved.names == cameras.names
     assert not np.array_equal(moved.camera_to_world, cameras.camera_to_world)
 
 
 def test_frames_not_trained_on_move_with_their_neighbours(cameras):
     refinement = Trainer(cameras, floor_points(cameras), REFINING, 0, "cpu").refinement
-    assert isinstance(refinement, Refinement)
+    assert isinstance(refinement, PoseRefinement)
     with torch.no_grad():
-        refinement.shift[:, 0] = torch.arange(14.0) / 10.0
-    found, said = refinement.refined(cameras)
+        refinement.translation[:, 0] = torch.arange(14.0) / 10.0
+    found, said = refinement.refined_cameras(cameras)
     shift = (found.camera_to_world - cameras.camera_to_world)[:, 0, 3]
     np.testing.assert_allclose(shift[~cameras.held_out], np.arange(14) / 10.0, atol=1e-6)
     for i in np.flatnonzero(cameras.held_out):
@@ -137,7 +132,7 @@ def test_two_refinements_are_equal_bit_by_bit(cameras):
             while not trainer.done:
                 trainer.step()
         assert trainer.refinement is not None
-        return trainer.refinement.turn.detach(), trainer.field.table
+        return trainer.refinement.rotation.detach(), trainer.field.table
 
     first, second = once(), once()
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True)) and first[0].abs().max() > 0.0

@@ -6,11 +6,11 @@ from textured import SIZE, K, filmed_corridor, picture, pose_at
 
 from twin import runtime
 from twin.capture.localize import MIN_INLIERS, candidate_lenses, register_photo
-from twin.capture.photos import PhotoFacts
+from twin.capture.photos import PhotoExif
 from twin.errors import InputError
 from twin.geometry.poses import rotation_angle
 
-NOTHING = PhotoFacts(None, (np.nan, np.nan, np.nan), None, 1)
+NOTHING = PhotoExif(None, (np.nan, np.nan, np.nan), None, 1)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_another_camera_is_found_with_its_focal_length(scene):
     """A larger picture of another shape and focal length, unknown or roughly told by its header."""
     size, intrinsics, pose = (480, 480), np.array([520.0, 520.0, 240.0, 240.0]), pose_at(2.1, 0.1, -0.3)
     photo = picture(pose, size, intrinsics)
-    for facts, said in ((NOTHING, "estimated"), (PhotoFacts(1.05, NOTHING.gps, None, 1), "EXIF")):
+    for facts, said in ((NOTHING, "estimated"), (PhotoExif(1.05, NOTHING.gps, None, 1), "EXIF")):
         found = register_photo(photo, facts, scene)
         assert found.lens_from == said
         assert found.lens.intrinsics[0] == pytest.approx(520.0, rel=0.03)
@@ -59,7 +59,7 @@ def test_a_photo_of_something_else_is_refused(scene):
 
 
 def test_the_photos_own_header_comes_before_the_scenes_cameras(scene):
-    said = [origin for _, _, origin in candidate_lenses(SIZE, PhotoFacts(0.8, NOTHING.gps, None, 1), scene)]
+    said = [origin for _, _, origin in candidate_lenses(SIZE, PhotoExif(0.8, NOTHING.gps, None, 1), scene)]
     assert said == ["EXIF", "the calibration of 'day'", "the camera of 'day'", "estimated"]
     halved, held, _ = candidate_lenses((160, 120), NOTHING, scene)[0]
     assert held

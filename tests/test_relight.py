@@ -17,11 +17,11 @@ from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.added_lightings import AddedLighting, added_lightings, check_name, field_result
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import Layout
-from twin.nerf.field import RadianceField, untrained
+from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.fog import Fog, mixed
 from twin.nerf.lightings import Lightings
 from twin.relight import fit_photo, main
-from twin.scene import SceneDir, seal
+from twin.scene import SceneDir, write_stamp
 
 
 def small_field(seed: int = 0) -> RadianceField:
@@ -29,7 +29,7 @@ def small_field(seed: int = 0) -> RadianceField:
     frames = tuple(f"day/{i:06d}" for i in range(4))
     appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, seed)
     layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
-    return untrained(layout, appearance, seed, "cpu")
+    return untrained_field(layout, appearance, seed, "cpu")
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def scene(tmp_path_factory) -> SceneDir:
     scene.stage("field").mkdir()
     small_field().save(scene.stage("field"))
     for stage in ("capture", "cameras", "metric", "field"):
-        seal(scene.stage(stage), stage)
+        write_stamp(scene.stage(stage), stage)
     write_image(scene.root / "photo.png", picture(pose_at(2.4, 0.2), tint=(0.9, 0.6, 0.4)))
     return scene
 
@@ -75,13 +75,13 @@ def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
     distance = depth * np.linalg.norm(unproject(pixel_grid(*size), wide), axis=-1)
     noise = rng.normal(0.0, 0.01, seen.rgb[0].shape).astype(np.float32)
     hidden = Fog(0.02, (0.8, 0.7, 0.6))
-    hazy = fit_photo(field, hidden.over(seen.rgb[0], distance.astype(np.float32)) + noise, pose, wide)
-    assert hazy.air.extinction == pytest.approx(0.02, rel=0.05)
-    np.testing.assert_allclose(hazy.air.airlight, hidden.airlight, atol=0.03)
-    assert psnr(hazy.pictures[1], hidden.over(seen.rgb[0], distance.astype(np.float32))) > 40.0
+    hazy = fit_photo(field, hidden.apply(seen.rgb[0], distance.astype(np.float32)) + noise, pose, wide)
+    assert hazy.fog.extinction == pytest.approx(0.02, rel=0.05)
+    np.testing.assert_allclose(hazy.fog.airlight, hidden.airlight, atol=0.03)
+    assert psnr(hazy.images[1], hidden.apply(seen.rgb[0], distance.astype(np.float32))) > 40.0
     assert hazy.psnr_other_half > hazy.psnr_clear_other_half + 0.2
     clear = fit_photo(field, seen.rgb[0] + noise, pose, wide)
-    assert clear.air == Fog() and clear.psnr_other_half == clear.psnr_clear_other_half
+    assert clear.fog == Fog() and clear.psnr_other_half == clear.psnr_clear_other_half
 
 
 def test_a_half_is_judged_by_what_was_fitted_to_the_other():
@@ -93,24 +93,24 @@ def test_a_half_is_judged_by_what_was_fitted_to_the_other():
 
 def test_air_by_closed_forms_and_between_two_lightings():
     rgb, distance = np.full((1, 2, 3), 0.5, np.float32), np.array([[0.0, 1e6]], np.float32)
-    np.testing.assert_array_equal(Fog().over(rgb, distance), rgb)
-    near, far = Fog(0.03, (1.0, 0.0, 0.5)).over(rgb, distance)[0]
+    np.testing.assert_array_equal(Fog().apply(rgb, distance), rgb)
+    near, far = Fog(0.03, (1.0, 0.0, 0.5)).apply(rgb, distance)[0]
     kept = np.exp(-3.0)  # air reaches 100 m
     np.testing.assert_allclose(near, 0.5)
     np.testing.assert_allclose(far, kept * 0.5 + (1 - kept) * np.array([1.0, 0.0, 0.5]), rtol=1e-5)
     names, vectors = ("filmed", "a", "b"), np.eye(3, dtype=np.float32)
     airs = {"a": Fog(0.02, (1.0, 1.0, 1.0)), "b": Fog(0.06, (0.0, 0.0, 0.0))}
     mine = Lightings(names[:1], vectors[:1], ("filmed/0",), vectors[:1])
-    mine = mine.added(dict(zip(names[1:], vectors[1:], strict=True)), airs=airs)
-    assert mine.air("filmed") is None and mine.air("filmed/0") is None and mine.air("any") is None
-    assert mine.air("a") == airs["a"] and mine.filmed().airs == {}
-    assert mine.air("filmed:a:0.5") == Fog(0.01, (1.0, 1.0, 1.0))
-    between = mine.air("a:b:0.25")
+    mine = mine.added(dict(zip(names[1:], vectors[1:], strict=True)), fogs=airs)
+    assert mine.fog("filmed") is None and mine.fog("filmed/0") is None and mine.fog("any") is None
+    assert mine.fog("a") == airs["a"] and mine.filmed().fogs == {}
+    assert mine.fog("filmed:a:0.5") == Fog(0.01, (1.0, 1.0, 1.0))
+    between = mine.fog("a:b:0.25")
     assert between and between.extinction == pytest.approx(0.03) and between.airlight == pytest.approx((0.5,) * 3)
     assert mixed(Fog(), None, 0.5) == Fog() and mixed(None, None, 0.5) is None
     for share in ("x", "3"):
         with pytest.raises(InputError, match="a:b:"):
-            mine.air(f"a:b:{share}")
+            mine.fog(f"a:b:{share}")
 
 
 def _filmed(field, pose, size):
@@ -142,7 +142,7 @@ def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
     assert "old" in added_lightings(scene, 8)[0]
     another = scene.stage("field") / "another"
     another.touch()
-    seal(scene.stage("field"), "field")
+    write_stamp(scene.stage("field"), "field")
     try:
         field = twin.load_scene(scene.root).radiance_field()
         assert "old" not in field.lightings
@@ -153,7 +153,7 @@ def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
                 field.embedding(asked)
     finally:
         another.unlink()
-        seal(scene.stage("field"), "field")
+        write_stamp(scene.stage("field"), "field")
     assert "old" in twin.load_scene(scene.root).radiance_field().lightings
 
 
@@ -215,11 +215,11 @@ def test_the_air_of_a_hazy_photo_is_kept_and_told(scene, monkeypatch, capsys):
     air = Fog(0.03, (0.9, 0.8, 0.7))
 
     def hazy(field, photo, camera_to_world, intrinsics):
-        return replace(fit_photo(field, photo, camera_to_world, intrinsics), air=air, psnr_clear_other_half=12.34)
+        return replace(fit_photo(field, photo, camera_to_world, intrinsics), fog=air, psnr_clear_other_half=12.34)
 
     monkeypatch.setattr("twin.relight.fit_photo", hazy)
     assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "hazy"]) == 0
-    assert "visibility 100 m; in clear air those halves have 12.3 dB" in capsys.readouterr().out
+    assert "visibility 100 m; without fog those halves have 12.3 dB" in capsys.readouterr().out
     assert added_lightings(scene, 8)[2]["hazy"] == air
 
 
@@ -244,5 +244,5 @@ def test_a_share_of_a_mixture_is_from_0_to_1(share):
 
 @pytest.mark.parametrize("name", RESERVED_LIGHTINGS)
 def test_what_means_a_light_drawn_at_random_is_no_name(name):
-    with pytest.raises(InputError, match=rf"--name '{name}': has a meaning of its own"):
+    with pytest.raises(InputError, match=rf"--name '{name}': reserved"):
         check_name(name, ("day",))

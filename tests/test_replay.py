@@ -57,7 +57,7 @@ def check(buffer: FrameReplayBuffer, worlds: NaiveWorlds) -> int:
     for world in range(WORLDS):
         for age in range(filled):  # 0: the newest
             row = np.array([(buffer.pos - 1 - age) % buffer.buffer_size])
-            if not buffer.whole(row, np.array([world]))[0]:
+            if not buffer.is_complete(row, np.array([world]))[0]:
                 continue
             before, after, action, reward, end, state = worlds.seen[world][total - 1 - age]
             stacks = buffer.stacks(row, np.array([world]))
@@ -74,7 +74,7 @@ def check(buffer: FrameReplayBuffer, worlds: NaiveWorlds) -> int:
 @pytest.mark.parametrize("longest", [1, 2, 6, 1000])
 @pytest.mark.parametrize("steps", [3, 40, 41, 137])
 def test_stacks_are_what_went_in(longest, steps):
-    buffer = FrameReplayBuffer(40 * WORLDS, SPACE, ACTION, "cpu", WORLDS, states=STATES)
+    buffer = FrameReplayBuffer(40 * WORLDS, SPACE, ACTION, "cpu", WORLDS, state_size=STATES)
     worlds = NaiveWorlds(longest, longest)
     for _ in range(steps):
         worlds.step(buffer)
@@ -84,7 +84,7 @@ def test_stacks_are_what_went_in(longest, steps):
 
 
 def test_samples_are_transitions_and_each_comes(tmp_path):
-    buffer = FrameReplayBuffer(10 * WORLDS, SPACE, ACTION, "cpu", WORLDS, seed=5, states=STATES)
+    buffer = FrameReplayBuffer(10 * WORLDS, SPACE, ACTION, "cpu", WORLDS, seed=5, state_size=STATES)
     worlds = NaiveWorlds(0, 4)
     for _ in range(33):
         worlds.step(buffer)
@@ -123,7 +123,7 @@ def test_shifted_samples_are_shifted_by_so_much_with_edges_repeated():
 def test_what_was_saved_is_there_after_more_was_written(tmp_path):
     slack = 7 * WORLDS
     settings = (20 * WORLDS, SPACE, ACTION, "cpu", WORLDS)
-    buffer = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack, states=STATES)
+    buffer = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack, state_size=STATES)
     worlds = NaiveWorlds(3, 3)
     for _ in range(50):
         worlds.step(buffer)
@@ -133,7 +133,7 @@ def test_what_was_saved_is_there_after_more_was_written(tmp_path):
     saved = [list(seen) for seen in worlds.seen]
     for _ in range(7):  # as many as the slack allows, and then it is killed
         worlds.step(buffer)
-    again = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack, states=STATES)
+    again = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack, state_size=STATES)
     again.set_state(arrays, rest)
     worlds.seen = saved
     assert check(again, worlds) == count
@@ -153,7 +153,7 @@ def test_pictures_of_another_size_are_refused(tmp_path):
 
 def test_weather_is_laid_over_half_of_what_samples_begin_with_and_over_no_target():
     def drawn(colours: float):
-        buffer = FrameReplayBuffer(60, SPACE, ACTION, "cpu", WORLDS, colours=colours, seed=4)
+        buffer = FrameReplayBuffer(60, SPACE, ACTION, "cpu", WORLDS, color_strength=colours, seed=4)
         worlds = NaiveWorlds(2, 6)
         for _ in range(15):
             worlds.step(buffer)

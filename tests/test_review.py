@@ -9,38 +9,46 @@ import pytest
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
 from twin.files import read_json
-from twin.geometry.cameras import Cameras, Posed, Viewpoints, nearest_frame, pixel_grid, resized, unproject
+from twin.geometry.cameras import (
+    Cameras,
+    PosedCameras,
+    Viewpoints,
+    intrinsics_for_size,
+    nearest_frame,
+    pixel_grid,
+    unproject,
+)
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
-from twin.report.chase_camera import bird_pose
-from twin.report.review_chapters import lighting_along
+from twin.report.chase_camera import overview_pose
+from twin.report.review_chapters import lighting_at
 from twin.report.review_studio import (
-    Prefetched,
+    Prefetcher,
     Studio,
-    error_colours,
+    appearance_of_frame,
+    comparison_row,
+    error_colors,
+    evenly_spaced,
     frames_to_compare,
-    greyed,
-    judged_row,
-    light_of_frame,
+    gray_out,
     scale_bar,
     side_by_side,
-    spread,
 )
 from twin.report.review_video import write_review_video
 from twin.report.video_layout import (
     FrameLayout,
     MapView,
-    depth_colours,
+    depth_colors,
     draw_text,
     fit,
     footprints,
+    map_rotation,
     shorten,
     text_width,
-    turn_of,
     wrap,
 )
-from twin.report.video_writer import describe, read_frames
+from twin.report.video_writer import read_frames, video_info
 from twin.scene import SceneDir
 
 
@@ -55,9 +63,9 @@ class ChequeredField:
     def lightings(self) -> tuple[str, ...]:
         return tuple(self.brightness)
 
-    def render(self, cameras: Posed, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
+    def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
         self.asked.append(lighting)
-        intrinsics, size = resized(cameras, size)
+        intrinsics, size = intrinsics_for_size(cameras, size)
         a, b, share = lighting.split(":") if ":" in lighting else (lighting, lighting, "0")
         dark, bright = (self.brightness[name.split("/")[0]] for name in (a, b))
         level = (1 - float(share)) * dark + float(share) * bright
@@ -121,7 +129,7 @@ def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path
     metrics = write_review_video(scene, config(), out, field)
     assert metrics["follower"] is None
     assert "no route" in metrics["not_applicable"]
-    about = describe(out / "review.mp4")
+    about = video_info(out / "review.mp4")
     assert (about["codec"], about["pixel_format"]) == ("h264", "yuv420p")
     assert about["frames"] == metrics["frames"] == len(list(read_frames(out / "review.mp4")))
     assert metrics["duration_s"] == metrics["frames"] / 5
@@ -170,11 +178,11 @@ def test_frames_to_compare_show_both_kinds_in_order(tmp_path: Path) -> None:
 
 def test_a_held_out_frame_gets_the_light_of_its_neighbours(tmp_path: Path) -> None:
     cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField({"day": 1.0, "night": 0.3}))
-    assert light_of_frame(cameras, 13) == "night/000001"
-    assert light_of_frame(cameras, 14) == "night/000001:night/000003:0.5"
+    assert appearance_of_frame(cameras, 13) == "night/000001"
+    assert appearance_of_frame(cameras, 14) == "night/000001:night/000003:0.5"
     last = cameras.select(np.arange(3))  # its last frame is held out
-    assert light_of_frame(last, 2) == "day/000001"
-    assert light_of_frame(cameras.select(cameras.held_out), 0) == "day"
+    assert appearance_of_frame(last, 2) == "day/000001"
+    assert appearance_of_frame(cameras.select(cameras.held_out), 0) == "day"
 
 
 def test_the_nearest_frame_is_at_the_same_place(tmp_path: Path) -> None:
@@ -185,17 +193,17 @@ def test_the_nearest_frame_is_at_the_same_place(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("count", "expected"), [(0, []), (1, [5]), (2, [0, 9]), (3, [0, 4, 9]), (99, list(range(10)))])
 def test_spread(count: int, expected: list[int]) -> None:
-    assert spread(range(10), count) == expected
+    assert evenly_spaced(range(10), count) == expected
 
 
 def test_every_lighting_has_its_stretch_of_the_drive() -> None:
     lightings = ("day", "dusk", "night")
-    assert lighting_along(lightings, 0.0) == ("day", "day")
-    assert lighting_along(lightings, 0.5) == ("dusk", "dusk")
-    assert lighting_along(lightings, 1.0) == ("night", "night")
-    code, words = lighting_along(lightings, 0.3)
+    assert lighting_at(lightings, 0.0) == ("day", "day")
+    assert lighting_at(lightings, 0.5) == ("dusk", "dusk")
+    assert lighting_at(lightings, 1.0) == ("night", "night")
+    code, words = lighting_at(lightings, 0.3)
     assert code.startswith("day:dusk:0.6") and words == "day → dusk"
-    assert lighting_along(("day",), 0.99) == ("day", "day")
+    assert lighting_at(("day",), 0.99) == ("day", "day")
 
 
 def test_panels_do_not_overlap_and_fit_the_canvas() -> None:
@@ -237,7 +245,7 @@ def test_fit_keeps_proportions() -> None:
 
 
 def test_near_is_brighter_than_far_and_nothing_is_empty() -> None:
-    shades = depth_colours(np.array([[1.0, 5.0, 30.0, FAR]]), np.array([[1.0, 1.0, 1.0, 0.0]]))
+    shades = depth_colors(np.array([[1.0, 5.0, 30.0, FAR]]), np.array([[1.0, 1.0, 1.0, 0.0]]))
     brightness = shades.astype(int).sum(-1)[0]
     assert brightness[0] > brightness[1] > brightness[2]
     assert tuple(shades[0, 3]) == (28, 34, 43)
@@ -249,7 +257,7 @@ def test_the_plan_runs_from_left_to_right() -> None:
     start, end = path[[0, -1]] @ plan.to_pixel[:, :2].T + plan.to_pixel[:, 2]
     assert start[0] < 40 and end[0] > 160
     assert start[1] == pytest.approx(40, abs=1) and end[1] == pytest.approx(40, abs=1)
-    assert np.linalg.det(turn_of(path)) == pytest.approx(1.0)
+    assert np.linalg.det(map_rotation(path)) == pytest.approx(1.0)
     # To the right of a southward path lies west, which is below it in the plan.
     west = plan.to_pixel @ [0.0, -15.0, 1.0]
     assert west[1] > 45
@@ -266,7 +274,7 @@ def test_footprints_are_outlines_and_flat_parts_have_none() -> None:
 def test_a_bird_looks_along_the_route() -> None:
     route = np.stack([np.linspace(0, 40, 50), np.zeros(50), np.zeros(50)], 1)
     for s in (0.0, 20.0, 40.0):
-        pose = bird_pose(route, s)
+        pose = overview_pose(route, s)
         assert pose[0, 2] > 0.5 and pose[2, 2] < 0 and pose[2, 3] > 1.0
 
 
@@ -274,7 +282,7 @@ def test_what_is_masked_is_grey_and_the_rest_untouched() -> None:
     image = np.random.default_rng(0).integers(0, 255, (40, 60, 3)).astype(np.uint8)
     ignored = np.zeros((40, 60), bool)
     ignored[:, :20] = True
-    out = greyed(image, ignored)
+    out = gray_out(image, ignored)
     assert (out[:, 20:] == image[:, 20:]).all()
     assert (out[:, :20] == out[:, :20, :1]).all()
 
@@ -285,14 +293,14 @@ def test_a_row_of_pictures_has_one_height() -> None:
 
 
 def test_work_ahead_keeps_order_and_hands_on_errors() -> None:
-    with Prefetched(iter(range(20)), depth=3) as items:
+    with Prefetcher(iter(range(20)), depth=3) as items:
         assert list(items) == list(range(20))
 
     def fails() -> Iterator[int]:
         yield 1
         raise ValueError("broken")
 
-    with Prefetched(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
+    with Prefetcher(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
         list(items)
 
 
@@ -304,7 +312,7 @@ def test_work_ahead_stops_when_nobody_reads() -> None:
             made.append(len(made))
             yield made[-1]
 
-    with Prefetched(endless(), depth=2) as items:
+    with Prefetcher(endless(), depth=2) as items:
         assert next(iter(items)) == 0
     count = len(made)
     assert count <= 5
@@ -326,14 +334,14 @@ def test_a_judged_row_shows_the_lighting_as_learnt_and_scores_what_is_not_masked
     layout = FrameLayout.for_pictures(160, 9 / 16)
     studio = Studio("x", field, cameras, layout, None, tmp_path, 48, cameras.positions[:, :2])  # type: ignore[arg-type]
     field.asked.clear()
-    row, score = judged_row(studio, 14)
+    row, score = comparison_row(studio, 14)
     assert field.asked == ["night"]
     assert score > 50.0  # only the rounding to bytes is wrong
     wrong = row[30 : 30 + 180, -6 - 320 : -6]
-    dark = error_colours(np.zeros((1, 1)))[0, 0]
+    dark = error_colors(np.zeros((1, 1)))[0, 0]
     assert (np.abs(wrong[5:-5, 165:-5].astype(int) - dark).max(-1) < 5).all()
     assert (wrong[5:-5, :145] == [150, 160, 174]).all() == masked
-    assert (error_colours(np.array([[0.1, 0.3, 0.9]])).astype(int).sum(-1)[0] > int(dark.sum())).all()
+    assert (error_colors(np.array([[0.1, 0.3, 0.9]])).astype(int).sum(-1)[0] > int(dark.sum())).all()
 
 
 def test_labels_of_a_scale_do_not_overlap() -> None:

@@ -10,14 +10,14 @@ from analytic import drive, right_turn, street
 from twin.errors import InputError
 from twin.geometry.route import (
     SPACING,
+    check_no_jumps,
     distance_to_route,
     filmed_route,
     path_inliers,
     path_jumps,
-    refuse_jumps,
+    remove_stationary,
     route_length,
     smooth_route,
-    without_rocking,
 )
 
 
@@ -61,7 +61,7 @@ def test_standing_and_rocking_leave_no_trace():
 def test_a_round_trip_keeps_its_return():
     angle = np.linspace(0, 2 * np.pi, 60)
     circle = 5 * np.stack([np.cos(angle), np.sin(angle)], -1)
-    assert len(without_rocking(circle)) > 50
+    assert len(remove_stationary(circle)) > 50
     assert route_length(smooth_route(_lifted(circle))) == pytest.approx(10 * np.pi, rel=0.02)
 
 
@@ -109,13 +109,13 @@ def test_two_passes_in_one_film_are_refused_by_the_names_of_their_frames(tmp_pat
     rng = np.random.default_rng(0)
     twice = np.concatenate([_bend(), _bend(count=60) + shift]) + 0.03 * rng.standard_normal((130, 2))
     cameras = _filmed(tmp_path, twice)
-    for check in (refuse_jumps, filmed_route):
+    for check in (check_no_jumps, filmed_route):
         with pytest.raises(InputError, match=r"film/000069 to film/000070.*keep = \[\[") as error:
             check(cameras)
     assert "keep = [[0, 34.5]]" in str(error.value) or "keep = [[35, 64.5]]" in str(error.value)
     assert list(path_jumps(cameras.positions, cameras.times)) == [69]
     for one_pass in (cameras.select(cameras.times <= 34.5), cameras.select(cameras.times >= 35.0)):
-        refuse_jumps(one_pass)
+        check_no_jumps(one_pass)
         assert 40.0 < route_length(filmed_route(one_pass)) < 55.0
 
 
@@ -139,13 +139,13 @@ def _driven(speeds: list[float]) -> np.ndarray:
     ],
 )
 def test_turns_stops_and_changes_of_speed_are_no_jumps(tmp_path: Path, xy):
-    refuse_jumps(_filmed(tmp_path, xy))
+    check_no_jumps(_filmed(tmp_path, xy))
 
 
 def test_lost_frames_are_no_jump_unless_the_gap_in_time_is_too_short(tmp_path: Path):
     steps = [0.6] * 40 + [9.0] + [0.6] * 40
     times = 0.5 * np.arange(82)
     with pytest.raises(InputError, match=r"jumps 9\.0 m"):
-        refuse_jumps(_filmed(tmp_path, _driven(steps), times))
+        check_no_jumps(_filmed(tmp_path, _driven(steps), times))
     times[41:] += 7.0  # 14 frames between them
-    refuse_jumps(_filmed(tmp_path, _driven(steps), times))
+    check_no_jumps(_filmed(tmp_path, _driven(steps), times))

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from twin.errors import InputError
 from twin.learn.checkpoint import load_state, save_state
 from twin.learn.policy import load_policy, save_policy
-from twin.learn.policy_network import Architecture, normalized, prepared
+from twin.learn.policy_network import Architecture, normalize_colors, preprocess
 from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.train_config import TrainConfig
@@ -49,7 +49,7 @@ class SpotEnv(gymnasium.Env):
         picture = np.zeros((6, 9, 16), np.uint8)
         picture[:, :, self.where : self.where + 2] = 255
         self.raw = picture
-        return normalized(picture)
+        return normalize_colors(picture)
 
 
 def spot_model(folder: Path | None = None, seed: int = 0, privileged: bool = False) -> PixelSAC:
@@ -68,15 +68,15 @@ def spot_model(folder: Path | None = None, seed: int = 0, privileged: bool = Fal
         gradient_steps=1,
         ent_coef="auto_0.1",
         replay_buffer_class=FrameReplayBuffer,
-        replay_buffer_kwargs={"file": file, "slack": 500, "seed": seed, "states": states},
-        states=(1.0,) * states,
+        replay_buffer_kwargs={"file": file, "slack": 500, "seed": seed, "state_size": states},
+        state_scales=(1.0,) * states,
         policy_kwargs={
             "features_extractor_class": Encoder,
             "features_extractor_kwargs": {"architecture": TINY},
             "net_arch": [32, 32],
             "share_features_extractor": True,
             "normalize_images": False,
-            "states": states,
+            "state_size": states,
         },
         seed=seed,
         device="cpu",
@@ -97,9 +97,9 @@ def test_it_learns_to_point_and_its_file_does_the_same(tmp_path, privileged):
     for _ in range(50):
         small = env._look()
         large = env.raw.repeat(2, 1).repeat(2, 2)
-        np.testing.assert_array_equal(prepared(large, 2), small)
+        np.testing.assert_array_equal(preprocess(large, 2), small)
         action = policy(large)
-        steady = model.steady(torch.as_tensor(small[None]), deterministic=True)[0]
+        steady = model.averaged_actor(torch.as_tensor(small[None]), deterministic=True)[0]
         np.testing.assert_allclose(action, steady.detach().numpy(), atol=1e-5)
         errors.append(abs(action[0] - (env.where / 7.0 - 1.0)))
         untrained.append(abs(env.where / 7.0 - 1.0))
@@ -117,7 +117,7 @@ def test_critics_are_told_the_state_and_the_encoder_learns_to_tell_it():
         out = []
         for _ in range(60):
             features = model.actor.features_extractor(torch.as_tensor(env._look()[None]))
-            out.append(model.teller(features).item() - env.state[0])
+            out.append(model.state_head(features).item() - env.state[0])
         return float(np.sqrt(np.mean(np.square(out))))
 
     before = error()
@@ -186,7 +186,7 @@ def test_a_saved_training_goes_on_as_if_never_stopped(tmp_path, privileged):
     assert torch.equal(at_saving, after_loading)
     for (name, a), b in zip(model.policy.state_dict().items(), again.policy.state_dict().values(), strict=True):
         assert torch.equal(a, b), name
-    for a, b in zip(model.teller.parameters(), again.teller.parameters(), strict=True):
+    for a, b in zip(model.state_head.parameters(), again.state_head.parameters(), strict=True):
         assert torch.equal(a, b)
     assert torch.equal(model.log_ent_coef, again.log_ent_coef)
 

@@ -16,8 +16,8 @@ from twin import runtime
 from twin.align import main
 from twin.assets.ground import Ground
 from twin.capture.camera_models import Lens
-from twin.capture.localize import _shared_focal, _Sight, register_film
-from twin.config_file import overruled, read_robot
+from twin.capture.localize import _LocalizedFrame, _shared_focal, register_film
+from twin.config_file import merge_robot, read_robot
 from twin.errors import InputError
 from twin.geometry.images import read_image
 from twin.geometry.poses import rotation_angle
@@ -26,13 +26,13 @@ from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
 from twin.robot import BASE_HEIGHT, HuskyParams
-from twin.scene import seal
+from twin.scene import write_stamp
 from twin.sysid.camera_extrinsics import (
     CameraExtrinsics,
-    align_camera,
+    base_heading,
+    calibrate_camera,
+    camera_pose_on_ground,
     estimate_extrinsics,
-    heading_of,
-    with_extrinsics,
 )
 from twin.sysid.identification import toml_text
 
@@ -106,7 +106,7 @@ def test_a_seated_camera_is_where_the_model_has_it(tmp_path):
         below = origin - BASE_HEIGHT * normal
         return below[2] - (xy - below[:2]) @ normal[:2] / normal[2]
 
-    pose = with_extrinsics(world.robot, camera.xpos[:2], heading, ground_at)
+    pose = camera_pose_on_ground(world.robot, camera.xpos[:2], heading, ground_at)
     np.testing.assert_allclose(pose[:3, 3], camera.xpos, atol=1e-4)
     np.testing.assert_allclose(pose[:3, :3] * [1, -1, -1], camera.xmat.reshape(3, 3), atol=1e-3)
 
@@ -179,7 +179,7 @@ def scene(tmp_path_factory):
     Ground(flat, np.array([-4.0, -4.0]), 0.1, flat == 0.0, np.zeros((*flat.shape, 3), np.uint8)).save(mesh)
     scene.stage("field").mkdir()
     for stage in ("capture", "cameras", "metric", "field", "mesh"):
-        seal(scene.stage(stage), stage)
+        write_stamp(scene.stage(stage), stage)
     return scene
 
 
@@ -238,7 +238,7 @@ def film(filmed, tmp_path_factory):
 
 def test_a_camera_is_aligned_by_its_film(scene, film):
     known = HuskyParams(camera_intrinsics=tuple(K), camera_size=(320, 240), camera_offset=LOW.camera_offset)
-    aligned, frames = align_camera(film, scene, known)
+    aligned, frames = calibrate_camera(film, scene, known)
     assert len(frames) == aligned.frames >= 26
     assert "camera_intrinsics" not in aligned.identified  # as it was given
     for name, limit in {"height": 0.02, "yaw": 0.4, "pitch": 0.3, "roll": 0.3}.items():
@@ -305,7 +305,7 @@ def test_a_lens_by_hand_is_believed(place, film, found_once, capsys):
     robot.write_text("camera_intrinsics = [400.0, 400.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
     by_hand(place, "camera_pitch = 5.0\ncamera_intrinsics = [520.0, 520.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
     assert main([str(place.root), str(film)]) == 0
-    assert "overrules what was fitted: camera_pitch;" in capsys.readouterr().out
+    assert "overrides fitted values: camera_pitch;" in capsys.readouterr().out
     assert not {"camera_intrinsics", "camera_size"} & set(read_robot(robot))
 
 
@@ -319,7 +319,7 @@ def test_what_cannot_be_used_is_refused_in_a_line(place, film, registered, tmp_p
     for other in ("husky", str(place.root / "robot.toml")):
         assert "give the scene's folder" in refused(other, str(film))
     for more in (("--level",), ("--out", str(tmp_path))):
-        assert "--out and --level belong to a log" in refused(root, str(film), *more)
+        assert "--out and --level are for logs" in refused(root, str(film), *more)
     bare = tmp_path / "bare"
     bare.mkdir()
     (bare / "scene.toml").write_text(place.config_file.read_text())
@@ -341,9 +341,9 @@ def test_what_cannot_be_used_is_refused_in_a_line(place, film, registered, tmp_p
 def test_a_size_without_its_intrinsics_is_refused():
     fitted = {"camera_intrinsics": [512.0, 512.0, 320.0, 180.0], "camera_size": [640, 360], "friction": 0.6}
     with pytest.raises(InputError, match=r"camera_size = \[1280, 720\], but robot\.toml has the camera_intrinsics"):
-        overruled(fitted, {"camera_size": [1280, 720]}, "scene.toml")
+        merge_robot(fitted, {"camera_size": [1280, 720]}, "scene.toml")
     own = {"camera_intrinsics": [1000.0, 1000.0, 640.0, 360.0]}
-    assert overruled(fitted, own, "scene.toml") == {"friction": 0.6, **own}
+    assert merge_robot(fitted, own, "scene.toml") == {"friction": 0.6, **own}
 
 
 def test_a_name_that_toml_does_not_take_is_made_one(tmp_path):
@@ -352,13 +352,13 @@ def test_a_name_that_toml_does_not_take_is_made_one(tmp_path):
     assert read_robot(path) == {"friction": 0.5}
 
 
-def sights(nearest: float, farthest: float) -> list[_Sight]:
+def sights(nearest: float, farthest: float) -> list[_LocalizedFrame]:
     """Frames of points at such distances [m], seen with a focal length of 260 px."""
     rng, out = np.random.default_rng(0), []
     for _ in range(12):
         place = np.column_stack([rng.uniform(-3, 3, (80, 2)), rng.uniform(nearest, farthest, 80)])
         image = 260.0 * place[:, :2] / place[:, 2:] + [160.0, 120.0] + rng.normal(0.0, 0.3, (80, 2))
-        out.append(_Sight(image, place, pycolmap.Rigid3d(), 260.0))
+        out.append(_LocalizedFrame(image, place, pycolmap.Rigid3d(), 260.0))
     return out
 
 
@@ -380,13 +380,13 @@ def test_a_wall_in_front_does_not_tell_the_focal_length():
 def test_a_seat_that_stays_unknown_is_refused(scene, film, found_once, monkeypatch):
     vague = CameraExtrinsics(0.001, 0.5, 0.1, 0.1)
     monkeypatch.setattr(
-        "twin.sysid.camera_extrinsics.find_seat", lambda *_: (CameraExtrinsics(1.0, 0.0, 5.0, 0.0), vague)
+        "twin.sysid.camera_extrinsics.estimate_extrinsics", lambda *_: (CameraExtrinsics(1.0, 0.0, 5.0, 0.0), vague)
     )
     known = HuskyParams(camera_intrinsics=tuple(K), camera_size=(320, 240))
     with pytest.raises(InputError, match=r"uncertain by 0\.50, 0\.10, 0\.10° .* film a longer drive"):
-        align_camera(film, scene, known)
+        calibrate_camera(film, scene, known)
 
 
 def test_heading_is_the_way_the_base_looks():
     poses = drive(ASKEW, weave=0.0, count=3)
-    np.testing.assert_allclose(heading_of(poses, np.deg2rad(1.4)), 0.0, atol=2e-3)
+    np.testing.assert_allclose(base_heading(poses, np.deg2rad(1.4)), 0.0, atol=2e-3)

@@ -8,13 +8,20 @@ import pytest
 from tiny_world import tiny_world
 
 from twin.assets.ground import Ground
-from twin.geometry.cameras import Cameras, pixel_grid, resized, unproject
+from twin.geometry.cameras import Cameras, intrinsics_for_size, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import point_at
 from twin.nerf.rendering import FAR, Rendering
 from twin.report.build_report import page
-from twin.report.visual_vs_collision import Looks, along_the_drive, compare, look, seen_row, seen_section
+from twin.report.visual_vs_collision import (
+    GeometryViews,
+    compare_geometry,
+    gap_row,
+    geometry_section,
+    render_views,
+    view_poses,
+)
 from twin.scene import SceneDir
 
 STATIONS = (0.0, 1.0, 2.0)
@@ -30,7 +37,7 @@ class SolidField:
         mujoco.mj_forward(model, self.data)
 
     def render(self, cameras, lighting, size):
-        intrinsics, size = resized(cameras, size)
+        intrinsics, size = intrinsics_for_size(cameras, size)
         rays = unproject(pixel_grid(*size), intrinsics[0])
         pose = cameras.camera_to_world[0]
         lengths = np.linalg.norm(rays, axis=-1)
@@ -50,7 +57,7 @@ def place(tmp_path_factory):
     mesh = SceneDir(root).stage("mesh")
     eyes = np.array([point_at(world.route, s) + np.array([0.0, 0.013, 0.6]) for s in STATIONS])
     poses = np.array([look_at(eye, eye + np.array([1.0, 0.007, -0.1])) for eye in eyes])
-    looks = look(SolidField(world.model()), world, poses, "day")
+    looks = render_views(SolidField(world.model()), world, poses, "day")
     above = [look_at(np.array([3.0 + x, 0.0, 12.0]), np.array([3.01, 0.0, 0.0])) for x in (0.0, 1.0)]
     cameras = replace(
         Cameras.load(SceneDir(root).stage("metric")).select(np.array([1, 1])),
@@ -63,7 +70,7 @@ def place(tmp_path_factory):
 
 def test_what_shows_the_solid_scene_has_no_gap(place):
     world, looks, cameras, ground, parts = place
-    found = compare(looks, world, cameras, ground, parts)
+    found = compare_geometry(looks, world, cameras, ground, parts)
     assert found["pixels"] > 5000 and found["views"] == 3
     assert found["median_m"] < 1e-3 and found["p90_m"] < 5e-3
     assert found["ground_p95_m"] < 0.01 and found["standing_median_m"] < 1e-3
@@ -73,14 +80,14 @@ def test_what_shows_the_solid_scene_has_no_gap(place):
 
 def test_what_is_seen_above_the_corridor_is_a_leak(place):
     world, looks, cameras, ground, parts = place
-    points = looks.points(looks.solid, world.intrinsics)
+    points = looks.points(looks.collision_depth, world.intrinsics)
     s_near = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
     assert s_near.sum() > 30
     # The ground there is seen as if it were 0.35 m higher, along the same rays.
     eye = looks.camera_to_world[:, None, None, 2, 3]
     share = (eye - points[..., 2] - 0.35) / (eye - points[..., 2])
-    raised = replace(looks, seen=np.where(s_near, looks.seen * share, looks.seen))
-    found = compare(raised, world, cameras, ground, parts)
+    raised = replace(looks, visual_depth=np.where(s_near, looks.visual_depth * share, looks.visual_depth))
+    found = compare_geometry(raised, world, cameras, ground, parts)
     assert found["corridor_leak_m"] == pytest.approx(0.35, abs=0.1)
     assert found["corridor_ghost_m"] < 0.02
     assert max(found["along"]["leak_m"][:3]) > 0.3 and max(found["along"]["leak_m"][4:]) < 0.05
@@ -88,17 +95,17 @@ def test_what_is_seen_above_the_corridor_is_a_leak(place):
 
 def test_what_is_solid_but_seen_through_is_a_ghost_and_unfilmed_ones_are_told_apart(place):
     world, looks, cameras, ground, parts = place
-    points = looks.points(looks.solid, world.intrinsics)
+    points = looks.points(looks.collision_depth, world.intrinsics)
     hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
     eye = looks.camera_to_world[:, None, None, 2, 3]
     share = (eye - points[..., 2] + 0.28) / (eye - points[..., 2])
-    sunk = replace(looks, seen=np.where(hole, looks.seen * share, looks.seen))
-    found = compare(sunk, world, cameras, ground, parts)
+    sunk = replace(looks, visual_depth=np.where(hole, looks.visual_depth * share, looks.visual_depth))
+    found = compare_geometry(sunk, world, cameras, ground, parts)
     assert found["corridor_ghost_m"] == pytest.approx(0.28, abs=0.06)
     assert found["corridor_leak_m"] < 0.02 and found["unfilmed_ghost_m"] < 0.02
     elsewhere = cameras.camera_to_world.copy()
     elsewhere[:, 0, 3] += 100.0
-    unfilmed = compare(sunk, world, replace(cameras, camera_to_world=elsewhere), ground, parts)
+    unfilmed = compare_geometry(sunk, world, replace(cameras, camera_to_world=elsewhere), ground, parts)
     assert unfilmed["corridor_ghost_m"] == 0.0 and unfilmed["unfilmed_ghost_m"] == pytest.approx(0.28, abs=0.06)
 
 
@@ -106,11 +113,11 @@ def test_what_is_solid_but_seen_through_is_a_ghost_and_unfilmed_ones_are_told_ap
 def sunk(place):
     """Looks through a hole of 0.28 m in the ground before the robot."""
     world, looks, *_ = place
-    points = looks.points(looks.solid, world.intrinsics)
+    points = looks.points(looks.collision_depth, world.intrinsics)
     hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
     eye = looks.camera_to_world[:, None, None, 2, 3]
     share = (eye - points[..., 2] + 0.28) / (eye - points[..., 2])
-    return replace(looks, seen=np.where(hole, looks.seen * share, looks.seen))
+    return replace(looks, visual_depth=np.where(hole, looks.visual_depth * share, looks.visual_depth))
 
 
 @pytest.mark.parametrize(
@@ -138,45 +145,49 @@ def test_only_two_directions_of_one_film_determine_a_depth(place, sunk, what, tw
         "a frame per film": replace(cameras, sources=films),
         "three frames, two of them from one place": cameras.select(np.array([0, 0, 1])),
     }[what]
-    found = compare(sunk, world, given, ground, parts)
+    found = compare_geometry(sunk, world, given, ground, parts)
     # A ghost is in one of the two figures, so one of the two cautions is always given.
     ghost, other = ("corridor_ghost_m", "unfilmed_ghost_m")[:: 1 if two_directions else -1]
     assert found[ghost] == pytest.approx(0.28, abs=0.06) and found[other] < 0.02
-    cautions = [caution.what for caution in seen_section({"seen_touched": found}).cautions]
+    cautions = [caution.what for caution in geometry_section({"seen_touched": found}).cautions]
     assert len(cautions) == 1 and ("from build to build" in cautions[0]) != two_directions
 
 
 def test_a_part_that_is_not_seen_is_a_ghost_and_one_that_is_not_solid_a_leak(place):
     world, looks, cameras, ground, parts = place
-    part = ~looks.is_ground & (looks.solid < 8.0)
+    part = ~looks.is_ground & (looks.collision_depth < 8.0)
     assert part.sum() > 50
-    unseen = compare(replace(looks, seen=np.where(part, FAR, looks.seen)), world, cameras, ground, parts)
+    unseen = compare_geometry(
+        replace(looks, visual_depth=np.where(part, FAR, looks.visual_depth)), world, cameras, ground, parts
+    )
     assert unseen["ghost_share"] > 0.5 and unseen["leak_share"] in (None, 0.0)
     none = Parts([], [])
-    leaky = compare(replace(looks, solid=np.where(part, FAR, looks.solid)), world, cameras, ground, none)
+    leaky = compare_geometry(
+        replace(looks, collision_depth=np.where(part, FAR, looks.collision_depth)), world, cameras, ground, none
+    )
     assert leaky["leak_share"] is None or leaky["leak_share"] > 0.3
-    far_off = replace(looks, seen=np.where(part, looks.seen - 0.6, looks.seen))
-    assert compare(far_off, world, cameras, ground, parts)["leak_share"] > 0.5
+    far_off = replace(looks, visual_depth=np.where(part, looks.visual_depth - 0.6, looks.visual_depth))
+    assert compare_geometry(far_off, world, cameras, ground, parts)["leak_share"] > 0.5
 
 
 def test_a_drive_is_looked_at_every_two_metres():
     poses = np.tile(np.eye(4), (101, 1, 1))
     poses[:, 0, 3] = np.linspace(0.0, 10.0, 101)
-    assert along_the_drive(poses)[:, 0, 3] == pytest.approx([0.0, 2.0, 4.0, 6.0, 8.0])
+    assert view_poses(poses)[:, 0, 3] == pytest.approx([0.0, 2.0, 4.0, 6.0, 8.0])
 
 
 def test_the_page_tells_it(place, tmp_path):
     world, looks, cameras, ground, parts = place
-    found = compare(looks, world, cameras, ground, parts)
+    found = compare_geometry(looks, world, cameras, ground, parts)
     report = {"scene": "tiny", "seen_touched": found, "review": {"follower": None}}
-    section = seen_section(report)
-    assert not section.cautions and any(fact.name == "largest ghost in the corridor" for fact in section.facts)
+    section = geometry_section(report)
+    assert not section.cautions and any(fact.name == "largest collision-only in the corridor" for fact in section.facts)
     told = page(SceneDir(tmp_path), report)
-    assert "Seen and touched" in told and "Seen but not solid" in told
-    large = seen_section({"seen_touched": found | {"corridor_leak_m": 0.4, "unfilmed_ghost_m": 0.9}})
+    assert "Visual and collision geometry" in told and "Difference of visual and collision" in told
+    large = geometry_section({"seen_touched": found | {"corridor_leak_m": 0.4, "unfilmed_ghost_m": 0.9}})
     assert large.cautions[0].what.startswith("Something in the corridor") and len(large.cautions) == 2
-    just_over = seen_section({"seen_touched": found | {"median_m": 0.0521}}).cautions
-    assert [it.what for it in just_over] == ["What is seen and what is solid differ: 0.052 m, more than 0.05 m."]
-    assert seen_section({}).not_applicable
-    assert seen_row(looks, 0).shape[1] > 4 * 300
-    assert isinstance(looks, Looks)
+    just_over = geometry_section({"seen_touched": found | {"median_m": 0.0521}}).cautions
+    assert [it.what for it in just_over] == ["Visual and collision geometry differ: 0.052 m, more than 0.05 m."]
+    assert geometry_section({}).not_applicable
+    assert gap_row(looks, 0).shape[1] > 4 * 300
+    assert isinstance(looks, GeometryViews)

@@ -24,10 +24,10 @@ def test_slope_is_found_from_accelerations():
     down = (truth[0] + 1j * truth[1]) * np.exp(-1j * (start[1:, None] + yaw))
     acceleration = -np.stack([down.real, down.imag], -1) + [0.4, -0.2]
     windows = replace(windows, follows=np.arange(n) > 0)
-    found = rollout.gravity(replace(windows, acceleration=acceleration), kinematics.NOMINAL)
+    found = rollout.slope_gravity(replace(windows, acceleration=acceleration), kinematics.NOMINAL)
     expected = (truth[0] + 1j * truth[1]) * np.exp(-1j * start[:-1])  # as it stood where the window before began
     assert found[:, 0] + 1j * found[:, 1] == pytest.approx(expected, abs=0.1)
-    assert not rollout.gravity(windows, kinematics.NOMINAL).any()
+    assert not rollout.slope_gravity(windows, kinematics.NOMINAL).any()
 
 
 CHAINS = np.array([False, True, True, True, False, False, True, True])
@@ -38,8 +38,8 @@ def test_one_slope_seen_from_four_headings_is_one_slope():
     turn = np.array([0.3, -0.7, 1.1, 0.2])
     heading = np.concatenate([[0.0], np.cumsum(turn)[:-1]])
     vector = 0.8 * np.exp(1j * (0.4 - heading))
-    lasting = rollout.Slopes(1.0, 1e9, 0.5)
-    found, _ = rollout.smoothed(lasting, vector, turn, CHAINS[:4])
+    lasting = rollout.SlopeModel(1.0, 1e9, 0.5)
+    found, _ = rollout.smooth_slopes(lasting, vector, turn, CHAINS[:4])
     assert found == pytest.approx(vector * 1.0 / (1.0 + 0.25 / 4))  # four readings of variance 0.25 against 1
 
 
@@ -48,8 +48,8 @@ def test_slopes_are_the_gaussian_posterior():
     rng = np.random.default_rng(0)
     readings = rng.normal(size=8) + 1j * rng.normal(size=8)
     turn = rng.uniform(-2, 2, 8)
-    terrain = rollout.Slopes(0.7, 3.0, 0.4)
-    found, cost = rollout.smoothed(terrain, readings, turn, CHAINS)
+    terrain = rollout.SlopeModel(0.7, 3.0, 0.4)
+    found, cost = rollout.smooth_slopes(terrain, readings, turn, CHAINS)
     chain = np.cumsum(~CHAINS)
     heading = np.array([turn[np.flatnonzero(chain[:i] == chain[i])].sum() for i in range(8)])
     apart = np.abs(np.arange(8)[:, None] - np.arange(8))
@@ -61,7 +61,7 @@ def test_slopes_are_the_gaussian_posterior():
     assert cost == pytest.approx(-normal.logpdf(world.real) - normal.logpdf(world.imag))
 
 
-@pytest.mark.parametrize("truth", [rollout.Slopes(0.3, 12.0, 0.2), rollout.Slopes(0.2, 6.0, 0.5)])
+@pytest.mark.parametrize("truth", [rollout.SlopeModel(0.3, 12.0, 0.2), rollout.SlopeModel(0.2, 6.0, 0.5)])
 def test_how_rough_ground_and_imu_are_is_found(truth):
     rng = np.random.default_rng(1)
     n, keep = 600, np.exp(-1 / truth.windows)
@@ -71,17 +71,17 @@ def test_how_rough_ground_and_imu_are_is_found(truth):
         new = truth.steepness * (rng.normal() + 1j * rng.normal())
         slopes[i] = keep * slopes[i - 1] * np.exp(-1j * turn[i - 1]) + np.sqrt(1 - keep**2) * new if follows[i] else new
     readings = slopes + truth.noise * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    found = rollout.terrain(readings, turn, follows)
+    found = rollout.fit_slope_model(readings, turn, follows)
     assert found.steepness == pytest.approx(truth.steepness, rel=0.3)
     assert found.noise == pytest.approx(truth.noise, rel=0.1)
     assert found.windows == pytest.approx(truth.windows, rel=0.5)
-    told, _ = rollout.smoothed(found, readings, turn, follows)
+    told, _ = rollout.smooth_slopes(found, readings, turn, follows)
     assert np.abs(told - slopes).mean() < 0.7 * np.abs(readings - slopes).mean()
 
 
 def test_before_a_window_is_the_one_it_follows():
     wheels = np.arange(3 * logs.SAMPLES * 2, dtype=float).reshape(3, logs.SAMPLES, 2)
-    before = replace(windows_of(wheels), follows=np.array([False, True, False])).before
+    before = replace(windows_of(wheels), follows=np.array([False, True, False])).preceding_wheels
     np.testing.assert_array_equal(before[1], np.concatenate([wheels[0], wheels[1, :1]]))
     for i in (0, 2):
         np.testing.assert_array_equal(before[i], np.repeat(wheels[i, :1], logs.SAMPLES + 1, 0))
@@ -93,10 +93,10 @@ def test_a_reading_that_cannot_be_ground_spoils_no_other():
     windows = replace(windows_of(np.full((n, logs.SAMPLES, 2), [2.0, 3.0])), follows=np.arange(n) > 0)
     acceleration = rng.normal(0, 0.3, (n, logs.SAMPLES, 2))
     acceleration += rng.normal(0, 0.3, (n, 1, 2))
-    plain = rollout.gravity(replace(windows, acceleration=acceleration), kinematics.NOMINAL)
+    plain = rollout.slope_gravity(replace(windows, acceleration=acceleration), kinematics.NOMINAL)
     acceleration[30] = 500.0
-    struck = rollout.gravity(replace(windows, acceleration=acceleration), kinematics.NOMINAL)
-    assert np.hypot(*struck.T).max() < rollout.STEEPEST * rollout.GRAVITY
+    struck = rollout.slope_gravity(replace(windows, acceleration=acceleration), kinematics.NOMINAL)
+    assert np.hypot(*struck.T).max() < rollout.MAX_SLOPE * rollout.GRAVITY
     assert np.abs(struck - plain)[np.abs(np.arange(n) - 30) > 10].max() < 0.15
 
 
@@ -106,10 +106,12 @@ def test_readings_without_noise_are_taken(value):
     n = 400
     wheels = np.full((n, logs.SAMPLES, 2), 3.0)
     windows = replace(windows_of(wheels), follows=np.arange(n) > 0, acceleration=np.full_like(wheels, value))
-    assert not rollout.gravity(windows, kinematics.NOMINAL).any()
+    assert not rollout.slope_gravity(windows, kinematics.NOMINAL).any()
     turn, readings = np.full(n, 0.3), 0.7 * np.exp(-0.3j * np.arange(n))
     for exact in (readings, 0 * readings):
-        found, _ = rollout.smoothed(rollout.terrain(exact, turn, windows.follows), exact, turn, windows.follows)
+        found, _ = rollout.smooth_slopes(
+            rollout.fit_slope_model(exact, turn, windows.follows), exact, turn, windows.follows
+        )
         assert found == pytest.approx(exact, abs=0.02)
 
 
@@ -120,9 +122,9 @@ def test_wheels_do_what_they_did_before_the_window():
     before = np.stack([np.linspace(6.0, -2.0, count), 1.0 + np.sin(np.arange(count) / 4)], -1)[None]
     told = np.full((1, 225, 2), 2.0)
     model = rollout.plane_model(params)
-    lead = rollout._led(before, round(logs.PERIOD / model.opt.timestep), params.servo_lag)
+    lead = rollout._lag_compensated(before, round(logs.PERIOD / model.opt.timestep), params.servo_lag)
     data = mujoco.MjData(model)
-    states, joints = rollout._starts(model, params, before[:, 0])
+    states, joints = rollout._initial_states(model, params, before[:, 0])
     mujoco.mj_setState(model, data, states[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
     done = []
     for row in lead[0]:
@@ -131,12 +133,12 @@ def test_wheels_do_what_they_did_before_the_window():
         done.append(data.qvel[joints[[0, 1]]].copy())
     assert np.abs(np.array(done)[24::25] - before[0, 1:]).max() < 0.05
     level = np.zeros((1, 2))
-    out = rollout.drive(params, told, before, level)
+    out = rollout.simulate_windows(params, told, before, level)
     assert out.wheels[0, 0] == pytest.approx(before[0, -1], abs=0.05)
     assert out.wheels[0, -1] == pytest.approx([2.0, 2.0], abs=0.05)
     # The body moves as it had come to, in the samples before time starts as well.
-    held = rollout.drive(params, told, np.repeat(before[:, -1:], count, 1), level)
-    early = [np.diff(o.poses[0, : rollout.BEFORE + 1, 2]) / logs.PERIOD for o in (out, held)]
+    held = rollout.simulate_windows(params, told, np.repeat(before[:, -1:], count, 1), level)
+    early = [np.diff(o.poses[0, : rollout.LEAD_SAMPLES + 1, 2]) / logs.PERIOD for o in (out, held)]
     assert np.abs(early[0] - early[1]).max() > 0.05
 
 
@@ -150,16 +152,16 @@ def test_the_fit_begins_each_window_as_the_log_does(monkeypatch):
 
     def noted(params, told, before, slope, timestep=None):
         seen.append(before)
-        k = logs.SAMPLES + drivetrain.AHEAD
-        shapes = (rollout.BEFORE + k, 3), (k, 2), (k - 1, 2)
+        k = logs.SAMPLES + drivetrain.EXTRA_SAMPLES
+        shapes = (rollout.LEAD_SAMPLES + k, 3), (k, 2), (k - 1, 2)
         return rollout.Rollouts(*(np.zeros((len(told), *shape)) for shape in shapes))
 
-    monkeypatch.setattr(tires, "drive", noted)
+    monkeypatch.setattr(tires, "simulate_windows", noted)
     params = HuskyParams()
-    tires.fit_ground(params, drivetrain.Drivetrain.of(params, False), windows, np.zeros((n, 2)))
+    tires.fit_ground(params, drivetrain.Drivetrain.from_robot(params, False), windows, np.zeros((n, 2)))
     assert seen
     for before in seen:
-        np.testing.assert_array_equal(before, windows.before[::2])
+        np.testing.assert_array_equal(before, windows.preceding_wheels[::2])
 
 
 def test_a_slope_pulls_downhill():
@@ -167,17 +169,19 @@ def test_a_slope_pulls_downhill():
     however it stands on it when the window begins."""
     n = 12
     wheels = np.full((n, logs.SAMPLES, 2), [-3.0, 3.0])
-    turning = kinematics.Icr(y_left=0.56, y_right=-0.56)  # as SOFT turns
+    turning = kinematics.IcrModel(y_left=0.56, y_right=-0.56)  # as SOFT turns
     windows = replace(windows_of(wheels), follows=np.arange(n) > 0)
     poses = kinematics.predict(turning, windows)
     start = np.concatenate([[0.0], np.cumsum(poses[:-1, logs.SAMPLES, 2])])
     downhill = np.exp(1j * (0.8 - start))  # in each window's first frame
     down = downhill[:, None] * np.exp(-1j * poses[:, : logs.SAMPLES, 2])
-    slopes = rollout.gravity(replace(windows, acceleration=-np.stack([down.real, down.imag], -1)), turning)
+    slopes = rollout.slope_gravity(replace(windows, acceleration=-np.stack([down.real, down.imag], -1)), turning)
     assert np.hypot(*slopes.T) == pytest.approx(np.ones(n), abs=0.1)
     told = np.full((n, 225, 2), [-3.0, 3.0])
-    driven = [tires.drive(SOFT, told, windows.before, s, 0.005).poses for s in (0 * slopes, slopes)]
-    still, moved = (logs.retimed(poses, np.zeros(n), rollout.BEFORE) for poses in driven)
+    driven = [
+        tires.simulate_windows(SOFT, told, windows.preceding_wheels, s, 0.005).poses for s in (0 * slopes, slopes)
+    ]
+    still, moved = (logs.resample_poses(poses, np.zeros(n), rollout.LEAD_SAMPLES) for poses in driven)
     shift = (moved - still)[:, -1, :2] @ [1, 1j]
     assert np.abs(np.angle(shift / downhill)).max() < np.radians(20)
     assert np.abs(shift).min() > 0.05

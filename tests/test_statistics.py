@@ -8,19 +8,19 @@ from scipy import stats
 
 from twin.evaluation.statistics import (
     CONFIDENCE,
-    Refused,
+    UndefinedStatistic,
     mean_rate,
     mmrv,
-    mmrv_rows,
+    mmrv_batched,
     pearson,
-    pearson_rows,
+    pearson_batched,
     rate_difference,
     spearman,
-    spearman_rows,
+    spearman_batched,
     wilson,
     winner_agreement,
+    winner_batched,
     winner_regret,
-    winner_rows,
 )
 
 
@@ -134,18 +134,18 @@ def test_rates_summed_up_differently_are_tied() -> None:
     assert twin[0] != twin[1]
     assert mmrv(twin=twin, real=np.array([0.5, 0.5, 0.9])) == 0.0
     assert spearman(twin=twin, real=np.array([0.5, 0.5, 0.9])) == pytest.approx(1.0)
-    with pytest.raises(Refused):
+    with pytest.raises(UndefinedStatistic):
         pearson(twin=np.array([0.3, 0.3, 0.1 + 0.2]), real=twin)
 
 
 @pytest.mark.parametrize("statistic", [pearson, spearman])
 def test_what_is_not_defined_is_refused(statistic) -> None:
     for n in range(3):
-        with pytest.raises(Refused, match=f"{n} policies; at least 3"):
+        with pytest.raises(UndefinedStatistic, match=f"{n} policies; at least 3"):
             statistic(twin=np.arange(n), real=np.arange(n))
-    with pytest.raises(Refused, match=r"all rates in the twin are 0\.5"):
+    with pytest.raises(UndefinedStatistic, match=r"all rates in the twin are 0\.5"):
         statistic(twin=[0.5] * 4, real=[0.1, 0.2, 0.3, 0.4])
-    with pytest.raises(Refused, match="all rates on the road are 0"):
+    with pytest.raises(UndefinedStatistic, match="all rates on the road are 0"):
         statistic(twin=[0.1, 0.2, 0.3, 0.4], real=[0.0] * 4)
 
 
@@ -155,7 +155,7 @@ def test_constant_scores_have_a_winner_and_violations() -> None:
     assert winner_regret(twin=flat, real=real) == pytest.approx(0.5)
     assert mmrv(twin=flat, real=real) == pytest.approx((0.9 + 0.6 + 0.0) / 3)
     for statistic in (mmrv, winner_agreement, winner_regret):
-        with pytest.raises(Refused, match="1 policies; at least 2"):
+        with pytest.raises(UndefinedStatistic, match="1 policies; at least 2"):
             statistic(twin=[0.5], real=[0.5])
 
 
@@ -170,16 +170,16 @@ def test_rows_are_the_same_statistics() -> None:
     rng = np.random.default_rng(2)
     twin, real = np.stack([tied(rng, 6) for _ in range(30)]), np.stack([tied(rng, 6) for _ in range(30)])
     twin[3] = 0.25
-    for rows, one in ((pearson_rows, pearson), (spearman_rows, spearman), (mmrv_rows, mmrv)):
+    for rows, one in ((pearson_batched, pearson), (spearman_batched, spearman), (mmrv_batched, mmrv)):
         got = rows(twin=twin, real=real)
         for i in range(30):
             if np.isnan(got[i]):
-                with pytest.raises(Refused):
+                with pytest.raises(UndefinedStatistic):
                     one(twin=twin[i], real=real[i])
             else:
                 assert got[i] == pytest.approx(one(twin=twin[i], real=real[i]))
-    assert np.isnan(pearson_rows(twin=twin, real=real)[3])
-    agreement, regret = winner_rows(twin=twin, real=real)
+    assert np.isnan(pearson_batched(twin=twin, real=real)[3])
+    agreement, regret = winner_batched(twin=twin, real=real)
     assert agreement[5] == winner_agreement(twin=twin[5], real=real[5])
     assert regret[5] == winner_regret(twin=twin[5], real=real[5])
 

@@ -109,7 +109,7 @@ def test_same_seed_same_sightings_on_any_number_of_cores(tmp_path, monkeypatch):
     cameras = film(tmp_path, 5)
     pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
     first, _ = stereo_depths(pixels, 4, "cpu")
-    monkeypatch.setattr("twin.nerf.buffers.cores", lambda: 1)
+    monkeypatch.setattr("twin.nerf.buffers.available_cores", lambda: 1)
     second, _ = stereo_depths(pixels, 4, "cpu")
     assert np.array_equal(first.distance, second.distance)
     assert np.array_equal(first.pixel, second.pixel)
@@ -158,7 +158,7 @@ def test_the_homography_agrees_with_projection(tmp_path):
     place = unproject(pixel, K) * depth[:, None] @ cameras.camera_to_world[0, :3, :3].T + cameras.positions[0]
     homogeneous = np.column_stack([pixel, np.ones(2)])
     for k, j in enumerate((1, 3)):
-        h = homogeneous @ geometry.turn[k].T + geometry.shift[k] / depth[:, None]
+        h = homogeneous @ geometry.homography[k].T + geometry.epipole[k] / depth[:, None]
         expected, z = project(place, cameras.camera_to_world[j], K)
         assert np.allclose(h[:, :2] / h[:, 2:], expected)
         assert np.allclose(h[:, 2] * depth, z)

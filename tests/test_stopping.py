@@ -21,12 +21,12 @@ from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
 from twin import cli
-from twin.errors import InputError, refuse, shortened
+from twin.errors import InputError, print_error, shortened
 from twin.geometry.images import write_image
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import Layout
-from twin.nerf.field import untrained
-from twin.scene import seal
+from twin.nerf.field import untrained_field
+from twin.scene import write_stamp
 
 _PATIENCE = 120.0  # [s] until a verb has started what it starts
 _WOULD_TAKE = {"validate": 900, "train": 100_000}  # episodes and steps; far more than a test waits for
@@ -50,9 +50,9 @@ def _corridor(root: Path) -> Path:
     layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
     for stage in ("field", "mesh"):
         scene.stage(stage).mkdir()
-    untrained(layout, appearance, 0, "cpu").save(scene.stage("field"))
+    untrained_field(layout, appearance, 0, "cpu").save(scene.stage("field"))
     for stage in ("capture", "cameras", "metric", "field", "mesh"):
-        seal(scene.stage(stage), stage)
+        write_stamp(scene.stage(stage), stage)
     return root
 
 
@@ -74,10 +74,10 @@ def cases(tmp_path_factory) -> dict[str, Case]:
     validate = ("--policy", "ahead", "--task", "ahead", "--lightings", "day", "--episodes", many, "--processes", "2")
     train = ("--task", "ahead", "--lighting", "day", "--run", "new", "--steps", steps, "--processes", "2")
     return {
-        "build": Case((str(filmed), "--until", "metric"), "twin.capture.worker"),
+        "build": Case((str(filmed), "--until", "metric"), "twin.capture.solver"),
         "train": Case((str(driven), *train), "twin.env.vector_env_child", 2),
         "validate": Case((str(driven), *validate), "multiprocessing.spawn", 2),
-        "relight": Case((str(corridor), str(corridor / "photo.png"), "--name", "new"), "twin.capture.worker"),
+        "relight": Case((str(corridor), str(corridor / "photo.png"), "--name", "new"), "twin.capture.solver"),
     }
 
 
@@ -142,8 +142,8 @@ from twin.assets import convex
 ball = trimesh.creation.icosphere(4)
 def piece(k):
     bumps = 1.0 + 0.3 * np.sin(9.0 * ball.vertices + k).prod(1)
-    return convex.Piece.of(ball.vertices * bumps[:, None], ball.faces)
-convex._coacd([piece(k) for k in range(40)], 0.01, Path({str(tmp_path)!r}), 0)
+    return convex.SolidPiece.from_mesh(ball.vertices * bumps[:, None], ball.faces)
+convex._run_coacd([piece(k) for k in range(40)], 0.01, Path({str(tmp_path)!r}), 0)
 """
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     children: list[psutil.Process] = []
@@ -208,7 +208,7 @@ def test_wrong_arguments_are_one_line(capsys):
     "value", ["x" * 10**6, "1" * 10**4, list(range(10**5)), "a'b" * 1000, "\x1b[31m\n" * 10**4, "ab " * 10**4]
 )
 def test_a_refusal_repeats_eighty_characters_of_a_value(capsys, value):
-    refuse(InputError(f"scene.toml: key = {value!r}; expected a number"))
+    print_error(InputError(f"scene.toml: key = {value!r}; expected a number"))
     said = capsys.readouterr().err
     assert said.startswith("error: scene.toml: key = ") and said.endswith("; expected a number\n")
     assert said.count("\n") == 1 and "\x1b" not in said and len(said) < 1600

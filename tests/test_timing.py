@@ -23,7 +23,7 @@ def test_stale_poses_were_measured_when_their_sensor_measured():
     lost = [2, 4, 6, 12, *range(14, 41, 2)]
     early = [*range(1, 38, 2), 38, 40]  # 21 of them: on the edge between two samples
     resting = list(range(11, 41, 2))  # at first: it was last measured less than a period before
-    measured = held([regular, old, late, lost, early, resting, []]).measured / logs.PERIOD
+    measured = held([regular, old, late, lost, early, resting, []]).measurement_times / logs.PERIOD
     np.testing.assert_allclose(measured[0], np.arange(41) // 2 * 2, atol=1e-9)
     np.testing.assert_allclose(measured[1], (np.arange(41) + 1) // 2 * 2 - 1, atol=1e-9)
     np.testing.assert_allclose(measured[2, [0, 6, 10, 11, 12, 13, 40]], [0, 6, 6, 8, 10, 12, 40], atol=1e-9)
@@ -64,7 +64,7 @@ def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
     by_distance = [list(range(each // 2, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
     steady = [list(range(2, 41, 2))] * 10 + [list(range(1, 41))]
     for appeared in (by_distance, steady):
-        measured = held(appeared).measured / logs.PERIOD
+        measured = held(appeared).measurement_times / logs.PERIOD
         for window, each in zip(measured, appeared, strict=True):
             assert window[[each[0], each[-1], 40]] == pytest.approx([each[0], each[-1], each[-1]], abs=1e-9)
             assert window[0] == pytest.approx(min(0, 2 * each[0] - each[1]), abs=1e-9)
@@ -73,5 +73,5 @@ def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
 def test_a_sensor_as_fast_as_the_log_is_taken_at_its_word():
     appeared, truth, _ = delivered(1.0)
     windows = held(appeared)
-    assert windows.measured[:, -1] / logs.PERIOD == pytest.approx([each[-1] for each in appeared])
+    assert windows.measurement_times[:, -1] / logs.PERIOD == pytest.approx([each[-1] for each in appeared])
     assert np.abs(windows.elapsed[:, -1] / logs.PERIOD - truth).mean() < 0.5

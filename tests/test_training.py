@@ -25,11 +25,11 @@ from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
 from twin.learn.policy import load_policy
-from twin.learn.policy_evaluation import FRESH
+from twin.learn.policy_evaluation import FRESH_EPISODES
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import EPISODE_COLUMNS, _check_same, _keep_rows
-from twin.runtime import alone
+from twin.learn.training import TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
+from twin.runtime import exclusive_lock
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_the_verb(scene, capsys):
     assert (scene / "runs/one/success.png").exists()
     assert load_policy(scene / "runs/one").trained["observe"] == "simulator"
     choice = json.loads((scene / "runs/one/choice.json").read_text())
-    assert choice["steps"] == 4 and choice["chosen"]["trials"] == FRESH
+    assert choice["steps"] == 4 and choice["chosen"]["trials"] == FRESH_EPISODES
     assert train.main([*common, "--run", "one", "--steps", "4", "--lighting", "day"]) == 2
     assert "error: " in capsys.readouterr().err
     assert train.main([*common, "--run", "two", "--lighting", "dusk"]) == 2
@@ -125,7 +125,7 @@ def test_the_verb(scene, capsys):
 
 
 def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
-    with alone(scene / "runs/.locked.lock", "x"):
+    with exclusive_lock(scene / "runs/.locked.lock", "x"):
         assert train.main([str(scene), "--task", "ahead", "--run", "locked", "--quiet", "--steps", "4"]) == 2
     assert "locked is being trained by process" in capsys.readouterr().err
     assert not (scene / "runs/locked").exists()
@@ -163,13 +163,13 @@ def test_the_last_policy_is_a_checkpoint(scene, tmp_path):
 def test_no_resumption_drives_what_validation_or_another_seed_drives(scene, tmp_path, monkeypatch):
     from twin.learn import training
 
-    given, whole = [], training.PreparedVecEnv.seed
+    given, whole = [], training.PreprocessedVecEnv.seed
 
     def spy(worlds, seed):
         given.append(seed)
         return whole(worlds, seed)
 
-    monkeypatch.setattr(training.PreparedVecEnv, "seed", spy)
+    monkeypatch.setattr(training.PreprocessedVecEnv, "seed", spy)
     for seed in (0, 1):
         for steps in (8, 16, 24):
             training.train(twin.load_scene(scene), tmp_path / str(seed), replace(SHORT, seed=seed, steps=steps))
@@ -245,13 +245,13 @@ def test_arriving_is_worth_what_surviving_for_ever_would_be():
 def test_episodes_that_began_on_the_way_do_not_count(tmp_path):
     some = [("8", 1, "0.00"), ("16", 0, "7.50"), ("24", 0, "0.00"), ("32", 1, "0.10"), ("40", 1, "0.00")]
     rows = [[step, "1.0", "7", "training", str(won), "goal", "3.0", "8", "1.0", start] for step, won, start in some]
-    (tmp_path / "episodes.csv").write_text(csv_text(EPISODE_COLUMNS, rows))
+    (tmp_path / "episodes.csv").write_text(csv_text(TRAINING_EPISODE_COLUMNS, rows))
     steps, success = read_episodes(tmp_path)
     assert steps.tolist() == [8, 24, 40] and success.tolist() == [1, 0, 1]
-    assert _keep_rows(tmp_path / "episodes.csv", EPISODE_COLUMNS, 32) == [True, False]
+    assert _keep_rows(tmp_path / "episodes.csv", TRAINING_EPISODE_COLUMNS, 32) == [True, False]
     assert (tmp_path / "episodes.csv").read_text().count("\n") == 5  # all that was driven is kept
     before = [row[:-1] for row in rows]  # as trainings of before wrote them
-    (tmp_path / "episodes.csv").write_text(csv_text(EPISODE_COLUMNS[:-1], before))
+    (tmp_path / "episodes.csv").write_text(csv_text(TRAINING_EPISODE_COLUMNS[:-1], before))
     assert read_episodes(tmp_path)[1].tolist() == [1, 0, 0, 1, 1]
 
 
@@ -270,7 +270,7 @@ def test_setups_vary_what_they_say():
     assert TrainConfig(observe="simulator").options()["randomise"] == day["randomise"]
     assert varied["rewards"].cross_track == -varied["rewards"].step and varied["start_along"] > 0.0
     assert varied["rewards"].steering == -0.5 * varied["rewards"].step
-    assert len(TrainConfig().states) == 7 and TrainConfig(privileged=False).states == ()
+    assert len(TrainConfig().state_scales) == 7 and TrainConfig(privileged=False).state_scales == ()
 
 
 def test_states_are_what_the_world_tells(scene):
@@ -281,7 +281,7 @@ def test_states_are_what_the_world_tells(scene):
         *_, done, infos = env.step(np.array([[0.5], [-0.5]], np.float32))
         assert not done.any() and all("first_state" not in info for info in infos)
         for i, info in enumerate(infos):
-            assert info["state"].shape == (len(TrainConfig().states),)
+            assert info["state"].shape == (len(TrainConfig().state_scales),)
             assert info["state"][2] == pytest.approx(info["cross_track"], abs=1e-6)
             assert info["state"][0] == pytest.approx(info["speed"], abs=1e-6)
             assert np.sign(info["state"][1]) == (1, -1)[i]
@@ -289,6 +289,6 @@ def test_states_are_what_the_world_tells(scene):
     assert done.all()
     for i, info in enumerate(infos):
         assert info["state"][2] == pytest.approx(info["cross_track"], abs=1e-6)
-        assert info["first_state"][2] == pytest.approx(env.worlds.tasks[i].cross_track, abs=1e-6)
+        assert info["first_state"][2] == pytest.approx(env.vector_env.tasks[i].cross_track, abs=1e-6)
         assert info["first_state"][0] == pytest.approx(0.0, abs=1e-3) and info["state"][0] > 0.1
     env.close()

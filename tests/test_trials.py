@@ -11,7 +11,7 @@ from twin.evaluation.trials import (
     EPISODE_COLUMNS,
     Cell,
     Trial,
-    cells_text,
+    cells_csv,
     csv_text,
     read_results,
     read_trials,
@@ -49,7 +49,7 @@ def test_trials_are_read_as_written(tmp_path: Path) -> None:
 
 
 def test_cells_have_their_interval() -> None:
-    header, row = cells_text([TWIN[0]]).splitlines()
+    header, row = cells_csv([TWIN[0]]).splitlines()
     assert header == ",".join(CELL_COLUMNS)
     low, high = wilson(90, 100)
     assert row == f"nerf,straight,sun,100,90,0.9000,{low:.4f},{high:.4f}"

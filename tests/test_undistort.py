@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from twin.capture.camera_models import pinhole_of, undistortion_map, write_pinhole_image
+from twin.capture.camera_models import fitted_pinhole, undistortion_map, write_pinhole_image
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
 
@@ -21,7 +21,7 @@ from twin.geometry.images import psnr, read_image, write_image
 )
 def test_undistorted_pixels_see_along_the_same_ray(model: str, params: list[float]) -> None:
     camera = pycolmap.Camera(model=model, params=params, width=320, height=240)
-    pinhole = pinhole_of(camera)
+    pinhole = fitted_pinhole(camera)
     mapping = undistortion_map(camera, pinhole)
     assert mapping is not None and mapping.shape == (240, 320, 2)
     assert mapping.min() >= -0.51 and (mapping.reshape(-1, 2).max(0) <= [319.51, 239.51]).all()  # nothing to fill in
@@ -38,7 +38,7 @@ def test_undistortion_undoes_distortion(tmp_path: Path) -> None:
 
     raw_rays = np.asarray(camera.cam_from_img(pixel_grid(320, 240).reshape(-1, 2))).reshape(240, 320, 2)
     write_image(tmp_path / "raw.png", picture(raw_rays))
-    pinhole = pinhole_of(camera)
+    pinhole = fitted_pinhole(camera)
     write_pinhole_image(tmp_path / "raw.png", tmp_path / "a" / "flat.png", undistortion_map(camera, pinhole))
     expected = picture(unproject(pixel_grid(320, 240), np.array(pinhole))[..., :2])
     flat = read_image(tmp_path / "a" / "flat.png")[..., 0]
@@ -47,8 +47,8 @@ def test_undistortion_undoes_distortion(tmp_path: Path) -> None:
 
 def test_a_pinhole_image_is_left_alone(tmp_path: Path) -> None:
     camera = pycolmap.Camera(model="PINHOLE", params=[300.0, 301.0, 160.0, 120.0], width=320, height=240)
-    assert pinhole_of(camera) == (300.0, 301.0, 160.0, 120.0)
-    assert undistortion_map(camera, pinhole_of(camera)) is None
+    assert fitted_pinhole(camera) == (300.0, 301.0, 160.0, 120.0)
+    assert undistortion_map(camera, fitted_pinhole(camera)) is None
     image = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
     write_image(tmp_path / "raw.png", image)
     write_pinhole_image(tmp_path / "raw.png", tmp_path / "flat.png", None)

@@ -14,20 +14,20 @@ from tiny_twin import tiny_twin
 
 from twin import load_scene, runtime, validate
 from twin.env import episode_lighting
-from twin.env.domain_randomization import ANOTHER_DAY, asked
+from twin.env.domain_randomization import EVALUATION_RANGES, lighting_options
 from twin.env.suite import EnvFactory, fingerprint
 from twin.errors import InputError
 from twin.evaluation.trials import Trial, read_trials
 from twin.learn import policy_evaluation
 from twin.learn.policy import Control, load_policy, save_policy
-from twin.learn.policy_evaluation import EpisodeChunk, campaign, drawn_light, run_chunk
+from twin.learn.policy_evaluation import EpisodeChunk, campaign, run_chunk, with_sampled_lighting
 from twin.loading import Twin
-from twin.report.validation_summary import lines, pairs, rate, summary
+from twin.report.validation_summary import compare_pairs, success_rate, summarize, summary_lines
 from twin.robot import HuskyParams
-from twin.runtime import alone
-from twin.validate import seeds_of
+from twin.runtime import exclusive_lock
+from twin.validate import lighting_seeds
 
-FIRST = seeds_of("day", 1)[0]
+FIRST = lighting_seeds("day", 1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +60,12 @@ def test_an_episode_is_the_same_whoever_drives_beside(scene):
 def test_an_episode_is_that_of_the_environment_alone(scene):
     import twin
     from twin.env.drivers import PolicyDriver
-    from twin.env.episode import record
+    from twin.env.episode import record_episode
 
     policy = load_policy(scene / "runs" / "ahead")
     (driven,) = run_chunk(chunk(scene, [5]))
     environment = twin.load(scene, "ahead", 5, lighting="day", **policy.options())
-    episode = record(environment, PolicyDriver(policy))
+    episode = record_episode(environment, PolicyDriver(policy))
     assert (driven.cause, driven.steps) == (episode.cause, len(episode.times) - 1)
     assert driven.progress == episode.progress[-1]  # to the last bit, which decides who meets the kerb
     assert driven.trust == pytest.approx(episode.trust[:-1].mean(), abs=1e-9)
@@ -80,7 +80,7 @@ def test_drawn_lights_do_not_depend_on_those_before(scene):
     def light(numbers):
         stage = EnvFactory.open(load_scene(scene), "ahead", {"size": (32, 18)})
         for number in numbers:
-            drawn_light(stage, number)
+            with_sampled_lighting(stage, number)
         return stage.field.embedding(f"drawn_{numbers[-1]}")
 
     np.testing.assert_array_equal(light([3]), light([0, 5, 3]))
@@ -106,13 +106,15 @@ def test_randomised_episodes_are_others_and_repeat(scene, monkeypatch):
     assert [a == b for a, b in zip(said, other, strict=True)] == [True, True, False, False]
     assert run_chunk(chunk(scene, seeds)) == plain
     stage = EnvFactory.open(
-        scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **asked("day+randomised")}
+        scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **lighting_options("day+randomised")}
     )
-    assert stage.options.lighting == "day" and stage.options.randomise == ANOTHER_DAY
+    assert stage.options.lighting == "day" and stage.options.randomise == EVALUATION_RANGES
     fitted = dataclasses.replace(load_scene(scene).world(), robot=HuskyParams(friction=0.6))
     monkeypatch.setattr(Twin, "world", lambda self: fitted)
     options = load_policy(scene / "runs" / "ahead").options()
-    stages = [EnvFactory.open(scene, "ahead", {**options, **asked(f"day{what}")}) for what in ("+randomised", "")]
+    stages = [
+        EnvFactory.open(scene, "ahead", {**options, **lighting_options(f"day{what}")}) for what in ("+randomised", "")
+    ]
     assert stages[0].options.randomise.friction == (1.0, 1.0) and stages[1].options.randomise is None
     with pytest.raises(InputError, match="randomized"):
         run_chunk(chunk(scene, [0], "day+randomized"))
@@ -181,7 +183,7 @@ def test_another_policy_of_the_same_name_is_refused(fresh, tmp_path):
 
 
 def test_two_validations_do_not_mix(fresh):
-    with alone(fresh / ".validation.lock", "x"), pytest.raises(InputError, match="validation by process"):
+    with exclusive_lock(fresh / ".validation.lock", "x"), pytest.raises(InputError, match="validation by process"):
         run(fresh, "ahead")
     assert not (fresh / "validation" / "episodes.csv").exists()
 
@@ -217,9 +219,9 @@ def test_a_table_of_which_nothing_is_noted_is_not_added_to(fresh):
 
 
 def test_the_worst_light_is_proved_on_fresh_episodes(fresh, monkeypatch):
-    monkeypatch.setattr(validate, "_LIGHTS", 4)
-    monkeypatch.setattr(validate, "_LOOKS", 1)
-    monkeypatch.setattr(validate, "_FINALISTS", 2)
+    monkeypatch.setattr(validate, "_SEARCH_LIGHTINGS", 4)
+    monkeypatch.setattr(validate, "_SEARCH_EPISODES", 1)
+    monkeypatch.setattr(validate, "_SEARCH_KEPT", 2)
     said = validate.validate(fresh, ["ahead"], "ahead", ["day"], 2, worst=True)
     (worst,) = said["worst"]
     assert validate.validate(fresh, ["ahead"], "ahead", ["day"], 2)["worst"] == [worst]  # it is not forgotten
@@ -255,22 +257,22 @@ def trial(policy: str, seed: int, cause: str, trust: float | None = 1.0, progres
 def test_paired_episodes_are_a_coin_tossed():
     a = [trial("a", k, "goal" if k < 8 else "collision") for k in range(10)]
     b = [trial("b", k, "goal" if k < 1 else "timeout") for k in range(1, 12)]
-    (pair,) = pairs([*a, *b])
+    (pair,) = compare_pairs([*a, *b])
     assert (pair["episodes"], pair["only_a"], pair["only_b"]) == (9, 7, 0)
     assert pair["p"] == pytest.approx(2 * 0.5**7)
-    assert pairs(a) == []
+    assert compare_pairs(a) == []
 
 
 def test_the_summary_splits_by_cause_and_trust():
     trials = [trial("a", 0, "goal"), trial("a", 1, "goal", 0.5), trial("a", 2, "stuck", 0.5), trial("a", 3, "stuck")]
-    (cell,) = summary(trials)["cells"]
+    (cell,) = summarize(trials)["cells"]
     assert cell["causes"] == {"stuck": 2}
     assert (cell["successes"], cell["trials"]) == (2, 4)
     assert (cell["trusted"]["successes"], cell["trusted"]["trials"]) == (1, 2)
     assert (cell["low_trust"]["successes"], cell["low_trust"]["trials"]) == (1, 2)
     assert 0.0 < cell["low"] < 0.5 < cell["high"] < 1.0
-    assert rate([])["rate"] is None
-    assert "2 got stuck" in lines(summary(trials))[0]
+    assert success_rate([])["rate"] is None
+    assert "2 got stuck" in summary_lines(summarize(trials))[0]
 
 
 def test_two_nodes_of_ray_give_the_table_of_one_process(fresh):

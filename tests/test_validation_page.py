@@ -16,26 +16,33 @@ from tiny_twin import tiny_twin
 
 from twin import film, runtime, validate
 from twin.errors import InputError
-from twin.evaluation.training_curves import RECENT, binned, trainings
-from twin.evaluation.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
+from twin.evaluation.statistics import rate_summary
+from twin.evaluation.training_curves import binned_rates, training_summaries
+from twin.evaluation.trials import EPISODE_COLUMNS, RECENT_EPISODES, Trial, csv_text, read_trials
 from twin.files import digest_file, write_json
 from twin.report.figures import SERIES
-from twin.report.validation_report import FEW, Curve, better, rate_tiles, rates, validation_page
+from twin.report.validation_report import (
+    MAX_PLOTTED_LIGHTINGS,
+    TrainingCurve,
+    pair_heatmap,
+    rate_figure,
+    rate_heatmap,
+    validation_page,
+)
 from twin.report.validation_summary import (
     FAILURES,
-    chance_words,
-    pair_words,
-    percent,
-    rate,
-    share,
-    summary,
+    failure_text,
+    limitations,
+    p_value_text,
+    pair_text,
+    rate_text,
+    success_rate,
+    summarize,
     typical_episode,
-    unknowns,
     verdicts,
-    why,
     worst_episode,
 )
-from twin.report.video_writer import describe
+from twin.report.video_writer import video_info
 
 TRAINED = {"run": "ahead", "task": "ahead", "observe": "nerf", "lighting": "training", "step": 300}
 EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: step, success
@@ -70,10 +77,10 @@ def trial(
 
 def told(trials, **more) -> dict:
     """What `summary.json` would hold."""
-    return summary(trials) | {"training": {}, "worst": [], "films": []} | more
+    return summarize(trials) | {"training": {}, "worst": [], "films": []} | more
 
 
-def page(folder: Path, said: dict, *curves: Curve) -> Text:
+def page(folder: Path, said: dict, *curves: TrainingCurve) -> Text:
     """The page's text; the maps are any picture."""
     from PIL import Image
 
@@ -114,17 +121,20 @@ def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
     (tmp_path / "validation").mkdir()
     noted = {"policies": {name: digest_file(head) for name, head in heads.items()}}
     write_json(tmp_path / "validation" / "validated.json", noted)
-    found = trainings(tmp_path, ["r", "r/5", "my_module:act", "r/6"])
+    found = training_summaries(tmp_path, ["r", "r/5", "my_module:act", "r/6"])
     assert set(found) == {"r", "r/5"}
     for name, step in (("r", 3000), ("r/5", 1500)):
-        won = [success for at, success in rows if at <= step][-RECENT:]
-        assert {k: found[name][k] for k in ("successes", "trials")} == {"successes": sum(won), "trials": RECENT}
+        won = [success for at, success in rows if at <= step][-RECENT_EPISODES:]
+        assert {k: found[name][k] for k in ("successes", "trials")} == {
+            "successes": sum(won),
+            "trials": RECENT_EPISODES,
+        }
     assert found["r"]["low"] < found["r"]["rate"] < found["r"]["high"] and found["r/5"]["run"] == "r"
     # The run was trained on, or is another one: its curve is not that of the policy that was validated.
     write_json(heads["r"], {"trained": {"step": 4000}})
-    assert set(trainings(tmp_path, ["r", "r/5"])) == {"r/5"}
+    assert set(training_summaries(tmp_path, ["r", "r/5"])) == {"r/5"}
     shutil.rmtree(tmp_path / "validation")
-    assert trainings(tmp_path, ["r", "r/5"]) == {}
+    assert training_summaries(tmp_path, ["r", "r/5"]) == {}
 
 
 # ---- words
@@ -135,7 +145,7 @@ def test_every_cause_has_words():
 
     assert set(FAILURES) == set(CAUSES) - {"goal"}
     cell = {"causes": {"collision": 2, "out_of_bounds": 9}}
-    assert why(cell) == "9 left the corridor, 2 hit something" and why({"causes": {}}) == ""
+    assert failure_text(cell) == "9 left the corridor, 2 hit something" and failure_text({"causes": {}}) == ""
 
 
 def test_the_headline_compares_what_all_have_driven():
@@ -145,7 +155,8 @@ def test_the_headline_compares_what_all_have_driven():
     trials += [trial("b", k, "goal" if k < 7 else "stuck") for k in range(10)]
     (verdict,) = verdicts(told(trials))
     assert (
-        "b reaches the goal most often: in 7 of 10 episodes in the light that all have driven in (day)" in verdict.text
+        "b reaches the goal most often: in 7 of 10 episodes in the light that was used for all policies (day)"
+        in verdict.text
         and verdict.mood == "mixed"
     )
     apart = [trial("a", 0, light="day"), trial("b", 0, light="night")]
@@ -163,17 +174,17 @@ def test_a_weak_light_and_untrusted_pictures_are_headlines():
 
 def test_differences_are_named_by_chance():
     pair = {"a": "x", "b": "y", "only_a": 9, "only_b": 1, "p": 0.02}
-    assert pair_words(pair) == "first is better"
-    assert pair_words(pair | {"only_a": 1, "only_b": 9}) == "second is better"
-    assert pair_words(pair | {"p": 0.3}) == "within chance" and pair_words(pair | {"only_b": 9}) == "no difference"
-    assert [chance_words(p) for p in (1e-5, 0.0213, 0.62, 1.0)] == ["<0.1%", "2.1%", "62%", "100%"]
+    assert pair_text(pair) == "first is better"
+    assert pair_text(pair | {"only_a": 1, "only_b": 9}) == "second is better"
+    assert pair_text(pair | {"p": 0.3}) == "within chance" and pair_text(pair | {"only_b": 9}) == "no difference"
+    assert [p_value_text(p) for p in (1e-5, 0.0213, 0.62, 1.0)] == ["<0.1%", "2.1%", "62%", "100%"]
 
 
 def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
-    assert percent(share(3, 4)).startswith("75% (") and percent(rate([])) == "–"
+    assert rate_text(rate_summary(3, 4)).startswith("75% (") and rate_text(success_rate([])) == "–"
     text = page(tmp_path, told([trial("my_module:act")])).text
     assert "not known" in text and "nan" not in text and "None" not in text
-    assert "There is no such episode here" in text and "Nothing was filmed" in text
+    assert "There is no such episode here" in text and "No videos" in text
     for absent in ("Which policy is better", "The worst light that", "How they were trained"):
         assert (absent in text) == (absent == "The worst light that")
 
@@ -182,18 +193,18 @@ def test_the_page_says_the_tables_numbers(tmp_path):
     trials = [trial("a", k, "goal" if k < 31 else "collision", trust=0.9 if k % 2 else 0.5) for k in range(40)]
     trials += [trial("b", k, "goal" if k < 12 else "timeout", light=light) for k in range(40) for light in ("day", "n")]
     trials += [trial("a", 7, "stuck", task="bend", light="any")]
-    trained = {"a": TRAINED | {"run": "a"} | share(96, 100)}
-    worst = [summary([trial("a", k, "rollover", light="drawn_3") for k in range(5)])["cells"][0] | {"of": 16}]
-    curve = Curve("a", np.arange(10, 400, 10), np.arange(39) % 2)
+    trained = {"a": TRAINED | {"run": "a"} | rate_summary(96, 100)}
+    worst = [summarize([trial("a", k, "rollover", light="drawn_3") for k in range(5)])["cells"][0] | {"of": 16}]
+    curve = TrainingCurve("a", np.arange(10, 400, 10), np.arange(39) % 2)
     said = told(trials, training=trained, worst=worst)
     text = page(tmp_path, said, curve).text
     for cell in [*said["cells"], *worst]:
-        assert percent(cell) in text and why(cell) in text
-    assert percent(trained["a"]) in text and "after 300 steps" in text and "in varying light" in text
+        assert rate_text(cell) in text and failure_text(cell) in text
+    assert rate_text(trained["a"]) in text and "after 300 steps" in text and "in varying light" in text
     assert "19" in text and "only first arrived" in text and "first is better" in text  # 31 - 12 episodes
-    assert percent(said["cells"][0]["low_trust"]) in text
+    assert rate_text(said["cells"][0]["low_trust"]) in text
     assert "drawn_3" in text and "5 rolled over" in text
-    assert all(v.text in text for v in verdicts(said)) and all(c.what in text for c in unknowns(said))
+    assert all(v.text in text for v in verdicts(said)) and all(c.what in text for c in limitations(said))
 
 
 def test_names_from_files_are_text(tmp_path):
@@ -215,8 +226,8 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
     assert links == {"summary.json", "cells.csv", "episodes.csv"} and all((folder / link).exists() for link in links)
     assert json.loads((folder / "summary.json").read_text()) == said
     assert list(said["training"]) == ["ahead"]  # the other's run has no episodes
-    won = [success for step, success in EPISODES if step <= TRAINED["step"]][-RECENT:]
-    assert percent(share(sum(won), len(won))) in shown.text and "How they were trained" in shown.text
+    won = [success for step, success in EPISODES if step <= TRAINED["step"]][-RECENT_EPISODES:]
+    assert rate_text(rate_summary(sum(won), len(won))) in shown.text and "How they were trained" in shown.text
 
 
 class NoCamera:
@@ -259,9 +270,9 @@ def test_films_are_the_tables_episodes(fresh, episodes):
         assert episode.progress[-1] == pytest.approx(row.progress, abs=1e-3)
         assert episode.trust[:-1].mean() == pytest.approx(row.trust, abs=1e-4)
         assert (one["cause"], one["progress_m"], one["of"]) == (row.cause, row.progress, 6)
-        assert describe(folder / one["file"])["frames"] > row.steps // 2
+        assert video_info(folder / one["file"])["frames"] > row.steps // 2
     shown = Text((folder / "validation.html").read_text(encoding="utf-8"))
-    assert {f["file"] for f in said["films"]} <= set(shown.links) and "To film any row" in shown.text
+    assert {f["file"] for f in said["films"]} <= set(shown.links) and "any row of episodes.csv" in shown.text
     # What is filmed stays, is not filmed again, and is still on the page of a call that films nothing.
     before = len(episodes)
     assert validate.validate(fresh, ["ahead", "left"], "ahead", ["night", "held-out"], 3, films=True) == said
@@ -274,7 +285,7 @@ def test_a_film_that_ends_otherwise_than_the_table_is_refused(fresh, episodes):
     table = fresh / "validation" / "episodes.csv"
     (row,) = read_trials(table)
     table.write_text(csv_text(EPISODE_COLUMNS, [replace(row, steps=row.steps + 1).row()]))
-    with pytest.raises(InputError, match="driven again to be filmed"):
+    with pytest.raises(InputError, match="driven again for its film"):
         validate.validate(fresh, ["left"], "ahead", ["day"], 1, films=True)
     assert not list((fresh / "validation").rglob("*.mp4")) and (fresh / "validation" / "validation.html").exists()
 
@@ -301,7 +312,7 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
 @pytest.mark.parametrize("count", [1, 4, 24, 1000])
 def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count):
     won = np.arange(count) % 3 == 0
-    points = binned(np.arange(count), won)
+    points = binned_rates(np.arange(count), won)
     assert sum(n for _, _, n, _, _ in points) == count and sum(k for _, k, _, _, _ in points) == won.sum()
     assert all(n >= min(5, count) and low - 1e-9 <= k / n <= high + 1e-9 for _, k, n, low, high in points)
     assert len(points) == min(25, max(1, count // 5))
@@ -311,7 +322,7 @@ def test_whose_robot_is_judged_is_said():
     """Where episodes are drawn anew and nothing is known of the robot, it says what would tell."""
 
     def cautions(light: str, **more) -> str:
-        return " ".join(c.what for c in unknowns(told([trial(light=light)], **more)))
+        return " ".join(c.what for c in limitations(told([trial(light=light)], **more)))
 
     assert "another one drives every episode" in cautions("held-out+randomised", robot_known=[])
     assert "another one" not in cautions("held-out+randomised", robot_known=["friction"])
@@ -319,12 +330,12 @@ def test_whose_robot_is_judged_is_said():
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
-@pytest.mark.parametrize("lights", [2, FEW, 11])
+@pytest.mark.parametrize("lights", [2, MAX_PLOTTED_LIGHTINGS, 11])
 def test_names_of_many_lightings_leave_room_for_the_rates(lights):
     """A legend wider than the figure, or names taller than it, would squeeze its axes to nothing."""
     names = [f"afternoon_of_day_{k}+randomised" for k in range(lights)]
-    cells = summary([trial(light=name) for name in names])["cells"]
-    figure = rates(cells) if lights <= FEW else rate_tiles(cells, {})
+    cells = summarize([trial(light=name) for name in names])["cells"]
+    figure = rate_figure(cells) if lights <= MAX_PLOTTED_LIGHTINGS else rate_heatmap(cells, {})
     FigureCanvasAgg(figure).draw()
     assert figure.axes[0].get_position().width > 0.5
 
@@ -343,7 +354,7 @@ def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
 
 def test_many_lightings_are_tiles_with_the_mean_of_those_that_all_drove():
     """`a` is better in every light; a mean over what each drove, or over episodes, would say otherwise."""
-    assert FEW < 6
+    assert MAX_PLOTTED_LIGHTINGS < 6
     won = {"a": [0, 25, 100, 100, 100, 100], "b": [None, None, 100, 75, 75, 75]}
     trials = [
         trial(policy, seed, "goal" if seed < rate * n / 100 else "collision", light=f"day_{k}")
@@ -353,7 +364,7 @@ def test_many_lightings_are_tiles_with_the_mean_of_those_that_all_drove():
         for n in [20 if k == 2 else 4]
         for seed in range(n)
     ]
-    drawn = tiles(rate_tiles(summary(trials)["cells"], {"a": 0.5, "b": None}))
+    drawn = tiles(rate_heatmap(summarize(trials)["cells"], {"a": 0.5, "b": None}))
     assert {light: text for (policy, light), (text, _) in drawn.items() if policy == "a"} == {
         "in training": "50", "mean": "100",
         "day_0": "0", "day_1": "25", "day_2": "100", "day_3": "100", "day_4": "100", "day_5": "100",
@@ -366,7 +377,7 @@ def test_many_lightings_are_tiles_with_the_mean_of_those_that_all_drove():
 
 def test_where_no_lighting_is_shared_there_is_no_mean():
     trials = [trial("ab"[k % 2], seed, light=f"day_{k}") for k in range(6) for seed in range(3)]
-    drawn = tiles(rate_tiles(summary(trials)["cells"], {}))
+    drawn = tiles(rate_heatmap(summarize(trials)["cells"], {}))
     assert set(drawn) == {("ab"[k % 2], f"day_{k}") for k in range(6)}
 
 
@@ -374,7 +385,7 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
     """`good` arrives in 20 episodes, `fair` in 2, `poor` in none: two more may be chance."""
     won = {"poor": 0, "good": 20, "fair": 2}
     trials = [trial(name, seed, "goal" if seed < n else "collision") for name, n in won.items() for seed in range(20)]
-    drawn = tiles(better(summary(trials)["pairs"]))
+    drawn = tiles(pair_heatmap(summarize(trials)["pairs"]))
     assert {key: text for key, (text, _) in drawn.items()} == {
         ("good  1", "2"): "+18", ("good  1", "3"): "+20", ("fair  2", "1"): "−18",
         ("fair  2", "3"): "+2", ("poor  3", "1"): "−20", ("poor  3", "2"): "−2",
@@ -387,8 +398,8 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
 
 
 def test_what_never_drove_the_same_is_not_compared():
-    assert summary([trial("a", 1), trial("b", 2), trial("c", 1, light="night")])["pairs"] == []
-    (pair,) = summary([trial("a", 1), trial("b", 1), trial("c", 2)])["pairs"]
+    assert summarize([trial("a", 1), trial("b", 2), trial("c", 1, light="night")])["pairs"] == []
+    (pair,) = summarize([trial("a", 1), trial("b", 1), trial("c", 2)])["pairs"]
     assert (pair["a"], pair["b"], pair["episodes"]) == ("a", "b", 1)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.report.video_writer import VideoWriter, describe, even, read_frames
+from twin.report.video_writer import VideoWriter, even, read_frames, video_info
 
 
 def _gradient(i: int, width: int = 64, height: int = 48) -> np.ndarray:
@@ -19,7 +19,7 @@ def test_a_film_is_h264_yuv420p_and_keeps_its_pictures(tmp_path: Path) -> None:
     with VideoWriter(path, (64, 48), fps=5, crf=12) as film:
         for frame in frames:
             film.write(frame)
-    about = describe(path)
+    about = video_info(path)
     assert (about["codec"], about["pixel_format"]) == ("h264", "yuv420p")
     assert (about["width"], about["height"], about["fps"], about["frames"]) == (64, 48, 5.0, 10)
     read = list(read_frames(path))

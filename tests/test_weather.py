@@ -8,11 +8,11 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import runtime
-from twin.env.domain_randomization import ANOTHER_DAY, UNTOLD, RandomizationSample, Ranges
+from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, RandomizationSample, Ranges
 from twin.env.episode_lighting import LightingSets, sample_lighting
 from twin.env.suite import EnvFactory, fingerprint
 from twin.env.task import WEATHER, DriveTask
-from twin.env.weather import DirectionalRelighting, FogSample, Weather, _solids
+from twin.env.weather import DirectionalRelighting, FogSample, Weather, _solid_shadows
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.added_lightings import AddedLighting, field_result
 from twin.nerf.fog import Fog
@@ -30,18 +30,18 @@ def scene(tmp_path_factory):
 def test_haze_hides_by_distance_and_spares_what_is_near():
     distance = np.array([[1500.0, 1500.0], [30.0, 3.0]], np.float32)
     rgb = np.array([[[0.8] * 3, [0.6] * 3], [[0.1] * 3, [0.1] * 3]], np.float32)
-    np.testing.assert_array_equal(FogSample(0.0).over(rgb, distance), rgb)
-    hazy = FogSample(0.05).over(rgb, distance)
+    np.testing.assert_array_equal(FogSample(0.0).apply(rgb, distance), rgb)
+    hazy = FogSample(0.05).apply(rgb, distance)
     np.testing.assert_allclose(hazy[0], 0.7, atol=1e-3)  # the horizon, whose mean is the airlight
     for column, metres in ((0, 30.0), (1, 3.0)):
         kept = np.exp(-0.05 * metres)
         np.testing.assert_allclose(hazy[1, column], kept * 0.1 + (1 - kept) * 0.7, rtol=1e-5)
-    np.testing.assert_allclose(FogSample(0.05, 0.5).over(rgb, distance)[0], 0.35, atol=4e-3)
+    np.testing.assert_allclose(FogSample(0.05, 0.5).apply(rgb, distance)[0], 0.35, atol=4e-3)
     air = FogSample(0.05)
-    air.over(rgb, distance)
-    np.testing.assert_allclose(air.over(0.0 * rgb, distance)[0], 0.7, atol=6e-3)  # that of the first picture
+    air.apply(rgb, distance)
+    np.testing.assert_allclose(air.apply(0.0 * rgb, distance)[0], 0.7, atol=6e-3)  # that of the first picture
     near = np.ones_like(distance)
-    np.testing.assert_allclose(FogSample(1e3).over(rgb, near)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
+    np.testing.assert_allclose(FogSample(1e3).apply(rgb, near)[1], rgb[:1].mean(), rtol=1e-5)  # nothing is far
 
 
 def _pose(x: float, turned: float) -> np.ndarray:
@@ -58,14 +58,14 @@ def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
     covers = []
     for seed in range(30):
         weather = Weather(RandomizationSample(shade=0.5), np.random.default_rng(seed))
-        light = weather.over(rgb, depth, rays, _pose(0.0, 0.0))
+        light = weather.apply(rgb, depth, rays, _pose(0.0, 0.0))
         assert light.min() >= 0.5 and light.max() <= 1.0
-        moved = weather.over(rgb, depth, rays, _pose(0.5, 0.0))  # five pixels further
+        moved = weather.apply(rgb, depth, rays, _pose(0.5, 0.0))  # five pixels further
         np.testing.assert_allclose(moved[:, :-5], light[:, 5:], atol=1e-4)
-        turned = weather.over(rgb, depth, rays, _pose(0.0, np.pi / 2))
+        turned = weather.apply(rgb, depth, rays, _pose(0.0, np.pi / 2))
         np.testing.assert_allclose(np.rot90(turned), light, atol=1e-4)
         covers.append(float((light[..., 0] < 0.75).mean()))
-        np.testing.assert_array_equal(weather.over(rgb, 500.0 * depth, rays, np.eye(4)), rgb)  # the sky
+        np.testing.assert_array_equal(weather.apply(rgb, 500.0 * depth, rays, np.eye(4)), rgb)  # the sky
     assert 0.1 < np.mean(covers) < 0.6 and np.std(covers) > 0.1
 
 
@@ -84,7 +84,7 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
     np.testing.assert_array_equal(clear, plain)
     assert task.obstacles == ()
     hazy, task = first(extinction=(0.2, 0.2))
-    assert hazy.std() < 0.9 * clear.std() and task.draw.record()["extinction"] == pytest.approx(0.2)
+    assert hazy.std() < 0.9 * clear.std() and task.sample.record()["extinction"] == pytest.approx(0.2)
     wide = twin.load(scene, "ahead", 0, pixels=False, half_width=3.0, randomise=Ranges(bystanders=(4, 4)))
     wide.reset()
     assert len(wide.task.obstacles) == 4 and all(abs(one.lateral) > 3.6 for one in wide.task.obstacles)
@@ -98,7 +98,7 @@ def test_randomised_episodes_have_weather_and_bystanders(scene):
         differ.append(not np.array_equal(crowded, first(seed, extinction=(0.0, 0.0))[0]))
     assert any(differ)
     rng = np.random.default_rng(0)
-    assert {Ranges(bystanders=(0, 3)).draw(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
+    assert {Ranges(bystanders=(0, 3)).sample(rng).bystanders for _ in range(60)} == {0, 1, 2, 3}
 
 
 FOG = Fog(0.1, (0.9, 0.8, 0.7))
@@ -125,18 +125,20 @@ def test_a_picture_under_a_photos_light_is_seen_through_its_air(photos):
     plain, environment = first("day")
     np.testing.assert_array_equal(first("clear")[0], plain)
     view = Viewpoints.of(
-        environment.physics.camera_to_world[None], environment.pixels._overlay.intrinsics, SMALL["size"]
+        environment.physics.camera_to_world[None], environment.pixels._renderer.intrinsics, SMALL["size"]
     )
     seen = built.field().render(view, "day")
-    rays = unproject(pixel_grid(*SMALL["size"]), environment.pixels._overlay.intrinsics)
+    rays = unproject(pixel_grid(*SMALL["size"]), environment.pixels._renderer.intrinsics)
     kept = np.exp(-0.1 * np.minimum(seen.depth[0] * np.linalg.norm(rays, axis=-1), 100.0))[..., None]
     expected = kept * np.clip(seen.rgb[0], 0.0, 1.0) + (1.0 - kept) * [0.9, 0.8, 0.7]
     np.testing.assert_allclose(first("foggy")[0], 255.0 * expected, atol=2.0)
     half = first("day:foggy:0.5")[0]
     assert np.abs(half - plain).mean() < np.abs(first("foggy")[0] - plain).mean()
-    bare = [EnvFactory.open(built, "ahead", {"lighting": name, **SMALL})._bare for name in ("day", "clear", "foggy")]
+    bare = [
+        EnvFactory.open(built, "ahead", {"lighting": name, **SMALL})._field_only for name in ("day", "clear", "foggy")
+    ]
     assert bare == [True, True, False]  # pictures that stay on a device have no air
-    assert not EnvFactory.open(built, "ahead", {"lighting": ("day", "foggy"), **SMALL})._bare
+    assert not EnvFactory.open(built, "ahead", {"lighting": ("day", "foggy"), **SMALL})._field_only
 
 
 def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
@@ -146,15 +148,15 @@ def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
     ranges = Ranges(**(still | strong), hold_known=True)
     environment = twin.load(photos, "ahead", 3, lighting="foggy", **SMALL, randomise=ranges)
     shown = environment.reset().observation["pixels"][-1].astype(float)
-    intrinsics, task = environment.pixels._overlay.intrinsics, environment.task
+    intrinsics, task = environment.pixels._renderer.intrinsics, environment.task
     pose, rays = environment.physics.camera_to_world, unproject(pixel_grid(*SMALL["size"]), intrinsics)
     seen = photos.field().render(Viewpoints.of(pose[None], intrinsics, SMALL["size"]), "day")
-    left = RandomizationSample(sunlight=0.7 * UNTOLD, shade=0.75 * UNTOLD)
-    lit = Weather(left, task.rng(WEATHER)).over(seen.rgb[0], seen.depth[0], rays, pose)
+    left = RandomizationSample(sunlight=0.7 * KNOWN_WEATHER_FRACTION, shade=0.75 * KNOWN_WEATHER_FRACTION)
+    lit = Weather(left, task.rng(WEATHER)).apply(seen.rgb[0], seen.depth[0], rays, pose)
     distance = seen.depth[0] * np.linalg.norm(rays, axis=-1)
-    expected = FOG.over(lit, distance.astype(np.float32))
+    expected = FOG.apply(lit, distance.astype(np.float32))
     np.testing.assert_allclose(shown, 255.0 * np.clip(expected, 0.0, 1.0), atol=1.0)
-    assert np.abs(255.0 * expected - 255.0 * FOG.over(seen.rgb[0], distance)).max() > 10.0  # it shows
+    assert np.abs(255.0 * expected - 255.0 * FOG.apply(seen.rgb[0], distance)).max() > 10.0  # it shows
 
 
 def test_the_air_drifts_with_the_light(photos):
@@ -167,19 +169,19 @@ def test_the_air_drifts_with_the_light(photos):
     assert ends == {"foggy → day", "foggy → night"}  # filmed ones
     away = light("foggy")
     for time, share in ((0.0, 1.0), (2.5, 0.75), (5.0, 0.5), (10.0, 0.0), (99.0, 0.0)):
-        air = away.air_at(time)
+        air = away.fog_at(time)
         assert air.extinction == pytest.approx(share * FOG.extinction)
         assert not share or air.airlight == pytest.approx(FOG.airlight)
     extinctions = {
         air if air is None else round(air.extinction, 6)
-        for air in (light(("day", "foggy"), seed).air_at(99.0) for seed in range(20))
+        for air in (light(("day", "foggy"), seed).fog_at(99.0) for seed in range(20))
     }
     assert extinctions == {None, 0.0, FOG.extinction}
     environment = twin.load(photos, "ahead", 3, lighting="foggy", **SMALL, lighting_drift=True)
     environment.reset()
-    environment.pixels.lights[0] = replace(environment.pixels.lights[0], duration=0.1)
+    environment.pixels.lightings[0] = replace(environment.pixels.lightings[0], duration=0.1)
     cleared = environment.step(np.zeros(2)).observation["pixels"][-1].astype(float)
-    environment.pixels.lights[0] = replace(environment.pixels.lights[0], end_air=FOG)
+    environment.pixels.lightings[0] = replace(environment.pixels.lightings[0], end_fog=FOG)
     assert np.abs(environment.step(np.zeros(2)).observation["pixels"][-1] - cleared).mean() > 5.0
 
 
@@ -188,27 +190,27 @@ def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows
     def draw(lighting: str, ranges: Ranges) -> RandomizationSample:
         environment = twin.load(photos, "ahead", 5, lighting=lighting, **SMALL, randomise=ranges)
         environment.reset()
-        told = environment.task.draw
+        told = environment.task.sample
         assert environment.task.info(environment.physics)["randomisation"] == told.record()
         return told
 
-    unknown, known = draw("day", ANOTHER_DAY), draw(lighting, ANOTHER_DAY)
+    unknown, known = draw("day", EVALUATION_RANGES), draw(lighting, EVALUATION_RANGES)
     assert unknown.extinction > 0.0
-    weaker = {"sunlight": UNTOLD * unknown.sunlight, "shade": UNTOLD * unknown.shade}
+    weaker = {"sunlight": KNOWN_WEATHER_FRACTION * unknown.sunlight, "shade": KNOWN_WEATHER_FRACTION * unknown.shade}
     assert known == replace(unknown, extinction=0.0, airlight=1.0, **weaker)
-    assert draw(lighting, replace(ANOTHER_DAY, hold_known=False)) == unknown  # as in training
+    assert draw(lighting, replace(EVALUATION_RANGES, hold_known=False)) == unknown  # as in training
 
 
 def test_validations_know_how_much_a_photo_leaves_to_be_drawn(photos, monkeypatch):
     names = ("foggy", "foggy+randomised", "day+randomised")
     before = [fingerprint(photos, "ahead", name) for name in names]
-    monkeypatch.setattr("twin.env.suite.UNTOLD", 0.5)
+    monkeypatch.setattr("twin.env.suite.KNOWN_WEATHER_FRACTION", 0.5)
     after = [fingerprint(photos, "ahead", name) for name in names]
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, True]
 
 
 def test_solid_shadows_have_straight_edges_and_no_seam():
-    patterns = np.stack([_solids(np.random.default_rng(seed)) for seed in range(40)])
+    patterns = np.stack([_solid_shadows(np.random.default_rng(seed)) for seed in range(40)])
     assert patterns.min() == 0.0 and patterns.max() == 1.0
     covers = patterns.mean((1, 2))
     assert covers.min() > 0.02 and covers.max() < 0.9 and covers.std() > 0.05
@@ -250,7 +252,7 @@ def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]
 def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
     depth, points, masks = street(ground)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
-    lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)
+    lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).apply(rgb, depth, points)
     light = {name: np.median(lit[mask][:, 1]) / 0.5 for name, mask in masks.items()}
     assert light["ground"] == pytest.approx(1.0, abs=0.01)
     assert light["right"] == pytest.approx(np.exp(0.7 * (np.cos(LOW) - np.sin(LOW))), rel=0.01)
@@ -260,7 +262,7 @@ def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
     towards, away = (lit[masks["sky"] & side][:, 1].mean() for side in (RAYS[..., 0] < 0.0, RAYS[..., 0] > 0.0))
     assert towards > 1.05 * away
     np.testing.assert_array_equal(
-        DirectionalRelighting(0.0, LEFT, np.random.default_rng(0)).over(rgb, depth, points), rgb
+        DirectionalRelighting(0.0, LEFT, np.random.default_rng(0)).apply(rgb, depth, points), rgb
     )
 
 
@@ -268,7 +270,7 @@ def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
     ahead = np.tile(np.linspace(20.0, 45.0, 251, dtype=np.float32), (3, 1))
     points = np.stack([np.minimum(ahead, 40.0), 0.0 * ahead, 0.0 * ahead - 1.0], -1)  # the ground, 1 m below
     rgb = np.full((*ahead.shape, 3), 0.5, np.float32)
-    lit = np.log(DirectionalRelighting(0.7, LEFT, np.random.default_rng(3)).over(rgb, ahead, points)[0, :, 1] / 0.5)
+    lit = np.log(DirectionalRelighting(0.7, LEFT, np.random.default_rng(3)).apply(rgb, ahead, points)[0, :, 1] / 0.5)
     assert abs(lit[0]) < 1e-3 and np.ptp(lit[-40:]) < 1e-3 and abs(lit[-1]) > 0.05
     steps = np.diff(lit)
     assert np.abs(steps).max() < 0.02 * abs(lit[-1]) and (np.sign(lit[-1]) * steps > -1e-3).all()
@@ -277,13 +279,13 @@ def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
 def test_what_is_low_keeps_its_light_and_skies_differ():
     depth, points, masks = street(1.0)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
-    lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).over(rgb, depth, points)[..., 1] / 0.5
+    lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).apply(rgb, depth, points)[..., 1] / 0.5
     high, right = points[..., 2], points[..., 1] < -3.9
     middle = np.median(lit[right & (abs(high + 0.2) < 0.05) & (depth < 15.0)])
     assert np.log(middle) == pytest.approx(0.5 * 0.7 * (np.cos(LOW) - np.sin(LOW)), rel=0.15)
     assert np.median(lit[right & (high < -0.5) & (high > -0.9) & (depth < 15.0)]) == pytest.approx(1.0, abs=0.01)
     skies = [
-        np.median(DirectionalRelighting(0.7, LEFT, np.random.default_rng(k)).over(rgb, depth, points)[masks["sky"]])
+        np.median(DirectionalRelighting(0.7, LEFT, np.random.default_rng(k)).apply(rgb, depth, points)[masks["sky"]])
         for k in range(20)
     ]
     assert np.std(np.log(skies)) > 0.2
@@ -304,13 +306,13 @@ def test_the_sun_stays_where_it_is_when_the_robot_turns_and_its_shadows_are_its_
             pose[:3, 3] = -100.0, -50.0, 0.5
             ahead = (RAYS @ pose[:3, :3].T)[..., 0]
             depth = (10.0 / ahead).astype(np.float32)  # a wall across x, 10 m ahead
-            lit = weather.over(rgb, depth, RAYS, pose)
+            lit = weather.apply(rgb, depth, RAYS, pose)
             seen.append(np.median(lit[:20, 20:-20, 1]) / 0.5)
-        sun = weather._sides._sun
+        sun = weather._relighting._sun
         assert seen == pytest.approx([np.exp(0.7 * (-sun[0] - sun[2]))] * 2, rel=0.01)  # the wall looks back at us
         ratios.append(seen[0])
     assert max(ratios) > 1.3 and min(ratios) < 0.6
-    sides = weather._sides
+    sides = weather._relighting
     both = Weather(RandomizationSample(sunlight=0.7, shade=0.5), np.random.default_rng(11))
-    np.testing.assert_allclose(both._sides._sun, sides._sun)
-    np.testing.assert_allclose(both._shade._slant, sides._sun[:2] / sides._sun[2], rtol=1e-5)
+    np.testing.assert_allclose(both._relighting._sun, sides._sun)
+    np.testing.assert_allclose(both._shadows._slant, sides._sun[:2] / sides._sun[2], rtol=1e-5)

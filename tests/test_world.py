@@ -14,14 +14,14 @@ from twin.geometry.images import read_image
 from twin.mjcf.scene_xml import (
     add_ground,
     check_portable,
-    compacted,
     covered_by_ground,
-    face_tiles,
+    drop_unused_vertices,
+    face_texture,
     film_camera,
     rest_pose,
     run,
 )
-from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest, point_at, total_turn
+from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest_on_route, point_at, total_turn
 from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams
 
 
@@ -253,7 +253,7 @@ def test_a_robot_fitted_on_soft_ground_starts_on_a_slope(tmp_path, degrees, serv
 
 
 def test_something_solid_at_the_start_is_refused_on_soft_ground_too(tmp_path):
-    with pytest.raises(InputError, match=r"something solid is there: raise mesh\.obstacle_height"):
+    with pytest.raises(InputError, match=r"an obstacle is there: raise mesh\.obstacle_height"):
         on_a_slope(tmp_path, 2.0, SOFT, boxes=((0.4, 0.3, 0.2),))
 
 
@@ -278,7 +278,7 @@ def test_a_copy_that_moves_otherwise_is_a_bug_of_the_exporter(tmp_path, written,
     text = (out / "scene.xml").read_text()
     assert text.count(written) == 1
     (out / "scene.xml").write_text(text.replace(written, instead))
-    with pytest.raises(RuntimeError, match="moves otherwise"):
+    with pytest.raises(RuntimeError, match="moves differently"):
         check_portable(out, built)
 
 
@@ -299,7 +299,7 @@ def test_tiles_interpolate_corner_colours_exactly():
     """Bilinear lookup in the texture, by hand, against the linear interpolation of the corners."""
     rng = np.random.default_rng(2)
     colors = rng.integers(60, 120, (7, 3, 3)).astype(np.uint8)  # no clamping of the fourth texel
-    texture, texcoords = face_tiles(colors)
+    texture, texcoords = face_texture(colors)
     height, width, _ = texture.shape
     for face in range(7):
         weights = rng.dirichlet(np.ones(3))
@@ -317,7 +317,7 @@ def test_texture_coordinates_survive_the_obj(exported):
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     with np.load(folder.parent / "4_mesh" / "visual.npz") as data:
         vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
-    vertices, colors, faces = compacted(
+    vertices, colors, faces = drop_unused_vertices(
         vertices, colors, faces[~covered_by_ground(vertices, tiny_ground())[faces].all(1)]
     )
     mesh = model.mesh("visual")
@@ -342,7 +342,7 @@ def test_nearest_against_dense_samples():
     s_dense = np.linspace(0, arc_lengths(route)[-1], 20001)
     dense = point_at(route, s_dense)
     points = np.random.default_rng(3).uniform([-1, -5], [10, 2], (60, 2))
-    s, error = nearest(route, points)
+    s, error = nearest_on_route(route, points)
     gaps = np.linalg.norm(points[:, None] - dense[None], axis=-1)
     np.testing.assert_allclose(np.abs(error), gaps.min(1), atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(point_at(route, s) - points, axis=1), np.abs(error), atol=1e-9)
@@ -350,13 +350,13 @@ def test_nearest_against_dense_samples():
 
 def test_left_of_the_route_is_positive():
     route = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]])
-    s, error = nearest(route, np.array([[5.0, 1.0], [5.0, -1.0], [9.0, 5.0]]))
+    s, error = nearest_on_route(route, np.array([[5.0, 1.0], [5.0, -1.0], [9.0, 5.0]]))
     np.testing.assert_allclose(s, [5.0, 5.0, 15.0])
     np.testing.assert_allclose(error, [1.0, -1.0, 1.0])
     # A route that meets itself: only the wanted stretch is looked at.
     loop = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.1]])
-    assert nearest(loop, np.array([0.02, 0.2]))[0] == pytest.approx(15.8)
-    assert nearest(loop, np.array([0.02, 0.2]), around=(0.0, 2.0))[0] == pytest.approx(0.02)
+    assert nearest_on_route(loop, np.array([0.02, 0.2]))[0] == pytest.approx(15.8)
+    assert nearest_on_route(loop, np.array([0.02, 0.2]), around=(0.0, 2.0))[0] == pytest.approx(0.02)
 
 
 def test_headings_and_turns():
@@ -385,7 +385,7 @@ def test_many_points_are_projected_as_each_alone():
     middle = rng.uniform(0.0, arc_lengths(route)[-1], 50)
     low, high = middle - rng.uniform(0.0, 1.0, 50), middle + rng.uniform(0.0, 3.0, 50)
     points = point_at(route, middle) + rng.normal(scale=0.5, size=(50, 2))
-    together = np.stack(nearest(route, points, (low, high)), -1)
-    alone = [nearest(route, points[i], (low[i], high[i])) for i in range(50)]
+    together = np.stack(nearest_on_route(route, points, (low, high)), -1)
+    alone = [nearest_on_route(route, points[i], (low[i], high[i])) for i in range(50)]
     np.testing.assert_array_equal(together, alone)
-    assert (np.abs(together[:, 0] - nearest(route, points)[0]) > 1.0).any()  # elsewhere it is nearer still
+    assert (np.abs(together[:, 0] - nearest_on_route(route, points)[0]) > 1.0).any()  # elsewhere it is nearer still

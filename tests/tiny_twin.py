@@ -10,10 +10,10 @@ from tiny_world import tiny_config, tiny_ground, tiny_scene
 
 from twin.mjcf.scene_xml import run
 from twin.nerf.baked import BakedField
-from twin.nerf.brick_layout import BrickLayout, leaps
+from twin.nerf.brick_layout import BrickLayout, skip_distances
 from twin.nerf.lightings import Lightings
 from twin.robot import HuskyParams
-from twin.scene import seal
+from twin.scene import write_stamp
 
 LAYOUT = BrickLayout((4.5, -2.5, 1.0), (8.0, 6.0, 2.0), 0.1, 0.5, (12, 9, 5), (8, 8, 4))
 
@@ -45,7 +45,7 @@ def tiny_twin(
     scene.stage("field").mkdir()
     tiny_field(boxes).save(scene.stage("field"))
     for stage in ("metric", "mesh", "mjcf", "field"):
-        seal(scene.stage(stage), stage)
+        write_stamp(scene.stage(stage), stage)
     return root
 
 
@@ -83,4 +83,4 @@ def tiny_field(boxes) -> BakedField:
     vectors = np.eye(2, 4, dtype=np.float32)
     frames = np.repeat(vectors, 4, 0) + rng.normal(0, 0.1, (8, 4)).astype(np.float32)
     names = Lightings(("day", "night"), vectors, tuple(f"{n}/{k}" for n in ("day", "night") for k in range(4)), frames)
-    return BakedField(layout, names, arrays | leaps(layout, arrays), "cpu")
+    return BakedField(layout, names, arrays | skip_distances(layout, arrays), "cpu")

@@ -15,13 +15,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from twin import cli, runtime
+from twin import commands, runtime
 from twin.config import SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError
-from twin.files import digest_file, path_is_link, remove, write_json
-from twin.runtime import PeakMemory, alone
-from twin.scene import STAGES, SceneDir, Stamp, commit, key_of, package_versions, recover, replace_file, seal
+from twin.files import digest_file, is_link, remove, write_json
+from twin.runtime import PeakMemory, exclusive_lock
+from twin.scene import (
+    SceneDir,
+    Stamp,
+    commit_stage,
+    package_versions,
+    recover_stages,
+    replace_file,
+    stage_key,
+    write_stamp,
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +66,15 @@ PIPELINE = (
     ),
 )
 
+_ON_DEVICE = ("field", "mesh")
+"""Stages that take a device."""
+
+_TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
+"""Durations [s] on the demo with 2 cores; only their ratios matter, since the pace of a build is measured."""
+
+_LEAST_TIMED = 30.0
+"""Typical seconds that must have been measured before a time left is said: the first stage is too short to tell."""
+
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")
 """Folders of a scene that twin writes: never an input."""
 
@@ -66,6 +84,7 @@ def build(
     until: str | None = None,
     force: tuple[str, ...] = (),
     overrides: tuple[str, ...] = (),
+    device: str | None = None,
 ) -> dict[str, Any]:
     """Builds the scene at `root` and returns its report (also written to `build/report.json`).
 
@@ -74,25 +93,32 @@ def build(
         until: Last stage to run; None = all.
         force: Stages to run again although they are up to date.
         overrides: `section.key=value` settings that take precedence over `scene.toml`.
+        device: cpu or cuda, for the stages that compute the field; None: cuda where it is usable.
 
     Raises:
         InputError: Bad input; what was built before stays as it was.
     """
     scene = SceneDir(root)
     config = load_config(scene.config_file, overrides)
+    if device:
+        from twin.nerf.buffers import resolve_device
+
+        resolve_device(device)  # before anything is built
     inputs = input_digests(scene, config)
     _check_folder(scene.build)
     scene.build.mkdir(exist_ok=True)
-    with alone(scene.build / ".lock", f"{scene.root} is being built"):
-        recover(scene)
+    with exclusive_lock(scene.build / ".lock", f"{scene.root} is being built"):
+        recover_stages(scene)
         stamps: dict[str, Stamp] = {}
         skipped: dict[str, bool] = {}
         for stage in PIPELINE:
             depends = _depends(stage, config, inputs, stamps)
             stamp = None if stage.name in force else Stamp.load(scene.stage(stage.name))
-            skipped[stage.name] = stamp is not None and stamp.key == key_of(depends)
+            skipped[stage.name] = stamp is not None and stamp.key == stage_key(depends)
             if stamp is None or not skipped[stage.name]:
-                stamp = _run(stage, scene, config, depends)
+                done = {name: it.seconds for name, it in stamps.items() if not skipped[name]}
+                _announce(stage, done, until)
+                stamp = _run(stage, scene, config, depends, device)
             stamps[stage.name] = stamp
             if stage.name == until:
                 break
@@ -101,8 +127,27 @@ def build(
     return report
 
 
+def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
+    """Says which stage begins and, once the pace is known, how long the rest of the build takes.
+
+    Args:
+        stage: The stage.
+        done: Durations [s] of the stages that this build ran before it.
+        until: Last stage to run; None = all.
+    """
+    names = [one.name for one in PIPELINE]
+    names = names[: names.index(until) + 1] if until else names
+    number = names.index(stage.name)
+    typical = sum(_TYPICAL[name] for name in done)
+    pace = sum(done.values()) / typical if typical else 1.0
+    expected = [pace * _TYPICAL[name] for name in names[number:]]
+    runtime.set_stage(runtime.BuildStage(number + 1, len(names), expected[0], sum(expected[1:])))
+    left = f", about {max(1, round(sum(expected) / 60))} min left" if typical > _LEAST_TIMED else ""
+    runtime.log_line(f"stage {number + 1} of {len(names)}: {stage.name}{left}")
+
+
 def _check_folder(folder: Path) -> None:
-    if (path_is_link(folder) and not folder.exists()) or (folder.exists() and not folder.is_dir()):
+    if (is_link(folder) and not folder.exists()) or (folder.exists() and not folder.is_dir()):
         raise InputError(f"{folder} is no folder; move it away: what is built goes there")
 
 
@@ -115,7 +160,7 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     Raises:
         InputError: one is absent, or neither a file nor a folder.
     """
-    from twin.capture.formats import files_read, is_image
+    from twin.capture.formats import is_image, source_files
     from twin.files import is_folder
 
     files: set[Path] = set()
@@ -125,7 +170,7 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
             is_folder(path, f"put {name!r} of {scene.config_file} there or correct the path")
         path = scene.root / source.path
         images = scene.root / source.images if source.images else None
-        read = files_read(path, source.kind, images)
+        read = source_files(path, source.kind, images)
         files.update(read)
         posed = path.suffix == ".json" or (path.is_dir() and any(path.glob("cameras.*")))
         # Beside a posed set lies what else belongs to it, all below one folder of the scene.
@@ -184,20 +229,22 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     }
 
 
-def _run(stage: Stage, scene: SceneDir, config: SceneConfig, depends: dict[str, Any]) -> Stamp:
-    runtime.say(f"{stage.name}")
+def _run(stage: Stage, scene: SceneDir, config: SceneConfig, depends: dict[str, Any], device: str | None) -> Stamp:
     out = scene.partial(stage.name)
     out.mkdir()
     start = time.perf_counter()
     try:
         with PeakMemory() as peak:
-            metrics = importlib.import_module(stage.module).run(scene, config, out)
+            choice = {"device": device} if stage.name in _ON_DEVICE else {}
+            metrics = importlib.import_module(stage.module).run(scene, config, out, **choice)
         about = {"metrics": metrics, "seconds": time.perf_counter() - start, "peak_memory_bytes": peak.bytes}
-        stamp = seal(out, stage.name, depends, device=os.environ.get("TWIN_DEVICE", "auto"), **about)
+        stamp = write_stamp(out, stage.name, depends, device=device or "auto", **about)
     except BaseException:
         remove(out)
         raise
-    commit(scene, stage.name)
+    finally:
+        runtime.set_stage(None)
+    commit_stage(scene, stage.name)
     return stamp
 
 
@@ -235,10 +282,10 @@ def publish(scene: SceneDir, report: dict[str, Any]) -> None:
         report: All but `truth`, the comparison with the known truth if this build has one, and `cautions`, which are
             put into it.
     """
-    from twin.report.build_report import comparison_of
+    from twin.report.build_report import load_truth_comparison
     from twin.report.build_sections import cautions
 
-    compared = comparison_of(scene)
+    compared = load_truth_comparison(scene)
     report["truth"] = compared and compared["figures"]
     report["cautions"] = cautions(report)
     write_json(scene.report_json, report)
@@ -247,17 +294,6 @@ def publish(scene: SceneDir, report: dict[str, Any]) -> None:
 
         replace_file(scene.stage("review") / "review.mp4", scene.review_mp4)
         write_page(scene, report)
-
-
-def _select_device(device: str | None) -> None:
-    if device is None:
-        return
-    if device == "cuda":
-        import torch
-
-        if not torch.cuda.is_available():
-            raise InputError("--device cuda: no usable CUDA device; leave the option out, or use --device cpu")
-    os.environ["TWIN_DEVICE"] = device
 
 
 def summary(report: dict[str, Any]) -> str:
@@ -299,46 +335,14 @@ def summary(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-_EPILOG = """\
-a scene.toml of your own road:
-
-  [[source]]                      # one per film; several lightings make one twin
-  path = "input/morning.mp4"      # video, photo folder, COLMAP model or transforms.json
-  lighting = "morning"
-  # mask = "input/robot.png"      # 0 = ignore (an image, or a folder named like the frames)
-  # camera = { model = "PINHOLE", params = [fx, fy, cx, cy], width = 1280, height = 720 }
-
-  [metric]                        # where the metres come from: one of
-  camera_height = 1.2             #   lens above the ground [m]
-  # gps = true                    #   EXIF positions
-  # distance = { metres = 5.0, frame_a = "morning/000010", a = [u, v], b = [u, v] }
-  # marker = { family = "DICT_APRILTAG_36h11", id = 0, size = 0.2 }
-  # poses_are_metric = true       #   poses that came with the input
-
-python -m twin.new SCENE VIDEO... writes such a folder.
-"""
-
-
-def main(argv: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Runs the verb; returns the exit status, see `twin.cli`."""
-    parser = cli.Parser(
-        prog="python -m twin.build",
-        description="Turn a filmed place into a drivable MuJoCo twin.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("scene", type=Path, help="folder with scene.toml and input/")
-    parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"stop after: {', '.join(STAGES)}")
-    parser.add_argument("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="run it again")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
-    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return cli.run(parser, _main, argv)
+    return commands.main("build", arguments)
 
 
-def _main(options: argparse.Namespace) -> None:
-    _select_device(options.device)
-    report = build(options.scene, options.until, tuple(options.force), tuple(options.set))
+def command(options: argparse.Namespace) -> None:
+    """The work of the verb, given the options of `twin.commands`."""
+    report = build(options.scene, options.until, tuple(options.force), tuple(options.set), options.device)
     if not options.quiet:
         print(summary(report))
         if options.until is None:

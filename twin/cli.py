@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 from twin import runtime
-from twin.errors import InputError, refuse, shortened
+from twin.errors import InputError, print_error, shortened
 
 _STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _FULL = "free some space and run it again"
@@ -81,15 +81,15 @@ def run(parser: argparse.ArgumentParser, work: Callable[[Any], None], arguments:
             work(options)
             sys.stdout.flush()
     except InputError as error:
-        return refuse(error)
+        return print_error(error)
     except BrokenPipeError:  # who read what is printed has gone
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the exit would complain
         return 128 + int(signal.SIGPIPE)
     except MemoryError as error:
-        return refuse(f"out of memory ({error}); close other programs, or ask for less at once")
+        return print_error(f"out of memory ({error}); close other programs, or ask for less at once")
     except OSError as error:
-        return refuse(in_words(error))
+        return print_error(in_words(error))
     except KeyboardInterrupt as error:
         with contextlib.suppress(OSError):
             print("stopped; run it again to go on", file=sys.stderr)

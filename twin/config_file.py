@@ -1,7 +1,7 @@
-"""Reading `scene.toml` and `robot.toml`: a TOML table becomes dataclasses of `config.py`, or one line says why not.
+"""Reads and checks `scene.toml` and `robot.toml` into the dataclasses of `config.py`.
 
-An *override* is a setting of the command line, `section.key=value`, which wins over the file. Unknown keys are refused
-with the nearest valid name, so that a typo never silently becomes a default.
+An *override* is a command-line setting `section.key=value`, which replaces that of the file. Unknown keys are errors
+that suggest the nearest valid name, so that a typo never silently becomes a default.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from twin.config import (
     MAPPERS,
     MARKER_FAMILIES,
     OBSTACLE_KINDS,
-    RANDOMISED,
+    RANDOMIZED,
     RESERVED_LIGHTINGS,
     UPS,
     MetricConfig,
@@ -28,42 +28,42 @@ from twin.config import (
     SourceConfig,
     TaskConfig,
 )
-from twin.errors import InputError, shown
-from twin.files import exists, parse_toml, path_is_link, read_toml
+from twin.errors import InputError, short_repr
+from twin.files import exists, is_link, parse_toml, read_toml
 from twin.robot import HuskyParams
 
 ROBOT_TOML = "robot.toml"
 
-LONGEST_NAME = 80
-"""Characters of a name that files are named after."""
-_MOST = math.inf
-# What a number may be. Beyond these a stage would end in an error of arithmetic, for want of memory or never, most of
-# them minutes into a build. An image narrower than 64 px has too few features to be reconstructed from, the near box is
-# divided into bricks of 0.24 m at first, and fewer than 100 bricks do not cover even the far grid at its coarsest.
+MAX_NAME = 80
+"""Upper bound of characters of a name that becomes part of a file name."""
+_INF = math.inf
+# Ranges of values. Outside them a stage fails by arithmetic or memory, or never ends, mostly minutes into a build. An
+# image narrower than 64 px has too few features for reconstruction, the near box is first divided into bricks of
+# 0.24 m, and fewer than 100 bricks do not cover even the coarsest far grid.
 _RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "capture": {
-        "frames": (0, _MOST),
+        "frames": (0, _INF),
         "fps": (1e-3, 1e3),
-        "max_frames": (2, _MOST),
-        "max_size": (64, _MOST),
-        "held_out_every": (2, _MOST),
-        "min_motion": (0, _MOST),
+        "max_frames": (2, _INF),
+        "max_size": (64, _INF),
+        "held_out_every": (2, _INF),
+        "min_motion": (0, _INF),
     },
     "cameras": {
         "features": (1, 1e6),
         "max_feature_size": (64, 1e5),
         "min_registered": (0, 1),
-        "max_outlier": (1e-3, _MOST),
+        "max_outlier": (1e-3, _INF),
     },
-    "metric": {"camera_height": (0, _MOST)},
+    "metric": {"camera_height": (0, _INF)},
     "nerf": {
-        "steps": (1, _MOST),
+        "steps": (1, _INF),
         "rays": (1, 2**20),
         "samples": (1, 1024),
-        "sightings": (0, 0.7),  # the others are the triples' and the single pixels'
-        "bake_steps": (1, _MOST),
-        "max_bricks": (100, _MOST),
-        "max_width": (32, _MOST),
+        "sightings": (0, 0.7),  # the other rays belong to triples and single pixels
+        "bake_steps": (1, _INF),
+        "max_bricks": (100, _INF),
+        "max_width": (32, _INF),
         "learning_rate": (1e-6, 1),
         "appearance_dim": (1, 1024),
         "levels": (1, 32),
@@ -75,21 +75,21 @@ _RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "voxel": (1e-2, 1),
         "ground_cell": (1e-2, 1),
         "ground_smoothing": (0, 10),
-        "obstacle_height": (0, _MOST),
+        "obstacle_height": (0, _INF),
         "max_height": (0.1, 100),
-        "max_parts": (0, _MOST),
-        "max_protrusion": (1e-2, _MOST),
+        "max_parts": (0, _INF),
+        "max_protrusion": (1e-2, _INF),
         "margin": (1, 1e3),
-        "views": (1, _MOST),
+        "views": (1, _INF),
         "view_width": (8, 4096),
     },
     "mjcf": {"half_width": (0.1, 100), "hfield_cell": (1e-2, 10), "corridor_margin": (0, 100)},
     "review": {
-        "speed": (1e-2, _MOST),
+        "speed": (1e-2, _INF),
         "fps": (1, 240),
         "width": (1, 4096),
         "render_width": (1, 4096),
-        "renders": (0, _MOST),
+        "renders": (0, _INF),
     },
 }
 
@@ -100,14 +100,14 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
     Raises:
         InputError: no such file, wrong TOML, unknown key, wrong type, or a value out of range.
     """
-    table = _table(path)
+    table = _read_table(path)
     if table is None:
         raise InputError(f"no scene.toml at {path}; write one, or run python -m twin.new SCENE VIDEO...")
     for override in overrides:
         _apply_override(table, override)
     if isinstance(table.get("robot", {}), dict):
-        table["robot"] = overruled(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), str(path))
-    config = parse(SceneConfig, table, str(path))
+        table["robot"] = merge_robot(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), str(path))
+    config = parse_table(SceneConfig, table, str(path))
     if not config.name:
         config = dataclasses.replace(config, name=path.resolve().parent.name)
     _check(config, path)
@@ -115,19 +115,19 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
 
 
 def read_robot(path: Path) -> dict[str, Any]:
-    """The table in a `robot.toml`, checked; empty where there is no such file. Raises InputError."""
-    table = _table(path) or {}
-    parse(HuskyParams, table, str(path))
+    """The checked table of a `robot.toml`; empty if there is no such file. Raises InputError."""
+    table = _read_table(path) or {}
+    parse_table(HuskyParams, table, str(path))
     return table
 
 
-def overruled(robot: dict[str, Any], by_hand: dict[str, Any], where: str) -> dict[str, Any]:
-    """What a `robot.toml` says, but for what `[robot]` in `scene.toml` says otherwise.
+def merge_robot(robot: dict[str, Any], by_hand: dict[str, Any], where: str) -> dict[str, Any]:
+    """Merges a `robot.toml` with `[robot]` of `scene.toml` (`by_hand`), which takes precedence.
 
-    Intrinsics and the size that they are for go together: whichever has the intrinsics has the size.
+    `camera_intrinsics` and `camera_size` belong together: both come from the table that has the intrinsics.
 
     Raises:
-        InputError: a size by hand for intrinsics that are not; `where` opens the message.
+        InputError: `by_hand` has the size and `robot` the intrinsics; `where` opens the message.
     """
     if "camera_intrinsics" in by_hand:
         robot = {name: value for name, value in robot.items() if name != "camera_size"}
@@ -139,17 +139,17 @@ def overruled(robot: dict[str, Any], by_hand: dict[str, Any], where: str) -> dic
     return robot | by_hand
 
 
-def _table(path: Path) -> dict[str, Any] | None:
-    """What a TOML file says; None where there is no such file."""
+def _read_table(path: Path) -> dict[str, Any] | None:
+    """The table of a TOML file; None if there is no such file."""
     if path.parent.is_file():
-        raise InputError(f"{path.parent} is a file; give the folder of the scene, {_folder(path.parent)}")
-    if not exists(path) and not path_is_link(path):
+        raise InputError(f"{path.parent} is a file; give the folder of the scene, {_folder_hint(path.parent)}")
+    if not exists(path) and not is_link(path):
         return None
     return read_toml(path)
 
 
-def _folder(file: Path) -> str:
-    """The scene's folder that was probably meant where a file was given."""
+def _folder_hint(file: Path) -> str:
+    """Suggests a scene folder when a file was given."""
     return f"{file.parent}" if file.name == "scene.toml" else "such as scenes/demo"
 
 
@@ -160,7 +160,7 @@ def _apply_override(table: dict[str, Any], override: str) -> None:
         raise InputError(f"--set {override!r}: expected section.key=value, such as nerf.steps=4000")
     try:
         value = parse_toml(f"value = {text}", "--set")["value"]
-    except (InputError, KeyError):  # no TOML, or none that is taken: a word, to be checked as such
+    except (InputError, KeyError):  # a bare word, checked as a string
         value = text
     for name in names[:-1]:
         table = table.setdefault(name, {})
@@ -169,10 +169,10 @@ def _apply_override(table: dict[str, Any], override: str) -> None:
     table[names[-1]] = value
 
 
-def parse(kind: type, table: Any, where: str) -> Any:
-    """A frozen dataclass of `kind` from a TOML table, checked key by key. Raises InputError."""
+def parse_table(kind: type, table: Any, where: str) -> Any:
+    """Converts a TOML table to the frozen dataclass `kind`, checked key by key. Raises InputError."""
     if not isinstance(table, dict):
-        raise InputError(f"{where}: expected a table, got {shown(table)}")
+        raise InputError(f"{where}: expected a table, got {short_repr(table)}")
     hints = typing.get_type_hints(kind)
     for key in table:
         if key not in hints:
@@ -182,7 +182,7 @@ def parse(kind: type, table: Any, where: str) -> Any:
     values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
         return kind(**values)
-    except InputError as error:  # a dataclass that checks its own values
+    except InputError as error:  # from the dataclass's own checks
         raise InputError(f"{where}: {error}") from None
 
 
@@ -192,15 +192,15 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         hint = next(option for option in typing.get_args(hint) if option is not type(None))
         origin = typing.get_origin(hint)
     if dataclasses.is_dataclass(hint):
-        return parse(typing.cast(type, hint), value, where)
+        return parse_table(typing.cast(type, hint), value, where)
     if origin is tuple:
         if not isinstance(value, list):
-            raise InputError(f"{where}: expected a list, got {shown(value)}")
+            raise InputError(f"{where}: expected a list, got {short_repr(value)}")
         return tuple(_convert(typing.get_args(hint)[0], item, where) for item in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = _real(value, where)
     if type(value) is not hint:
-        raise InputError(f"{where}: expected {hint.__name__}, got {shown(value)}")
+        raise InputError(f"{where}: expected {hint.__name__}, got {short_repr(value)}")
     if hint is float and not math.isfinite(value):
         raise InputError(f"{where}: expected a finite number, got {value}")
     return value
@@ -210,7 +210,7 @@ def _real(value: int, where: str) -> float:
     try:
         return float(value)
     except OverflowError:
-        raise InputError(f"{where}: expected a number below 1e308, got {shown(value)}") from None
+        raise InputError(f"{where}: expected a number below 1e308, got {short_repr(value)}") from None
 
 
 def _scale_sources(metric: MetricConfig) -> tuple[str, ...]:
@@ -238,16 +238,16 @@ def _check(config: SceneConfig, path: Path) -> None:
     for section, ranges in _RANGES.items():
         for key, (low, high) in ranges.items():
             _check_range(getattr(getattr(config, section), key), low, high, f"{path}: {section}.{key}")
-    _check_range(config.seed, 0, 2**31 - 1, f"{path}: seed")  # as COLMAP takes it
+    _check_range(config.seed, 0, 2**31 - 1, f"{path}: seed")  # COLMAP's range
     for source in config.source:
-        _check_range(source.camera_height, 0, _MOST, f"{path}: camera_height of [[source]] {source.path!r}")
-        _check_parts(source.keep, f"{path}: keep of [[source]] {source.path!r}")
-    _check_parts(config.capture.keep, f"{path}: capture.keep")
+        _check_range(source.camera_height, 0, _INF, f"{path}: camera_height of [[source]] {source.path!r}")
+        _check_segments(source.keep, f"{path}: keep of [[source]] {source.path!r}")
+    _check_segments(config.capture.keep, f"{path}: capture.keep")
     _check_obstacles(config.obstacle, path)
     _check_metric(config.metric, path)
     given = _scale_sources(config.metric)
     if len(given) != 1 and not (not given and any(source.camera_height > 0.0 for source in config.source)):
-        # Checked before anything runs, so that nobody waits minutes to learn it.
+        # Checked here, not minutes into the build.
         raise InputError(
             f"{path}: [metric] gives {'no scale' if not given else ' and '.join(given)}; give exactly one of "
             "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
@@ -257,7 +257,7 @@ def _check(config: SceneConfig, path: Path) -> None:
 
 def _check_range(value: float, low: float, high: float, what: str) -> None:
     if not low <= value <= high:
-        expected = f"at least {low:,.10g}" if high == _MOST else f"{low:,.10g} to {high:,.10g}"
+        expected = f"at least {low:,.10g}" if high == _INF else f"{low:,.10g} to {high:,.10g}"
         raise InputError(f"{what} = {value:,.10g}; expected {expected}")
 
 
@@ -287,14 +287,12 @@ def _check_source(source: SourceConfig, path: Path) -> None:
 
 
 def check_lighting(name: str, what: str) -> None:
-    """Refuses a name that no lighting may have; `what` opens the message of the InputError."""
-    if set(name) & set(":/") or name.endswith(RANDOMISED):
-        raise InputError(
-            f"{what} = {name!r}: ':', '/' and '{RANDOMISED}' have a meaning of their own; choose a plain name"
-        )
+    """Raises InputError for a name that a lighting cannot have; `what` opens the message."""
+    if set(name) & set(":/") or name.endswith(RANDOMIZED):
+        raise InputError(f"{what} = {name!r}: ':', '/' and '{RANDOMIZED}' are reserved; choose a plain name")
     if name in RESERVED_LIGHTINGS:
         raise InputError(
-            f"{what} = {name!r} has a meaning of its own, a light drawn at random; choose another name, such as morning"
+            f"{what} = {name!r} is reserved for a lighting sampled at random; choose another name, such as morning"
         )
     _check_name(name, what)
 
@@ -307,7 +305,7 @@ def _check_tasks(tasks: tuple[TaskConfig, ...], path: Path) -> None:
                 "expected a name, start ≥ 0 and length > 0 [m]"
             )
         _check_name(task.name, f"{path}: [[task]] name")
-    _check_apart([task.name for task in tasks], "[[task]]", path)
+    _check_unique([task.name for task in tasks], "[[task]]", path)
 
 
 def _check_metric(metric: MetricConfig, path: Path) -> None:
@@ -340,34 +338,34 @@ def _check_choice(value: str, choices: Iterable[str], what: str) -> None:
     if value in names:
         return
     lower = {name.lower(): name for name in names}
-    near = difflib.get_close_matches(value.lower()[:LONGEST_NAME], list(lower), n=1)
+    near = difflib.get_close_matches(value.lower()[:MAX_NAME], list(lower), n=1)
     hint = f"did you mean {lower[near[0]]!r}?" if near else f"expected {', '.join(names[:-1])} or {names[-1]}"
     raise InputError(f"{what} = {value!r}; {hint}")
 
 
 def _check_name(name: str, what: str) -> None:
-    """Refuses a name that cannot be part of a file's name."""
-    unfit = not name.isprintable() or "/" in name or "\\" in name or name.startswith(".") or not name.strip()
-    if unfit or len(name) > LONGEST_NAME or len(name.encode()) > 2 * LONGEST_NAME:
+    """Raises InputError for a name that cannot be part of a file name."""
+    invalid = not name.isprintable() or "/" in name or "\\" in name or name.startswith(".") or not name.strip()
+    if invalid or len(name) > MAX_NAME or len(name.encode()) > 2 * MAX_NAME:
         raise InputError(
-            f"{what} = {name!r}; files are named after it: expected at most {LONGEST_NAME} characters without slashes "
+            f"{what} = {name!r}; files are named after it: expected at most {MAX_NAME} characters without slashes "
             "and line ends, and no dot to begin with"
         )
 
 
-def _check_apart(names: list[str], what: str, path: Path) -> None:
+def _check_unique(names: list[str], what: str, path: Path) -> None:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: two {what} are named {twice!r}; give each a name of its own")
+        raise InputError(f"{path}: two {what} are named {twice!r}; give each a different name")
 
 
-def _check_parts(parts: tuple[tuple[float, ...], ...], what: str) -> None:
+def _check_segments(parts: tuple[tuple[float, ...], ...], what: str) -> None:
     end = 0.0
     for part in parts:
         if len(part) != 2 or not end <= part[0] < part[1]:
             raise InputError(
-                f"{what} = {shown([list(one) for one in parts])}; expected pairs [from, to] in seconds, 0 ≤ from < to, "
-                "in order and apart, such as [[0, 62.5]]"
+                f"{what} = {short_repr([list(one) for one in parts])}; expected pairs [from, to] in seconds, "
+                "0 ≤ from < to, in order and apart, such as [[0, 62.5]]"
             )
         end = part[1]
 
@@ -387,4 +385,4 @@ def _check_obstacles(obstacles: tuple[ObstacleConfig, ...], path: Path) -> None:
         if one.to and not one.speed > 0.0:
             raise InputError(f"{path}: [[obstacle]] speed = {one.speed}; expected more than 0 where it moves")
     names = [one.name or f"{one.kind}_{k}" for k, one in enumerate(obstacles)]
-    _check_apart(names, "[[obstacle]]", path)
+    _check_unique(names, "[[obstacle]]", path)

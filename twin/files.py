@@ -1,7 +1,7 @@
-"""Reading files that may be anything, and writing files so that a reader never sees half of one.
+"""Checked reading and atomic writing of files.
 
-Readers take regular files only, so that none waits for a pipe; what is wrong with a file is an `InputError` that names
-it. Writers write aside, as `<name>.partial`, and rename: a full disk or a kill leaves the former file as it was.
+Readers accept regular files only, so that none blocks on a pipe, and raise `InputError` with the file's name for any
+defect. Writers write `<name>.partial` and rename it: a full disk or a kill leaves the former file unchanged.
 """
 
 import contextlib
@@ -31,15 +31,15 @@ from safetensors.numpy import load_file
 from twin.errors import InputError
 
 PARTIAL = ".partial"
-"""Suffix of what is being written."""
+"""Suffix of files and folders that are being written."""
 
-_MOST_TEXT = 64 << 20  # [bytes] of a JSON or CSV file
-_MOST_DIGITS = 40  # of an integer in JSON; the state of a random generator has 39
-_MOST_ARRAYS = 2 << 30  # [bytes] of all arrays of a file, unpacked
-_MOST_TOML = 4 << 20  # [bytes]
-_DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")  # a.b.c. and so on
-_WHOLE = 2**63  # beyond which no setting goes
-_KINDS = {
+_MAX_TEXT = 64 << 20  # [bytes] of a JSON or CSV file
+_MAX_DIGITS = 40  # of an integer in JSON; a random generator's state has 39
+_MAX_ARRAYS = 2 << 30  # [bytes] of all arrays of a file, uncompressed
+_MAX_TOML = 4 << 20  # [bytes]
+_DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")  # 64 or more dotted parts
+_INT64_LIMIT = 2**63  # bound of TOML integers
+_FILE_KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe",
     stat.S_IFSOCK: "a socket",
@@ -51,32 +51,32 @@ _KINDS = {
 # ---- reading
 
 
-def regular(path: Path) -> Path:
-    """The path of a regular file, or of a link to one.
+def regular_file(path: Path) -> Path:
+    """Returns the path of a regular file, or of a link to one.
 
     Raises:
-        InputError: nothing there, a dangling link, a folder, a pipe, a device; or a name that no file can have.
+        InputError: a missing file, a dangling link, a folder, a pipe, a device, or an invalid file name.
     """
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
-        what = "a link to nothing" if path_is_link(path) else getattr(error, "strerror", None) or str(error)
+        what = "a link to nothing" if is_link(path) else getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path}: {what}; expected a file") from None
     if kind != stat.S_IFREG:
-        raise InputError(f"{path} is {_KINDS.get(kind, 'no regular file')}; expected a file")
+        raise InputError(f"{path} is {_FILE_KINDS.get(kind, 'no regular file')}; expected a file")
     return path
 
 
 def exists(path: Path) -> bool:
-    """Whether there is anything of this name; False for a name that no file can have, where Path.exists raises."""
+    """True if the path exists; False for an invalid file name, where Path.exists raises."""
     try:
         return path.exists()
     except OSError:
         return False
 
 
-def path_is_link(path: Path) -> bool:
-    """Whether there is a link of this name, dangling or not; False for a name that no file can have."""
+def is_link(path: Path) -> bool:
+    """True for a link, dangling or not; False for an invalid file name."""
     try:
         return path.is_symlink()
     except (OSError, ValueError):
@@ -84,18 +84,18 @@ def path_is_link(path: Path) -> bool:
 
 
 def read_bytes(path: Path, most: int | None = None) -> bytes:
-    """The contents of a file. Raises InputError: see `regular`; or more than `most` bytes."""
-    size = regular(path).stat().st_size
+    """The contents of a file. Raises InputError as `regular_file` does, or for more than `most` bytes."""
+    size = regular_file(path).stat().st_size
     if most is not None and size > most:
         raise InputError(f"{path} has {size:,} bytes; expected at most {most:,}")
     return path.read_bytes()
 
 
-def read_text(path: Path, most: int = _MOST_TEXT) -> str:
-    """The contents of a text file in UTF-8, with or without a byte-order mark.
+def read_text(path: Path, most: int = _MAX_TEXT) -> str:
+    """The contents of a UTF-8 text file, with or without a byte-order mark.
 
     Raises:
-        InputError: see `regular`; no UTF-8, or more than `most` bytes.
+        InputError: as `regular_file`, or for text that is not UTF-8 or has more than `most` bytes.
     """
     try:
         return read_bytes(path, most).decode("utf-8-sig")
@@ -104,16 +104,16 @@ def read_text(path: Path, most: int = _MOST_TEXT) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file; its numbers are finite and its integers have at most 40 digits.
+    """The value in a JSON file with finite numbers and integers of at most 40 digits.
 
     Raises:
-        InputError: see `regular`; or no such JSON.
+        InputError: as `regular_file`, or for other content.
     """
     return parse_json(read_text(path), path)
 
 
 def parse_json(text: str, where: object) -> Any:
-    """The value of a JSON text, checked as by `read_json`; `where` opens the message of the InputError."""
+    """The value of a JSON text, checked as by `read_json`; `where` opens the error message."""
     try:
         return json.loads(text, parse_int=_json_integer, parse_float=_json_float, parse_constant=_json_float)
     except RecursionError:
@@ -123,7 +123,7 @@ def parse_json(text: str, where: object) -> Any:
 
 
 def _json_integer(text: str) -> int:
-    if len(text) > _MOST_DIGITS:
+    if len(text) > _MAX_DIGITS:
         raise ValueError(f"an integer of {len(text)} digits")
     return int(text)
 
@@ -136,14 +136,14 @@ def _json_float(text: str) -> float:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file; integers fit 64 bits, as TOML has it. Raises InputError: see `regular`; or no TOML."""
-    return parse_toml(read_text(path, _MOST_TOML), path)
+    """The table in a TOML file with 64-bit integers. Raises InputError as `regular_file` does, or for other content."""
+    return parse_toml(read_text(path, _MAX_TOML), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
-    """The table of a TOML text, checked as by `read_toml`; `where` opens the message of the InputError."""
+    """The table of a TOML text, checked as by `read_toml`; `where` opens the error message."""
     try:
-        if _DEEP_KEY.search(text):  # the time that tomllib takes for one grows with the square of its parts
+        if _DEEP_KEY.search(text):  # tomllib's time for one is quadratic in its parts
             raise RecursionError
         table = tomllib.loads(text)
         _check_numbers(table)
@@ -158,21 +158,21 @@ def _check_numbers(value: Any) -> None:
     if isinstance(value, dict | list):
         for item in value.values() if isinstance(value, dict) else value:
             _check_numbers(item)
-    elif isinstance(value, int) and not -_WHOLE <= value < _WHOLE:
+    elif isinstance(value, int) and not -_INT64_LIMIT <= value < _INT64_LIMIT:
         raise ValueError("an integer that does not fit 64 bits")
 
 
-def load_arrays(path: Path, most: int = _MOST_ARRAYS) -> dict[str, NDArray]:
+def load_arrays(path: Path, most: int = _MAX_ARRAYS) -> dict[str, NDArray]:
     """The arrays of an npz file; nothing in it can run code.
 
     Args:
         path: The file.
-        most: Bytes of all arrays together, unpacked.
+        most: Upper bound of all arrays together, uncompressed [bytes].
 
     Raises:
-        InputError: see `regular`; no npz file, a damaged one, pickled objects, or more than `most` bytes.
+        InputError: as `regular_file`, or for a damaged file, pickled objects, or more than `most` bytes.
     """
-    with damaged(regular(path), f"expected arrays as numpy.savez writes them{_PICKLED}"):
+    with wrap_read_errors(regular_file(path), "expected arrays as numpy.savez writes them, without pickled objects"):
         with zipfile.ZipFile(path) as archive:
             total = sum(entry.file_size for entry in archive.infolist())
             if total > most:
@@ -183,11 +183,8 @@ def load_arrays(path: Path, most: int = _MOST_ARRAYS) -> dict[str, NDArray]:
             return {name: data[name] for name in data.files}
 
 
-_PICKLED = ", without pickled objects"
-
-
 def _check_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    """Raises ValueError where an array's header promises more than its file holds: it would be allocated first."""
+    """Raises ValueError if an array's header declares more data than the file has, before it is allocated."""
     if not entry.filename.endswith(".npy"):
         return
     with archive.open(entry) as file:
@@ -198,8 +195,8 @@ def _check_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
 
 
 @contextlib.contextmanager
-def damaged(path: Path, cure: str) -> Iterator[None]:
-    """Turns the errors of reading a file's contents into one InputError, which names the file and the cure."""
+def wrap_read_errors(path: Path, cure: str) -> Iterator[None]:
+    """Converts errors in reading a file's contents into an InputError with the file's name and the cure."""
     try:
         yield
     except InputError:
@@ -214,26 +211,26 @@ def damaged(path: Path, cure: str) -> Iterator[None]:
 
 
 def load_tensors(path: Path) -> dict[str, NDArray]:
-    """The arrays of a safetensors file. Raises InputError: see `regular`; or no such file."""
-    with damaged(regular(path), "expected a safetensors file"):
+    """The arrays of a safetensors file. Raises InputError as `regular_file` does, or for other content."""
+    with wrap_read_errors(regular_file(path), "expected a safetensors file"):
         return load_file(path)
 
 
 def toml_string(text: str) -> str:
     """A text as TOML's basic string: quotes, backslashes and control characters escaped, lone surrogates replaced."""
-    whole = text.encode("utf-8", "replace").decode("utf-8")
-    return json.dumps(whole, ensure_ascii=False).replace("\x7f", "\\u007f")
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def check_shapes(arrays: Mapping[str, tuple[NDArray, tuple[int, ...], str]]) -> None:
-    """Raises ValueError where an array is of another shape or kind: given by name with its shape and `dtype.kind`."""
+    """Raises ValueError if an array, given by name as (array, shape, `dtype.kind`), has another shape or kind."""
     for name, (array, shape, kind) in arrays.items():
         if array.shape != shape or array.dtype.kind != kind:
             raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {shape} of kind {kind!r}")
 
 
-def checked_text(value: Any) -> str:
-    """A text from a JSON file. Raises TypeError: it is none."""
+def require_text(value: Any) -> str:
+    """Returns a value from a JSON file if it is a text. Raises TypeError otherwise."""
     if not isinstance(value, str):
         raise TypeError(f"{type(value).__name__} where a text is expected")
     return value
@@ -244,7 +241,7 @@ def checked_text(value: Any) -> str:
 
 def digest_file(path: Path) -> str:
     """SHA-256 of a file's bytes."""
-    with regular(path).open("rb") as file:
+    with regular_file(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -257,10 +254,10 @@ def digest_json(value: Any) -> str:
 
 
 @contextlib.contextmanager
-def aside(path: Path) -> Iterator[Path]:
-    """A path to write to, which takes the place of `path` when the block ends and goes when the block fails.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path that replaces `path` when the block ends and is removed if the block fails.
 
-    Its name has the suffix of `path`, since writers of films and arrays go by it.
+    It has the suffix of `path`, since writers of films and arrays choose the format by it.
     """
     partial = path.with_name(f".{path.stem[:200]}{PARTIAL}{path.suffix}")
     try:
@@ -273,46 +270,46 @@ def aside(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file aside and renames it."""
-    with aside(path) as partial:
+    """Writes a file atomically."""
+    with atomic_path(path) as partial:
         partial.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text in UTF-8, as `write_bytes` does; odd bytes of file names are escaped."""
+    """Writes a UTF-8 text atomically; undecodable bytes of file names are escaped."""
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON as `write_text` does. NaN is refused."""
+    """Writes JSON atomically. Raises ValueError for NaN."""
     write_bytes(path, json_bytes(value))
 
 
 def json_bytes(value: Any) -> bytes:
-    """The contents that `write_json` gives a file."""
+    """The file contents that `write_json` writes."""
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode("utf-8")
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Writes an npz file as `write_bytes` does. Raises OSError where the disk is full."""
-    with aside(path) as partial:
+    """Writes an npz file atomically. Raises OSError if the disk is full."""
+    with atomic_path(path) as partial:
         np.savez(partial, **arrays)  # type: ignore[arg-type]
 
 
 def allocate(path: Path, size: int) -> None:
-    """Makes a file of a size whose bytes the disk has set aside, keeping what it holds.
+    """Allocates disk space for a file up to a size and keeps its contents.
 
-    A map of a file with holes in it ends the process by SIGBUS when the disk is full. On file systems that copy on
-    write a full disk may still do so later.
+    Memory-mapping a sparse file ends the process by SIGBUS when the disk is full. On copy-on-write file systems a full
+    disk may still do so later.
 
     Args:
-        path: The file; made where it does not exist.
+        path: The file; created if it does not exist.
         size: [bytes]
 
     Raises:
-        OSError: the disk is full; a file that was made for this is gone then.
+        OSError: the disk is full; a newly created file is removed.
     """
-    there = path.exists()
+    existed = path.exists()
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         if hasattr(os, "posix_fallocate"):
@@ -321,7 +318,7 @@ def allocate(path: Path, size: int) -> None:
             for start in range(os.fstat(file).st_size, size, 1 << 20):
                 os.pwrite(file, bytes(min(1 << 20, size - start)), start)
     except OSError as error:
-        if not there:
+        if not existed:
             path.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
@@ -329,18 +326,18 @@ def allocate(path: Path, size: int) -> None:
 
 
 def remove(path: Path) -> None:
-    """Removes whatever is there: a file, a link (not what it points to), or a folder with all that is in it."""
+    """Removes a file, a link (not its target), or a folder with its contents; a missing path is no error."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
 
 
-# ---- What lies at a path that a user or a file of theirs names; such a name may be anything.
+# ---- paths given by users, which may be invalid
 
 
 def is_file(path: Path) -> bool:
-    """Whether a regular file is there, or a link to one; False for a name that no file can have."""
+    """True for a regular file or a link to one; False for an invalid file name."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -351,26 +348,26 @@ def is_folder(path: Path, cure: str) -> bool:
     """True for a folder, False for a regular file.
 
     Args:
-        path: What is asked about.
-        cure: Ends the message of the InputError.
+        path: The path to check.
+        cure: Ends the error message.
 
     Raises:
-        InputError: neither is there: nothing, a link to nothing, a pipe, a device; or no name of a file.
+        InputError: neither: a missing path, a dangling link, a pipe, a device, or an invalid file name.
     """
     try:
         if stat.S_ISDIR(path.stat().st_mode):
             return True
     except (OSError, ValueError):
-        pass  # said by the next line
+        pass  # `regular_file` raises
     try:
-        regular(path)
+        regular_file(path)
     except InputError as error:
         raise InputError(f"{str(error).removesuffix('; expected a file')}; {cure}") from None
     return False
 
 
-def folder(path: Path, cure: str) -> Path:
-    """The path of a folder. Raises InputError where it is none; `cure` ends the message."""
+def require_folder(path: Path, cure: str) -> Path:
+    """Returns the path of a folder. Raises InputError for anything else; `cure` ends the message."""
     if not is_folder(path, cure):
         raise InputError(f"{path} is a file; {cure}")
     return path

@@ -1,12 +1,12 @@
-"""Verb: start a scene folder from films.
+"""Verb: creates a scene folder from films.
 
     python -m twin.new scenes/my_road day.mp4 dusk.mp4 --camera-height 1.2
 
-writes `scenes/my_road/scene.toml`, with every line a user is likely to want, and copies the films into `input/`.
+writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
 `python -m twin.build scenes/my_road` builds it.
 
-A *posed image set* is a `transforms.json` or a COLMAP model, which names images that lie elsewhere. Its *root* is the
-nearest folder that has all of it below; from there the files it needs are copied, where they were below it.
+A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the nearest
+folder that contains all of its files; they are copied with their paths relative to it.
 """
 
 import argparse
@@ -15,11 +15,11 @@ import shutil
 import sys
 from pathlib import Path
 
-from twin import cli
-from twin.capture.formats import ImageSet, detect_kind, files_named, find_model, read_colmap, read_transforms
+from twin import commands
+from twin.capture.formats import ImageSet, detect_kind, find_model, listed_files, read_colmap, read_transforms
 from twin.capture.video import probe
-from twin.config import RANDOMISED, RESERVED_LIGHTINGS
-from twin.config_file import LONGEST_NAME
+from twin.config import RANDOMIZED, RESERVED_LIGHTINGS
+from twin.config_file import MAX_NAME
 from twin.errors import InputError
 from twin.files import digest_file, is_file, toml_string, write_text
 from twin.scene import SceneDir
@@ -27,7 +27,7 @@ from twin.scene import SceneDir
 _POSED = ("colmap", "transforms")
 
 _HEAD = """\
-# What twin.build knows of this place. Every other setting has a default: see twin/config.py.
+# Settings of this place. All others have defaults: see twin/config.py.
 name = {name}
 """
 
@@ -35,8 +35,8 @@ _SOURCE = """
 [[source]]
 path = {path}
 lighting = {lighting}  # sources filmed under the same light may share a name
-# mask = "input/mask.png"      # 0 = ignore: the robot's own bonnet, a person walking ahead; or a folder of masks
-# A calibrated camera pays: forward driving bends a self-calibrated one. Lengths in pixels, of the upright picture.
+# mask = "input/mask.png"      # 0 = ignore: the robot's own hood, a person walking ahead; or a folder of masks
+# Calibrate the camera if possible: forward motion biases self-calibration. Lengths in pixels of the upright image.
 # camera = {{ model = "PINHOLE", params = [fx, fy, cx, cy], width = 1920, height = 1080 }}
 """
 
@@ -46,16 +46,16 @@ fps = 2.0                      # frames kept per second of film, the sharpest of
 # frames = 80                  # or: so many per film
 # keep = [[0, 62.5]]           # only these parts of a film [s]: a route is one pass; in a [[source]] for that one
 
-[metric]                       # where the metres come from; exactly one way
+[metric]                       # source of the metric scale; exactly one
 {camera_height}
-# gps = true                   # the photos' EXIF positions
-# poses_are_metric = true      # the input brought poses in metres
+# gps = true                   # EXIF positions of the photos
+# poses_are_metric = true      # the given poses are in metres
 # marker = {{ family = "DICT_APRILTAG_36h11", id = 0, size = 0.16 }}   # a printed marker; side of its square [m]
 # distance = {{ metres = 3.5, frame_a = "day/000012", a = [400, 500], b = [700, 500] }}   # two points on the road
 
 [mjcf]
 half_width = 1.0               # half the width of the drivable corridor around the filmed route [m]
-# route = false                # for an object filmed around, where nothing drives
+# route = false                # for a capture around an object, without driving
 """
 
 
@@ -63,16 +63,15 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
     """Writes a scene folder: copies of the films under `input/`, then `scene.toml`.
 
     Args:
-        root: The scene folder; made where it does not exist.
+        root: The scene folder; created if it does not exist.
         films: Films, image folders or posed image sets; one source and one lighting each.
-        camera_height: Lens above the ground [m]; without it the line is left for the user to fill.
+        camera_height: Lens above the ground [m]; without it the user completes the line.
 
     Returns:
         The path of `scene.toml`.
 
     Raises:
-        InputError: a scene is there already, a film cannot be read, a posed image set's images are not to be found, or
-            the height is impossible.
+        InputError: an existing scene, an unreadable film, missing images of a posed image set, or an invalid height.
     """
     scene = SceneDir(root)
     if scene.config_file.exists():
@@ -91,27 +90,27 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
     inputs.mkdir(parents=True, exist_ok=True)
     text = _HEAD.format(name=toml_string(root.resolve().name))
     for film in films:
-        path = _brought(film, inputs)
+        path = _import_film(film, inputs)
         lighting = _lighting(path, detect_kind(film))
         text += _SOURCE.format(path=toml_string(("input" / path).as_posix()), lighting=toml_string(lighting))
     given = f"{camera_height:<14g}" if camera_height is not None else None
     line = f"camera_height = {given} # lens above the ground [m], carried at a constant height"
     if given is None:
-        line = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another way below"
+        line = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another source below"
     write_text(scene.config_file, text + _REST.format(camera_height=line))
     return scene.config_file
 
 
-def _brought(film: Path, inputs: Path) -> Path:
-    """Where a film (or folder, or posed image set) is under `input/`, relative to it; copied unless it is there."""
+def _import_film(film: Path, inputs: Path) -> Path:
+    """Path relative to `input/` of a film, folder or posed image set, copied there unless it is there already."""
     film, inputs = (Path(os.path.normpath(path.absolute())) for path in (film, inputs))
     if film.is_relative_to(inputs):
         return film.relative_to(inputs)
-    return _copied_set(film, inputs) if detect_kind(film) in _POSED else _copied(film, inputs)
+    return _copy_image_set(film, inputs) if detect_kind(film) in _POSED else _copy_film(film, inputs)
 
 
-def _copied(film: Path, inputs: Path) -> Path:
-    """A copy of a film (or folder) under `input/`; what is there already is kept and reused where it is the same."""
+def _copy_film(film: Path, inputs: Path) -> Path:
+    """Copies a film or folder to `input/` and returns its relative path; an identical copy is reused."""
     copy, number = inputs / film.name, 2
     while copy.exists() and not _is_same(film, copy):
         copy, number = inputs / f"{film.stem}_{number}{film.suffix}", number + 1
@@ -119,15 +118,15 @@ def _copied(film: Path, inputs: Path) -> Path:
         aside = copy.with_name(copy.name + ".partial")  # an interrupted copy never passes for a film
         if film.is_dir():
             shutil.rmtree(aside, ignore_errors=True)
-            shutil.copytree(film, aside, ignore=_no_files)
+            shutil.copytree(film, aside, ignore=_not_copied)
         else:
             shutil.copyfile(film, aside)
         aside.replace(copy)
     return copy.relative_to(inputs)
 
 
-def _no_files(folder: str, names: list[str]) -> list[str]:
-    """What of a folder is not copied: pipes, devices, and links that lead nowhere or to folders, perhaps this one."""
+def _not_copied(folder: str, names: list[str]) -> list[str]:
+    """Entries of a folder that are not copied: pipes, devices, dangling links, links to folders (perhaps cyclic)."""
     paths = [Path(folder) / name for name in names]
     return [path.name for path in paths if not is_file(path) and (path.is_symlink() or not path.is_dir())]
 
@@ -137,8 +136,8 @@ def _is_same(film: Path, copy: Path) -> bool:
     return both_files and digest_file(film) == digest_file(copy)
 
 
-def _copied_set(film: Path, inputs: Path) -> Path:
-    """A copy of a posed image set under `input/`, from its root on."""
+def _copy_image_set(film: Path, inputs: Path) -> Path:
+    """Copies a posed image set from its root to `input/` and returns its relative path."""
     root, files = _posed_files(film)
     copy, number = inputs / root.name, 2
     while copy.exists():
@@ -146,9 +145,9 @@ def _copied_set(film: Path, inputs: Path) -> Path:
     aside = copy.with_name(copy.name + ".partial")
     shutil.rmtree(aside, ignore_errors=True)
     for file in files:
-        place = aside / file.relative_to(root)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, place)
+        target = aside / file.relative_to(root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, target)
     within = film.relative_to(root)
     outside = [path for path in _image_set(aside / within).paths if not path.is_relative_to(aside)]
     if outside:
@@ -159,7 +158,7 @@ def _copied_set(film: Path, inputs: Path) -> Path:
 
 
 def _image_set(film: Path) -> ImageSet:
-    """A posed image set. Raises InputError where its images are not to be found."""
+    """Reads a posed image set. Raises InputError if its images are missing."""
     try:
         return read_colmap(film) if detect_kind(film) == "colmap" else read_transforms(film)
     except InputError as error:
@@ -167,13 +166,13 @@ def _image_set(film: Path) -> ImageSet:
 
 
 def _posed_files(film: Path) -> tuple[Path, list[Path]]:
-    """The root of a posed image set, and the files that are needed of it."""
+    """The root of a posed image set and its files."""
     model = find_model(film) if film.is_dir() else None
     if model is not None:
         files = [path for path in model.iterdir() if path.is_file()]
     else:
         table = film / "transforms.json" if film.is_dir() else film
-        files = [table, *files_named(table)]
+        files = [table, *listed_files(table)]
     files = [Path(os.path.normpath(file)) for file in (*files, *_image_set(film).paths)]
     root = Path(os.path.commonpath([film if film.is_dir() else film.parent, *files]))
     if root == root.parent:
@@ -184,25 +183,22 @@ def _posed_files(film: Path) -> tuple[Path, list[Path]]:
 
 
 def _lighting(path: Path, kind: str) -> str:
-    """A lighting's name for a path under `input/`: that of the film, or of the root of a posed image set."""
+    """A lighting's name from a path under `input/`: that of the film, or of the root of a posed image set."""
     name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
     name = "".join(c if c.isprintable() and c not in ":/\\" else "_" for c in name).lstrip(".") or "film"
-    name = name.replace(RANDOMISED, RANDOMISED.replace("+", "_"))
-    while len(name) > LONGEST_NAME or len(name.encode()) > 2 * LONGEST_NAME:
+    name = name.replace(RANDOMIZED, RANDOMIZED.replace("+", "_"))
+    while len(name) > MAX_NAME or len(name.encode()) > 2 * MAX_NAME:
         name = name[:-1]
     return f"{name}_light" if name in RESERVED_LIGHTINGS else name
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the verb; returns the exit status, see `twin.cli`."""
-    parser = cli.Parser(prog="python -m twin.new", description="Start a scene folder from films.")
-    parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
-    parser.add_argument("films", type=Path, nargs="+", metavar="VIDEO", help="films or image folders, one per lighting")
-    parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
-    return cli.run(parser, _main, arguments)
+    return commands.main("new", arguments)
 
 
-def _main(options: argparse.Namespace) -> None:
+def command(options: argparse.Namespace) -> None:
+    """The work of the verb, given the options of `twin.commands`."""
     config = new_scene(options.scene, options.films, options.camera_height)
     print(f"wrote {config}")
     if options.camera_height is None:

@@ -1,12 +1,11 @@
-"""Verb: learn one more lighting of a built place from a single photo of it.
+"""Verb: adds a lighting to a built scene from a single photo.
 
     python -m twin.relight scenes/demo photo.jpg --name afternoon
 
-finds where the photo was taken (`capture/localize.py`), then the appearance embedding and the air under which the
-frozen field looks most like it. The lighting goes to `<scene>/lightings/afternoon.json`, with a picture beside it: the
-photo, the field under what was fitted, and under the most similar filmed one. From then on
-`twin.load_scene(scene).field()` has it: `lighting="afternoon"`, `"sun:afternoon:0.5"`; environments lay its air over
-their pictures.
+localizes the photo (`capture/localize.py`), then fits an appearance embedding and fog so that renderings of the frozen
+field match it. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it: the photo, the
+field under the fitted lighting, and under the most similar filmed one. Afterwards `twin.load_scene(scene).field()` has
+it as `lighting="afternoon"` or `"sun:afternoon:0.5"`; environments apply its fog to their images.
 """
 
 import argparse
@@ -17,50 +16,50 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import cli
+from twin import commands
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.nerf.added_lightings import AddedLighting, check_name, field_result
 from twin.nerf.fog import Fog
-from twin.scene import SceneDir, finished
+from twin.scene import SceneDir, require_stage
 
 _CLEAR = Fog()
-_MAX_WIDTH = 480  # [px] longer side of the picture fitted, as that of the frames trained on
+_MAX_WIDTH = 480  # [px] longer side of the fitted image, as for training frames
 _STEPS = 300
-_RAYS = 10_000  # fitted at most, spread evenly
-_LOOK_RAYS = 1000  # that tell which filmed frame is most like the photo
-_HAZY = 0.2  # [dB] by which haze has to explain the other half better
-_GAP = 4  # [px] between the pictures
+_RAYS = 10_000  # upper bound of fitted rays, spread evenly
+_START_RAYS = 1000  # for choosing the most similar filmed frame
+_FOG_GAIN = 0.2  # [dB] by which fog must improve the other half of the image
+_GAP = 4  # [px] between the images
 
 
 @dataclass(frozen=True)
-class Relit:
-    """What a photo's lighting was fitted as."""
+class PhotoFit:
+    """The lighting fitted to a photo, and its scores."""
 
     nearest: str
-    """The filmed lighting that looks most like the photo."""
+    """The filmed lighting most similar to the photo."""
     embedding: NDArray[np.float32]
-    """Shape (dim,)."""
-    air: Fog
-    """Clear where haze does not explain the picture better."""
-    pictures: tuple[NDArray, NDArray, NDArray]
-    """Photo, field under the fitted lighting and air, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
+    """Appearance embedding, shape (dim,)."""
+    fog: Fog
+    """Clear if fog does not improve the fit."""
+    images: tuple[NDArray, NDArray, NDArray]
+    """Photo, field under the fitted lighting and fog, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
     psnr_nearest: float
     """[dB]"""
     psnr_fitted: float
     """[dB]"""
     psnr_other_half: float
-    """[dB] of each half of the picture, left and right, under what was fitted to the other; mean over both."""
+    """Mean PSNR of the left and right half of the image, each under the lighting fitted to the other half [dB]."""
     psnr_clear_other_half: float
-    """[dB] The same with the air taken for clear."""
+    """The same without fog [dB]."""
 
 
-def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArray) -> Relit:
-    """The lighting of a photo and its air, by optimisation with the field frozen.
+def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArray) -> PhotoFit:
+    """Fits the appearance embedding and fog of a photo with the field frozen.
 
-    The air is taken for clear unless what is fitted to one half of the picture then explains the other half better by
-    `_HAZY`.
+    Cross-validation decides on fog: it is kept only if the fit to one half of the image then improves the other half by
+    `_FOG_GAIN`.
 
     Args:
         field: A `RadianceField`.
@@ -75,64 +74,64 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     height, width = photo.shape[:2]
     v, u = np.mgrid[:height, :width] + 0.5
-    cameras = CameraArrays(np.asarray(camera_to_world)[None], np.asarray(intrinsics)[None], field.where)
+    cameras = CameraArrays(np.asarray(camera_to_world)[None], np.asarray(intrinsics)[None], field.device)
     pixel = np.stack([u.ravel(), v.ravel()], -1)
     features, harmonics, depth, _ = field.trace(cameras, np.zeros(len(pixel), int), pixel)
     rays = unproject(pixel_grid(width, height), np.asarray(intrinsics))
     distance = depth.cpu().numpy().reshape(height, width) * np.linalg.norm(rays, axis=-1).astype(np.float32)
-    distances = torch.as_tensor(distance.ravel(), device=field.where)
-    colours = torch.as_tensor(photo.reshape(-1, 3).astype(np.float32), device=field.where)
+    distances = torch.as_tensor(distance.ravel(), device=field.device)
+    colors = torch.as_tensor(photo.reshape(-1, 3).astype(np.float32), device=field.device)
 
-    def picture(embedding: NDArray, air: Fog = _CLEAR) -> NDArray:
-        return air.over(field.colour(features, harmonics, embedding).reshape(photo.shape), distance)
+    def render(embedding: NDArray, fog: Fog = _CLEAR) -> NDArray:
+        return fog.apply(field.color(features, harmonics, embedding).reshape(photo.shape), distance)
 
-    def fitted(use: NDArray, start: NDArray, hazy: bool) -> tuple[NDArray, Fog]:
-        some = torch.as_tensor(use[:: max(1, len(use) // _RAYS)], device=field.where)
-        seen = field, features[some], harmonics[some], colours[some]
-        return fit_appearance(*seen, start, _STEPS, distances[some] if hazy else None)
+    def fit(pixels: NDArray, start: NDArray, with_fog: bool) -> tuple[NDArray, Fog]:
+        some = torch.as_tensor(pixels[:: max(1, len(pixels) // _RAYS)], device=field.device)
+        rays = field, features[some], harmonics[some], colors[some]
+        return fit_appearance(*rays, start, _STEPS, distances[some] if with_fog else None)
 
-    filmed = {name: picture(field.embedding(name)) for name in field.lightings}
+    filmed = {name: render(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
-    # A frame is a nearer start than its lighting, and what is fitted from there suits other views of the place better:
-    # by up to 1.7 dB on the demo, and never worse by more than 0.2 dB.
-    some = slice(None, None, max(1, height * width // _LOOK_RAYS))
+    # Starting from the most similar frame instead of a lighting suits other views of the place better: by up to 1.7 dB
+    # on the demo, and never worse by more than 0.2 dB.
+    some = slice(None, None, max(1, height * width // _START_RAYS))
     starts = [*field.appearance.named().vectors, *field.appearance.named().frame_vectors]
-    looks = [field.colour(features[some], harmonics[some], one) for one in starts]
-    start = starts[int(np.argmin([((look - photo.reshape(-1, 3)[some]) ** 2).mean() for look in looks]))]
+    renders = [field.color(features[some], harmonics[some], one) for one in starts]
+    start = starts[int(np.argmin([((one - photo.reshape(-1, 3)[some]) ** 2).mean() for one in renders]))]
     left = np.broadcast_to(np.arange(width) < width // 2, (height, width))
     with single_threaded_torch():
-        clear, hazy = (
-            float(np.mean([psnr(picture(*fitted(np.flatnonzero(h), start, air)), photo, ~h) for h in (left, ~left)]))
-            for air in (False, True)
+        clear, foggy = (
+            float(np.mean([psnr(render(*fit(np.flatnonzero(h), start, with_fog)), photo, ~h) for h in (left, ~left)]))
+            for with_fog in (False, True)
         )
-        is_hazy = hazy > clear + _HAZY
-        embedding, air = fitted(np.arange(height * width), start, is_hazy)
-    shown = picture(embedding, air)
-    return Relit(
-        *(nearest, embedding, air, (photo, shown, filmed[nearest])),
-        *(psnr(filmed[nearest], photo), psnr(shown, photo), hazy if is_hazy else clear, clear),
+        is_foggy = foggy > clear + _FOG_GAIN
+        embedding, fog = fit(np.arange(height * width), start, is_foggy)
+    fitted = render(embedding, fog)
+    return PhotoFit(
+        *(nearest, embedding, fog, (photo, fitted, filmed[nearest])),
+        *(psnr(filmed[nearest], photo), psnr(fitted, photo), foggy if is_foggy else clear, clear),
     )
 
 
 def relight(root: Path, photo: Path, name: str) -> AddedLighting:
-    """Adds the lighting of a photo to the scene at `root`, under a name, and returns it.
+    """Adds the lighting of a photo to the scene at `root` under a name, and returns it.
 
     Raises:
-        InputError: no built scene, no usable photo, one that does not show the place, or an impossible name.
+        InputError: no built scene, an unusable photo, a photo that cannot be localized, or an invalid name.
     """
     scene = SceneDir(root)
     if not scene.config_file.exists():
         raise InputError(f"no scene.toml in {root}; give the scene's folder, such as scenes/demo")
     result = field_result(scene)
 
-    from twin.capture.camera_models import flattened
+    from twin.capture.camera_models import undistorted
     from twin.capture.localize import register_photo
     from twin.capture.photos import load_photo
     from twin.geometry.cameras import Cameras
     from twin.nerf.field import RadianceField
 
     for stage in ("capture", "cameras", "metric"):
-        finished(scene, stage)
+        require_stage(scene, stage)
     field = RadianceField.load(scene.stage("field"))
     check_name(name, field.lightings)
     image, facts = load_photo(photo, None)
@@ -141,7 +140,7 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
     except InputError as error:
         raise InputError(f"{photo}: {error}") from None
     position = found.camera_to_world[:3, 3]
-    flat, lens = flattened(image, found.lens) if found.lens.is_distorted else (image, found.lens)
+    flat, lens = undistorted(image, found.lens) if found.lens.is_distorted else (image, found.lens)
     scale = min(1.0, _MAX_WIDTH / max(lens.width, lens.height))
     lens = lens.scaled(round(lens.width * scale), round(lens.height * scale))
     small = np.asarray(resize(flat, lens.width, lens.height), np.float32) / 255.0
@@ -162,44 +161,35 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
         "psnr_clear_other_half": round(relit.psnr_clear_other_half, 3),
     }
     gap = np.ones((lens.height, _GAP, 3), np.float32)
-    a, b, c = relit.pictures
+    a, b, c = relit.images
     write_image(scene.lightings / f"{name}.png", np.hstack([a, gap, b, gap, c]))
-    lighting = AddedLighting(name, [float(x) for x in relit.embedding], relit.air, result, str(photo), figures)
+    lighting = AddedLighting(name, [float(x) for x in relit.embedding], relit.fog, result, str(photo), figures)
     lighting.save(scene)
     return lighting
 
 
 def summary(lighting: AddedLighting) -> str:
-    """The lines printed at the end."""
-    f, air = lighting.figures, lighting.air
-    clear = f"in clear air those halves have {f['psnr_clear_other_half']:.1f} dB"
+    """The printed summary of an added lighting."""
+    f, fog = lighting.figures, lighting.air
+    clear = f"without fog those halves have {f['psnr_clear_other_half']:.1f} dB"
     x, y, z = np.array(f["camera_to_world"])[:3, 3]
     return (
         f"registered with {f['inliers']} inliers of {f['matches']} matches at ({x:.2f}, {y:.2f}, {z:.2f}) m, "
         f"{f['from_path_m']:.2f} m from the nearest frame; {f['reprojection_error_px']:.2f} px; "
         f"focal length {f['focal_px']:.0f} px ({f['focal_from']})\n"
         f"{lighting.name}: {f['psnr_nearest']:.1f} dB under the nearest filmed lighting ({f['nearest']}), "
-        f"{f['psnr_fitted']:.1f} dB fitted; each half of the picture by the other's fit {f['psnr_other_half']:.1f} dB\n"
-        + (f"visibility {3.0 / air.extinction:.0f} m; {clear}" if air.extinction else "the air is clear")
+        f"{f['psnr_fitted']:.1f} dB fitted; each half of the image by the other's fit {f['psnr_other_half']:.1f} dB\n"
+        + (f"visibility {3.0 / fog.extinction:.0f} m; {clear}" if fog.extinction else "no fog")
     )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the verb; returns the exit status, see `twin.cli`."""
-    parser = cli.Parser(
-        prog="python -m twin.relight",
-        description="Learn one more lighting of a built place from a single photo of it: find where it was taken, then "
-        "fit the field's appearance and the air to it. What it looks like this afternoon, the twin then looks like, "
-        "everywhere.",
-    )
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
-    parser.add_argument("--name", required=True, help="what the lighting is to be called; an added one is replaced")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return cli.run(parser, _main, arguments)
+    return commands.main("relight", arguments)
 
 
-def _main(options: argparse.Namespace) -> None:
+def command(options: argparse.Namespace) -> None:
+    """The work of the verb, given the options of `twin.commands`."""
     lighting = relight(options.scene, options.photo, options.name)
     if not options.quiet:
         print(summary(lighting))

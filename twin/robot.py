@@ -1,13 +1,11 @@
-"""What a Husky is and what may differ from one to the next: facts and parameters, no MuJoCo.
+"""Constants and parameters of the Clearpath Husky, without MuJoCo.
 
 *Base* is Clearpath's `base_link`: x forward, y left, z up; its origin lies between the wheels, 0.132 m above flat
-ground. A *side* is the front and the rear wheel of the left or of the right, which one motor drives through gear and
-belt; arrays per side are ordered left, right. The *track ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for
-a differential drive whose wheels roll freely and larger for a skid-steered robot, whose tyres must scrub sideways.
+ground. A *side* is the front and rear wheel on the left or right, driven by one motor through gear and belt; arrays per
+side are ordered left, right. The *track ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a differential
+drive with freely rolling wheels and larger for a skid-steered robot, whose tires scrub sideways.
 
-`HuskyParams` is what `[robot]` in `scene.toml` and the file `robot.toml` beside it may set.
-
-Figures: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml).
+Source of the constants: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml).
 """
 
 from dataclasses import dataclass
@@ -18,13 +16,13 @@ from twin.errors import InputError
 from twin.types import Array
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-"""Order of wheel arrays everywhere; body, joint and encoder of a wheel are `<name>_wheel`."""
+"""Order of all wheel arrays; body, joint and encoder of a wheel are named `<name>_wheel`."""
 SIDES = ("left", "right")
-"""Order of arrays per side; also the names of the actuators."""
+"""Order of arrays per side, and names of the actuators."""
 
 CHASSIS_MASS = 46.034  # [kg]
 WHEEL_MASS = 2.637  # [kg]
-WHEEL_RADIUS = 0.1651  # [m], nominal: what the robot's controller reckons with
+WHEEL_RADIUS = 0.1651  # [m] nominal, used by the robot's controller
 WHEEL_WIDTH = 0.1143  # [m]
 WHEELBASE = 0.512  # [m]
 TRACK = 0.5708  # [m]
@@ -33,14 +31,14 @@ BASE_HEIGHT = WHEEL_RADIUS - HUB_HEIGHT  # [m] of the base origin above flat gro
 GEAR_RATIO = 79.0  # motor turns per wheel turn
 
 CAMERA_SIZE = (160, 90)
-"""Width, height of the pictures a policy gets of the front camera [px]."""
+"""Width, height of a policy's images from the front camera [px]."""
 REAR_HEAVY = (-0.085, -0.00065, 0.062)
-"""The published centre of mass of the chassis with x and y exchanged [m]."""
+"""The published center of mass of the chassis with x and y exchanged [m]."""
 
 
 @dataclass(frozen=True)
 class PixelCamera:
-    """A pinhole camera in pixels: OpenCV convention, (0, 0) is the corner of the top-left pixel."""
+    """A pinhole camera: OpenCV convention, (0, 0) is the outer corner of the top-left pixel."""
 
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [px]."""
@@ -48,10 +46,10 @@ class PixelCamera:
     """Width, height [px]."""
 
     def resized(self, size: tuple[int, int]) -> "PixelCamera":
-        """The same camera with pictures of another size (width, height) [px], scaled by the width.
+        """The same camera at another image size (width, height) [px], scaled by the width.
 
-        Pixels keep their shape, so fy scales like fx; where the aspect ratio differs, the middle of the picture's
-        height is cut out (or, for a picture wider than the new one, extended).
+        Pixels keep their shape, so fy scales like fx; if the aspect ratio differs, the height is cropped or extended
+        about its middle.
         """
         scale = size[0] / self.size[0]
         fx, fy, cx, cy = (float(x) * scale for x in self.intrinsics)
@@ -60,12 +58,12 @@ class PixelCamera:
 
 
 ZED2 = PixelCamera((530.0, 530.0, 640.0, 360.0), (1280, 720))
-"""A ZED 2's left lens at 1280 × 720, typical; the calibration of the unit at hand governs."""
+"""Typical left lens of a ZED 2 at 1280 × 720; prefer the calibration of the actual unit."""
 
 
 @dataclass(frozen=True)
 class HuskyParams:
-    """What may differ from robot to robot, or be fitted to logs.
+    """Parameters that differ between robots or are fitted to logs: `[robot]` in `scene.toml`, and `robot.toml`.
 
     Raises:
         InputError: a value out of range.
@@ -73,51 +71,50 @@ class HuskyParams:
 
     # Body.
     center_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.062)
-    """Of the chassis, in the base [m]. The published (−.00065, −.085, .062) would lie 8.5 cm to the right of a
-    symmetric robot; read as transposed it is rear-heavy (`REAR_HEAVY`) and turns with chi = 1.43. Centred it turns with
-    1.805, which is nearer to what Clearpath's controller assumes (1.82 to 1.875) and to what logs of a real one show
-    (2.15 and more); so centred is the default."""
+    """Center of mass of the chassis in the base [m]. The published (−.00065, −.085, .062) would lie 8.5 cm to the right
+    of a symmetric robot; read as transposed it is rear-heavy (`REAR_HEAVY`) and turns with chi = 1.43. Centered it
+    turns with 1.805, nearer to Clearpath's controller (1.82 to 1.875) and to logs of a real robot (2.15 and more),
+    hence the default."""
     payload_mass: float = 0.0
-    """[kg] on the top plate."""
+    """Mass on the top plate [kg]."""
     payload_position: tuple[float, float, float] = (0.0, 0.0, 0.35)
-    """Centre of the payload in the base [m]."""
+    """Center of the payload in the base [m]."""
 
-    # Tyres.
+    # Tires.
     friction: float = 0.7
-    """Sliding friction of a tyre, on whatever it touches."""
+    """Sliding friction coefficient of the tires on any surface."""
     rolling_resistance: float = 0.015
-    """Rolling resistance coefficient Crr: force / load. Rolling and sliding share a tyre's grip: it slides at
-    Crr / friction · s / √(1 − s²) of its rolling speed under a share s of its grip, next to nothing by default."""
+    """Rolling resistance coefficient Crr: force / load. Rolling and sliding share a tire's grip: at a fraction s of its
+    grip it slides at Crr / friction · s / √(1 − s²) of its rolling speed, negligible by default."""
     wheel_radius: tuple[float, float] = (WHEEL_RADIUS, WHEEL_RADIUS)
-    """Effective radius of the left and of the right tyres [m]: pressure and wear. The robot's own controller goes on
-    reckoning with the nominal one."""
+    """Effective radius of the left and right tires [m], by pressure and wear. The robot's controller keeps using the
+    nominal radius."""
     spin_friction: float = 1e-4
-    """Of a tyre's contact patch turning on the spot: moment / load [m]. Next to nothing by default, for the scrubbing
-    of four wheels dominates on hard ground; tyres that sink in have a long patch."""
+    """Torsional friction of a tire's contact patch: moment / load [m]. Negligible by default, since the scrubbing of
+    four wheels dominates on hard ground; tires that sink in have a long patch."""
     slip_stiffness: float = 10.0
-    """How stiffly friction holds a tyre, against how stiffly the ground carries it (MuJoCo's `impratio`). Below 1 tyres
-    creep as on soft ground: force grows with the speed of slip before they slide."""
+    """Stiffness of tire friction relative to that of normal contact (MuJoCo's `impratio`). Below 1 tires creep as on
+    soft ground: force grows with slip speed before they slide."""
     ground_viscosity: float = 0.0
-    """Of what the wheels wade through, such as long grass, mud or snow [Pa s]; none by default. It drags the tyres back
-    with about 2.4 N per Pa s and m/s each, so it grows with speed, and turns harder the faster."""
+    """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]. Each tire is dragged by about
+    2.4 N per Pa s and m/s, so drag grows with speed and turning is harder the faster."""
     wheel_shape: str = "ellipsoid"
     """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
 
     # Drivetrain.
     servo_gain: float = 1600.0
-    """Torque of a side per wheel speed error [N m s/rad]; stiff, as the motor controllers close the loop on encoder
-    counts."""
+    """Torque of a side per wheel speed error [N m s/rad]; stiff, as in the motor controllers' encoder loop."""
     servo_lag: float = 0.0
-    """Time constant of the first-order lag with which a side's wheel speed command takes effect [s]."""
+    """Time constant of the first-order lag of a side's wheel speed command [s]."""
     motor_inertia: float = 0.15
-    """Inertia of rotors and gears as felt at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the gear
-    ratio of 79 squared, shared by two wheels. It also keeps stiffly driven wheels from stick-slip flutter: without it a
-    point turn at 1.8 rad/s on a friction of 1.0 hops (9 m/s² rms at the camera), from 0.1 up there is none at all."""
+    """Inertia of rotors and gears at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the squared gear
+    ratio of 79, shared by two wheels. It also prevents stick-slip flutter of stiffly driven wheels: without it a point
+    turn at 1.8 rad/s on a friction of 1.0 hops (9 m/s² rms at the camera), from 0.1 on there is none."""
     motor_torque: float = 70.0
-    """Torque limit of a side, at its wheels [N m]. None is published."""
+    """Torque limit of a side at its wheels [N m]; not published."""
     motor_constant: float = 0.035
-    """Torque per current at the motor's shaft, losses of gear and belt taken off [N m/A]. None is published: with this
-    one the motors' continuous 8 A are 22 N m at the wheels of a side, and 70 N m are 25 A."""
+    """Torque per current at the motor's shaft, net of losses of gear and belt [N m/A]; not published. With this value
+    the motors' continuous 8 A are 22 N m at the wheels of a side, and 70 N m are 25 A."""
 
     # Controller.
     max_speed: float = 1.0
@@ -129,29 +126,29 @@ class HuskyParams:
     max_yaw_acceleration: float = 6.0
     """[rad/s²]"""
     max_wheel_speed: float = 1.0
-    """Of a tyre's circumference [m/s]; beyond it both sides slow down alike."""
+    """Limit of a tire's circumferential speed [m/s]; beyond it both sides are scaled down alike."""
     separation_multiplier: float = 1.875
-    """Clearpath's `wheel_separation_multiplier`: the controller's own guess of chi."""
+    """Clearpath's `wheel_separation_multiplier`: the controller's estimate of chi."""
     command_latency: float = 0.0
-    """From a command being given to the controller acting on it [s]."""
+    """Delay from a command to the controller's action [s]."""
 
     # Front camera.
     camera_height: float = 0.6
-    """Of the lens above flat ground [m]."""
+    """Height of the lens above flat ground [m]."""
     camera_offset: tuple[float, float] = (0.36, 0.0)
-    """Of the lens forward and left of the base origin [m]."""
+    """Position of the lens forward and left of the base origin [m]."""
     camera_pitch: float = 5.0
-    """How far it looks down [°]."""
+    """Downward angle [°]."""
     camera_yaw: float = 0.0
-    """How far it looks to the left [°]."""
+    """Angle to the left [°]."""
     camera_roll: float = 0.0
-    """How far it leans to the right [°]."""
+    """Angle of leaning to the right [°]."""
     camera_intrinsics: tuple[float, ...] = ()
-    """fx, fy, cx, cy at `camera_size` [px]; empty: in a scene those of the film, elsewhere a ZED 2's."""
+    """fx, fy, cx, cy at `camera_size` [px]; empty: those of the film in a scene, otherwise those of a ZED 2."""
     camera_size: tuple[int, int] = ZED2.size
-    """Width, height of its native pictures [px], which `camera_intrinsics` belong to."""
+    """Width, height of native images [px], which `camera_intrinsics` refer to."""
     camera_latency: float = 0.0
-    """From the light reaching the lens to the picture reaching the policy [s]."""
+    """Delay from exposure to the policy's receipt of the image [s]."""
 
     def __post_init__(self) -> None:
         lengths = {"center_of_mass": 3, "payload_position": 3, "wheel_radius": 2, "camera_offset": 2, "camera_size": 2}
@@ -171,20 +168,20 @@ class HuskyParams:
 
     @property
     def camera_position(self) -> tuple[float, float, float]:
-        """Of the front camera in the base [m]."""
+        """Position of the front camera in the base [m]."""
         return (*self.camera_offset, self.camera_height - BASE_HEIGHT)
 
     @property
     def camera_rotation(self) -> Array:
         """The front camera's axes right, up and back (columns) in the base, shape (3, 3)."""
         yaw, pitch, roll = np.deg2rad([self.camera_yaw, self.camera_pitch, self.camera_roll])
-        turned = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
         axes = np.array([[0, np.sin(pitch), -np.cos(pitch)], [-1, 0, 0], [0, np.cos(pitch), np.sin(pitch)]])
-        leaning = np.array([[np.cos(roll), np.sin(roll), 0], [-np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-        return turned @ axes @ leaning
+        about_axis = np.array([[np.cos(roll), np.sin(roll), 0], [-np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+        return about_z @ axes @ about_axis
 
     def camera(self, fallback: PixelCamera = ZED2) -> PixelCamera:
-        """The front camera at its native size; `fallback` where no intrinsics are given."""
+        """The front camera at its native size; `fallback` if no intrinsics are given."""
         if not self.camera_intrinsics:
             return fallback
         fx, fy, cx, cy = self.camera_intrinsics
@@ -193,7 +190,7 @@ class HuskyParams:
 
 WHEEL_SHAPES = ("ellipsoid", "cylinder")
 
-# What a value may be; wide enough for any Husky, narrow enough to catch millimetres, degrees and percent.
+# Ranges of values: wide enough for any Husky, narrow enough to catch millimetres, degrees and percent.
 _RANGES: dict[str, tuple[float, float]] = {
     "center_of_mass": (-0.5, 0.5),
     "payload_mass": (0.0, 100.0),

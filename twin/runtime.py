@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar with time left on a terminal, a line now and then elsewhere, nothing when quiet."""
+"""Runtime services of the verbs: progress bars, child processes, CPU cores, memory and file locks."""
 
 import contextlib
 import ctypes
@@ -9,46 +9,95 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import psutil
 from tqdm import tqdm
 
 from twin.errors import InputError
-from twin.files import regular
+from twin.files import regular_file
 
 T = TypeVar("T")
+
+# ---- progress on standard error
 
 _quiet = False
 
 
 def set_quiet(quiet: bool) -> None:
-    """Silences (or restores) every bar of this process."""
+    """Turns all progress output of this process off or on."""
     global _quiet
     _quiet = quiet
 
 
 def is_quiet() -> bool:
-    """Whether bars are silenced in this process."""
+    """True if progress output of this process is off."""
     return _quiet
 
 
-def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
-    """A bar to be driven by hand: `update(n)`, `set_postfix_str(s)`, `close()`; also a context manager.
+@dataclass(frozen=True)
+class BuildStage:
+    """The running stage of a build, shown by its progress bars."""
 
-    It shows from `after` seconds on, for what takes long the first time only.
+    number: int
+    count: int
+    expected: float
+    """Expected duration of the stage [s], from the pace so far."""
+    later: float
+    """Expected duration of the stages after it [s]."""
+    started: float = field(default_factory=time.monotonic)
+
+    def left(self, bar: float) -> float:
+        """Time left of the whole build [s], given that of the current bar [s]."""
+        return max(self.expected - (time.monotonic() - self.started), bar) + self.later
+
+
+_stage: BuildStage | None = None
+
+
+def set_stage(stage: BuildStage | None) -> None:
+    """Sets the build stage that bars of this process show with the time left of the build; None: no build."""
+    global _stage
+    _stage = stage
+
+
+class _Bar(tqdm):
+    """A progress bar that also shows the time left of the whole build."""
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        facts: dict[str, Any] = super().format_dict
+        if _stage:
+            rate = facts["rate"] or (facts["n"] - facts["initial"]) / max(facts["elapsed"], 1e-6)
+            bar = max((facts["total"] or 0) - facts["n"], 0) / rate if rate else 0.0
+            left = self.format_interval(_stage.left(bar))
+            facts["bar_format"] = f"{{l_bar}}{{bar}}{{r_bar}}, stage {_stage.number}/{_stage.count}, {left} to the end"
+        return facts
+
+
+def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
+    """A progress bar, advanced by `update(n)`; also a context manager.
+
+    A terminal shows a bar with the time left, a log file a line every 10 s, quiet mode nothing.
+
+    Args:
+        what: Description.
+        total: Number of units.
+        unit: Name of a unit.
+        after: Delay before the bar appears [s], for work that takes long the first time only.
     """
     every = 0.1 if sys.stderr.isatty() else 10.0
-    return tqdm(
+    return _Bar(
         total=total, desc=f"  {what}", unit=unit, disable=_quiet, mininterval=every, dynamic_ncols=True, delay=after
     )
 
 
 def track(items: Iterable[T], what: str, total: int | None = None, unit: str = "it") -> Iterator[T]:
-    """Yields the items under a bar."""
+    """Yields the items and advances a progress bar."""
     if total is None:
         total = len(items)  # type: ignore[arg-type]
     with bar(what, total, unit) as progress:
@@ -57,44 +106,43 @@ def track(items: Iterable[T], what: str, total: int | None = None, unit: str = "
             progress.update()
 
 
-def say(line: str) -> None:
-    """One line for the user, above the bars."""
+def log_line(line: str) -> None:
+    """Prints a line above the progress bars."""
     if not _quiet:
         tqdm.write(line, file=sys.stderr)
 
 
-# ---- Processes that verbs start: none outlives the one that started it.
+# ---- child processes
 
-
-PARENT = "TWIN_PARENT"
-"""Environment variable with the number of the process that starts another."""
+PARENT_VARIABLE = "TWIN_PARENT"
+"""Environment variable with the process number of the parent."""
 
 _PR_SET_PDEATHSIG = 1
-_LOOK = 0.5  # [s] between two looks for the parent
+_PARENT_POLL = 0.5  # [s] between checks for the parent
 
 
-def environment(**more: str) -> dict[str, str]:
-    """The environment for a process that calls `die_with_parent`."""
-    return {**os.environ, PARENT: str(os.getpid()), **more}
+def child_environment(**more: str) -> dict[str, str]:
+    """Environment variables for a child process that calls `die_with_parent`."""
+    return {**os.environ, PARENT_VARIABLE: str(os.getpid()), **more}
 
 
 def die_with_parent(parent: int | None = None) -> None:
-    """Call first in a child: it is killed when its parent dies, however it does, so that no second writer is left.
+    """Makes this process die when its parent dies, so that no second writer survives; call first in a child.
 
     Args:
-        parent: Its number; by default what `environment` says, or who the parent is now.
+        parent: Process number; by default that of `child_environment`, or the present parent.
     """
-    parent = parent or int(os.environ.get(PARENT, os.getppid()))
+    parent = parent or int(os.environ.get(PARENT_VARIABLE, os.getppid()))
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it was gone before the call
+    if os.getppid() != parent:  # it died before the call
         os._exit(1)
-    # For systems without that call.
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    # For systems without prctl.
+    threading.Thread(target=_exit_when_orphaned, args=(parent,), daemon=True).start()
 
 
-def ignore_stops() -> None:
-    """Call in a child that its parent ends: signals of a terminal are for the parent. SIGTERM ends the child."""
+def ignore_terminal_signals() -> None:
+    """Makes a child ignore the terminal's signals, which the parent handles; SIGTERM still ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -102,35 +150,33 @@ def ignore_stops() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
 
 
-def _watch(parent: int) -> None:
+def _exit_when_orphaned(parent: int) -> None:
     while os.getppid() == parent:
-        time.sleep(_LOOK)
+        time.sleep(_PARENT_POLL)
     os._exit(1)
 
 
-# ---- How many CPU cores there are to use.
-
+# ---- CPU cores
 
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")
-_most: int | None = None
+_core_limit: int | None = None
 
 
-def use(most: int) -> None:
-    """This process is one of several that share the cores: it uses so many of them."""
-    global _most
-    _most = most
+def limit_cores(limit: int) -> None:
+    """Limits `available_cores`, for one of several processes that share the cores."""
+    global _core_limit
+    _core_limit = limit
 
 
-def cores() -> int:
-    """CPU cores this process may use: those it is bound to, where the system can tell, else all of the machine's; no
-    more than its container is allowed."""
-    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(there, _most or there, _quota() or there)
+def available_cores() -> int:
+    """Number of CPU cores this process may use: its affinity, else all cores, within `limit_cores` and cgroup quota."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(count, _core_limit or count, _quota() or count)
 
 
 @cache
 def _quota() -> int | None:
-    """Of a container's processor time (Linux control groups 2), in whole cores; None: no bound."""
+    """CPU quota of the container (Linux cgroup v2) in whole cores; None: unlimited."""
     try:
         quota, period = _QUOTA.read_text(encoding="ascii").split()
     except (OSError, ValueError):
@@ -138,25 +184,24 @@ def _quota() -> int | None:
     return None if quota == "max" else max(1, round(int(quota) / int(period)))
 
 
-# ---- Peak memory of this process and everything it started, sampled while a block runs.
+# ---- memory
+
+_MEMORY_POLL = 0.2  # [s]
 
 
-_PERIOD = 0.2  # [s]
-
-
-def resident() -> int:
-    """Sum of the resident sizes of this process and everything it started; shared pages count in each [bytes]."""
+def resident_memory() -> int:
+    """Resident memory of this process and its descendants [bytes]; shared pages count in each process."""
     this, total = psutil.Process(), 0
     for process in (this, *this.children(recursive=True)):
         try:
             total += process.memory_info().rss
         except psutil.Error:
-            continue  # it ended between the listing and the look
+            continue  # it ended after it was listed
     return total
 
 
 class PeakMemory:
-    """Context manager; `bytes` is the largest `resident()` seen."""
+    """Context manager that samples `resident_memory`; `bytes` is the maximum."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -173,38 +218,38 @@ class PeakMemory:
 
     def _watch(self) -> None:
         while True:
-            self.bytes = max(self.bytes, resident())
-            if self._stop.wait(_PERIOD):
+            self.bytes = max(self.bytes, resident_memory())
+            if self._stop.wait(_MEMORY_POLL):
                 return
 
 
-# ---- One process at a time writes what others would mix into.
+# ---- file lock
 
 
 @contextlib.contextmanager
-def alone(path: Path, what: str) -> Iterator[None]:
-    """Holds a lock that goes with the process, however it ends.
+def exclusive_lock(path: Path, what: str) -> Iterator[None]:
+    """Holds a lock on a file; it is released when the process ends, even if killed.
 
     Args:
-        path: File to lock, with the holder's process number in it while the lock is held. It is removed at the end;
-            one that a killed process left is taken over.
-        what: Sentence that says what goes on there, for the error.
+        path: Lock file, which contains the holder's process number. It is removed at the end; a file left by a killed
+            process is taken over.
+        what: Describes the locked work in the error message.
 
     Raises:
-        InputError: another holds it, or what is there is no file.
+        InputError: another process holds the lock, or `path` is not a regular file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
         if path.exists() or path.is_symlink():
-            regular(path)
+            regular_file(path)
         with path.open("a+") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 file.seek(0)
                 raise InputError(f"{what} by process {file.read().strip() or '?'}; wait for it or stop it") from None
-            if not _is(file.fileno(), path):
-                continue  # the holder of before removed it between our opening it and our locking it
+            if not _is_same_file(file.fileno(), path):
+                continue  # the former holder removed it after we opened it
             try:
                 file.truncate(0)
                 os.write(file.fileno(), str(os.getpid()).encode())
@@ -214,8 +259,8 @@ def alone(path: Path, what: str) -> Iterator[None]:
             return
 
 
-def _is(descriptor: int, path: Path) -> bool:
-    """Whether an open file is the one of this name."""
+def _is_same_file(descriptor: int, path: Path) -> bool:
+    """True if an open file is the one at `path`."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

@@ -1,15 +1,19 @@
-"""A scene folder: every path named once, and the stamp that says what made an artifact.
+"""Paths of a scene folder, and the stamps of build stages.
 
 scenes/<name>/
   scene.toml            the only hand-written file
-  robot.toml            where there is one: what differs on the robot, as `[robot]` of scene.toml
-  input/                films or photos, never written by twin
+  robot.toml            optional: robot parameters, as `[robot]` of scene.toml
+  input/                films or photos; only `twin.new` writes here
   build/
-    1_capture/ ... 6_review/   one folder per stage, written aside as `<folder>.partial` and renamed when done
+    1_capture/ ... 6_review/   one folder per stage, written as `<folder>.partial` and renamed when done
     report.json report.html review.mp4
   lightings/            <name>.json and .png: lightings fitted to photos of the built place
-  validation/           episodes.csv, cells.csv, validation.html, films/: policies driven in the twin
-  forecast/             forecast.json .csv .html: what that says about the real runs
+  validation/           episodes.csv, cells.csv, validation.html, films/: policies evaluated in the twin
+  forecast/             forecast.json .csv .html: forecast of success on the real road
+
+A stage's *key* is the hash of everything its result depends on: its config sections, the digests of its input files,
+the *results* (content digests) of its upstream stages, its version and the seed. A stage folder is up to date if its
+stamp has the present key and all its files are as written. Package versions are recorded, but are not part of the key.
 """
 
 import os
@@ -22,7 +26,16 @@ from pathlib import Path
 from typing import Any
 
 from twin.errors import InputError
-from twin.files import aside, damaged, digest_file, digest_json, read_json, regular, remove, write_json
+from twin.files import (
+    atomic_path,
+    digest_file,
+    digest_json,
+    read_json,
+    regular_file,
+    remove,
+    wrap_read_errors,
+    write_json,
+)
 
 STAGES: dict[str, str] = {
     "capture": "1_capture",
@@ -33,7 +46,7 @@ STAGES: dict[str, str] = {
     "mjcf": "5_mjcf",
     "review": "6_review",
 }
-"""Stage name → folder under `build/`, in the order they run."""
+"""Stage name → folder under `build/`, in running order."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +68,7 @@ class SceneDir:
         return self.build / STAGES[name]
 
     def partial(self, name: str) -> Path:
-        """The folder a stage is being written to."""
+        """The folder of a stage while it is written."""
         return self.build / f"{STAGES[name]}.partial"
 
     def stamp(self, name: str) -> Path:
@@ -71,7 +84,7 @@ class SceneDir:
 
     @property
     def truth_json(self) -> Path:
-        """The comparison with the known truth, of generated places."""
+        """Comparison with the known truth, for generated scenes only."""
         return self.build / "truth.json"
 
     @property
@@ -80,7 +93,7 @@ class SceneDir:
 
     @property
     def lightings(self) -> Path:
-        """Lightings added to the built field; outside `build/`, which may be deleted."""
+        """Lightings added to the built field; kept outside `build/`, which may be deleted."""
         return self.root / "lightings"
 
     @property
@@ -89,12 +102,12 @@ class SceneDir:
 
     @property
     def episodes_csv(self) -> Path:
-        """One row per trial in the twin; columns in `twin.evaluation.trials`."""
+        """One row per trial in the twin; for columns see `twin.evaluation.trials`."""
         return self.validation / "episodes.csv"
 
     @property
     def cells_csv(self) -> Path:
-        """The same, summed up by policy, task and lighting."""
+        """Trials aggregated by policy, task and lighting."""
         return self.validation / "cells.csv"
 
     @property
@@ -103,7 +116,7 @@ class SceneDir:
 
     @property
     def truth(self) -> Path:
-        """Known truth of a synthetic scene (`truth/truth.npz`). Only reports and tests may read it, never a stage."""
+        """Ground truth of a generated scene (`truth/truth.npz`); no stage may read it."""
         return self.root / "truth"
 
     @property
@@ -112,41 +125,35 @@ class SceneDir:
 
 
 _NAME = re.compile(r"\w[\w.-]*")
-_LONGEST_NAME = 80  # characters; with what is added to it, a file system takes 255 bytes
+_MAX_NAME = 80  # characters; a file system takes 255 bytes, including what twin appends
 
 
 def check_name(name: str, what: str) -> str:
-    """A name that becomes that of a file or folder.
+    """Returns `name` if it can be the name of a file or folder.
 
     Args:
         name: Letters, digits and `_ . -`, the first a letter, a digit or `_`; at most 80 characters.
-        what: What it is the name of, such as `--run`, to open the message.
+        what: Origin of the name, such as `--run`, which opens the error message.
 
     Raises:
-        InputError: it is something else, such as a path.
+        InputError: another name, such as a path.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{what} {name!r}: expected a name of letters, digits and _ . - only, no path")
-    if len(name) > _LONGEST_NAME or len(name.encode()) > 2 * _LONGEST_NAME:
-        raise InputError(f"{what} {name!r}: {len(name)} characters; expected at most {_LONGEST_NAME}")
+    if len(name) > _MAX_NAME or len(name.encode()) > 2 * _MAX_NAME:
+        raise InputError(f"{what} {name!r}: {len(name)} characters; expected at most {_MAX_NAME}")
     return name
 
 
 def run_folder(scene: SceneDir, name: str) -> Path:
-    """The folder of a training run. Raises InputError where the name is none; see `check_name`."""
+    """The folder of a training run. Raises InputError for an invalid name; see `check_name`."""
     return scene.root / "runs" / check_name(name, "--run")
 
 
-# ---- What made an artifact, and whether it would be made the same way again.
-#
-# A stage's *key* is the hash of everything its result depends on: its config sections, the digests of its input files,
-# the *results* (content digests) of its upstream stages, its version and the seed. A stage folder whose stamp carries
-# the present key, and whose files are all as they were written, is up to date. Package versions are recorded, but are
-# not in the key.
-
+# ---- stamps
 
 _CURE = "build the scene again"
-_MOST_READ = 256 << 20  # [bytes] of a file that is compared when a scene is opened
+_MAX_HASHED = 256 << 20  # [bytes] of a file that is hashed when a scene is opened
 _PACKAGES = ("twin", "numpy", "torch", "warp-lang", "mujoco", "mujoco-warp", "pycolmap", "coacd", "av", "scipy")
 
 
@@ -156,23 +163,23 @@ class Stamp:
 
     stage: str
     key: str
-    """Hash of what the stage depends on."""
+    """Hash of `depends`."""
     result: str
-    """Hash of the files the stage made."""
+    """Hash of the stage's files."""
     depends: dict[str, Any]
-    """What went into the key: version, seed, config, inputs, upstream."""
+    """Dependencies of the stage: version, seed, config, inputs, upstream."""
     files: dict[str, int]
-    """Every file the stage made, relative to its folder, and its size [bytes]."""
+    """Sizes [bytes] of the stage's files by path relative to its folder."""
     metrics: dict[str, Any]
-    """The stage's numbers for the report."""
+    """Numbers for the report."""
     seconds: float
     peak_memory_bytes: int
     device: str
     packages: dict[str, str]
     sha256: dict[str, str] = field(default_factory=dict)
-    """Digest of every file; empty in stamps of before, whose folders are compared with `result` as a whole."""
+    """Digest of every file; empty in older stamps, whose folders are compared with `result` as a whole."""
     itself: str = ""
-    """Digest of all of the above; empty in stamps of before."""
+    """Digest of all fields above; empty in older stamps."""
 
     def save(self, folder: Path) -> None:
         stamp = replace(self, itself=self._digest())
@@ -180,42 +187,42 @@ class Stamp:
 
     @staticmethod
     def load(folder: Path) -> "Stamp | None":
-        """The stamp of a finished stage folder, or None where it is missing, damaged, or does not fit its files.
+        """The stamp of a finished stage folder; None if it is missing, damaged, or does not match its files.
 
-        Every file is read.
+        All files are read.
         """
         try:
-            return Stamp.checked(folder)
+            return Stamp.verified(folder)
         except InputError:
             return None
 
     @staticmethod
-    def checked(folder: Path, most: int | None = None) -> "Stamp":
+    def verified(folder: Path, max_hashed: int | None = None) -> "Stamp":
         """The stamp of a finished stage folder, which fits its files.
 
         Args:
-            folder: Of the stage.
-            most: Of files larger than this only the size is compared [bytes]; None: all are read.
+            folder: Folder of the stage.
+            max_hashed: Larger files are compared by size only [bytes]; None: all are read.
 
         Raises:
-            InputError: names the file that is damaged or missing.
+            InputError: a file is damaged or missing.
         """
         path = folder / "stamp.json"
-        with damaged(path, _CURE):
+        with wrap_read_errors(path, _CURE):
             read = read_json(path)
             stamp = Stamp(**read)
             if stamp.itself and stamp.itself != stamp._digest():
                 raise ValueError("it is not as it was written")
             for name, size in stamp.files.items():
-                stamp._check(folder / name, name, int(size), most)
+                stamp._check(folder / name, name, int(size), max_hashed)
             if not stamp.sha256 and digest_folder(folder)[0] != stamp.result:
                 raise InputError(f"{folder} is damaged (its files are not as they were written); {_CURE}")
         return stamp
 
-    def _check(self, file: Path, name: str, size: int, most: int | None) -> None:
+    def _check(self, file: Path, name: str, size: int, max_hashed: int | None) -> None:
         if not file.is_file():
             raise InputError(f"{file} is missing; {_CURE}")
-        small = most is None or size <= most
+        small = max_hashed is None or size <= max_hashed
         if file.stat().st_size != size or (name in self.sha256 and small and digest_file(file) != self.sha256[name]):
             raise InputError(f"{file} is damaged (it is not as it was written); {_CURE}")
 
@@ -223,12 +230,12 @@ class Stamp:
         return digest_json({name: value for name, value in asdict(self).items() if name != "itself"})
 
 
-def key_of(depends: dict[str, Any]) -> str:
+def stage_key(depends: dict[str, Any]) -> str:
     return digest_json(depends)
 
 
 def digest_folder(folder: Path) -> tuple[str, dict[str, int], dict[str, str]]:
-    """Content digest of a folder, and its files with their sizes [bytes] and with their digests."""
+    """Content digest of a folder, sizes [bytes] of its files, and digests of its files."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "stamp.json")
     names = [path.relative_to(folder).as_posix() for path in files]
     digests = [digest_file(path) for path in files]
@@ -240,62 +247,64 @@ def digest_folder(folder: Path) -> tuple[str, dict[str, int], dict[str, str]]:
     )
 
 
-def seal(folder: Path, stage: str, depends: dict[str, Any] | None = None, **more: Any) -> Stamp:
-    """Stamps a stage folder with what is in it now.
+def write_stamp(folder: Path, stage: str, depends: dict[str, Any] | None = None, **more: Any) -> Stamp:
+    """Writes the stamp of a stage folder for its present files.
 
     Args:
-        folder: Of the stage.
-        stage: Its name.
-        depends: What went into the key.
+        folder: Folder of the stage.
+        stage: Name of the stage.
+        depends: Dependencies that form the key.
         more: Fields of `Stamp`: metrics, seconds, peak_memory_bytes, device.
     """
     depends = depends or {}
     result, files, sha256 = digest_folder(folder)
-    about = {"metrics": {}, "seconds": 0.0, "peak_memory_bytes": 0, "device": "auto", **more}
-    stamp = Stamp(stage, key_of(depends), result, depends, files, packages=package_versions(), sha256=sha256, **about)
+    fields = {"metrics": {}, "seconds": 0.0, "peak_memory_bytes": 0, "device": "auto", **more}
+    stamp = Stamp(
+        stage, stage_key(depends), result, depends, files, packages=package_versions(), sha256=sha256, **fields
+    )
     stamp.save(folder)
     return stamp
 
 
 @lru_cache(maxsize=64)
-def _finished(folder: Path, _stamped: tuple[int, int]) -> Stamp:
-    return Stamp.checked(folder, _MOST_READ)
+def _verified_stamp(folder: Path, _stamped: tuple[int, int]) -> Stamp:
+    return Stamp.verified(folder, _MAX_HASHED)
 
 
-def finished(scene: SceneDir, stage: str) -> Path:
-    """The folder of a stage that has been built and is as it was written.
+def require_stage(scene: SceneDir, stage: str) -> Path:
+    """The folder of a built stage, after its files were compared with its stamp.
 
-    A process compares the files of a stage once. Files above 256 MiB are compared by size alone: a change that keeps
-    their size is found by the next build, which reads everything.
+    A process compares the files of a stage once. Files above 256 MiB are compared by size only; the next build, which
+    reads everything, finds changes that keep the size.
 
     Raises:
-        InputError: the stage has not been built, or a file of it is damaged.
+        InputError: the stage has not been built, or one of its files is damaged.
     """
     folder = scene.stage(stage).resolve()
     path = folder / "stamp.json"
     if not path.exists():
         raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run python -m twin.build {scene.root}")
-    facts = regular(path).stat()
-    _finished(folder, (facts.st_mtime_ns, facts.st_size))
+    facts = regular_file(path).stat()
+    _verified_stamp(folder, (facts.st_mtime_ns, facts.st_size))
     return scene.stage(stage)
 
 
-def result_of(scene: SceneDir, stage: str) -> str:
-    """What the result of a built stage is known by. Raises InputError: see `finished`."""
-    finished(scene, stage)
+def stage_result(scene: SceneDir, stage: str) -> str:
+    """Content digest of a built stage. Raises InputError as `require_stage` does."""
+    require_stage(scene, stage)
     facts = scene.stamp(stage).stat()
-    return _finished(scene.stage(stage).resolve(), (facts.st_mtime_ns, facts.st_size)).result
+    return _verified_stamp(scene.stage(stage).resolve(), (facts.st_mtime_ns, facts.st_size)).result
 
 
 def package_versions() -> dict[str, str]:
-    """Installed versions of what decides a result."""
+    """Installed versions of the packages that affect results."""
     return {name: metadata.version(name) for name in _PACKAGES}
 
 
-def commit(scene: SceneDir, stage: str) -> None:
-    """Puts the partial folder of a stage, stamped, in the place of the former one.
+def commit_stage(scene: SceneDir, stage: str) -> None:
+    """Replaces the folder of a stage by its stamped partial folder.
 
-    A kill between the two renames leaves the former folder as `<folder>.old`; `recover` puts it back.
+    A kill between the two renames leaves the former folder as `<folder>.old`, which `recover_stages` restores.
     """
     partial, final = scene.partial(stage), scene.stage(stage)
     old = final.with_name(final.name + ".old")
@@ -306,8 +315,8 @@ def commit(scene: SceneDir, stage: str) -> None:
     remove(old)
 
 
-def recover(scene: SceneDir) -> None:
-    """Clears what a killed build left: half-written folders go, a former result that was being replaced returns."""
+def recover_stages(scene: SceneDir) -> None:
+    """Cleans up after a killed build: removes partial folders and restores a former result under replacement."""
     for stage in STAGES:
         final = scene.stage(stage)
         old = final.with_name(final.name + ".old")
@@ -320,8 +329,8 @@ def recover(scene: SceneDir) -> None:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Puts a copy of `source` at `target` in one step (a hard link where the file system has them)."""
-    with aside(target) as partial:
+    """Replaces `target` by a copy of `source` atomically (a hard link if the file system supports it)."""
+    with atomic_path(target) as partial:
         partial.unlink(missing_ok=True)
         try:
             os.link(source, partial)

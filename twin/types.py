@@ -1,12 +1,12 @@
-"""Names for arrays that cross rooms. Shapes and units are in the docstrings of what takes or returns them."""
+"""Array types shared by all packages; shapes and units are in the docstrings of their users."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Geometry, physics and statistics are computed in double precision."""
+"""Double precision: geometry, physics and statistics."""
 Array32 = NDArray[np.float32]
-"""What the field and its renderers compute with."""
+"""Single precision: the radiance field and its renderers."""
 Image = NDArray[np.uint8]
-"""RGB, shape (height, width, 3); several: (n, height, width, 3)."""
+"""RGB, shape (height, width, 3), or (n, height, width, 3)."""
 Indices = NDArray[np.int64]

@@ -1,11 +1,11 @@
-"""Verb: how often policies succeed in a built scene, lighting by lighting.
+"""Verb: evaluates the success rates of policies in a built scene, per lighting.
 
     python -m twin.validate scenes/demo --task straight --policy scenes/demo/runs/first --episodes 100
     python -m twin.validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst --films
 
-A policy is a run (its name or folder), a checkpoint of one, an ONNX file or `module:function`. All drive the same
-episodes. What is in `validation/episodes.csv` already is not driven again, so a validation that was stopped goes on.
-`validation/validation.html` shows it all.
+A policy is a run (name or folder), a checkpoint of one, an ONNX file or `module:function`. All policies drive the same
+episodes. Episodes in `validation/episodes.csv` are not driven again, so a stopped validation continues.
+`validation/validation.html` shows the results.
 """
 
 import argparse
@@ -15,35 +15,35 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from twin import cli, runtime
-from twin.config import HELD_OUT, RANDOMISED
-from twin.env.domain_randomization import asked, known_of
+from twin import commands, runtime
+from twin.config import HELD_OUT, RANDOMIZED
+from twin.env.domain_randomization import lighting_options, measured_parameters
 from twin.env.suite import fingerprint
 from twin.errors import InputError
-from twin.evaluation.training_curves import read_episodes, trainings
-from twin.evaluation.trials import EPISODE_COLUMNS, Trial, cells_text, csv_text, read_trials, tally
-from twin.files import damaged, digest_file, digest_json, read_json, write_bytes, write_json, write_text
+from twin.evaluation.training_curves import read_episodes, training_summaries
+from twin.evaluation.trials import EPISODE_COLUMNS, Trial, cells_csv, csv_text, read_trials, tally
+from twin.files import digest_file, digest_json, read_json, wrap_read_errors, write_bytes, write_json, write_text
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign
 from twin.loading import Twin, load_scene
-from twin.report.validation_report import Curve, write_validation_page
-from twin.report.validation_summary import failure_map, lines, summary, typical_episode, worst_episode
-from twin.runtime import alone
+from twin.report.validation_report import TrainingCurve, write_validation_page
+from twin.report.validation_summary import failure_map, summarize, summary_lines, typical_episode, worst_episode
+from twin.runtime import exclusive_lock
 from twin.scene import SceneDir
 
-DEFAULT_LIGHTINGS = (HELD_OUT, HELD_OUT + RANDOMISED)
-"""As the place was filmed but for its light; and nearer to what a road does."""
+DEFAULT_LIGHTINGS = (HELD_OUT, HELD_OUT + RANDOMIZED)
+"""Unseen light alone, and unseen light with domain randomization, which is closer to a real road."""
 
-_FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # of validation; see `seeds_of`
-_SEARCH_SEED, _PROOF_SEED = 2_000_000, 3_000_000  # of the search for the worst light, and of the proof that it is bad
-_MOST_PROCESSES = 1024
-_LIGHTS, _LOOKS, _FINALISTS = 16, 4, 4  # lights drawn, episodes in each, and how many are looked at more closely
+_FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # see `lighting_seeds`
+_SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # of the search for the worst lighting and of its final evaluation
+_MAX_PROCESSES = 1024
+_SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # sampled, episodes in each, kept after the first round
 
 Key = tuple[str, str, str, int]
 
 
 class Campaign:
-    """Episodes driven and to be driven of one scene and task, and the table they go to."""
+    """Evaluation episodes of one scene and task, and the table that stores them."""
 
     def __init__(
         self,
@@ -60,15 +60,15 @@ class Campaign:
             task: See `twin.load`.
             path: The table.
             policies: Source and trust by name.
-            processes: How many drive here.
-            ray: Address of a Ray cluster that drives instead.
+            processes: Number of local worker processes.
+            ray: Address of a Ray cluster to use instead.
         """
         self._scene, self.task, self.path, self._policies = str(twin.scene.root.resolve()), task, path, policies
         self._processes, self._ray = processes, ray
         self._done = {_key(t): t for t in read_trials(path)} if path.exists() and _has_rows(path) else {}
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
-        """Trials of (policy, lighting, seeds), in that order; what is not in the table yet is driven and added."""
+        """Trials of (policy, lighting, seeds), in that order; missing ones are driven and added to the table."""
         keys = [(name, self.task, lighting, seed) for name, lighting, seeds in wanted for seed in seeds]
         chunks: list[tuple[str, EpisodeChunk]] = []
         for name, lighting, seeds in wanted:
@@ -126,70 +126,70 @@ def validate(
     ray: str | None = None,
     films: bool = False,
 ) -> dict:
-    """Drives what is missing and writes `validation/`; returns what is in its `summary.json`.
+    """Drives missing episodes and writes `validation/`; returns the contents of its `summary.json`.
 
     Raises:
-        InputError: a policy, the scene, the task or a lighting is not to be had; or names of other policies or another
-            build are in the table; or an episode of the table ends otherwise when it is driven again to be filmed;
-            or another process is at it.
+        InputError: unknown policy, scene, task or lighting; a table with episodes of other policies under the same
+            names or of another build; an episode with another outcome when it is driven again for its film; another
+            process that writes the same tables.
     """
     twin = load_scene(root)
     folder = twin.scene.validation
     policies = _policies(root, sources, trust)
     lightings = tuple(dict.fromkeys(lightings))
-    with alone(folder.with_name(".validation.lock"), f"policies are being driven for {folder}"):
-        _mend(folder / "episodes.csv")
-        _mend(folder / "worst.csv")
+    with exclusive_lock(folder.with_name(".validation.lock"), f"policies are being driven for {folder}"):
+        _drop_partial_row(folder / "episodes.csv")
+        _drop_partial_row(folder / "worst.csv")
         _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
         todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
-        wanted = [(name, one, seeds_of(one, episodes)) for name in policies for one in lightings]
+        wanted = [(name, one, lighting_seeds(one, episodes)) for name in policies for one in lightings]
         driven = todo.drive(wanted, "validate")
         if worst:
             searched = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
             for name in policies:
-                _search(searched, name, episodes)
-        said = _write(twin)
+                _search_worst_lighting(searched, name, episodes)
+        results = _write_results(twin)
         if films:
             for name, (source, _) in policies.items():
-                _film(root, folder, source, trust, [t for t in driven if t.policy == name])
-            said = _write(twin)
-        return said
+                _write_films(root, folder, source, trust, [t for t in driven if t.policy == name])
+            results = _write_results(twin)
+        return results
 
 
-def _write(twin: Twin) -> dict:
-    """Tells what is in the tables: `cells.csv`, `summary.json`, maps and page; returns the summary."""
+def _write_results(twin: Twin) -> dict:
+    """Writes `cells.csv`, `summary.json`, maps and page from the tables; returns the summary."""
     folder, trials = twin.scene.validation, read_trials(twin.scene.episodes_csv)
-    write_text(twin.scene.cells_csv, cells_text(tally(trials)))
-    said = summary(trials)
-    said["training"] = trainings(twin.scene.root, dict.fromkeys(t.policy for t in trials))
-    said["worst"] = _worst_lights(folder / "worst.csv")
-    said["robot_known"] = known_of(twin.world().robot)
+    write_text(twin.scene.cells_csv, cells_csv(tally(trials)))
+    results = summarize(trials)
+    results["training"] = training_summaries(twin.scene.root, dict.fromkeys(t.policy for t in trials))
+    results["worst"] = _worst_lightings(folder / "worst.csv")
+    results["robot_known"] = measured_parameters(twin.world().robot)
     films = folder / "films" / "films.json"
-    said["films"] = _filmed(films)
-    write_json(folder / "summary.json", said)
+    results["films"] = _read_films(films)
+    write_json(folder / "summary.json", results)
     _draw_maps(twin, folder, trials)
-    runs = dict.fromkeys(trained["run"] for trained in said["training"].values())
-    curves = [Curve(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
-    write_validation_page(twin.scene, said, curves)
-    return said
+    runs = dict.fromkeys(trained["run"] for trained in results["training"].values())
+    curves = [TrainingCurve(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
+    write_validation_page(twin.scene, results, curves)
+    return results
 
 
-def _worst_lights(path: Path) -> list[dict]:
-    """A cell for every policy and task that the worst light was searched for: its fresh episodes in that light."""
+def _worst_lightings(path: Path) -> list[dict]:
+    """A cell for every policy and task with a search: the final evaluation in the worst lighting."""
     trials = read_trials(path) if path.exists() and _has_rows(path) else []
-    cells = summary([t for t in trials if t.seed >= _PROOF_SEED])["cells"]
+    cells = summarize([t for t in trials if t.seed >= _FINAL_SEED])["cells"]
     return [
         c | {"of": len({t.lighting for t in trials if (t.policy, t.task) == (c["policy"], c["task"])})} for c in cells
     ]
 
 
-def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[Trial]) -> None:
-    """Films the typical and the worst of a policy's episodes on a task; what is filmed already is kept."""
+def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[Trial]) -> None:
+    """Films the typical and the worst of a policy's episodes on a task; existing films are kept."""
     from twin.film import film, film_name
-    from twin.report.video_writer import last_frame
+    from twin.report.video_writer import last_frame_jpeg
 
-    noted = folder / "films" / "films.json"
-    before = _filmed(noted)
+    recorded = folder / "films" / "films.json"
+    before = _read_films(recorded)
     chosen: dict[Trial, list[str]] = {}
     for kind, trial in (("typical", typical_episode(trials)), ("worst", worst_episode(trials))):
         chosen.setdefault(trial, []).append(kind)
@@ -198,29 +198,29 @@ def _film(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[T
         path = folder / "films" / trial.policy / film_name(trial.task, trial.lighting, trial.seed)
         poster = path.with_suffix(".jpg")
         if not poster.exists():
-            episode = film(root, trial.task, source, trial.seed, path, trust, **asked(trial.lighting))[1]
+            episode = film(root, trial.task, source, trial.seed, path, trust, **lighting_options(trial.lighting))[1]
             if (episode.cause, len(episode.times) - 1) != (trial.cause, trial.steps):
                 path.unlink()
                 raise InputError(
-                    f"{trial.policy}, {trial.task}, {trial.lighting}, seed {trial.seed}: driven again to be filmed it "
+                    f"{trial.policy}, {trial.task}, {trial.lighting}, seed {trial.seed}: driven again for its film it "
                     f"ends by {episode.cause} after {len(episode.times) - 1} steps; expected {trial.cause} after "
                     f"{trial.steps}, as in {folder / 'episodes.csv'}: the policy's code changed, or another kind of "
-                    f"machine drove it; move {folder} away to validate anew"
+                    f"machine drove it; move {folder} away to validate again"
                 )
-            write_bytes(poster, last_frame(path))
-        told = {"policy": trial.policy, "task": trial.task, "lighting": trial.lighting, "seed": trial.seed}
-        told |= {"which": which, "cause": trial.cause, "progress_m": trial.progress, "of": len(trials)}
+            write_bytes(poster, last_frame_jpeg(path))
+        entry = {"policy": trial.policy, "task": trial.task, "lighting": trial.lighting, "seed": trial.seed}
+        entry |= {"which": which, "cause": trial.cause, "progress_m": trial.progress, "of": len(trials)}
         files = {"file": path.relative_to(folder).as_posix(), "poster": poster.relative_to(folder).as_posix()}
-        mine.append(told | files)
+        mine.append(entry | files)
     key = trials[0].policy, trials[0].task
-    write_json(noted, [one for one in before if (one["policy"], one["task"]) != key] + mine)
+    write_json(recorded, [one for one in before if (one["policy"], one["task"]) != key] + mine)
 
 
-def _filmed(path: Path) -> list[dict]:
-    """What `films.json` has; nothing where there is none. Raises InputError: not one that `_film` wrote."""
+def _read_films(path: Path) -> list[dict]:
+    """The entries of `films.json`, if there is one. Raises InputError for contents not written by `_write_films`."""
     if not path.exists():
         return []
-    with damaged(path, "delete it, and the films are noted again"):
+    with wrap_read_errors(path, "delete it, and the films are recorded again"):
         films = [dict(one) for one in read_json(path)]
         for one in films:
             _ = [one[name] + "" for name in ("policy", "task", "lighting", "cause", "file", "poster")]
@@ -228,42 +228,44 @@ def _filmed(path: Path) -> list[dict]:
     return films
 
 
-def seeds_of(lighting: str, episodes: int) -> range:
-    """Of a lighting's episodes, the same for every policy.
+def lighting_seeds(lighting: str, episodes: int) -> range:
+    """Seeds of a lighting's episodes, the same for every policy and different for every lighting.
 
-    Another lighting has others: a seed decides start, robot, weather and bystanders, too, so that one seed in ten
-    lightings would be hardly more than one episode, and an interval that counts ten too narrow.
+    A seed also determines start, robot, weather and distractors: a seed shared by ten lightings would be little more
+    than one episode, and a confidence interval for ten would be too narrow.
     """
     first = _FIRST_SEED + _PER_LIGHTING * (crc32(lighting.encode()) % _BLOCKS)
     return range(first, first + episodes)
 
 
-def _search(search: Campaign, policy: str, episodes: int) -> None:
-    """Drives a policy in many drawn lights, and in fresh episodes in the one of them in which it fares worst.
+def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None:
+    """Searches a policy's worst among sampled lightings by successive halving, then evaluates it in new episodes.
 
-    Few episodes in every light, as many again in the worst of them: successive halving. The way driven breaks ties.
+    Ties in success are broken by progress.
     """
-    seeds = range(_SEARCH_SEED, _SEARCH_SEED + _LOOKS)
-    lights = [f"drawn_{k}" for k in range(_LIGHTS)]
-    looks: dict[str, list[Trial]] = {name: [] for name in lights}
-    while len(lights) > 1:
-        trials = search.drive([(policy, light, seeds) for light in lights], f"worst light of {len(lights)}")
+    seeds = range(_SEARCH_SEED, _SEARCH_SEED + _SEARCH_EPISODES)
+    candidates = [f"drawn_{k}" for k in range(_SEARCH_LIGHTINGS)]
+    trials_by_lighting: dict[str, list[Trial]] = {name: [] for name in candidates}
+    while len(candidates) > 1:
+        wanted = [(policy, name, seeds) for name in candidates]
+        trials = search.drive(wanted, f"worst lighting of {len(candidates)}")
         for trial in trials:
-            looks[trial.lighting].append(trial)
-        fared = {name: _fared(looks[name]) for name in lights}
-        lights = sorted(lights, key=lambda name: fared[name])[: _FINALISTS if len(lights) > _FINALISTS else 1]
+            trials_by_lighting[trial.lighting].append(trial)
+        scores = {name: _score(trials_by_lighting[name]) for name in candidates}
+        kept = _SEARCH_KEPT if len(candidates) > _SEARCH_KEPT else 1
+        candidates = sorted(candidates, key=lambda name: scores[name])[:kept]
         seeds = range(seeds.stop, seeds.stop + 2 * len(seeds))
-    # What was worst by chance among many is less bad than it looked: so it is driven in anew.
-    proof = range(_PROOF_SEED, _PROOF_SEED + episodes)
-    search.drive([(policy, lights[0], proof)], f"{lights[0]} anew")
+    # The minimum over many noisy scores is biased, hence an independent evaluation.
+    final = range(_FINAL_SEED, _FINAL_SEED + episodes)
+    search.drive([(policy, candidates[0], final)], f"{candidates[0]} again")
 
 
-def _fared(trials: Sequence[Trial]) -> tuple[float, float]:
+def _score(trials: Sequence[Trial]) -> tuple[float, float]:
     return sum(t.success for t in trials) / len(trials), sum(t.progress for t in trials) / len(trials)
 
 
 def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tuple[str, bool]]:
-    """Source by the name it has in tables; each is loaded once, so that what is wrong is said at once."""
+    """Source and trust by name in tables; each policy is loaded once to report errors early."""
     out: dict[str, tuple[str, bool]] = {}
     for source in sources:
         where = find_policy(root, source)
@@ -277,45 +279,45 @@ def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tupl
 def _check_same(
     folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, tuple[str, bool]]
 ) -> None:
-    """Notes which policies the tables are of, and which roads (a task under a lighting); refuses others so named."""
+    """Records digests of policies and roads (task and lighting). Raises InputError if one in the tables has changed."""
     path = folder / "validated.json"
-    noted: dict[str, Any] = {"roads": {}, "policies": {}}
+    recorded: dict[str, Any] = {"roads": {}, "policies": {}}
     if path.exists():
-        with damaged(path, f"move {folder} away to validate anew"):
-            there = dict(read_json(path))
-            noted |= {name: dict(there[name]) for name in noted if name in there}
+        with wrap_read_errors(path, f"move {folder} away to validate again"):
+            stored = dict(read_json(path))
+            recorded |= {name: dict(stored[name]) for name in recorded if name in stored}
     tables = [folder / "episodes.csv", folder / "worst.csv"]
     trials = [trial for table in tables if table.exists() and _has_rows(table) for trial in read_trials(table)]
     driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}
     for lighting in lightings:
         road, digest = _road(task, lighting), fingerprint(twin, task, lighting)
-        if road in driven and noted["roads"].get(road) != digest:
+        if road in driven and recorded["roads"].get(road) != digest:
             raise InputError(
-                f"{folder} has episodes of {task} under {lighting} from before the scene was built anew, its task, "
-                "obstacles or photo changed, or twin draws episodes otherwise; move it away to validate anew"
+                f"{folder} has episodes of {task} under {lighting} from before its scene, task, obstacles or photo, "
+                "or twin's sampling of episodes changed; move it away to validate again"
             )
-        noted["roads"][road] = digest
+        recorded["roads"][road] = digest
     for name, (source, _) in policies.items():
         digest = _digest(Path(source), source)
-        if name in driven and noted["policies"].get(name) != digest:
+        if name in driven and recorded["policies"].get(name) != digest:
             raise InputError(
                 f"policy {name!r} was validated as another file than {source} is now; move {folder} away, or "
                 "copy the policy to another name"
             )
-        noted["policies"][name] = digest
+        recorded["policies"][name] = digest
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(path, noted)
+    write_json(path, recorded)
 
 
 def _road(task: str, lighting: str) -> str:
-    """What episodes were driven on; all drawn lights are one's, as they come from one field."""
+    """Key of a task under a lighting; sampled lightings share one, as they come from one field."""
     return f"{task}, {'drawn' if lighting.startswith('drawn_') else lighting}"
 
 
 def _digest(path: Path, source: str) -> str:
-    """Of a policy's files; of a callable, whose code nobody can know, of its name."""
+    """Digest of a policy's files, or of the name of a callable, whose code is unknown."""
     if path.is_dir():
-        return digest_file(path / JSON)  # which has the digest of the weights
+        return digest_file(path / JSON)  # it contains the digest of the weights
     return digest_file(path) if path.is_file() else digest_json(source)
 
 
@@ -325,17 +327,17 @@ def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
 
     world, config = twin.world(), load_config(twin.scene.config_file)
     for task in dict.fromkeys(t.task for t in trials):
-        stretch = find_task(task, world, config.task)
+        segment = find_task(task, world, config.task)
         mine = [t for t in trials if t.task == task]
-        failure_map(folder / f"failures_{task}.png", mine, world, (stretch.start, stretch.end))
+        failure_map(folder / f"failures_{task}.png", mine, world, (segment.start, segment.end))
 
 
 def _key(trial: Trial) -> Key:
     return trial.policy, trial.task, trial.lighting, trial.seed
 
 
-def _mend(path: Path) -> None:
-    """Cuts off a last line that was being written when the process was killed."""
+def _drop_partial_row(path: Path) -> None:
+    """Removes an incomplete last line left by a killed process."""
     if path.exists():
         blob = path.read_bytes()
         if not blob.endswith(b"\n"):
@@ -349,34 +351,18 @@ def _has_rows(path: Path) -> bool:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the verb; returns the exit status, see `twin.cli`."""
-    parser = cli.Parser(prog="python -m twin.validate", description="How often policies succeed.")
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
-    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument(
-        "--lightings",
-        nargs="+",
-        default=list(DEFAULT_LIGHTINGS),
-        help="names, mixtures a:b:0.3, held-out, any; any of them with +randomised (default: %(default)s)",
-    )
-    parser.add_argument("--episodes", type=int, default=100, help="per policy and lighting; 100 unless given")
-    parser.add_argument("--worst", action="store_true", help="search for the light in which each policy fares worst")
-    parser.add_argument("--films", action="store_true", help="film each policy's typical and worst episode")
-    parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
-    parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
-    parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no table")
-    return cli.run(parser, _main, arguments)
+    return commands.main("validate", arguments)
 
 
-def _main(given: argparse.Namespace) -> None:
-    for name, most in (("episodes", _PER_LIGHTING), ("processes", _MOST_PROCESSES)):
+def command(given: argparse.Namespace) -> None:
+    """The work of the verb, given the options of `twin.commands`."""
+    for name, most in (("episodes", _PER_LIGHTING), ("processes", _MAX_PROCESSES)):
         if not 1 <= getattr(given, name) <= most:
             raise InputError(f"--{name} {getattr(given, name)}; expected 1 to {most}")
     how = (given.worst, given.trust, given.processes, given.ray, given.films)
-    said = validate(given.scene, given.policy, given.task, given.lightings, given.episodes, *how)
+    results = validate(given.scene, given.policy, given.task, given.lightings, given.episodes, *how)
     if not given.quiet:
-        print("\n".join(lines(said)))
+        print("\n".join(summary_lines(results)))
         print(f"look at {SceneDir(given.scene).validation / 'validation.html'}")
 
 

@@ -21,7 +21,7 @@ from matplotlib.text import Text
 
 import twin
 from twin.evaluation.forecasting import Forecast
-from twin.evaluation.training_curves import success_curve
+from twin.evaluation.training_curves import write_success_curve
 from twin.learn.policy import load_policy
 from twin.reality.lighting import WEATHER
 from twin.reality.real_test import RealTest
@@ -52,9 +52,9 @@ def main() -> None:
     given = parser.parse_args()
     run = given.scene / "runs" / given.run
     test = RealTest(load_policy(run), "straight")
-    road = [test.begin(name, _TRIAL).look(test.road.physics.camera_to_world, 0.0) for name in _SHOWN]
+    road = [test.reset(name, _TRIAL).capture(test.road.physics.camera_to_world, 0.0) for name in _SHOWN]
     drawn = twin_against_road(Forecast.load(given.scene / "forecast"))
-    curve = cv2.imread(str(success_curve(run)))[..., ::-1]
+    curve = cv2.imread(str(write_success_curve(run)))[..., ::-1]
     parts = [
         _caption("The road as the twin shows it in training: lights, suns, shadows and haze are drawn anew"),
         *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),

@@ -8,9 +8,9 @@ chosen here and thus before anything is known of how they drive.
 from dataclasses import dataclass
 from pathlib import Path
 
-from twin.config import HELD_OUT, RANDOMISED
+from twin.config import HELD_OUT, RANDOMIZED
 from twin.evaluation.statistics import MIN_TRIALS
-from twin.evaluation.training_curves import CHOICE
+from twin.evaluation.training_curves import CHOICE_FILE
 from twin.files import read_json
 from twin.reality.lighting import WEATHER
 
@@ -27,9 +27,9 @@ SHARES = (0.25, 0.5)
 """Of a run's steps, at which checkpoints are taken for the forecast."""
 EPISODES = 50
 """In the twin, per policy and lighting."""
-LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMISED), "checkpoint": (HELD_OUT + RANDOMISED,)}
+LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMIZED), "checkpoint": (HELD_OUT + RANDOMIZED,)}
 """Of the twin. The latter is what reality is compared with; the former, for finished policies, is the paper's."""
-PHOTOS = tuple(f"{name}{RANDOMISED}" for name in WEATHER)
+PHOTOS = tuple(f"{name}{RANDOMIZED}" for name in WEATHER)
 """Of the twin, by a photo of each day of the test: what reality is compared with, weather by weather."""
 PHOTO_EPISODES = 5
 """In the twin, per policy and weather."""
@@ -72,7 +72,7 @@ class Run:
         asked = read_json(path / "config.json")["steps"]
         if asked != steps:  # the learning rate falls by the steps asked for: a longer run is another training
             raise SystemExit(f"{path} is a run of {asked} steps, not of {steps}; move it away")
-        return (path / CHOICE).exists() and read_json(path / CHOICE)["steps"] >= steps
+        return (path / CHOICE_FILE).exists() and read_json(path / CHOICE_FILE)["steps"] >= steps
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:

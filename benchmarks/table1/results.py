@@ -7,10 +7,10 @@ from typing import Any
 from plan import PAPER, PHOTOS, SETUPS, TASKS, Run
 from scores import counts, over_days
 
-from twin.config import HELD_OUT, RANDOMISED
+from twin.config import HELD_OUT, RANDOMIZED
 from twin.evaluation.statistics import wilson
-from twin.evaluation.training_curves import CHOICE, read_episodes
-from twin.evaluation.trials import RECENT, Trial, read_trials
+from twin.evaluation.training_curves import CHOICE_FILE, read_episodes
+from twin.evaluation.trials import RECENT_EPISODES, Trial, read_trials
 from twin.files import read_json
 
 _JUDGED = ("validate", "validate_randomised", "validate_by_photo", "real")
@@ -85,7 +85,7 @@ def _over_days(parts: list[dict[str, Any]]) -> str:
 def _training(folder: Path) -> dict[str, Any]:
     with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
-    choice = read_json(folder / CHOICE) if (folder / CHOICE).exists() else None
+    choice = read_json(folder / CHOICE_FILE) if (folder / CHOICE_FILE).exists() else None
     ended, success = read_episodes(folder)
     before = success[ended <= choice["chosen"]["step"]] if choice else success
     return {
@@ -94,14 +94,14 @@ def _training(folder: Path) -> dict[str, Any]:
         "wall_s": float(last["wall_s"]),
         "memory_mb": float(last["memory_mb"]),
         "whole_episodes": len(success),
-        "exploring": _rate((before[-RECENT:] == 1).tolist()),
+        "exploring": _rate((before[-RECENT_EPISODES:] == 1).tolist()),
         "train": choice["chosen"] if choice else _rate([]),
     }
 
 
 def _judged(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
     out: dict[str, Any] = {"policy": name}
-    parts = [[t for t in twin if t.lighting == HELD_OUT], [t for t in twin if t.lighting == HELD_OUT + RANDOMISED]]
+    parts = [[t for t in twin if t.lighting == HELD_OUT], [t for t in twin if t.lighting == HELD_OUT + RANDOMIZED]]
     photos = [trial for trial in twin if trial.lighting in PHOTOS]
     for where, trials in zip(_JUDGED, (*parts, photos, real), strict=True):
         mine = [trial for trial in trials if trial.policy == name]

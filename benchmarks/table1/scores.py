@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from plan import SETUPS, SHARES, STEPS, TASKS
 
-from twin.config import RANDOMISED
-from twin.evaluation.prediction_powered import left_out_predictions
+from twin.config import RANDOMIZED
+from twin.evaluation.prediction_powered import leave_one_group_out
 from twin.evaluation.statistics import (
     MIN_POLICIES,
-    Refused,
+    UndefinedStatistic,
     mmrv,
     pearson,
     rate_difference,
@@ -85,7 +85,7 @@ def judged(results: dict[str, Any]) -> list[Judged]:
                     setup=run["setup"],
                     task=run["task"],
                     trained=int(step) / STEPS[names[run["task"]]] if step else 1.0,
-                    twin={k.removesuffix(RANDOMISED): v for k, v in counts(policy["validate_by_photo"]).items()},
+                    twin={k.removesuffix(RANDOMIZED): v for k, v in counts(policy["validate_by_photo"]).items()},
                     held_out=held_out["successes"] / held_out["trials"] if held_out["trials"] else float("nan"),
                     real=counts(policy["real"]),
                 )
@@ -164,8 +164,8 @@ def _corrected(twin: np.ndarray, real: np.ndarray, tasks: Sequence[np.ndarray]) 
     held: list[bool] = []
     for of in tasks:
         try:
-            _, low, high = left_out_predictions(twin=twin[of], real=real[of], groups=range(int(of.sum())))
-        except Refused:
+            _, low, high = leave_one_group_out(twin=twin[of], real=real[of], groups=range(int(of.sum())))
+        except UndefinedStatistic:
             continue
         held += ((low <= real[of]) & (real[of] <= high)).tolist()
     return sum(held), len(held)
@@ -174,7 +174,7 @@ def _corrected(twin: np.ndarray, real: np.ndarray, tasks: Sequence[np.ndarray]) 
 def _defined(statistic: Callable[..., float], twin: np.ndarray, real: np.ndarray) -> float | None:
     try:
         return statistic(twin=twin, real=real)
-    except Refused:
+    except UndefinedStatistic:
         return None
 
 

@@ -1,12 +1,11 @@
-"""Closed meshes into convex parts that are checked against them.
+"""Convex decomposition of closed meshes by CoACD (Wei et al. 2022), with checked results.
 
-A *piece* is one closed mesh to decompose, a *part* a closed convex hull. A part's *protrusion* is how far a point of
-its surface lies outside its piece [m]; *uncovered* is the share of a piece's surface further than that bound from every
-part.
+*Piece*: a closed mesh to decompose. *Part*: a closed convex hull. *Protrusion*: largest distance of a part's surface
+outside its piece [m]. *Uncovered*: fraction of a piece's surface further than the protrusion bound from every part.
 
-CoACD (Wei et al. 2022) has crashed, grown shapes, closed doorways and answered differently at the same seed. So it runs
-in child processes with one thread and a time limit, its answers are cached by what they were made from, every part is
-checked, and what fails is cut in halves until it passes.
+CoACD has crashed, grown shapes, closed doorways and returned different results for one seed. So it runs in child
+processes with one thread and a time limit, its results are cached by a hash of their inputs, and parts that protrude
+too far are split.
 """
 
 import argparse
@@ -28,16 +27,16 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from twin import runtime
 from twin.files import digest_json
-from twin.runtime import die_with_parent, environment
+from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
 
-_FACES = 400  # a piece is thinned to this many for CoACD, whose time grows fast with them; the check uses all of them
-_TIME_LIMIT = 120.0  # [s] per piece: far more than any takes, so that a busy machine does not change the answer
-_CHILDREN = 2
-_MAX_CORNERS = 32  # of a part
-_SAMPLING = 0.06  # [m] spacing of test points on surfaces
+_MAX_COACD_FACES = 400  # CoACD gets a mesh decimated to this, since its time grows fast; the check uses all faces
+_TIME_LIMIT = 120.0  # [s] per piece; far more than any needs, so that a busy machine does not change the result
+_PROCESSES = 2
+_MAX_HULL_VERTICES = 32
+_SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
 _MAX_UNCOVERED = 0.08
-_MAX_HALVINGS = 5
+_MAX_SPLITS = 5
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class ConvexPart:
 
     @staticmethod
     def hull(points: Array) -> "ConvexPart | None":
-        """The hull of points (k, 3), or None where they span no volume."""
+        """The hull of points (k, 3), or None if they span no volume."""
         if len(points) < 4:
             return None
         try:
@@ -69,22 +68,24 @@ class ConvexPart:
 
 @dataclass(frozen=True)
 class SolidPiece:
-    """A closed mesh, with points spread over its surface."""
+    """A closed mesh with sample points on its surface."""
 
     vertices: Array
     faces: NDArray[np.int64]
     samples: Array
     """Shape (s, 3)."""
     tree: cKDTree
-    """Of the samples."""
+    """Search tree of the samples."""
     inside: Callable[[Array], NDArray[np.bool_]]
-    """Which points (k, 3) the mesh encloses."""
+    """Maps points (k, 3) to the mask (k,) of those inside the mesh."""
 
     @staticmethod
-    def of(vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None) -> "SolidPiece":
-        """A piece; give `inside` where something knows it faster than by winding numbers."""
+    def from_mesh(
+        vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None
+    ) -> "SolidPiece":
+        """A piece from a mesh; `inside` replaces the default test by winding numbers with a faster one."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-        samples = surface_samples(vertices, faces, _SAMPLING)
+        samples = surface_samples(vertices, faces, _SAMPLE_SPACING)
 
         def by_winding(points: Array) -> NDArray[np.bool_]:
             return winding_number(points, vertices, faces) > 0.5
@@ -92,104 +93,110 @@ class SolidPiece:
         return SolidPiece(vertices, faces, samples, cKDTree(samples), inside or by_winding)
 
     def protrusion(self, part: ConvexPart) -> float:
-        """How far the part sticks out [m]; an upper estimate, by up to half the sampling."""
-        points = surface_samples(part.vertices, part.faces, 2 * _SAMPLING)
+        """Protrusion of a part [m], overestimated by up to half the sample spacing."""
+        points = surface_samples(part.vertices, part.faces, 2 * _SAMPLE_SPACING)
         away = self.tree.query(points)[0]
-        far = np.flatnonzero(away > _SAMPLING)
+        far = np.flatnonzero(away > _SAMPLE_SPACING)
         outside = far[~self.inside(points[far])]
         return float(away[outside].max(initial=0.0))
 
 
 @dataclass(frozen=True)
 class Decomposition:
-    """What became of all pieces."""
+    """Convex parts of all pieces, and statistics."""
 
     parts: list[ConvexPart]
     piece: NDArray[np.int64]
-    """Which piece each part came from."""
+    """Index of each part's piece, shape (n,)."""
     protrusion: Array
-    """Of each part [m]."""
+    """Protrusion of each part [m], shape (n,)."""
     uncovered: float
-    """Share of all pieces' surfaces further than the bound from their parts."""
+    """Uncovered fraction of the surfaces of all pieces."""
     failed: int
-    """Pieces CoACD crashed or timed out on."""
-    halved: int
-    """Parts that were cut because they stuck out too far."""
+    """Pieces on which CoACD crashed, timed out or left too much uncovered."""
+    split: int
+    """Parts that were split because they protruded too far."""
     cached: int
-    """Pieces whose answer was known."""
+    """Pieces whose result was in the cache."""
 
 
 def decompose(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) -> Decomposition:
-    """Convex parts of closed meshes, each within `bound` [m] of its mesh.
+    """Decomposes closed meshes into convex parts that protrude by at most `bound`.
 
-    Args:
-        pieces: Closed meshes.
-        bound: Protrusion allowed [m].
-        cache: Folder of earlier answers; made if absent.
-        seed: CoACD's.
+    A piece whose hull is within the bound [m] becomes that hull. If CoACD fails on a piece, its hull is split instead.
+    `cache` is the folder of earlier CoACD results, created if missing.
     """
-    whole = [ConvexPart.hull(piece.vertices) for piece in pieces]
-    sticks = [np.inf if hull is None else piece.protrusion(hull) for hull, piece in zip(whole, pieces, strict=True)]
-    hard = [i for i, protrusion in enumerate(sticks) if protrusion > bound]
-    answers, cached = _coacd([pieces[i] for i in hard], bound, cache, seed)
-    found = [
-        [(hull, out)] if hull is not None and out <= bound else [] for hull, out in zip(whole, sticks, strict=True)
+    hulls = [ConvexPart.hull(piece.vertices) for piece in pieces]
+    protrusions = [
+        np.inf if hull is None else piece.protrusion(hull) for hull, piece in zip(hulls, pieces, strict=True)
     ]
-    failed = halved = 0
-    missing = 0.0
-    for i, answer in zip(hard, answers, strict=True):
-        hull = whole[i]
+    complex_ = [i for i, protrusion in enumerate(protrusions) if protrusion > bound]
+    results, cached = _run_coacd([pieces[i] for i in complex_], bound, cache, seed)
+    parts_of = [
+        [(hull, protrusion)] if hull is not None and protrusion <= bound else []
+        for hull, protrusion in zip(hulls, protrusions, strict=True)
+    ]
+    failed = split = 0
+    uncovered = 0.0
+    for i, result in zip(complex_, results, strict=True):
+        hull = hulls[i]
         coarse = [hull] if hull is not None else []
-        fitted = [within_bound(part, pieces[i], bound) for part in answer or coarse]
-        open_ = uncovered(pieces[i], [part for cut in fitted for part, _ in cut], bound)
-        bad = answer is None or open_ > _MAX_UNCOVERED
+        fitted = [split_to_bound(part, pieces[i], bound) for part in result or coarse]
+        fraction = uncovered_fraction(pieces[i], [part for parts in fitted for part, _ in parts], bound)
+        bad = result is None or fraction > _MAX_UNCOVERED
         failed += bad
-        if bad and answer is not None:
-            fitted = [within_bound(part, pieces[i], bound) for part in coarse]
-            open_ = uncovered(pieces[i], [part for cut in fitted for part, _ in cut], bound)
-        halved += sum(len(cut) > 1 for cut in fitted)
-        missing += open_ * len(pieces[i].samples)
-        found[i] = [item for cut in fitted for item in cut]
+        if bad and result is not None:
+            fitted = [split_to_bound(part, pieces[i], bound) for part in coarse]
+            fraction = uncovered_fraction(pieces[i], [part for parts in fitted for part, _ in parts], bound)
+        split += sum(len(parts) > 1 for parts in fitted)
+        uncovered += fraction * len(pieces[i].samples)
+        parts_of[i] = [item for parts in fitted for item in parts]
     total = max(sum(len(piece.samples) for piece in pieces), 1)
     return Decomposition(
-        [part for items in found for part, _ in items],
-        np.array([i for i, items in enumerate(found) for _ in items], np.int64),
-        np.array([out for items in found for _, out in items], np.float64),
-        missing / total,
+        [part for items in parts_of for part, _ in items],
+        np.array([i for i, items in enumerate(parts_of) for _ in items], np.int64),
+        np.array([protrusion for items in parts_of for _, protrusion in items], np.float64),
+        uncovered / total,
         failed,
-        halved,
+        split,
         cached,
     )
 
 
-def within_bound(
-    part: ConvexPart, piece: SolidPiece, bound: float, halvings: int = _MAX_HALVINGS
+def split_to_bound(
+    part: ConvexPart, piece: SolidPiece, bound: float, max_splits: int = _MAX_SPLITS
 ) -> list[tuple[ConvexPart, float]]:
-    """The part and its protrusion if it fits, else those of hulls of the halves of the surface inside it, and so on."""
-    sticks_out = piece.protrusion(part)
-    if halvings == 0 or sticks_out <= bound:
-        return [(part, sticks_out)]
-    inside = piece.samples[inside_hull(part, piece.samples, 1e-3 + _SAMPLING)]
+    """Splits a part until its pieces protrude by at most `bound` [m]; returns the parts with their protrusions [m].
+
+    A split halves the surface inside the part along its longest axis and takes the hull of each half.
+    """
+    protrusion = piece.protrusion(part)
+    if max_splits == 0 or protrusion <= bound:
+        return [(part, protrusion)]
+    inside = piece.samples[inside_hull(part, piece.samples, 1e-3 + _SAMPLE_SPACING)]
     if len(inside) < 8:
         return []
     axis = int(np.argmax(np.ptp(inside, axis=0)))
     middle = float(inside[:, axis].min() + inside[:, axis].max()) / 2
     halves = []
-    for half in (inside[inside[:, axis] <= middle + _SAMPLING], inside[inside[:, axis] >= middle - _SAMPLING]):
+    for half in (
+        inside[inside[:, axis] <= middle + _SAMPLE_SPACING],
+        inside[inside[:, axis] >= middle - _SAMPLE_SPACING],
+    ):
         hull = ConvexPart.hull(half)
         if hull is not None:
-            halves += within_bound(hull, piece, bound, halvings - 1)
+            halves += split_to_bound(hull, piece, bound, max_splits - 1)
     return halves
 
 
 def inside_hull(part: ConvexPart, points: Array, slack: float = 0.0) -> NDArray[np.bool_]:
-    """Which points (k, 3) are in the part, or within about `slack` [m] of it."""
+    """Mask of the points (k, 3) inside the part or within about `slack` [m] of it."""
     normal, offset = half_spaces(part)
     return np.all(points @ normal.T <= offset + slack, axis=1)
 
 
 def half_spaces(part: ConvexPart) -> tuple[Array, Array]:
-    """Outward normals (f, 3) and offsets (f,): inside is normal · x ≤ offset."""
+    """Outward normals (f, 3) and offsets (f,) of the faces; inside, normal · x ≤ offset."""
     a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -198,16 +205,16 @@ def half_spaces(part: ConvexPart) -> tuple[Array, Array]:
     return normal, (normal * a[solid]).sum(1)
 
 
-def uncovered(piece: SolidPiece, parts: list[ConvexPart], bound: float) -> float:
-    """Share of the piece's surface further than about `bound` from every part."""
-    open_ = np.ones(len(piece.samples), bool)
+def uncovered_fraction(piece: SolidPiece, parts: list[ConvexPart], bound: float) -> float:
+    """Fraction of the piece's surface further than about `bound` [m] from every part."""
+    uncovered = np.ones(len(piece.samples), bool)
     for part in parts:
-        open_[open_] = ~inside_hull(part, piece.samples[open_], bound)
-    return float(open_.mean()) if len(open_) else 0.0
+        uncovered[uncovered] = ~inside_hull(part, piece.samples[uncovered], bound)
+    return float(uncovered.mean()) if len(uncovered) else 0.0
 
 
 def surface_samples(vertices: Array, faces: NDArray, spacing: float) -> Array:
-    """Points on every triangle about `spacing` apart, corners included; regular: the same mesh gives the same."""
+    """Points on a regular grid in every triangle, about `spacing` [m] apart, including the vertices; shape (k, 3)."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     level = np.clip(np.ceil(longest / spacing).astype(int), 1, 64)
@@ -221,9 +228,9 @@ def surface_samples(vertices: Array, faces: NDArray, spacing: float) -> Array:
 
 
 def winding_number(points: Array, vertices: Array, faces: NDArray) -> Array:
-    """How often a closed mesh winds around points (k, 3): 1 inside, 0 outside; shape (k,).
+    """Winding number of a closed mesh around points (k, 3): 1 inside, 0 outside; shape (k,).
 
-    Sum of signed solid angles over 4π (van Oosterom & Strackee 1983, eq. 8).
+    The sum of signed solid angles over 4π (van Oosterom & Strackee 1983, eq. 8).
     """
     out = np.zeros(len(points))
     corners = vertices[faces]
@@ -237,49 +244,51 @@ def winding_number(points: Array, vertices: Array, faces: NDArray) -> Array:
     return out
 
 
-def _coacd(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) -> tuple[list[list[ConvexPart] | None], int]:
-    """CoACD's parts of each piece, None where it failed, and how many were known from before."""
+def _run_coacd(
+    pieces: list[SolidPiece], bound: float, cache: Path, seed: int
+) -> tuple[list[list[ConvexPart] | None], int]:
+    """CoACD's parts of each piece (None if it failed), and the number of cached results."""
     cache.mkdir(parents=True, exist_ok=True)
-    setting = {"bound": bound, "seed": seed, "faces": _FACES, "coacd": metadata.version("coacd")}
+    setting = {"bound": bound, "seed": seed, "faces": _MAX_COACD_FACES, "coacd": metadata.version("coacd")}
     jobs = []
     for piece in pieces:
         shape = hashlib.sha256(piece.vertices.tobytes() + piece.faces.tobytes()).hexdigest()
         key = digest_json({**setting, "shape": shape})[:32]
         jobs.append((cache / f"{key}.in.npz", cache / f"{key}.npz", piece))
-    open_ = [job for job in jobs if not job[1].exists()]
-    for source, _, piece in open_:
+    pending = [job for job in jobs if not job[1].exists()]
+    for source, _, piece in pending:
         np.savez(source, vertices=piece.vertices, faces=piece.faces, bound=bound, seed=seed)
-    with runtime.bar("convex parts", len(open_), "piece") as bar, ThreadPoolExecutor(_CHILDREN) as pool:
-        # Alternate pieces, so that both children have large and small ones.
-        shares = [[(job[0], job[1]) for job in open_[k::_CHILDREN]] for k in range(_CHILDREN)]
+    with runtime.bar("convex parts", len(pending), "piece") as bar, ThreadPoolExecutor(_PROCESSES) as pool:
+        # Interleaved, so that both children get large and small pieces.
+        queues = [[(job[0], job[1]) for job in pending[k::_PROCESSES]] for k in range(_PROCESSES)]
         stopped = threading.Event()
         try:
-            list(pool.map(lambda share: _work_off(share, bar, stopped), shares))
+            list(pool.map(lambda queue: _run_children(queue, bar, stopped), queues))
         finally:
             stopped.set()
-    answers: list[list[ConvexPart] | None] = []
+    results: list[list[ConvexPart] | None] = []
     for source, target, _ in jobs:
         source.unlink(missing_ok=True)
-        answers.append(_read(target) if target.exists() else None)
-    return answers, len(jobs) - len(open_)
+        results.append(_read_parts(target) if target.exists() else None)
+    return results, len(jobs) - len(pending)
 
 
-def _work_off(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
-    """Runs children until every job is done or has killed one; a job that does is given up. Ends early once stopped."""
-    todo = list(jobs)
-    while todo:
-        command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in todo for path in job)]
+def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
+    """Runs child processes one after another until each job succeeds or crashes one; returns early once stopped."""
+    pending = list(jobs)
+    while pending:
+        command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in pending for path in job)]
         child = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            process_group=0,  # a signal to all of a terminal's is for us
-            env=environment(OMP_NUM_THREADS="1"),
+            process_group=0,  # terminal signals go to the parent only
+            env=child_environment(OMP_NUM_THREADS="1"),
         )
         done, since = 0, time.monotonic()
         while child.poll() is None and time.monotonic() - since < _TIME_LIMIT and not stopped.is_set():
-            if todo[done:] and todo[done][1].exists():
+            if pending[done:] and pending[done][1].exists():
                 done, since = done + 1, time.monotonic()
                 bar.update()
             else:
@@ -288,13 +297,13 @@ def _work_off(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threadi
         child.wait()
         if stopped.is_set():
             return
-        finished = sum(target.exists() for _, target in todo)
+        finished = sum(target.exists() for _, target in pending)
         bar.update(finished - done)
-        # Jobs are done in order: the first without an answer is the one that crashed or hung.
-        todo = [job for job in todo if not job[1].exists()][1:]
+        # Jobs run in order: the first without a result is the one that crashed or timed out.
+        pending = [job for job in pending if not job[1].exists()][1:]
 
 
-def _read(path: Path) -> list[ConvexPart] | None:
+def _read_parts(path: Path) -> list[ConvexPart] | None:
     with np.load(path, allow_pickle=False) as data:
         counts = data["counts"]
         points = np.split(data["points"], np.cumsum(counts)[:-1]) if len(counts) else []
@@ -302,8 +311,8 @@ def _read(path: Path) -> list[ConvexPart] | None:
     return parts or None
 
 
-def _child(paths: list[Path]) -> None:
-    """Decomposes one file after another; each answer appears under its name only when it is complete."""
+def _decompose_files(paths: list[Path]) -> None:
+    """Decomposes one file after another (in the child process); each result is renamed into place when complete."""
     import coacd
 
     coacd.set_log_level("off")
@@ -311,33 +320,32 @@ def _child(paths: list[Path]) -> None:
         with np.load(source, allow_pickle=False) as data:
             vertices, faces = data["vertices"], data["faces"]
             bound, seed = float(data["bound"]), int(data["seed"])
-        if len(faces) > _FACES:
-            thin = fast_simplification.simplify(
-                vertices.astype(np.float32), faces.astype(np.int32), target_count=_FACES, agg=3.0
-            )
-            vertices, faces = thin[0], thin[1]
+        if len(faces) > _MAX_COACD_FACES:
+            vertices, faces = fast_simplification.simplify(
+                vertices.astype(np.float32), faces.astype(np.int32), target_count=_MAX_COACD_FACES, agg=3.0
+            )[:2]
         result = coacd.run_coacd(
             coacd.Mesh(vertices, faces),
             threshold=bound,
             real_metric=True,
-            # The pieces are closed already, and what CoACD answers is checked: a coarse search does, 10 times sooner.
+            # The pieces are closed already, and the results are checked, so a coarse search suffices: 10 times faster.
             preprocess_mode="off",
             resolution=200,
             mcts_nodes=5,
             mcts_iterations=10,
             mcts_max_depth=2,
-            max_ch_vertex=_MAX_CORNERS,
+            max_ch_vertex=_MAX_HULL_VERTICES,
             decimate=True,
             seed=seed,
         )
         points = [np.asarray(v) for v, _ in result]
-        aside = target.with_suffix(".partial.npz")
-        np.savez(aside, points=np.concatenate(points), counts=np.array([len(p) for p in points]))
-        aside.replace(target)
+        partial = target.with_suffix(".partial.npz")
+        np.savez(partial, points=np.concatenate(points), counts=np.array([len(p) for p in points]))
+        partial.replace(target)
 
 
 if __name__ == "__main__":
     die_with_parent()
     parser = argparse.ArgumentParser(description="Child of twin.assets.convex.")
     parser.add_argument("paths", type=Path, nargs="+")
-    _child(parser.parse_args().paths)
+    _decompose_files(parser.parse_args().paths)

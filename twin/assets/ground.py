@@ -1,4 +1,8 @@
-"""The ground as a height field: a regular grid of heights over the xy plane."""
+"""Ground height field, fitted to rendered depth, sparse points and the camera path.
+
+*Datum*: a measured height z ± σ at (x, y), of one of three kinds: `field` (rendered pixels on near-level surfaces),
+`points` (structure from motion) and `path` (camera centers minus the camera height).
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from twin.assets.views import Views
 from twin.config import MeshConfig
-from twin.files import check_shapes, damaged, load_arrays
+from twin.files import check_shapes, load_arrays, wrap_read_errors
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.route import path_inliers, source_frames
 from twin.types import Array
@@ -21,28 +25,25 @@ from twin.types import Array
 
 @dataclass(frozen=True)
 class Ground:
-    """Height z [m] at `origin + cell · (column, row)`."""
+    """Heights z [m] on a regular grid; node (row, column) is at `origin + cell · (column, row)`."""
 
     height: NDArray[np.float64]
-    """Shape (rows along y, columns along x) [m]; no holes."""
+    """Shape (rows along y, columns along x) [m], without holes."""
     origin: NDArray[np.float64]
-    """x, y of cell (0, 0) [m], shape (2,)."""
+    """x, y of node (0, 0) [m], shape (2,)."""
     cell: float
     """Grid spacing [m]."""
     measured: NDArray[np.bool_]
-    """False where the height was filled in rather than seen, shape as `height`."""
+    """False where the height is extrapolated, shape as `height`."""
     rgb: NDArray[np.uint8]
-    """Mean colour, shape (rows, columns, 3)."""
+    """Mean color, shape (rows, columns, 3)."""
 
     def at(self, xy: NDArray) -> NDArray[np.float64]:
-        """Bilinear height [m] at points (..., 2); beyond the edge, that of the edge."""
-        column_row = (np.asarray(xy) - self.origin) / self.cell
-        return map_coordinates(
-            self.height, np.moveaxis(column_row[..., ::-1], -1, 0).reshape(2, -1), order=1, mode="nearest"
-        ).reshape(np.shape(xy)[:-1])
+        """Bilinear height [m] at points (..., 2), clamped to the edge."""
+        return _interpolate(self.height, self.origin, self.cell, xy, order=1)
 
     def coarsened(self, cell: float) -> "Ground":
-        """Every n-th node, n = cell / own cell rounded; what is left over at the far edges is cut off."""
+        """Every n-th node, n = cell / own cell rounded; a remainder at the far edges is cut off."""
         n = max(1, round(cell / self.cell))
         rows, columns = ((size - 1) // n * n + 1 for size in self.height.shape)
         nodes = np.s_[:rows:n, :columns:n]
@@ -54,9 +55,9 @@ class Ground:
 
     @staticmethod
     def load(folder: Path) -> "Ground":
-        """Raises InputError: no such file, or not one that `save` wrote."""
+        """Reads `ground.npz`. Raises InputError: it is missing or damaged."""
         path = folder / "ground.npz"
-        with damaged(path, "build the scene again"):
+        with wrap_read_errors(path, "build the scene again"):
             data = load_arrays(path)
             ground = Ground(data["height"], data["origin"], float(data["cell"]), data["measured"], data["rgb"])
             rows, columns = ground.height.shape
@@ -69,37 +70,35 @@ class Ground:
                 }
             )
             if not (0.0 < ground.cell < np.inf and np.isfinite(ground.height).all() and rows * columns):
-                raise ValueError(f"cell = {ground.cell}, or heights that are not finite")
+                raise ValueError(f"cell = {ground.cell}, expected > 0, and finite heights")
         return ground
 
 
-# ---- The ground from what there is: rendered depth, sparse points, and the path of a camera carried over it.
-#
-# A *datum* is a measured height z ± σ at (x, y). Three kinds: `field` (rendered pixels on near-level surface), `points`
-# (structure from motion) and `path` (camera centre minus the camera's height). The fit is the surface h that minimises
-#
-#     Σ ρ((h(xᵢ, yᵢ) − zᵢ) / σᵢ) + λ Σ |second differences of h|² + μ Σ |first differences of h|²,
-#
-# ρ = Geman-McClure by iterated reweighting: the second differences keep slopes and remove bumps, the first ones only
-# decide how far a slope goes on where nothing was seen. Solved by sparse factorisation, reweighted on coarse nodes, then
-# once on fine ones.
+def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: int) -> Array:
+    """Spline interpolation of a grid of heights at points (..., 2), clamped to the edge."""
+    column_row = (np.asarray(xy) - origin) / cell
+    at = np.moveaxis(column_row[..., ::-1], -1, 0).reshape(2, -1)
+    return map_coordinates(height, at, order=order, mode="nearest").reshape(np.shape(xy)[:-1])
 
 
-KINDS = ("field", "points", "path")
-_LEVEL = 0.94  # normals this upright (20°) can be ground
-_GATE, _GATE_PER_METRE = 0.25, 0.05  # [m] a datum may be this far from the path's level, more so far from the path
-_SIGMA_FIELD = 0.03  # [m] of a cell's median rendered depth near the lens
-_SIGMA_POINTS = 0.04  # [m] of a cell's median sparse point
-_SIGMA_PATH = 0.012  # [m] of a rigidly mounted camera's path
-_BESIDE_PATH = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] wheels beside the lens: the ground there was driven on as well
-_ROLL = 0.02  # cross slope of a road that the path cannot show
+# ---- ground fit
+
+
+DATA_KINDS = ("field", "points", "path")
+_MIN_UPRIGHT = 0.94  # z of a normal (20° from vertical); steeper surfaces are no ground
+_GATE, _GATE_PER_METER = 0.25, 0.05  # [m] from the level of the path, and per meter of distance from it
+_SIGMA_FIELD = 0.03  # [m] σ of a cell's median rendered height near the lens
+_SIGMA_POINTS = 0.04  # [m] σ of a cell's median sparse point
+_SIGMA_PATH = 0.012  # [m] σ of the path of a rigidly mounted camera
+_LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] beside the path, where the wheels drove
+_CROSS_SLOPE = 0.02  # possible cross slope of a road, which the path does not measure
 _COARSE_NODES, _FINE_NODES = 40_000, 200_000
-_BEND_LENGTH = 0.5  # [m] what is shorter is smoothed as noise
-_FLAT_LENGTH = 8.0  # [m] how far a slope is continued into the unseen
-_SWEEPS = 6
-_MOST_CELLS = 1_500_000
-_FAR = 18.0  # [m] ground further from the lens than this is a few pixel rows
-_FEW = 50  # data below which there is no ground to speak of
+_SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed as noise
+_EXTRAPOLATION_LENGTH = 8.0  # [m] over which slopes are continued where there are no data
+_REWEIGHTINGS = 6
+_MAX_CELLS = 1_500_000
+_MAX_DEPTH = 18.0  # [m] ground beyond this depth fills only a few pixel rows
+_MIN_DATA = 50  # data; with fewer the ground is flat
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,11 @@ class HeightData:
     sigma: Array
     """Shape (k,) [m]."""
     kind: NDArray[np.int8]
-    """Index into `KINDS`, shape (k,)."""
+    """Index into `DATA_KINDS`, shape (k,)."""
+
+    @staticmethod
+    def empty() -> "HeightData":
+        return HeightData(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int8))
 
     @staticmethod
     def join(parts: list["HeightData"]) -> "HeightData":
@@ -120,7 +123,7 @@ class HeightData:
 
 @dataclass(frozen=True)
 class HeightGrid:
-    """Nodes at origin + cell · (column, row)."""
+    """Grid of nodes at origin + cell · (column, row) [m]."""
 
     origin: Array
     cell: float
@@ -128,58 +131,55 @@ class HeightGrid:
     columns: int
 
     @staticmethod
-    def covering(low: Array, high: Array, cell: float, most: int) -> "HeightGrid":
-        """Nodes over the box from `low` to `high` (x, y), `most` nodes at most: the cell grows if it must."""
-        cell = max(cell, float(np.sqrt(np.prod(high - low) / most)))
+    def covering(low: Array, high: Array, cell: float, max_nodes: int) -> "HeightGrid":
+        """A grid over the box from `low` to `high` (x, y); the cell grows where it would exceed `max_nodes`."""
+        cell = max(cell, float(np.sqrt(np.prod(high - low) / max_nodes)))
         columns, rows = (int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
         return HeightGrid(np.asarray(low, float), cell, rows, columns)
 
     def index(self, xy: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Flat index of the nearest node, and whether there is one, of points (k, 2)."""
+        """Flat index (k,) of the node nearest to each point (k, 2), and a mask (k,) of those inside the grid."""
         column, row = np.rint((xy - self.origin) / self.cell).astype(int).T
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         return row * self.columns + column, inside
 
     def nodes(self) -> Array:
-        """Shape (rows, columns, 2)."""
+        """Positions x, y of the nodes [m], shape (rows, columns, 2)."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return self.origin + self.cell * np.stack([x, y], -1)
 
     def sample(self, height: Array, xy: Array, order: int = 1) -> Array:
-        """Heights at points (..., 2) of a field (rows, columns) by splines of `order`; beyond the edge, the edge's."""
-        column_row = (np.asarray(xy) - self.origin) / self.cell
-        at = np.moveaxis(column_row[..., ::-1], -1, 0).reshape(2, -1)
-        return map_coordinates(height, at, order=order, mode="nearest").reshape(np.shape(xy)[:-1])
+        """Heights [m] at points (..., 2), from nodes (rows, columns) by splines of `order`, clamped to the edge."""
+        return _interpolate(height, self.origin, self.cell, xy, order)
 
 
 def fit_height(
-    data: HeightData, grid: HeightGrid, start: Array | None = None, sweeps: int = _SWEEPS
+    data: HeightData, grid: HeightGrid, initial: Array | None = None, iterations: int = _REWEIGHTINGS
 ) -> tuple[Array, Array]:
-    """Robust height field through the data.
+    """Robust fit of a smooth height field h, which minimizes
 
-    Args:
-        data: Measured heights, at least one inside the grid.
-        grid: Where to solve.
-        start: Heights to weigh the data by at first (rows, columns); None = believe all at first.
-        sweeps: Reweightings.
+        Σ ρ((h(xᵢ, yᵢ) − zᵢ) / σᵢ) + λ Σ |second differences of h|² + μ Σ |first differences of h|²
 
-    Returns:
-        Heights (rows, columns) [m], and the final weight of each datum in [0, 1], shape (k,).
+    with the Geman-McClure loss ρ, by iteratively reweighted least squares with sparse factorization. The second
+    differences keep slopes and remove bumps; the first differences only limit how far a slope continues without data.
+
+    At least one datum must be inside the grid. The first weights come from the heights `initial` (rows, columns) [m],
+    or are equal. Returns heights (rows, columns) [m], and the final weight of each datum in [0, 1], shape (k,).
     """
     node, inside = grid.index(data.xyz[:, :2])
     node, z, sigma = node[inside], data.xyz[inside, 2], data.sigma[inside]
     count = grid.rows * grid.columns
-    smooth = _smoothness(grid)
-    height = None if start is None else start.ravel()
+    smooth = _smoothness_matrix(grid)
+    height = None if initial is None else initial.ravel()
     robust = np.ones(len(z))
-    for sweep in range(sweeps):
-        if height is not None and (sweep or start is not None):
-            # Geman-McClure, its width drawn in from 3 σ to 2 σ so that a far start is not lost.
-            width = (max(3.0 - sweep / 2, 2.0) if start is None else 2.0) * sigma
+    for iteration in range(iterations):
+        if height is not None:
+            # The width of the loss shrinks from 3 σ to 2 σ, so that a poor first solution does not reject good data.
+            width = (max(3.0 - iteration / 2, 2.0) if initial is None else 2.0) * sigma
             robust = (1.0 + ((height[node] - z) / width) ** 2) ** -2
         weight = robust / sigma**2
         system = (smooth + sparse.diags_array(np.bincount(node, weight, count))).tocsc()
-        # Symmetric positive definite: no pivoting and an ordering of AᵀA's cheaper cousin make it four times as fast.
+        # Symmetric positive definite: no pivoting, and an ordering of Aᵀ + A instead of AᵀA, make it 4 times as fast.
         factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         height = factors.solve(np.bincount(node, weight * z, count))
     assert height is not None
@@ -188,8 +188,8 @@ def fit_height(
     return height.reshape(grid.rows, grid.columns), weights
 
 
-def _smoothness(grid: HeightGrid) -> sparse.csr_array:
-    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the grid's nodes; λ makes structure of `_BEND_LENGTH` cost as much as σ = 3 cm."""
+def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
+    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the nodes; λ penalizes structure of length `_SMOOTHING_LENGTH` as much as σ = 3 cm."""
     rows, columns = grid.rows, grid.columns
 
     def difference(n: int, order: int) -> sparse.csr_array:
@@ -201,18 +201,18 @@ def _smoothness(grid: HeightGrid) -> sparse.csr_array:
     yy = sparse.kron(difference(rows, 2), eye_c)
     xy = sparse.kron(difference(rows, 1), difference(columns, 1))
     x, y = sparse.kron(eye_r, difference(columns, 1)), sparse.kron(difference(rows, 1), eye_c)
-    bend = max(_BEND_LENGTH / grid.cell, 0.5) ** 4 / _SIGMA_FIELD**2
-    flat = bend * (grid.cell / _FLAT_LENGTH) ** 2
+    bend = max(_SMOOTHING_LENGTH / grid.cell, 0.5) ** 4 / _SIGMA_FIELD**2
+    flat = bend * (grid.cell / _EXTRAPOLATION_LENGTH) ** 2
     return (bend * (xx.T @ xx + yy.T @ yy + 2.0 * xy.T @ xy) + flat * (x.T @ x + y.T @ y)).tocsr()
 
 
 def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
-    """One datum per occupied square of side `cell`: mean x and y, median z, and the σ of its best-seen member.
+    """One datum per occupied square of side `cell` [m]: mean x and y, median z and smallest σ of its points.
 
-    No smaller σ for many members: neighbouring pixels and points err alike, so that many are no better than a few.
+    σ does not fall with the number of points, since the errors of neighboring pixels and points are correlated.
     """
     if len(xyz) == 0:
-        return HeightData(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int8))
+        return HeightData.empty()
     key = np.floor(xyz[:, :2] / cell).astype(np.int64)
     key -= key.min(0)
     flat = key[:, 0] * (key[:, 1].max() + 1) + key[:, 1]
@@ -223,27 +223,27 @@ def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData
     middle = first + count // 2
     xy = np.add.reduceat(xyz[:, :2], first, axis=0) / count[:, None]
     best = np.minimum.reduceat(sigma, first)
-    # A lone pixel in a square is worth less than several that agree.
-    alone = 1.0 + 1.0 / count
-    return HeightData(np.column_stack([xy, xyz[middle, 2]]), best * alone, np.full(len(first), kind, np.int8))
+    # A single point is less reliable than several.
+    few = 1.0 + 1.0 / count
+    return HeightData(np.column_stack([xy, xyz[middle, 2]]), best * few, np.full(len(first), kind, np.int8))
 
 
 def field_data(views: Views, cell: float, far: float) -> tuple[HeightData, Array, NDArray[np.uint8]]:
-    """Near-level rendered pixels as data, one per cell, and all those pixels' points (k, 3) and colours (k, 3)."""
-    points, sigmas, colours = [], [], []
+    """Data from near-level rendered pixels, one per cell, and the points (k, 3) and colors (k, 3) of these pixels."""
+    points, sigmas, colors = [], [], []
     for i in range(len(views)):
         depth = views.depth[i]
-        keep = (depth > 0) & (depth < far) & (views.upward[i] > _LEVEL)
+        keep = (depth > 0) & (depth < far) & (views.upward[i] > _MIN_UPRIGHT)
         points.append(views.points(i)[keep])
-        # A pixel's depth errs by a share of itself; on ground seen at a glance that is slant times less in height.
+        # The error of a pixel is 2 % of its depth, which is slant times as much in height.
         sigmas.append(np.hypot(_SIGMA_FIELD, 0.02 * depth[keep] * views.slant[i][keep]))
-        colours.append(views.rgb[i][keep])
+        colors.append(views.rgb[i][keep])
     xyz = np.concatenate(points)
-    return cell_medians(xyz, np.concatenate(sigmas), cell, 0), xyz, np.concatenate(colours)
+    return cell_medians(xyz, np.concatenate(sigmas), cell, 0), xyz, np.concatenate(colors)
 
 
 def point_data(points: SparsePoints, cell: float) -> HeightData:
-    """Sparse points seen by three frames or more, one per cell. Most stand on things; the fit's gate tells."""
+    """Data from sparse points in at least three frames, one per cell; many are on obstacles, which the gate removes."""
     keep = (points.track_length >= 3) & (points.error < 2.0)
     return cell_medians(points.xyz[keep], np.full(keep.sum(), _SIGMA_POINTS), cell, 1)
 
@@ -251,17 +251,14 @@ def point_data(points: SparsePoints, cell: float) -> HeightData:
 def path_data(
     cameras: Cameras, ground_height: Array | None, camera_height: float
 ) -> tuple[HeightData, dict[str, dict]]:
-    """The path minus the camera's height, per source, with how steadily each was carried.
+    """Data from the camera path minus the camera height, with σ from how steadily each source was carried.
 
     Args:
         cameras: Metric cameras.
-        ground_height: Height of the ground below each camera as the other kinds see it, shape (n,) [m]; None = unknown.
-        camera_height: The height that set the scale [m]; 0 = each source's own median over `ground_height`.
-
-    Returns:
-        Data, and per source: camera height used, its rapid and slow spread, and σ [m].
+        ground_height: Ground height below each camera from the other kinds of data, shape (n,) [m]; None = unknown.
+        camera_height: The height that set the scale [m]; 0 = the median of each source above `ground_height`.
     """
-    parts, facts = [], {}
+    parts, metrics = [], {}
     for index in source_frames(cameras):
         index = index[path_inliers(cameras.positions[index])]
         position = cameras.positions[index]
@@ -274,9 +271,9 @@ def path_data(
         if ground_height is not None and len(z) > 4:
             drift = gaussian_filter1d(above, 4.0, mode="nearest")
             slow = 1.4826 * float(np.median(np.abs(drift - np.median(drift))))
-        # The other kinds waver by some 3 cm themselves; only what is beyond that tells of a hand.
+        # The other kinds of data vary by about 3 cm themselves; only the rest comes from carrying the camera.
         sigma = float(np.sqrt(_SIGMA_PATH**2 + rapid**2 + max(0.0, slow**2 - 0.03**2)))
-        facts[cameras.sources[index[0]]] = {
+        metrics[cameras.sources[index[0]]] = {
             "camera_height_m": height,
             "rapid_m": rapid,
             "slow_m": slow,
@@ -284,13 +281,12 @@ def path_data(
         }
         if len(index) < 2:
             continue
-        parts.append(_strip(np.column_stack([position[:, :2], z]), sigma))
-    empty = HeightData(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int8))
-    return (HeightData.join(parts) if parts else empty), facts
+        parts.append(_path_strip(np.column_stack([position[:, :2], z]), sigma))
+    return (HeightData.join(parts) if parts else HeightData.empty()), metrics
 
 
-def _strip(xyz: Array, sigma: float) -> HeightData:
-    """Points along the path and beside it, about every 0.25 m of a drive; none across gaps in the film."""
+def _path_strip(xyz: Array, sigma: float) -> HeightData:
+    """Data on the path and beside it, about every 0.25 m; none across gaps in the film."""
     step = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1)
     typical = np.median(step[step > 0.02]) if (step > 0.02).any() else 0.0
     points, sigmas = [], []
@@ -299,44 +295,44 @@ def _strip(xyz: Array, sigma: float) -> HeightData:
             continue
         along = (b - a)[:2] / length
         left = np.array([-along[1], along[0]])
-        for share in (np.arange(max(1, round(length / 0.25))) + 0.5) / max(1, round(length / 0.25)):
-            for aside in _BESIDE_PATH:
-                points.append(np.append((a + share * (b - a))[:2] + aside * left, a[2] + share * (b - a)[2]))
-                sigmas.append(np.hypot(sigma, _ROLL * abs(aside)))
+        for fraction in (np.arange(max(1, round(length / 0.25))) + 0.5) / max(1, round(length / 0.25)):
+            for offset in _LATERAL_OFFSETS:
+                points.append(np.append((a + fraction * (b - a))[:2] + offset * left, a[2] + fraction * (b - a)[2]))
+                sigmas.append(np.hypot(sigma, _CROSS_SLOPE * abs(offset)))
     return HeightData(np.array(points).reshape(-1, 3), np.array(sigmas), np.full(len(points), 2, np.int8))
 
 
-def near_ground(data: HeightData, level: Array, distance: Array) -> HeightData:
-    """The data within the gate of a first guess `level` (k,), wider with the distance (k,) from the path."""
-    keep = np.abs(data.xyz[:, 2] - level) < _GATE + _GATE_PER_METRE * distance
+def within_gate(data: HeightData, level: Array, distance: Array) -> HeightData:
+    """The data within a gate around a first estimate `level` (k,) [m]; it widens with the distance (k,) to the path."""
+    keep = np.abs(data.xyz[:, 2] - level) < _GATE + _GATE_PER_METER * distance
     return HeightData(data.xyz[keep], data.sigma[keep], data.kind[keep])
 
 
 def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> float:
-    """Median height of data above the path's data nearby [m]; 0 where fewer than ten meet."""
+    """Median height of data above path data within `reach` [m]; 0 with fewer than ten pairs."""
     if len(path.xyz) == 0 or len(data.xyz) == 0:
         return 0.0
     away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=reach)
-    met = np.isfinite(away)
-    return float(np.median(data.xyz[met, 2] - path.xyz[nearest[met], 2])) if met.sum() >= 10 else 0.0
+    paired = np.isfinite(away)
+    return float(np.median(data.xyz[paired, 2] - path.xyz[nearest[paired], 2])) if paired.sum() >= 10 else 0.0
 
 
-def solve(data: HeightData, low: Array, high: Array, cell: float) -> tuple[Array, HeightGrid, Array]:
+def fit_coarse_to_fine(data: HeightData, low: Array, high: Array, cell: float) -> tuple[Array, HeightGrid, Array]:
     """Coarse-to-fine fit over the box `low` to `high`: heights, their grid, and the weight of each datum."""
     coarse = HeightGrid.covering(low, high, 0.5, _COARSE_NODES)
     height, _ = fit_height(data, coarse)
     fine = HeightGrid.covering(low, high, max(0.25, cell), _FINE_NODES)
-    height, weights = fit_height(data, fine, coarse.sample(height, fine.nodes(), order=3), sweeps=1)
+    height, weights = fit_height(data, fine, coarse.sample(height, fine.nodes(), order=3), iterations=1)
     return height, fine, weights
 
 
-def low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig) -> tuple[Array, HeightGrid, Array]:
+def fit_low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig) -> tuple[Array, HeightGrid, Array]:
     """The fit at `ground_cell`, low-passed by `ground_smoothing`: heights, their grid, and the weight of each datum."""
-    grid = HeightGrid.covering(low, high, config.ground_cell, _MOST_CELLS)
-    if len(data.xyz) < _FEW:
+    grid = HeightGrid.covering(low, high, config.ground_cell, _MAX_CELLS)
+    if len(data.xyz) < _MIN_DATA:
         surface, weights = np.zeros((grid.rows, grid.columns)), np.zeros(len(data.xyz))
     else:
-        solved, fine, weights = solve(data, low, high, grid.cell)
+        solved, fine, weights = fit_coarse_to_fine(data, low, high, grid.cell)
         surface = fine.sample(solved, grid.nodes(), order=3)
     return gaussian_filter(surface, config.ground_smoothing / grid.cell, mode="nearest"), grid, weights
 
@@ -349,65 +345,55 @@ def build_ground(
     config: MeshConfig,
     height: float | None,
 ) -> tuple[Ground, dict[str, Any]]:
-    """The low-passed height field over a box, and how it was found.
+    """Fits the ground over a box, given by its low and high corners (x, y) [m]; also returns metrics for the report.
 
-    Args:
-        views: Renderings of the field.
-        cameras: Metric cameras.
-        points: Sparse points in the same frame.
-        box: Low and high corner (x, y) [m].
-        config: Cell and low-pass length.
-        height: The camera's height above ground that set the scale [m], 0 = estimate it per source; None = the path
-            says nothing about the ground (an object filmed around).
-
-    Returns:
-        The ground, and JSON-able facts.
+    `height` is the camera height that set the scale [m]; 0 = estimated per source; None = the path is not used (an
+    object filmed from around).
     """
     low, high = box
     coarse = HeightGrid.covering(low, high, 0.5, _COARSE_NODES)
-    nothing = HeightData(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int8))
-    path, carried = path_data(cameras, None, height) if height is not None else (nothing, {})
-    level = fit_height(path, coarse, sweeps=1)[0] if len(path.xyz) else np.zeros((coarse.rows, coarse.columns))
+    path, path_metrics = path_data(cameras, None, height) if height is not None else (HeightData.empty(), {})
+    level = fit_height(path, coarse, iterations=1)[0] if len(path.xyz) else np.zeros((coarse.rows, coarse.columns))
     tree = cKDTree(path.xyz[:, :2]) if len(path.xyz) else None
-    field, pixels, colours = field_data(views, 0.25, _FAR)
-    seen = []
+    field, pixels, colors = field_data(views, 0.25, _MAX_DEPTH)
+    visible = []
     for data in (field, point_data(points, 0.25)):
         away = tree.query(data.xyz[:, :2])[0] if tree is not None else np.zeros(len(data.xyz))
-        seen.append(near_ground(data, coarse.sample(level, data.xyz[:, :2]), away))
+        visible.append(within_gate(data, coarse.sample(level, data.xyz[:, :2]), away))
     bias = [0.0, 0.0]
-    if height is not None and sum(len(data.xyz) for data in seen) >= _FEW:
-        below = coarse.sample(fit_height(HeightData.join(seen), coarse)[0], cameras.positions[:, :2])
-        path, carried = path_data(cameras, below, height)
-        # Each kind errs in height as a whole (blurred depth, a tilted scale); beside the path that must leave no step.
-        bias = [bias_to_path(data, path) for data in seen]
-        seen = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(seen, bias, strict=True)]
-    data = HeightData.join([*seen, path])
-    surface, grid, weights = low_passed(data, low, high, config)
+    if height is not None and sum(len(data.xyz) for data in visible) >= _MIN_DATA:
+        below = coarse.sample(fit_height(HeightData.join(visible), coarse)[0], cameras.positions[:, :2])
+        path, path_metrics = path_data(cameras, below, height)
+        # Each kind has an offset in height (blurred depth, a tilted scale), which would leave a step beside the path.
+        bias = [bias_to_path(data, path) for data in visible]
+        visible = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(visible, bias, strict=True)]
+    data = HeightData.join([*visible, path])
+    surface, grid, weights = fit_low_passed(data, low, high, config)
     used = data.xyz[weights > 0.25, :2]
     measured = np.zeros((grid.rows, grid.columns), bool)
     node, inside = grid.index(used)
     measured.ravel()[node[inside]] = True
-    # Data sit 0.25 m apart; cells between them are measured, too.
+    # Data are 0.25 m apart; the cells between them count as measured.
     measured = binary_closing(np.pad(measured, 8), iterations=max(1, round(0.3 / grid.cell)))[8:-8, 8:-8]
     on_ground = np.abs(grid.sample(surface, pixels[:, :2]) - pixels[:, 2]) < 0.15
-    ground = Ground(surface, grid.origin, grid.cell, measured, _colours(grid, pixels[on_ground], colours[on_ground]))
+    ground = Ground(surface, grid.origin, grid.cell, measured, _mean_colors(grid, pixels[on_ground], colors[on_ground]))
     error = np.abs(ground.at(data.xyz[:, :2]) - data.xyz[:, 2])
-    facts: dict[str, Any] = {
-        "fitted": len(data.xyz) >= _FEW,
+    metrics: dict[str, Any] = {
+        "fitted": len(data.xyz) >= _MIN_DATA,
         "cell_m": grid.cell,
         "coverage": float(measured.mean()),
-        "path": carried,
-        "bias_m": dict(zip(KINDS, bias, strict=False)),
+        "path": path_metrics,
+        "bias_m": dict(zip(DATA_KINDS, bias, strict=False)),
     }
-    for i, kind in enumerate(KINDS):
-        of = data.kind == i
-        facts[f"{kind}_data"] = int(of.sum())
-        facts[f"{kind}_residual_m"] = float(np.median(error[of])) if of.any() else None
-    return ground, facts
+    for i, kind in enumerate(DATA_KINDS):
+        own = data.kind == i
+        metrics[f"{kind}_data"] = int(own.sum())
+        metrics[f"{kind}_residual_m"] = float(np.median(error[own])) if own.any() else None
+    return ground, metrics
 
 
-def _colours(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Mean colour per cell; cells without a pixel take that of the nearest one that has."""
+def _mean_colors(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Mean color per cell; cells without pixels get the color of the nearest cell with pixels."""
     node, inside = grid.index(points[:, :2])
     count = np.bincount(node[inside], minlength=grid.rows * grid.columns)
     mean = np.stack(

@@ -1,8 +1,7 @@
-"""What the radiance field shows from where the films were taken: the rays that surface and ground are made from.
+"""Color and depth rendered from the radiance field at training poses: the input of ground, mesh and splats.
 
-A *view* is one rendered pose. Its *inverse depth* is linear in the image wherever the surface is a plane, so that edges
-are told from slopes by second differences. *Slant* is |n · r| for the surface normal n and the ray r with unit z-depth:
-a step of 1 m of z-depth through the surface is a step of `slant` metres away from it.
+*View*: one rendered pose. *Slant*: |n · r| for the surface normal n and the ray r with unit z-depth; a point 1 m of
+z-depth behind a surface is `slant` meters away from it.
 """
 
 from dataclasses import dataclass
@@ -12,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
-from twin.geometry.cameras import Cameras, Posed, pixel_grid, scaled_intrinsics, unproject
+from twin.geometry.cameras import Cameras, PosedCameras, pixel_grid, scaled_intrinsics, unproject
 from twin.types import Array
 
 _BATCH = 8
-_TURN = 3.0  # [m per rad] how far apart two views are that differ by direction only
-_FLYING = 0.06  # share of inverse depth: between two surfaces further apart than this a pixel belongs to neither
+_METERS_PER_RADIAN = 3.0  # [m per rad] weight of direction in the distance between views
+_FLYING_PIXEL_STEP = 0.06  # relative steps of inverse depth to both neighbors; a pixel above is on no surface
 _MIN_OPACITY = 0.5
-_MIN_SLANT = 0.12  # below this, normals from depth say little
-NEAR = 0.3  # [m] nothing nearer to a lens than this is believed
+_MIN_SLANT = 0.12  # below this, normals from depth are unreliable
+_MIN_DEPTH = 0.3  # [m] from the lens; nearer depth is discarded
 
 
 class Rendered(Protocol):
-    """Shapes (n, h, w, 3), (n, h, w) z-depth [m], (n, h, w)."""
+    """Rendered images: RGB (n, h, w, 3), z-depth (n, h, w) [m] and opacity (n, h, w)."""
 
     @property
     def rgb(self) -> NDArray[np.float32]: ...
@@ -35,18 +34,18 @@ class Rendered(Protocol):
 
 
 class ColorField(Protocol):
-    """What is needed of a `RadianceField` here."""
+    """The part of the interface of `RadianceField` used here."""
 
     @property
     def lightings(self) -> tuple[str, ...]: ...
     @property
     def bounds(self) -> Array: ...
-    def render(self, cameras: Posed, lighting: str, size: tuple[int, int]) -> Rendered: ...
+    def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int]) -> Rendered: ...
 
 
 @dataclass(frozen=True)
 class Views:
-    """n renderings of one size."""
+    """n rendered views of one size."""
 
     camera_to_world: Array
     """Shape (n, 4, 4)."""
@@ -55,17 +54,17 @@ class Views:
     rgb: NDArray[np.uint8]
     """Shape (n, h, w, 3)."""
     depth: NDArray[np.float32]
-    """z-depth [m], shape (n, h, w); the background is further than any surface; 0 where it is not to be believed."""
+    """z-depth [m], shape (n, h, w); 0 where unreliable; that of the background is larger than of any surface."""
     slant: NDArray[np.float32]
     """Shape (n, h, w), in [0.12, √(1 + r²)]."""
     upward: NDArray[np.float32]
-    """z of the surface normal, turned to the lens, shape (n, h, w)."""
+    """z of the unit surface normal that faces the lens, shape (n, h, w)."""
 
     def __len__(self) -> int:
         return len(self.depth)
 
     def points(self, i: int, depth: NDArray | None = None) -> Array:
-        """World points of view i's pixels, at another z-depth where given, shape (h, w, 3) [m]."""
+        """World points (h, w, 3) [m] of the pixels of view i, at its own or the given z-depth (h, w)."""
         height, width = self.depth.shape[1:]
         rays = unproject(pixel_grid(width, height), self.intrinsics[i])
         local = rays * (self.depth[i] if depth is None else depth)[..., None]
@@ -75,59 +74,55 @@ class Views:
 def render_views(
     field: ColorField, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
 ) -> Views:
-    """Renders the field from `count` spread-out training frames, under its first lighting unless another is given.
+    """Renders the field from up to `count` well-distributed training frames, by default under its first lighting.
 
-    Args:
-        field: The radiance field.
-        cameras: Metric cameras.
-        count: Views at most.
-        width: Width of a view [px]; the height follows the first camera's shape.
-        far: Depth beyond which a pixel counts as background [m].
+    Views are `width` [px] wide, with the aspect ratio of the first camera. Depth beyond `far` [m] is background.
     """
-    chosen = cameras.select(spread_frames(cameras, count))
+    chosen = cameras.select(select_spread_frames(cameras, count))
     size = (width, max(2, round(width * float(cameras.sizes[0, 1] / cameras.sizes[0, 0]))))
-    old = [(int(w), int(h)) for w, h in chosen.sizes]
-    intrinsics = np.stack([scaled_intrinsics(k, s, size) for k, s in zip(chosen.intrinsics, old, strict=True)])
+    native = [(int(w), int(h)) for w, h in chosen.sizes]
+    intrinsics = np.stack([scaled_intrinsics(k, s, size) for k, s in zip(chosen.intrinsics, native, strict=True)])
     rgb, depth = [], []
     with runtime.bar("rendering depth", len(chosen), "view") as bar:
         for start in range(0, len(chosen), _BATCH):
             part = slice(start, start + _BATCH)
             image = field.render(chosen.select(np.arange(len(chosen))[part]), lighting or field.lightings[0], size)
             rgb.append((np.clip(image.rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
-            depth.append(believed_depth(np.asarray(image.depth), np.asarray(image.opacity), far))
+            depth.append(reliable_depth(np.asarray(image.depth), np.asarray(image.opacity), far))
             bar.update(len(image.depth))
     all_depth = np.concatenate(depth)
     slant, upward = surface_slant(all_depth, intrinsics, chosen.camera_to_world)
     return Views(chosen.camera_to_world, intrinsics, np.concatenate(rgb), all_depth, slant, upward)
 
 
-def spread_frames(cameras: Cameras, count: int) -> NDArray[np.int64]:
-    """Indices of `count` training frames, far apart in position and direction (farthest-point order), sorted."""
+def select_spread_frames(cameras: Cameras, count: int) -> NDArray[np.int64]:
+    """Sorted indices of up to `count` training frames, chosen by farthest-point sampling in position and direction."""
     candidates = np.flatnonzero(~cameras.held_out)
     if len(candidates) == 0:
         candidates = np.arange(len(cameras))
-    where = np.concatenate([cameras.positions, _TURN * cameras.camera_to_world[:, :3, 2]], 1)[candidates]
-    chosen, gap = [0], np.linalg.norm(where - where[0], axis=1)
+    poses = np.concatenate([cameras.positions, _METERS_PER_RADIAN * cameras.camera_to_world[:, :3, 2]], 1)[candidates]
+    chosen, gap = [0], np.linalg.norm(poses - poses[0], axis=1)
     while len(chosen) < min(count, len(candidates)):
         chosen.append(int(np.argmax(gap)))
-        gap = np.minimum(gap, np.linalg.norm(where - where[chosen[-1]], axis=1))
+        gap = np.minimum(gap, np.linalg.norm(poses - poses[chosen[-1]], axis=1))
     return np.sort(candidates[np.unique(chosen)])
 
 
-def believed_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.float32]:
-    """Depth (n, h, w) with 0 where a pixel is too near, half transparent, or hangs between two surfaces.
+def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.float32]:
+    """Sets depth (n, h, w) to 0 where a pixel is too near, half transparent or between two surfaces.
 
-    What is beyond `far`, or all but transparent, becomes background at 10 · far.
+    Depth beyond `far` [m] or of nearly transparent pixels becomes background at 10 · far. The inverse depth of a plane
+    is linear in the image, so a pixel between two surfaces differs from a slope by its second differences.
     """
     out = np.where((depth > far) | (opacity < 0.1) | ~np.isfinite(depth), 10.0 * far, depth).astype(np.float32)
-    bad = (out < NEAR) | ((opacity < _MIN_OPACITY) & (out < far))
+    bad = (out < _MIN_DEPTH) | ((opacity < _MIN_OPACITY) & (out < far))
     inverse = 1.0 / np.maximum(out, 1e-3)
     for axis in (1, 2):
         ahead = np.diff(inverse, axis=axis)
         first, second = (ahead[:, :-1], ahead[:, 1:]) if axis == 1 else (ahead[..., :-1], ahead[..., 1:])
         middle = inverse[:, 1:-1] if axis == 1 else inverse[..., 1:-1]
-        # Between its neighbours, far from both, and not on the line between them only by being a slope.
-        steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING * middle
+        # Between its neighbors, far from both, and off the line between them.
+        steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING_PIXEL_STEP * middle
         bent = np.abs(first - second) > 0.3 * np.abs(first + second)
         flying = steep & bent & (first * second > 0)
         if axis == 1:
@@ -139,7 +134,7 @@ def believed_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
 
 
 def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> tuple[NDArray, NDArray]:
-    """Slant and the upward part of the normal from depth maps (n, h, w): central differences of inverse depth.
+    """Slant and upward component of the normal, from central differences of inverse depth (n, h, w).
 
     A plane n · x = c seen along r = (x, y, 1) has inverse depth q = (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ).
     """
@@ -153,7 +148,7 @@ def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> 
         gx, gy = du * intrinsics[i, 0], dv * intrinsics[i, 1]
         normal = np.stack([gx, gy, inverse - rays[..., 0] * gx - rays[..., 1] * gy], -1)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
-        # n · r has the sign of the inverse depth, so the normal points away from the lens: the one towards it is −n.
+        # n · r has the sign of the inverse depth, so n points away from the lens and −n towards it.
         slant[i] = np.nan_to_num(np.maximum((normal * rays).sum(-1), _MIN_SLANT), nan=_MIN_SLANT)
         upward[i] = np.nan_to_num(-(normal @ camera_to_world[i, :3, :3].T)[..., 2], nan=0.0)
     return slant, upward

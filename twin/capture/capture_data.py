@@ -1,4 +1,4 @@
-"""What the capture stage hands on: kept frames on disk, and what is known of each before any geometry."""
+"""Output of stage `capture`: the kept frames and their metadata before any reconstruction."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.files import check_shapes, checked_text, damaged, load_arrays, read_json, write_json
+from twin.files import check_shapes, load_arrays, read_json, require_text, wrap_read_errors, write_json
 
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """One source after capture. All its frames share one camera unless poses came with one camera per image."""
+    """One source after capture. Its frames share one camera, except posed input with one camera per image."""
 
     name: str
     """Unique folder name of the source."""
@@ -22,11 +22,11 @@ class SourceInfo:
     """Size of the kept frames [px]."""
     height: int
     camera_model: str
-    """COLMAP model name of the known or assumed camera, at the size of the kept frames."""
+    """COLMAP model name of the known or assumed camera."""
     camera_params: tuple[float, ...]
-    """Known calibration or focal prior [px]; empty where nothing is known."""
+    """Calibration or focal length prior [px], at the size of the kept frames; empty if unknown."""
     calibrated: bool
-    """True: `camera_params` were given and are held fixed."""
+    """True if `camera_params` are a given calibration, which stays fixed."""
     camera_height: float
     """Lens above ground [m]; 0 = not given."""
 
@@ -41,15 +41,15 @@ class Capture:
     source_index: NDArray[np.int64]
     """Shape (n,)."""
     times: NDArray[np.float64]
-    """Time within the source [s]; for photos without a clock their index. Shape (n,)."""
+    """Time within the source [s]; the index for photos without a clock. Shape (n,)."""
     held_out: NDArray[np.bool_]
-    """True: never trained on. Shape (n,)."""
+    """True for test frames, which are never trained on. Shape (n,)."""
     gps: NDArray[np.float64]
     """Latitude [°], longitude [°], altitude [m]; NaN where unknown. Shape (n, 3)."""
     camera_to_world: NDArray[np.float64] | None = None
-    """Poses that came with the input (OpenCV axes), shape (n, 4, 4); None unless every source brought them."""
+    """Poses given with the input (OpenCV axes), shape (n, 4, 4); None unless all sources have them."""
     intrinsics: NDArray[np.float64] | None = None
-    """fx, fy, cx, cy [px] per frame of posed input, at the kept size, shape (n, 4); distortion is in the source."""
+    """fx, fy, cx, cy [px] per frame of posed input at the kept size, shape (n, 4); `SourceInfo` has the distortion."""
 
     def save(self, folder: Path) -> None:
         """Writes `capture.json` and `capture.npz`."""
@@ -61,12 +61,12 @@ class Capture:
 
     @staticmethod
     def load(folder: Path) -> "Capture":
-        """Raises InputError: no such files, or not those that `save` wrote."""
+        """Reads the files that `save` wrote. Raises InputError if they are missing or damaged."""
         head, data = read_json(folder / "capture.json"), load_arrays(folder / "capture.npz")
-        with damaged(folder / "capture.json", "build the scene again"):
+        with wrap_read_errors(folder / "capture.json", "build the scene again"):
             sources = tuple(SourceInfo(**{**s, "camera_params": tuple(s["camera_params"])}) for s in head["sources"])
-            names = tuple(map(checked_text, head["names"]))
-        with damaged(folder / "capture.npz", "build the scene again"):
+            names = tuple(map(require_text, head["names"]))
+        with wrap_read_errors(folder / "capture.npz", "build the scene again"):
             capture, n = Capture(sources, names, **data), len(names)
             shapes: dict[str, tuple[NDArray, tuple[int, ...], str]] = {
                 "source_index": (capture.source_index, (n,), "i"),

@@ -1,8 +1,9 @@
-"""Image sets as lists of files with what is known of each: plain folders, COLMAP models, `transforms.json`.
+"""Readers of image sets with their cameras and poses: plain folders, COLMAP models, `transforms.json`.
 
-A *dialect* is a tool's way of writing `transforms.json`: nerfstudio names its camera model and may have moved the
-world (`applied_transform`), instant-ngp may give only an angle of view and file names without a suffix. Both use OpenGL
-camera axes (y up, looking along −z); here poses are OpenCV's. What a dialect did to the world is undone, so that
+A COLMAP *model* is the folder with the files `cameras` and `images`; a *workspace* has it under `sparse/0`. Its points
+are not read. `transforms.json` has two variants: nerfstudio names the camera model and may have moved the world
+(`applied_transform`), instant-ngp may give only an angle of view and file names without suffix. Both use OpenGL camera
+axes (y up, looking along −z); poses here have OpenCV axes. nerfstudio's transform of the world is undone, so that
 sources posed by one reconstruction share its world.
 """
 
@@ -18,59 +19,59 @@ import numpy as np
 from twin.capture.camera_models import Lens, checked_lens
 from twin.capture.pycolmap_import import pycolmap
 from twin.config import CAMERA_MODELS
-from twin.errors import InputError, shown
-from twin.files import damaged, is_file, is_folder, read_bytes, read_json
+from twin.errors import InputError, short_repr
+from twin.files import is_file, is_folder, read_bytes, read_json, wrap_read_errors
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.images import image_size
 from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
-# ---- Posed images of a COLMAP model, text or binary, read without COLMAP so that a damaged file gives a clear message.
-#
-# Only the cameras and the images are needed; points are found anew. A *model* is the folder that holds `cameras` and
-# `images`; a COLMAP *workspace* has it under `sparse/0`.
-
-
-_MODEL_PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
+_MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _MODEL_NAMES = {int(pycolmap.CameraModelId.__members__[name]): name for name in CAMERA_MODELS}
-_COLMAP_LARGEST = 1e9  # number in a pose
 _CURE = "export the model again"
+_MAX_POSE_VALUE = 1e9  # of a COLMAP pose
+_MAX_CAMERA_VALUE = 1e12  # of a camera in `transforms.json`
+_MAX_COORDINATE = 1e9  # of a camera center in `transforms.json`
+_RIGID_TOLERANCE = 1e-2  # on the entries of RᵀR − 1; files with rounded numbers stay below
+
+
+# ---- COLMAP models, text or binary; parsed here, not by COLMAP, so that a damaged file gives a clear error
 
 
 def find_model(folder: Path) -> Path | None:
-    """The COLMAP model in a folder or at its usual places below it, or None."""
-    for place in _MODEL_PLACES:
-        model = folder / place
-        if any(_both(model, kind) for kind in (".bin", ".txt")):
+    """The COLMAP model in a folder or at the usual places below it, or None."""
+    for name in _MODEL_FOLDERS:
+        model = folder / name
+        if any(_is_model(model, kind) for kind in (".bin", ".txt")):
             return model
     return None
 
 
-def _both(model: Path, kind: str) -> bool:
+def _is_model(model: Path, kind: str) -> bool:
     return is_file(model / f"cameras{kind}") and is_file(model / f"images{kind}")
 
 
 def read_model(model: Path) -> list[tuple[str, Lens, Array]]:
-    """The registered images of a model: name, lens and camera_to_world (4, 4), in the order of the file.
+    """The registered images of a model in file order: name, lens and camera_to_world (4, 4).
 
-    Raises:
-        InputError: damaged or inconsistent files, or a pose that is not finite.
+    Raises InputError: damaged or inconsistent files, or a pose that is not finite.
     """
-    kind = ".bin" if _both(model, ".bin") else ".txt"
+    kind = ".bin" if _is_model(model, ".bin") else ".txt"
     read_cameras, read_images = (_cameras_bin, _images_bin) if kind == ".bin" else (_cameras_txt, _images_txt)
     cameras_path, images_path = model / f"cameras{kind}", model / f"images{kind}"
-    with damaged(cameras_path, _CURE):
+    with wrap_read_errors(cameras_path, _CURE):
         lenses = read_cameras(cameras_path)
-    with damaged(images_path, _CURE):
+    with wrap_read_errors(images_path, _CURE):
         images = read_images(images_path)
     posed = []
     for name, camera_id, values in images:
         if camera_id not in lenses:
             raise InputError(f"{images_path}: {name} uses camera {camera_id}, which {cameras_path.name} does not list")
-        place = PurePosixPath(name.replace("\\", "/"))
-        if not place.name or place.is_absolute() or ".." in place.parts or "\0" in name:
+        file = PurePosixPath(name.replace("\\", "/"))
+        if not file.name or file.is_absolute() or ".." in file.parts or "\0" in name:
             raise InputError(f"{images_path}: an image is named {name!r}; expected a path below the image folder")
-        if not np.abs(values).max() < _COLMAP_LARGEST or (length := float(np.linalg.norm(values[:4]))) < 1e-6:
+        if not np.abs(values).max() < _MAX_POSE_VALUE or (length := float(np.linalg.norm(values[:4]))) < 1e-6:
             raise InputError(f"{images_path}: the pose of {name} is not finite; remove that image or export again")
         pose = np.eye(4)
         pose[:3, :3] = rotation_from_quaternion(values[:4] / length)
@@ -88,7 +89,7 @@ def rotation_from_quaternion(q: Array) -> Array:
 
 def _cameras_txt(path: Path) -> dict[int, Lens]:
     lenses = {}
-    for number, line in enumerate(_text(path), 1):
+    for number, line in enumerate(_text_lines(path), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -103,7 +104,7 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 def _images_txt(path: Path) -> list[tuple[str, int, Array]]:
     images = []
-    lines = iter(enumerate(_text(path), 1))
+    lines = iter(enumerate(_text_lines(path), 1))
     for number, line in lines:
         if not line.strip() or line.startswith("#"):
             continue
@@ -118,37 +119,37 @@ def _images_txt(path: Path) -> list[tuple[str, int, Array]]:
     return images
 
 
-def _text(path: Path) -> list[str]:
+def _text_lines(path: Path) -> list[str]:
     try:
         return read_bytes(path).decode("utf-8").splitlines()
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; {_CURE}") from None
 
 
-class _Reader:
-    """Reads packed little-endian values from bytes, front to back."""
+class _BinaryReader:
+    """Reads packed little-endian values of a file in sequence."""
 
     def __init__(self, path: Path) -> None:
-        self.data, self.at = read_bytes(path), 0
+        self.data, self.offset = read_bytes(path), 0
 
     def take(self, layout: str) -> tuple:
-        values = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += struct.calcsize("<" + layout)
+        values = struct.unpack_from("<" + layout, self.data, self.offset)
+        self.offset += struct.calcsize("<" + layout)
         return values
 
     def text(self) -> str:
-        end = self.data.index(b"\0", self.at)
-        text, self.at = self.data[self.at : end].decode("utf-8"), end + 1
+        end = self.data.index(b"\0", self.offset)
+        text, self.offset = self.data[self.offset : end].decode("utf-8"), end + 1
         return text
 
     def skip(self, count: int) -> None:
-        if self.at + count > len(self.data):
+        if self.offset + count > len(self.data):
             raise ValueError(f"ends after {len(self.data)} bytes")
-        self.at += count
+        self.offset += count
 
 
 def _cameras_bin(path: Path) -> dict[int, Lens]:
-    reader, lenses = _Reader(path), {}
+    reader, lenses = _BinaryReader(path), {}
     for _ in range(reader.take("Q")[0]):
         key, model_id, width, height = reader.take("iiQQ")
         model = _MODEL_NAMES.get(model_id)
@@ -160,7 +161,7 @@ def _cameras_bin(path: Path) -> dict[int, Lens]:
 
 
 def _images_bin(path: Path) -> list[tuple[str, int, Array]]:
-    reader, images = _Reader(path), []
+    reader, images = _BinaryReader(path), []
     for _ in range(reader.take("Q")[0]):
         values = reader.take("I7dI")
         images.append((reader.text(), int(values[8]), np.array(values[1:8])))
@@ -168,10 +169,7 @@ def _images_bin(path: Path) -> list[tuple[str, int, Array]]:
     return images
 
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
-_LARGEST = 1e12  # number that a camera may have
-_FAR = 1e9  # units from the origin that no camera is
-_RIGID_TOLERANCE = 1e-2  # entries of RᵀR − 1; files with rounded numbers stay below
+# ---- image sets
 
 
 @dataclass(frozen=True)
@@ -180,22 +178,22 @@ class ImageSet:
 
     paths: tuple[Path, ...]
     lenses: tuple[Lens, ...] | None = None
-    """One per image, at the size the file's writer meant; None where no camera is given."""
+    """One per image, at the size given in the file; None without cameras."""
     camera_to_world: Array | None = None
-    """OpenCV axes, shape (n, 4, 4); None where no pose is given."""
+    """OpenCV axes, shape (n, 4, 4); None without poses."""
     masks: tuple[Path | None, ...] | None = None
-    """Masks that the set itself names."""
+    """One per image, as listed by the set."""
     missing: int = 0
-    """Images that are listed but do not exist."""
+    """Number of listed images that do not exist."""
 
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorting key under which `frame10` comes after `frame9`."""
+    """Sort key that puts `frame10` after `frame9`."""
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
 
 
 def detect_kind(path: Path) -> str:
-    """What a source is, from what lies at its path: video, images, colmap or transforms. Raises InputError."""
+    """The kind of a source by its files: video, images, colmap or transforms. Raises InputError for none of them."""
     if not is_folder(path, "check path = in scene.toml (it is relative to the scene folder)"):
         return "transforms" if path.suffix.lower() == ".json" else "video"
     if find_model(path):
@@ -208,7 +206,7 @@ def detect_kind(path: Path) -> str:
 
 
 def read_image_folder(folder: Path) -> ImageSet:
-    """The images of a folder in natural order. Raises InputError where there is none."""
+    """The images of a folder in natural order. Raises InputError if there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder}: not a folder; kind = 'images' needs a folder of images")
     paths = _image_files(folder)
@@ -220,12 +218,8 @@ def read_image_folder(folder: Path) -> ImageSet:
 def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
     """The registered images of a COLMAP model or workspace that exist as files.
 
-    Args:
-        folder: Model or workspace.
-        images: Image folder; by default looked for in and above the model.
-
-    Raises:
-        InputError: no model, damaged files, no image found.
+    The image folder is by default searched for in and above the model. Raises InputError: no model, damaged files, no
+    image found.
     """
     model = find_model(folder) if folder.is_dir() else None
     if model is None:
@@ -250,25 +244,22 @@ def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
 
 
 def read_transforms(path: Path, images: Path | None = None) -> ImageSet:
-    """The images of a `transforms.json` that exist as files.
+    """The images of a `transforms.json`, or of the folder that holds it, that exist as files.
 
-    Args:
-        path: The file, or the folder that holds it.
-        images: Image folder; by default file paths are relative to the JSON file.
+    By default their paths are relative to the JSON file.
 
-    Raises:
-        InputError: wrong JSON, a missing or impossible entry, a pose that is not rigid, no image found.
+    Raises InputError: wrong JSON, a missing or impossible entry, a pose that is not rigid, no image found.
     """
     path = path / "transforms.json" if path.is_dir() else path
-    with damaged(path, "export the file again"), np.errstate(all="ignore"):
-        return _image_set(path, _json(path), images)
+    with wrap_read_errors(path, "export the file again"), np.errstate(all="ignore"):
+        return _image_set(path, _transforms_table(path), images)
 
 
 def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageSet:
     frames = table.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: no frames in it; expected a nerfstudio or instant-ngp transforms.json")
-    undo, scale = _world_of(table, path)
+    to_original, scale = _undo_world_transform(table, path)
     entries: dict[Path, tuple[Lens, Array, Path | None]] = {}
     missing = 0
     for i, frame in enumerate(frames):
@@ -276,18 +267,18 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f"{where} has no file_path; export the file again")
         where += f" ({frame['file_path']})"
-        pose = _rigid(frame.get("transform_matrix"), where)
+        pose = _rigid_pose(frame.get("transform_matrix"), where)
         file = _find_image(path.parent, images, frame["file_path"])
         if file is None:
             missing += 1
             continue
-        world = opencv_to_mujoco(undo @ pose)  # the flip between OpenGL and OpenCV axes is its own inverse
+        world = opencv_to_mujoco(to_original @ pose)  # the flip between OpenGL and OpenCV axes is self-inverse
         world[:3, 3] /= scale
-        if not np.abs(world[:3, 3]).max() < _FAR:
+        if not np.abs(world[:3, 3]).max() < _MAX_COORDINATE:
             raise InputError(f"{where}: transform_matrix lies too far away; export the file again")
         mask = frame.get("mask_path")
         if not isinstance(mask, str | None):
-            raise InputError(f"{where}: mask_path = {shown(mask)}; expected a path")
+            raise InputError(f"{where}: mask_path = {short_repr(mask)}; expected a path")
         mask_path = path.parent / mask if mask and is_file(path.parent / mask) else None
         entries.setdefault(file, (lens_from_transforms({**table, **frame}, file, where), world, mask_path))
     if not entries:
@@ -306,12 +297,12 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
     )
 
 
-def files_named(path: Path, images: Path | None = None) -> list[Path]:
-    """The images and masks that a `transforms.json` names and that are there, wherever they lie; none of a bad file."""
+def listed_files(path: Path, images: Path | None = None) -> list[Path]:
+    """The existing images and masks listed by a `transforms.json`; empty for a damaged file."""
     try:
-        frames = _json(path).get("frames")
+        frames = _transforms_table(path).get("frames")
     except InputError:
-        return []  # reading it for good will say what is wrong
+        return []  # `read_transforms` will report the error
     found = set()
     for frame in frames if isinstance(frames, list) else ():
         if isinstance(frame, dict):
@@ -322,42 +313,35 @@ def files_named(path: Path, images: Path | None = None) -> list[Path]:
     return sorted(file for file in found if file is not None)
 
 
-def files_read(path: Path, kind: str, images: Path | None = None) -> list[Path]:
-    """Every file that reading a source takes, masks of `scene.toml` left out; of a damaged one, what is known.
+def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path]:
+    """All files read for a source except masks of `scene.toml`; for a damaged set, those that can be determined.
 
-    Args:
-        path: The source.
-        kind: auto, or what it is taken for.
-        images: Image folder of a posed set that has one elsewhere.
-
-    Raises:
-        InputError: nothing there that could be a source.
+    `kind` may be auto; `images` is the separate image folder of a posed set. Raises InputError if `path` is no source.
     """
     kind = detect_kind(path) if kind == "auto" else kind
     if kind == "transforms":
         table = path / "transforms.json" if path.is_dir() else path
-        return [table, *files_named(table, images)]
+        return [table, *listed_files(table, images)]
     if kind == "colmap" and path.is_dir() and (model := find_model(path)) is not None:
         files = [file for file in model.iterdir() if is_file(file)]
         try:
             return [*files, *read_colmap(path, images).paths]
         except InputError:
-            return files  # reading it for good will say what is wrong
+            return files  # reading the images will report the error
     return _image_files(path) if kind == "images" and path.is_dir() else [path]
 
 
 def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
-    """The lens of one frame; `table` is the file's top level overlaid with the frame's own entries.
+    """The lens of one frame; `table` is the file's top level updated with the frame's own entries.
 
-    Raises:
-        InputError: neither focal length nor angle of view, or a model COLMAP has no name for.
+    Raises InputError: neither focal length nor angle of view, or an unsupported camera model.
     """
 
     def number(key: str, default: float | None = None) -> float | None:
         value = table.get(key, default)
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if value is not None and not (number and abs(value) < _LARGEST):
-            raise InputError(f"{where}: {key} = {shown(value)}; expected a finite number")
+        numeric = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is not None and not (numeric and abs(value) < _MAX_CAMERA_VALUE):
+            raise InputError(f"{where}: {key} = {short_repr(value)}; expected a finite number")
         return value
 
     if "w" in table and "h" in table:
@@ -377,7 +361,7 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
     k1, k2, k3, k4, p1, p2 = (number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     name = table.get("camera_model") or ""
     if not isinstance(name, str):
-        raise InputError(f"{where}: camera_model = {shown(name)}; expected OPENCV, OPENCV_FISHEYE or PINHOLE")
+        raise InputError(f"{where}: camera_model = {short_repr(name)}; expected OPENCV, OPENCV_FISHEYE or PINHOLE")
     if name == "OPENCV_FISHEYE" or (not name and table.get("is_fisheye")):
         return checked_lens("OPENCV_FISHEYE", (*core, k1, k2, k3, k4), width, height, where)
     if name not in ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
@@ -392,7 +376,7 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is there and is called like an image."""
+    """True if the file exists and its name is that of an image."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and is_file(path)
 
 
@@ -400,7 +384,7 @@ def _image_files(folder: Path) -> list[Path]:
     return sorted(filter(is_image, folder.iterdir()), key=lambda p: natural_key(p.name))
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _transforms_table(path: Path) -> dict[str, Any]:
     try:
         table = read_json(path)
     except InputError as error:
@@ -410,7 +394,7 @@ def _json(path: Path) -> dict[str, Any]:
     return table
 
 
-def _rigid(value: Any, where: str) -> Array:
+def _rigid_pose(value: Any, where: str) -> Array:
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError):
@@ -427,34 +411,37 @@ def _rigid(value: Any, where: str) -> Array:
             "expected a rotation and a translation"
         )
     pose = np.eye(4)
-    u, _, vt = np.linalg.svd(rotation)  # the nearest rotation: rounded numbers must not bend rays
+    u, _, vt = np.linalg.svd(rotation)  # the nearest rotation, since the file's numbers may be rounded
     pose[:3, :3], pose[:3, 3] = u @ vt, matrix[:3, 3]
     return pose
 
 
-def _world_of(table: dict[str, Any], path: Path) -> tuple[Array, float]:
-    """What brings the file's world back to the one it was made from: a rigid transform, then a division by scale."""
-    undo = np.eye(4)
+def _undo_world_transform(table: dict[str, Any], path: Path) -> tuple[Array, float]:
+    """The rigid transform, and then the divisor of positions, that undo nerfstudio's transform of the world."""
+    to_original = np.eye(4)
     if "applied_transform" in table:
-        undo = inverse_pose(_rigid(table["applied_transform"], f"{path}: applied_transform"))
+        to_original = inverse_pose(_rigid_pose(table["applied_transform"], f"{path}: applied_transform"))
     scale = table.get("applied_scale", 1.0)
-    if not isinstance(scale, int | float) or isinstance(scale, bool) or not 1 / _LARGEST < scale < _LARGEST:
-        raise InputError(f"{path}: applied_scale = {shown(scale)}; expected a positive number")
-    # nerfstudio scales after it moves, x' = s (R x + t), so t of the undone transform is scaled as well.
-    undo[:3, 3] *= scale
-    return undo, float(scale)
+    if (
+        not isinstance(scale, int | float)
+        or isinstance(scale, bool)
+        or not 1 / _MAX_CAMERA_VALUE < scale < _MAX_CAMERA_VALUE
+    ):
+        raise InputError(f"{path}: applied_scale = {short_repr(scale)}; expected a positive number")
+    # nerfstudio scales after it moves, x' = s (R x + t), so the translation of the inverse is scaled too.
+    to_original[:3, 3] *= scale
+    return to_original, float(scale)
 
 
 def _find_image(base: Path, images: Path | None, name: str) -> Path | None:
     name = name.replace("\\", "/")
-    places = [images / name, images / Path(name).name] if images else [base / name]
-    for place in places:
-        if is_file(place):
-            return place
+    for path in [images / name, images / Path(name).name] if images else [base / name]:
+        if is_file(path):
+            return path
         # instant-ngp writes names without a suffix.
-        if place.name and place.suffix.lower() not in IMAGE_SUFFIXES:
+        if path.name and path.suffix.lower() not in IMAGE_SUFFIXES:
             for suffix in IMAGE_SUFFIXES:
-                for candidate in (place.with_name(place.name + suffix), place.with_name(place.name + suffix.upper())):
+                for candidate in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
                     if is_file(candidate):
                         return candidate
     return None

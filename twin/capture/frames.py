@@ -1,8 +1,8 @@
-"""Stage 1, capture: films and image sets become kept frames of one size, with masks, clock and a train/held-out split.
+"""Stage `capture`: converts films and image sets to kept frames of one size with masks, times and a held-out split.
 
-A *source* is one input under one lighting. A *kept* frame is upright and scaled down to `capture.max_size`, with the
-lens's distortion still in it. Its name is `<source>/<index>`, where the index is its place in the film, or in the image
-set's natural order, so the same moment has the same name whatever else is kept. *Held-out* frames are never trained on.
+A *source* is one input under one lighting. A *kept* frame is upright and scaled to `capture.max_size`; it still has the
+lens's distortion. Its name is `<source>/<index>`, where the index is its position in the film or in the natural order
+of the image set: it does not depend on which other frames are kept. *Held-out* frames are never trained on.
 """
 
 from pathlib import Path
@@ -15,39 +15,38 @@ from twin import runtime
 from twin.capture.capture_data import Capture
 from twin.capture.formats import detect_kind, read_colmap, read_image_folder, read_transforms
 from twin.capture.photos import read_photos
-from twin.capture.sources import NO_GPS, FrameWriter, KeptFrame, Masks, SourceTask, read_mask
-from twin.capture.video import FilmCount, damage_note, read_film
+from twin.capture.sources import NO_GPS, FrameWriter, KeptFrames, Masks, SourceTask, read_mask
+from twin.capture.video import FilmStatistics, damage_note, read_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
-from twin.config_file import LONGEST_NAME, check_lighting
+from twin.config_file import MAX_NAME, check_lighting
 from twin.errors import InputError
-from twin.files import folder
+from twin.files import require_folder
 from twin.scene import SceneDir
 from twin.types import Image
 
-# Words in a path that say what a thing is and not which one.
-_PLAIN_NAMES = ("images", "image", "sparse", "colmap", "input", "0", "dense", "data")
+# Parts of a path that do not identify a source.
+_GENERIC_NAMES = ("images", "image", "sparse", "colmap", "input", "0", "dense", "data")
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
-    """Reads every source of a scene and writes the kept frames and `Capture` to `out`.
+    """Reads all sources of a scene and writes the kept frames and `Capture` to `out`; returns metrics.
 
-    Raises:
-        InputError: an unreadable or impossible input, or fewer than two usable frames in all.
+    Raises InputError: an unreadable or impossible input, or fewer than two usable frames in all.
     """
     names = source_names([source.path for source in config.source])
-    lightings = [_lighting(source) for source in config.source]
+    lightings = [_lighting_name(source) for source in config.source]
     kept = []
     for name, lighting, source in zip(names, lightings, config.source, strict=True):
         with FrameWriter(out, name) as writer:
             kept.append(_read_source(scene.root, name, lighting, source, config.capture, writer))
     total = sum(len(one.index) for one in kept)
     if total < 2:
-        what = "frame" if total == 1 else "frames"
+        noun = "frame" if total == 1 else "frames"
         raise InputError(
-            f"{', '.join(names)}: {total} usable {what} in all (need 2, better 50); "
+            f"{', '.join(names)}: {total} usable {noun} in all (need 2, better 50); "
             "move the camera, film longer, or raise capture.fps"
         )
-    capture = _joined(kept, config.capture)
+    capture = _merged(kept, config.capture)
     capture.save(out)
     held_out = int(capture.held_out.sum())
     return {
@@ -61,10 +60,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 
 def source_names(paths: list[str]) -> list[str]:
-    """A unique folder name for each source: what its path is called, in characters every tool takes."""
+    """A unique folder name for each source, derived from its path, of ASCII letters, digits and `-_.`."""
     names: list[str] = []
     for path in paths:
-        base = _stem(path)
+        base = _source_name(path)
         name, number = base, 2
         while name.lower() in (taken.lower() for taken in names):
             name, number = f"{base}_{number}", number + 1
@@ -73,9 +72,9 @@ def source_names(paths: list[str]) -> list[str]:
 
 
 def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
-    """Which of a source's frames are held out: every n-th, never the first or the last, one at least of three.
+    """Mask (count,) of a source's held-out frames: every n-th, never the first or last, at least one of three or more.
 
-    The offset moves on from source to source, so that equal moments under several lightings are not all held out.
+    The offset depends on the source's number, so that the same place is not held out under all lightings.
     """
     index = np.arange(count)
     held_out = index % every == (every // 2 + source) % every
@@ -85,22 +84,22 @@ def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
     return held_out
 
 
-def _lighting(source: SourceConfig) -> str:
-    lighting = source.lighting or _stem(source.path)[:LONGEST_NAME]
+def _lighting_name(source: SourceConfig) -> str:
+    lighting = source.lighting or _source_name(source.path)[:MAX_NAME]
     check_lighting(lighting, f"{source.path}: lighting")
     return lighting
 
 
 def _read_source(
     root: Path, name: str, lighting: str, source: SourceConfig, config: CaptureConfig, writer: FrameWriter
-) -> KeptFrame:
+) -> KeptFrames:
     path = root / source.path
     kind = detect_kind(path) if source.kind == "auto" else source.kind
     masks = Masks(root / source.mask) if source.mask else None
     task = SourceTask(path, name, lighting, kind, source, config, masks, writer)
     images = root / source.images if source.images else None
     if images:
-        folder(images, "check images = in scene.toml, a folder")
+        require_folder(images, "check images = in scene.toml, a folder")
     if kind == "video":
         return _read_video(task)
     if kind == "images":
@@ -108,25 +107,25 @@ def _read_source(
     return read_photos(task, read_colmap(path, images) if kind == "colmap" else read_transforms(path, images))
 
 
-def _read_video(task: SourceTask) -> KeptFrame:
+def _read_video(task: SourceTask) -> KeptFrames:
     def mask_of(index: int, width: int, height: int) -> Image | None:
         found = task.masks.find((f"{index:06d}",)) if task.masks else None
         return read_mask(found, width, height) if found else None
 
-    kept, count, unmasked = KeptFrame(task.info((0, 0), None, False)), FilmCount(), 0
+    kept, count, unmasked = KeptFrames(task.info((0, 0), None, False)), FilmStatistics(), 0
     size = (0, 0)
     with runtime.bar(f"reading {task.name}", 0, "frame") as bar:
-        for frame in read_film(task.path, task.config, count, mask_of, task.parts):
+        for frame in read_film(task.path, task.config, count, mask_of, task.segments):
             size = (frame.image.shape[1], frame.image.shape[0])
             task.writer.put(frame.index, frame.image, frame.mask)
             unmasked += frame.mask is None
             kept.index.append(frame.index)
             kept.times.append(frame.time)
             kept.gps.append(NO_GPS)
-            bar.total = count.promised
+            bar.total = count.declared
             bar.update(count.decoded - bar.n)
     if note := damage_note(task.path, count):
-        runtime.say(f"  {note}")
+        runtime.log_line(f"  {note}")
     task.check_masked(unmasked, len(kept.index))
     lens = task.given_lens(count.size)
     kept.info = task.info(size, lens.scaled(*size) if lens else None, lens is not None)
@@ -134,7 +133,7 @@ def _read_video(task: SourceTask) -> KeptFrame:
         "kind": "video",
         "lighting": task.lighting,
         "decoded": count.decoded,
-        "promised": count.promised,
+        "promised": count.declared,
         "kept": len(kept.index),
         "duplicates": count.duplicates,
         "damaged": count.damaged,
@@ -147,11 +146,13 @@ def _read_video(task: SourceTask) -> KeptFrame:
     return kept
 
 
-def _joined(kept: list[KeptFrame], config: CaptureConfig) -> Capture:
+def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:
     without = [one.info.name for one in kept if not one.poses]
     if 0 < len(without) < len(kept):
         bare = ", ".join(without)
-        runtime.say(f"  the poses given are not used: {bare} brings none, so all cameras are reconstructed together")
+        runtime.log_line(
+            f"  the poses given are not used: {bare} brings none, so all cameras are reconstructed together"
+        )
     counts = [len(one.index) for one in kept]
     return Capture(
         sources=tuple(one.info for one in kept),
@@ -165,9 +166,9 @@ def _joined(kept: list[KeptFrame], config: CaptureConfig) -> Capture:
     )
 
 
-def _stem(path: str) -> str:
-    """What a path is called: its last part that tells one input from another, without its suffix."""
+def _source_name(path: str) -> str:
+    """A source's name: the last part of its path that is not generic, without suffix."""
     parts = [part for part in (*Path(path).parent.parts, Path(path).stem) if part not in ("", ".", "..", "/")]
-    telling = [part for part in parts if not part.startswith("transforms") and part.lower() not in _PLAIN_NAMES]
-    chosen = telling[-1] if telling else (parts[-1] if parts else "source")
+    specific = [part for part in parts if not part.startswith("transforms") and part.lower() not in _GENERIC_NAMES]
+    chosen = specific[-1] if specific else (parts[-1] if parts else "source")
     return "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in chosen).strip(".") or "source"

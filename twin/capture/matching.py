@@ -1,8 +1,10 @@
-"""Features and matches of a capture in COLMAP's database.
+"""Selects pairs of frames and computes their features and matches in COLMAP's database.
 
-One database camera per source (posed input may bring one per image). A *known* camera is a given calibration, held
-fixed for good; a *prior* one has a focal length to start from; an *unknown* one has neither. A pair is *verified* when
-enough of its matches obey one two-view geometry.
+A *pair* (i, j), i < j, holds indices of the capture's frames. Pairs come from four rules: *sequence* (neighbors in
+time), *probes* (a few distant frames that look alike or lie equally far along two sources), *expansion* (the
+surroundings of a verified probe) and *nearness* (cameras reconstructed close to each other). A pair is *verified* if
+enough of its matches satisfy one two-view geometry. Each source has one database camera; posed input may have one per
+image. A camera is *known* (a given, fixed calibration), has a focal length *prior*, or is *unknown*.
 """
 
 import shutil
@@ -15,34 +17,35 @@ from numpy.typing import NDArray
 from twin.capture.camera_models import Lens
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.pycolmap_import import pycolmap
-from twin.capture.worker import tell
+from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.images import write_image
 from twin.types import Array
 
-# ---- Which frames are worth matching.
-#
-# A *pair* is (i, j) with i < j, indices into the capture's frames. Frames of one source are ordered by time. Pairs come
-# from four places: *sequence* (neighbours in time), *probes* (a few far frames that look alike, or lie equally far along
-# two sources), *expansion* (what lies around a probe that held), and *nearness* (cameras found close to each other).
-
-
 Pair = tuple[int, int]
 
 SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Steps in time that are matched within a source: dense nearby, and long ones that keep a drive from bending."""
+"""Steps in time matched within a source: dense for neighbors, long ones against drift along a drive."""
 _WORDS = 32
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
 _CROSS_OFFSETS = (-2, -1, 0, 1, 2)
 _BLIND_OFFSETS = (-3, -2, -1, 0, 1, 2, 3)
+_CHUNK_FRAMES = 16
+_CHUNK_PAIRS = 100
+_MIN_FEATURES = 50
+_UNKNOWN_MODEL = "SIMPLE_RADIAL"
+_UNKNOWN_FOCAL = 1.2  # [longer side], COLMAP's default
 
 
-def ordered(i: int, j: int) -> Pair:
+# ---- selection of pairs
+
+
+def ordered_pair(i: int, j: int) -> Pair:
     return (i, j) if i < j else (j, i)
 
 
-def members(source_index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def frames_by_source(source_index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Frame indices of each source, in time order."""
     return [np.flatnonzero(source_index == s) for s in range(int(source_index.max()) + 1)]
 
@@ -50,7 +53,7 @@ def members(source_index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 def sequence_pairs(source_index: NDArray[np.int64]) -> set[Pair]:
     """Neighbours in time within each source."""
     pairs: set[Pair] = set()
-    for frames in members(source_index):
+    for frames in frames_by_source(source_index):
         for step in SEQUENCE_STEPS:
             pairs.update(zip(frames[:-step].tolist(), frames[step:].tolist(), strict=True))
     return pairs
@@ -59,17 +62,10 @@ def sequence_pairs(source_index: NDArray[np.int64]) -> set[Pair]:
 def frame_signatures(
     descriptors: list[NDArray[np.uint8]], source_index: NDArray[np.int64], rng: np.random.Generator
 ) -> Array:
-    """One unit vector per frame that is alike where frames look alike: VLAD (Jégou et al. 2010, eq. 1).
+    """VLAD image descriptors (Jégou et al. 2010, eq. 1): one unit vector per frame, for retrieval of similar frames.
 
-    The mean signature of each source is taken out, since it holds the lighting rather than the place.
-
-    Args:
-        descriptors: SIFT descriptors per frame, shapes (m_i, 128); m_i may be 0.
-        source_index: Source of each frame, shape (n,).
-        rng: Draws the sample that the visual words are learned from.
-
-    Returns:
-        Shape (n, 32 · 128); a frame without features has a zero row.
+    Each source's mean is subtracted, since it represents the lighting rather than the place. `descriptors` holds the
+    SIFT descriptors (m_i, 128) of each frame; the result has shape (n, 32 · 128), zero for a frame without features.
     """
     sample = np.concatenate(
         [d[rng.permutation(len(d))[:_SAMPLES_PER_FRAME]] for d in descriptors], dtype=np.float32
@@ -78,8 +74,8 @@ def frame_signatures(
     if len(sample) < _WORDS:
         return np.zeros((n, _WORDS * 128))
     words = sample[rng.permutation(len(sample))[:_WORDS]]
-    for _ in range(8):  # Lloyd's iterations; a few are plenty for retrieval
-        nearest = _nearest(sample, words)
+    for _ in range(8):  # Lloyd's iterations; a few suffice for retrieval
+        nearest = _nearest_words(sample, words)
         for k in range(_WORDS):
             if np.any(nearest == k):
                 words[k] = sample[nearest == k].mean(0)
@@ -88,115 +84,110 @@ def frame_signatures(
         if not len(d):
             continue
         features = d.astype(np.float32)
-        nearest = _nearest(features, words)
+        nearest = _nearest_words(features, words)
         np.add.at(signatures[i], nearest, features - words[nearest])
         signatures[i] /= np.maximum(np.linalg.norm(signatures[i], axis=1, keepdims=True), 1e-9)
     flat = signatures.reshape(n, -1)
-    for frames in members(source_index):
+    for frames in frames_by_source(source_index):
         flat[frames] -= flat[frames].mean(0)
     return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
 
 
-def _nearest(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+def _nearest_words(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.argmax(features @ words.T - 0.5 * (words**2).sum(1), axis=1)
 
 
 def probe_pairs(source_index: NDArray[np.int64], signatures: Array) -> set[Pair]:
-    """A few guesses at which far frames show the same place: across sources, and where one source comes back.
+    """Pairs of distant frames that may show the same place, across sources and where a source returns to a place.
 
-    Across sources each probed frame is tried against the frame equally far along the other source and its three most
-    alike; within a source against its two most alike that the sequence does not reach.
+    Each probed frame is paired with the frame equally far along every other source and the three most similar ones
+    there, and within its source with the two most similar ones beyond the sequence steps.
     """
     similarity = signatures @ signatures.T
-    groups = members(source_index)
+    groups = frames_by_source(source_index)
     pairs: set[Pair] = set()
     for a, first in enumerate(groups):
         probed = np.unique(np.linspace(0, len(first) - 1, min(_PROBES_PER_SOURCE, len(first))).round().astype(int))
         for k in probed:
             i = int(first[k])
             far = first[np.abs(np.arange(len(first)) - k) > SEQUENCE_STEPS[-1]]
-            pairs.update(ordered(i, int(j)) for j in far[np.argsort(-similarity[i, far])[:2]])
+            pairs.update(ordered_pair(i, int(j)) for j in far[np.argsort(-similarity[i, far])[:2]])
             for second in groups[a + 1 :]:
                 guess = round(k * (len(second) - 1) / max(len(first) - 1, 1))
-                pairs.add(ordered(i, int(second[guess])))
-                pairs.update(ordered(i, int(j)) for j in second[np.argsort(-similarity[i, second])[:3]])
+                pairs.add(ordered_pair(i, int(second[guess])))
+                pairs.update(ordered_pair(i, int(j)) for j in second[np.argsort(-similarity[i, second])[:3]])
     return pairs
 
 
 def expanded_pairs(
     source_index: NDArray[np.int64], probes: set[Pair], inliers: dict[Pair, int], min_inliers: int
 ) -> set[Pair]:
-    """What the probes that held suggest.
+    """Pairs in the surroundings of the verified probes.
 
-    Across two sources the best match of each probed frame is an anchor; between anchors the position along the other
-    source is interpolated, so that films driven at different speeds are tied frame by frame. Without two anchors the
-    sources are tied by equal share of their length. Within a source a held probe ties its surroundings.
-
-    Args:
-        source_index: Source of each frame, shape (n,).
-        probes: The probed pairs.
-        inliers: Verified matches per pair.
-        min_inliers: From this many on a probe holds.
+    Across two sources, the best match of each probed frame is an anchor. Between anchors the position along the other
+    source is interpolated, so that films of different speeds are paired frame by frame. With fewer than two anchors the
+    frames are paired by equal fractions of the sources' lengths. `inliers` holds the verified matches per pair; a probe
+    is verified with `min_inliers` of them.
     """
-    groups = members(source_index)
+    groups = frames_by_source(source_index)
     position = np.concatenate([np.arange(len(frames)) for frames in groups])
-    held = {pair: inliers.get(pair, 0) for pair in probes if inliers.get(pair, 0) >= min_inliers}
+    verified = {pair: inliers.get(pair, 0) for pair in probes if inliers.get(pair, 0) >= min_inliers}
     pairs: set[Pair] = set()
     for a, first in enumerate(groups):
-        for i, j in held:
+        for i, j in verified:
             if source_index[i] == source_index[j] == a:
                 for di in _CROSS_OFFSETS:
                     for dj in _CROSS_OFFSETS:
                         p, q = position[i] + di, position[j] + dj
                         if 0 <= p < len(first) and 0 <= q < len(first) and p != q:
-                            pairs.add(ordered(int(first[p]), int(first[q])))
+                            pairs.add(ordered_pair(int(first[p]), int(first[q])))
         for b in range(a + 1, len(groups)):
             second = groups[b]
             best: dict[int, tuple[int, int]] = {}
-            for (i, j), count in held.items():
+            for (i, j), count in verified.items():
                 if source_index[i] == a and source_index[j] == b:
                     best[int(position[i])] = max(best.get(int(position[i]), (0, 0)), (count, int(position[j])))
             if len(best) >= 2:
-                known = sorted(best)
-                where = np.interp(np.arange(len(first)), known, [best[p][1] for p in known])
-                # Past the outermost anchors np.interp stands still; there both films go on at their own pace.
+                anchors = sorted(best)
+                counterpart = np.interp(np.arange(len(first)), anchors, [best[p][1] for p in anchors])
+                # np.interp is constant beyond the outermost anchors; there the mean ratio of the sources is used.
                 pace = (len(second) - 1) / max(len(first) - 1, 1)
                 k = np.arange(len(first))
-                where += pace * (np.minimum(k - known[0], 0) + np.maximum(k - known[-1], 0))
+                counterpart += pace * (np.minimum(k - anchors[0], 0) + np.maximum(k - anchors[-1], 0))
                 offsets: tuple[int, ...] = _CROSS_OFFSETS
             else:
-                where = np.arange(len(first)) * (len(second) - 1) / max(len(first) - 1, 1)
+                counterpart = np.arange(len(first)) * (len(second) - 1) / max(len(first) - 1, 1)
                 offsets = _BLIND_OFFSETS
-            for i, centre in zip(first.tolist(), np.rint(where).astype(int), strict=True):
-                pairs.update(ordered(i, int(second[centre + d])) for d in offsets if 0 <= centre + d < len(second))
+            for i, center in zip(first.tolist(), np.rint(counterpart).astype(int), strict=True):
+                pairs.update(ordered_pair(i, int(second[center + d])) for d in offsets if 0 <= center + d < len(second))
     return pairs
 
 
 def near_pairs(
     camera_to_world: Array, frames: NDArray[np.int64], tried: set[Pair], reach: float, most: int
 ) -> set[Pair]:
-    """Pairs of cameras close to each other that look the same way (within 60°) where nothing around ties them yet.
+    """At most `most` pairs per camera of the nearest cameras within `reach` that look the same way (within 60°).
 
-    Args:
-        camera_to_world: Poses, shape (k, 4, 4).
-        frames: Frame index of each pose, shape (k,).
-        tried: Pairs matched already; a pair counts as tied if it, or one two frames off at either end, was tried.
-        reach: Largest distance of two cameras, in the unit of the poses.
-        most: Pairs per camera at most, nearest first.
+    Poses (k, 4, 4) belong to the frames (k,); `reach` is in their unit. A tried pair excludes all pairs up to two
+    frames off at both ends.
     """
-    centres, forward = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
-    tied = {
-        ordered(i + di, j + dj) for i, j in tried for di in _CROSS_OFFSETS for dj in _CROSS_OFFSETS if i + di != j + dj
+    centers, forward = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
+    linked = {
+        ordered_pair(i + di, j + dj)
+        for i, j in tried
+        for di in _CROSS_OFFSETS
+        for dj in _CROSS_OFFSETS
+        if i + di != j + dj
     }
     pairs: set[Pair] = set()
     for k in range(len(frames)):
-        distance = np.linalg.norm(centres - centres[k], axis=1)
+        distance = np.linalg.norm(centers - centers[k], axis=1)
         usable = (distance <= reach) & (forward @ forward[k] > 0.5)
         usable[k] = False
         fresh = 0
         for other in np.argsort(distance):
-            pair = ordered(int(frames[k]), int(frames[other]))
-            if not usable[other] or pair in tied:
+            pair = ordered_pair(int(frames[k]), int(frames[other]))
+            if not usable[other] or pair in linked:
                 continue
             pairs.add(pair)
             fresh += 1
@@ -205,16 +196,12 @@ def near_pairs(
     return pairs
 
 
-_CHUNK_FRAMES = 16
-_CHUNK_PAIRS = 100
-_MIN_FEATURES = 50
-_UNKNOWN_MODEL = "SIMPLE_RADIAL"
-_UNKNOWN_FOCAL = 1.2  # [longer side], COLMAP's own guess
+# ---- COLMAP's database
 
 
 @dataclass
 class Matcher:
-    """The database of one capture, and which pairs were tried in it."""
+    """The database of one capture and the pairs that were tried in it."""
 
     database: Path
     images: Path
@@ -231,10 +218,9 @@ class Matcher:
         return {int(image): frame for frame, image in enumerate(self.image_ids)}
 
     def extract(self, most: int, max_size: int) -> None:
-        """Finds SIFT features in every frame, masked parts left out.
+        """Extracts at most `most` SIFT features per frame outside the masks, at images of at most `max_size` [px].
 
-        Raises:
-            InputError: a source has frames without texture.
+        Raises InputError: the frames of a source have too little texture.
         """
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads, options.max_image_size, options.use_gpu = self.threads, max_size, False
@@ -243,13 +229,13 @@ class Matcher:
         if self.masks:
             reader.mask_path = str(self.masks)
         names = [f"{name}.png" for name in self.capture.names]
-        tell(bar="features", total=len(names))
+        send_message(bar="features", total=len(names))
         for start in range(0, len(names), _CHUNK_FRAMES):
             chunk = names[start : start + _CHUNK_FRAMES]
             pycolmap.extract_features(
                 self.database, self.images, chunk, pycolmap.CameraMode.PER_IMAGE, reader, options, pycolmap.Device.cpu
             )
-            tell(step=len(chunk))
+            send_message(step=len(chunk))
         with pycolmap.Database.open(self.database) as database:
             counts = np.array([database.num_keypoints_for_image(int(i)) for i in self.image_ids])
         for s, source in enumerate(self.capture.sources):
@@ -265,8 +251,8 @@ class Matcher:
         with pycolmap.Database.open(self.database) as database:
             return [np.asarray(database.read_descriptors(int(i)).data).reshape(-1, 128) for i in self.image_ids]
 
-    def match(self, pairs: set[Pair], what: str) -> None:
-        """Matches and verifies the pairs that were not tried before."""
+    def match(self, pairs: set[Pair], label: str) -> None:
+        """Matches and verifies the pairs that were not tried before; `label` is shown beside the progress bar."""
         fresh = sorted(pairs - self.tried)
         self.tried.update(fresh)
         options = pycolmap.FeatureMatchingOptions()
@@ -276,33 +262,27 @@ class Matcher:
         pairing = pycolmap.ImportedPairingOptions()
         listing = self.database.with_name("pairs.txt")
         pairing.match_list_path = str(listing)
-        tell(bar=what, total=len(fresh))
+        send_message(bar=label, total=len(fresh))
         for start in range(0, len(fresh), _CHUNK_PAIRS):
             chunk = fresh[start : start + _CHUNK_PAIRS]
             names = self.capture.names
             listing.write_text("".join(f"{names[i]}.png {names[j]}.png\n" for i, j in chunk), encoding="utf-8")
             pycolmap.match_image_pairs(self.database, options, pairing, verification, pycolmap.Device.cpu)
-            tell(step=len(chunk))
+            send_message(step=len(chunk))
 
     def verified(self) -> dict[Pair, int]:
-        """Verified matches per pair of frames, where there are any."""
+        """Number of verified matches per verified pair."""
         frame_of = self.frame_of()
         with pycolmap.Database.open(self.database) as database:
             pair_ids, counts = database.read_two_view_geometry_num_inliers()
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
-        return {ordered(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
+        return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
 
 
 def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, threads: int, seed: int) -> Matcher:
-    """A fresh database with the capture's frames and cameras.
+    """Creates a database in `work` with the frames and cameras of a capture, whose stage folder is `stage`.
 
-    Args:
-        capture: The kept frames.
-        stage: The capture stage's folder.
-        work: Where the database is made.
-        free_focal: Forget every calibration and focal prior.
-        threads: For COLMAP.
-        seed: For COLMAP's RANSAC.
+    `free_focal` ignores all calibrations and focal length priors; `threads` and `seed` are for COLMAP.
     """
     path, images = work / "database.db", stage / "images"
     path.unlink(missing_ok=True)
@@ -311,11 +291,11 @@ def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, t
     for s, source in enumerate(capture.sources):
         frames = np.flatnonzero(capture.source_index == s)
         posed = capture.camera_to_world is not None and capture.intrinsics is not None
-        one_each = posed and bool(np.ptp(capture.intrinsics[frames], axis=0).max() > 1e-9)  # type: ignore[index]
-        mode = pycolmap.CameraMode.PER_IMAGE if one_each else pycolmap.CameraMode.SINGLE
+        camera_per_image = posed and bool(np.ptp(capture.intrinsics[frames], axis=0).max() > 1e-9)  # type: ignore[index]
+        mode = pycolmap.CameraMode.PER_IMAGE if camera_per_image else pycolmap.CameraMode.SINGLE
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "PINHOLE"
-        # Imported before features are found, so that ids follow the frames' order and not the threads' luck.
+        # Imported before the extraction of features, so that ids follow the order of frames, not of threads.
         pycolmap.import_images(path, images, mode, [f"{capture.names[i]}.png" for i in frames], reader)
         with pycolmap.Database.open(path) as database:
             done = set()
@@ -331,16 +311,15 @@ def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, t
     return Matcher(path, images, _mask_folder(capture, stage, work), capture, image_ids, threads, seed, set())
 
 
-def _camera(source: SourceInfo, camera_id: int, forget: bool, intrinsics: NDArray | None) -> pycolmap.Camera:
+def _camera(source: SourceInfo, camera_id: int, ignore_prior: bool, intrinsics: NDArray | None) -> pycolmap.Camera:
     model, params = source.camera_model, source.camera_params
     if intrinsics is not None:
-        lens = Lens(model, params, source.width, source.height) if params else None
-        if lens is None:
-            model, params = "PINHOLE", tuple(float(v) for v in intrinsics)
+        if params:
+            params = Lens(model, params, source.width, source.height).with_intrinsics(np.asarray(intrinsics)).params
         else:
-            params = lens.with_intrinsics(np.asarray(intrinsics)).params
-        forget = False
-    if not params or forget:
+            model, params = "PINHOLE", tuple(float(v) for v in intrinsics)
+        ignore_prior = False
+    if not params or ignore_prior:
         guess = _UNKNOWN_FOCAL * max(source.width, source.height)
         camera = pycolmap.Camera.create_from_model_name(
             camera_id, model or _UNKNOWN_MODEL, guess, source.width, source.height
@@ -358,7 +337,7 @@ def _camera(source: SourceInfo, camera_id: int, forget: bool, intrinsics: NDArra
 
 
 def _mask_folder(capture: Capture, stage: Path, work: Path) -> Path | None:
-    """The masks under the names COLMAP looks for: `a.png` has the mask `a.png.png`. None where nothing is masked."""
+    """Copies the masks to a folder under COLMAP's names (`a.png.png` for `a.png`); None if no frame has a mask."""
     masked = {name for name in capture.names if (stage / "masks" / f"{name}.png").exists()}
     if not masked:
         return None
@@ -368,7 +347,7 @@ def _mask_folder(capture: Capture, stage: Path, work: Path) -> Path | None:
         target.parent.mkdir(parents=True, exist_ok=True)
         if name in masked:
             shutil.copyfile(stage / "masks" / f"{name}.png", target)
-        else:  # COLMAP finds nothing in an image whose mask is missing
+        else:  # COLMAP extracts no features from an image whose mask is missing
             source = capture.sources[int(s)]
             write_image(target, np.full((source.height, source.width), 255, np.uint8))
     return folder

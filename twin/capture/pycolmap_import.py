@@ -1,4 +1,4 @@
-"""`pycolmap`, imported so that SIGTERM stays ours: its log library would answer it with a C++ stack trace."""
+"""Imports `pycolmap` and keeps our SIGTERM handler: COLMAP's log library would print a C++ stack trace instead."""
 
 from twin.cli import signals_kept
 

@@ -1,7 +1,6 @@
-"""How many metres one unit of the reconstruction is, from one of five kinds of evidence.
+"""Estimates the metric scale of a reconstruction from camera height, a known distance, GPS or a printed marker.
 
-Each function returns a `Scale`: metres per unit, its relative standard deviation, and notes for the report. *Relative*
-always means divided by the scale itself.
+Each estimator returns a `Scale`. *Relative* means divided by the scale.
 """
 
 from dataclasses import dataclass, field
@@ -20,35 +19,33 @@ from twin.geometry.images import read_image
 from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
-_WAYS = (
+_SCALE_OPTIONS = (
     "metric.camera_height = 0.5 (lens above the ground [m]), [metric.distance] (two marked image points and the metres "
     "between them), metric.gps = true (EXIF positions), [metric.marker] (a printed ArUco or AprilTag marker), or "
     "metric.poses_are_metric = true"
 )
-_PIXEL_ERROR = 1.0  # [px] a hand marks a point about this well
+_PIXEL_ERROR = 1.0  # [px] of a point marked by hand
 _EARTH_A, _EARTH_E2 = 6378137.0, 6.69437999014e-3  # WGS 84: semi-major axis [m], squared eccentricity
 _GPS_TRIALS = 400
+_MIN_ANGLE = np.radians(2.0)  # [rad] between the rays of two frames to a marker
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Metres per unit of the reconstruction."""
+    """Meters per unit of the reconstruction."""
 
     value: float
     uncertainty: float
-    """One standard deviation, relative; 0 where the scale is taken on trust."""
+    """Relative standard deviation; 0 for poses that are given as metric."""
     notes: dict[str, Any] = field(default_factory=dict)
+    """Further entries of `metric.json`."""
 
 
-def chosen_way(metric: MetricConfig, source_heights: dict[str, float]) -> str:
-    """Which of the five ways the configuration gives.
+def select_scale_source(metric: MetricConfig, source_heights: dict[str, float]) -> str:
+    """The one scale source that is configured: camera_height, distance, gps, marker or poses_are_metric.
 
-    Args:
-        metric: The configuration.
-        source_heights: Camera height per source where it has one of its own [m]; 0 = none.
-
-    Raises:
-        InputError: none given, or more than one; a value that cannot be.
+    `source_heights` holds the sources' own camera heights [m], 0 for none. Raises InputError unless exactly one is
+    configured, or for a negative height.
     """
     given = []
     if metric.camera_height < 0 or any(h < 0 for h in source_heights.values()):
@@ -62,7 +59,7 @@ def chosen_way(metric: MetricConfig, source_heights: dict[str, float]) -> str:
     given += ["marker"] * (metric.marker is not None)
     given += ["poses_are_metric"] * metric.poses_are_metric
     if not given:
-        raise InputError(f"no scale given; give one of: {_WAYS}")
+        raise InputError(f"no scale given; give one of: {_SCALE_OPTIONS}")
     if len(given) > 1:
         raise InputError(f"{len(given)} scales given ({', '.join('metric.' + g for g in given)}); keep exactly one")
     return given[0]
@@ -71,18 +68,9 @@ def chosen_way(metric: MetricConfig, source_heights: dict[str, float]) -> str:
 def scale_from_height(
     cameras: Cameras, up: Array, points: Array, road: Road | None, default: float, own: dict[str, float]
 ) -> Scale:
-    """Scale from how high the lens was carried over the road.
+    """Scale from the known height of the cameras above the road; `points` (m, 3) are all sparse points.
 
-    Args:
-        cameras: In the reconstruction's unit.
-        up: Unit vector.
-        points: All sparse points, shape (m, 3).
-        road: Which of them lie on the road.
-        default: Height of every source without one of its own [m]; 0 = none.
-        own: Height of a source's lens [m]; 0 = none.
-
-    Raises:
-        InputError: no point lies below the path.
+    `own` holds the height by source and `default` that of the others [m]; 0 = none. Raises InputError without a road.
     """
     if road is None:
         raise InputError(
@@ -93,27 +81,27 @@ def scale_from_height(
     sources = np.array(cameras.sources)
     scales, weights, sigmas, spreads = [], [], [], []
     for name in dict.fromkeys(cameras.sources):
-        metres = own.get(name, 0.0) or default
-        if metres <= 0:
+        true_height = own.get(name, 0.0) or default
+        if true_height <= 0:
             continue
-        centres = cameras.positions[sources == name]
-        local = heights_above_road(on_road, centres, up, road.drop)
+        centers = cameras.positions[sources == name]
+        local = heights_above_road(on_road, centers, up, road.drop)
         if local is not None:
             measured = local[np.isfinite(local)]
             height = float(np.median(measured))
             spread = 1.4826 * float(np.median(np.abs(measured - height)))
             count = len(measured)
-        else:  # too few points under this path: the road as a whole
+        else:  # too few points below this path: use the road as a whole
             height, spread, count = road.drop, road.spread, 1
-        scales.append(metres / height)
+        scales.append(true_height / height)
         weights.append(count)
-        spreads.append(spread * metres / height)
-        # A road undulates smoothly: heights along it are worth a handful of independent ones.
+        spreads.append(spread * true_height / height)
+        # A road undulates smoothly, so the heights along it count as at most six independent ones.
         sigmas.append(spread / height / np.sqrt(min(count, 6)))
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
-    # Few points, or points of the verge only (a kerb is a tenth of the usual height): no better than 5 %.
+    # With few points, or points of the verge only (a kerb is a tenth of the usual height), no better than 5 %.
     few = 0.0 if road.reliable else 0.05
     sigma = float(np.sqrt(np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2))
     return Scale(
@@ -129,23 +117,21 @@ def scale_from_height(
 
 
 def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distance: DistanceConfig) -> Scale:
-    """Scale from two marked image points; both triangulated from two frames, or both on the ground.
+    """Scale from two marked points [px of the pinhole images], both triangulated from two frames or on the ground.
 
-    Args:
-        cameras: In the reconstruction's unit.
-        up: Unit vector.
-        ground_level: Height of the ground along `up`, in the reconstruction's unit.
-        distance: The marked points, in pixels of the pinhole images, and the metres between them.
+    `ground_level` is the height of the ground along `up` in the reconstruction's unit.
 
-    Raises:
-        InputError: unknown frame, a point outside its image, no metres, or rays that do not meet.
+    Raises InputError: unknown frame, a point outside its image, no distance, or rays that do not meet.
     """
     if not distance.metres > 0:
         raise InputError(f"metric.distance.metres = {distance.metres}; expected the metres between the points a and b")
-    marks = [_mark(cameras, "a", distance.frame_a, distance.a), _mark(cameras, "b", distance.frame_a, distance.b)]
+    marks = [
+        _marked_pixel(cameras, "a", distance.frame_a, distance.a),
+        _marked_pixel(cameras, "b", distance.frame_a, distance.b),
+    ]
     if distance.frame_b:
-        marks.append(_mark(cameras, "a2", distance.frame_b, distance.a2))
-        marks.append(_mark(cameras, "b2", distance.frame_b, distance.b2))
+        marks.append(_marked_pixel(cameras, "a2", distance.frame_b, distance.a2))
+        marks.append(_marked_pixel(cameras, "b2", distance.frame_b, distance.b2))
         if distance.frame_a == distance.frame_b:
             raise InputError(f"metric.distance: frame_a and frame_b are both {distance.frame_a!r}; mark two frames")
     frames = [frame for frame, _ in marks]
@@ -166,7 +152,7 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
         )
     shifts = np.concatenate([np.eye(pixels.size), -np.eye(pixels.size)]) * _PIXEL_ERROR
     lengths = np.array([length(shift.reshape(pixels.shape)) for shift in shifts])
-    # Both signs of each coordinate: half the sum of squares is the first-order variance.
+    # Each coordinate is shifted both ways, so half the sum of squares is the first-order variance.
     sigma = float(np.sqrt(0.5 * np.sum((lengths - measured) ** 2)) / measured)
     if not np.isfinite(sigma) or sigma > 0.5:
         raise InputError(
@@ -175,7 +161,7 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
     return Scale(distance.metres / measured, sigma, {"distance_units": measured})
 
 
-def _mark(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ...]) -> tuple[int, Array]:
+def _marked_pixel(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ...]) -> tuple[int, Array]:
     if frame not in cameras.names:
         raise InputError(
             f"metric.distance: no registered frame {frame!r}; expected a name such as {cameras.names[0]!r} "
@@ -202,7 +188,7 @@ def _on_ground(origin: Array, direction: Array, up: Array, level: float) -> Arra
 
 
 def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
-    """The point nearest to two rays; NaN where they are parallel or it lies behind a camera."""
+    """The point nearest to two rays, shape (3,); NaN if they are parallel or it lies behind a camera."""
     (o1, d1), (o2, d2) = first, second
     matrix = np.stack([d1, -d2], 1)
     along, _, rank, _ = np.linalg.lstsq(matrix, o2 - o1, rcond=1e-9)
@@ -212,7 +198,7 @@ def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> A
 
 
 def local_east_north_up(gps: Array) -> Array:
-    """Latitude [°], longitude [°], altitude [m] (WGS 84) as east, north, up [m] about the first row, shape (n, 3)."""
+    """East, north, up [m] relative to the first row from latitude [°], longitude [°], altitude [m] (WGS 84), (n, 3)."""
     lat, lon = np.radians(gps[:, 0]), np.radians(gps[:, 1])
     normal = _EARTH_A / np.sqrt(1.0 - _EARTH_E2 * np.sin(lat) ** 2)
     ecef = np.stack(
@@ -233,20 +219,15 @@ def local_east_north_up(gps: Array) -> Array:
 
 
 def scale_from_gps(
-    centres: Array, up: Array, gps: Array, rng: np.random.Generator
+    centers: Array, up: Array, gps: Array, rng: np.random.Generator
 ) -> tuple[Scale, tuple[Array, NDArray[np.bool_]]]:
-    """Scale and heading from GPS positions, by a similarity in the horizontal plane.
+    """Scale and heading from GPS positions by a robust similarity fit in the horizontal plane.
 
-    Heights are left out: a receiver's altitude is several times worse than its position, and up is known already.
-
-    Args:
-        centres: Camera centres in the reconstruction's unit, shape (n, 3).
-        up: Unit vector.
-        gps: Latitude, longitude, altitude per frame; NaN where unknown, shape (n, 3).
-        rng: Draws the samples of the robust fit.
+    Altitudes are not used: they are several times less accurate than positions, and up is known already. `gps` (n, 3)
+    holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown; `rng` samples the trials.
 
     Returns:
-        The scale; and the horizontal east axis in the reconstruction, shape (3,), with which frames fit, shape (n,).
+        The scale; and the horizontal east axis in the reconstruction, shape (3,), with the mask of inliers, shape (n,).
 
     Raises:
         InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
@@ -261,8 +242,8 @@ def scale_from_gps(
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
-    source = centres[known] @ first + 1j * (centres[known] @ second)
-    # A similarity of the plane is a complex factor and an offset: target = factor · source + offset.
+    source = centers[known] @ first + 1j * (centers[known] @ second)
+    # In complex numbers a similarity of the plane is target = factor · source + offset.
     best = np.inf
     n = len(source)
     for _ in range(_GPS_TRIALS):
@@ -270,9 +251,9 @@ def scale_from_gps(
         if abs(source[j] - source[i]) < 1e-9 * np.ptp(np.abs(source - source[0])):
             continue
         factor = (target[j] - target[i]) / (source[j] - source[i])
-        misfit = float(np.median(np.abs(target - target[i] - factor * (source - source[i]))))
-        if misfit < best:
-            best, fit, offset = misfit, factor, target[i] - factor * source[i]
+        error = float(np.median(np.abs(target - target[i] - factor * (source - source[i]))))
+        if error < best:
+            best, fit, offset = error, factor, target[i] - factor * source[i]
     if not np.isfinite(best):
         raise InputError("metric.gps: the camera never moved; give the scale another way")
     inliers = np.abs(target - offset - fit * source) <= max(3.0 * 1.4826 * best, 1e-6)
@@ -287,16 +268,16 @@ def scale_from_gps(
         inliers = again
     residual = np.abs(target - offset - fit * source)[inliers]
     extent = float(np.std(source[inliers]) * abs(fit))
-    # Errors of a receiver drift, so neighbours share them: about three frames make one independent position.
+    # GPS errors drift, so neighboring frames share them: about three frames count as one independent position.
     sigma = float(np.sqrt(np.mean(residual**2) / 2) / (extent * np.sqrt(max(inliers.sum() / 3.0, 1.0))))
     if not np.isfinite(sigma) or sigma > 0.3:
         raise InputError(
             f"metric.gps: positions fit within {np.median(residual):.1f} m but spread over {extent:.1f} m only; film "
             "a longer way, or give the scale another way"
         )
-    turn = fit / abs(fit)
-    # `turn` takes the plane's first axis to a direction in east-north; east in the plane is its conjugate.
-    east = first * turn.real - second * turn.imag
+    # The fit rotates the plane's first axis to a direction in east-north; east in the plane is the conjugate.
+    rotation = fit / abs(fit)
+    east = first * rotation.real - second * rotation.imag
     used = np.zeros(len(gps), bool)
     used[np.flatnonzero(known)[inliers]] = True
     notes = {
@@ -307,17 +288,10 @@ def scale_from_gps(
     return Scale(float(abs(fit)), sigma, notes), (east, used)
 
 
-# ---- Scale from a printed square marker (ArUco or AprilTag): its corners are found, triangulated and measured.
-
-
-_MIN_ANGLE = np.radians(2.0)  # [rad] between the rays of two frames
-
-
 def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
-    """Metres per unit from a marker that stands in the scene.
+    """Scale from a printed square marker (ArUco or AprilTag) in the scene, whose corners are triangulated.
 
-    Raises:
-        InputError: unknown family, no size, or not seen from two places.
+    Raises InputError: unknown family, no size, or not visible from two directions.
     """
     families = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
     if marker.family not in families:
@@ -332,12 +306,12 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
     detector = cv2.aruco.ArucoDetector(dictionary, settings)
     frames, corners = [], []
     for i in runtime.track(range(len(cameras)), "marker", unit="frame"):
-        grey = cv2.cvtColor(read_image(cameras.image_path(i)), cv2.COLOR_RGB2GRAY)
-        found, ids, _ = detector.detectMarkers(grey)
+        gray = cv2.cvtColor(read_image(cameras.image_path(i)), cv2.COLOR_RGB2GRAY)
+        found, ids, _ = detector.detectMarkers(gray)
         hits = [k for k, value in enumerate(np.ravel(ids) if ids is not None else []) if int(value) == marker.id]
-        if len(hits) == 1:  # two of the same number in one picture: neither can be trusted
+        if len(hits) == 1:  # with two markers of the same number in one image neither is used
             frames.append(i)
-            # OpenCV counts from the centre of the first pixel, cameras here from its corner.
+            # OpenCV's pixel coordinates start at the center of the first pixel, ours at its corner.
             corners.append(np.asarray(found[hits[0]], np.float64).reshape(4, 2) + 0.5)
     if len(frames) < 2:
         raise InputError(
@@ -361,8 +335,10 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
 
 
 def _triangulate(pixels: Array, camera_to_world: Array, intrinsics: Array) -> Array:
-    """The point seen at `pixels` (n, 2): linear triangulation (Hartley & Zisserman 2004, sec. 12.2), then Gauss-Newton
-    on the reprojection error."""
+    """Triangulates the point (3,) observed at `pixels` (n, 2), one per view.
+
+    Linear (Hartley & Zisserman 2004, sec. 12.2), then Gauss-Newton on the reprojection error.
+    """
     world_to_camera = inverse_pose(camera_to_world)
     fx, fy, cx, cy = intrinsics.T
     u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
@@ -378,8 +354,8 @@ def _triangulate(pixels: Array, camera_to_world: Array, intrinsics: Array) -> Ar
         local = np.einsum("nij,j->ni", world_to_camera[:, :3, :3], point) + world_to_camera[:, :3, 3]
         z = local[:, 2]
         residual = np.concatenate([(local[:, 0] / z - u) * fx, (local[:, 1] / z - v) * fy])
-        turn = world_to_camera[:, :3, :3]
-        du = (turn[:, 0] - (local[:, 0] / z)[:, None] * turn[:, 2]) / z[:, None] * fx[:, None]
-        dv = (turn[:, 1] - (local[:, 1] / z)[:, None] * turn[:, 2]) / z[:, None] * fy[:, None]
+        rotation = world_to_camera[:, :3, :3]
+        du = (rotation[:, 0] - (local[:, 0] / z)[:, None] * rotation[:, 2]) / z[:, None] * fx[:, None]
+        dv = (rotation[:, 1] - (local[:, 1] / z)[:, None] * rotation[:, 2]) / z[:, None] * fy[:, None]
         point = point - np.linalg.lstsq(np.concatenate([du, dv]), residual, rcond=None)[0]
     return point

@@ -1,8 +1,7 @@
-"""Stage `cameras`: where every frame was taken from, by structure from motion, and the frames without lens distortion.
+"""Stage `cameras`: camera poses and sparse points by structure from motion, and images without lens distortion.
 
-The *frame of reference* of what this stage writes is the reconstruction's own: turned, placed and scaled at will,
-unless the input brought poses. The work itself happens in a worker process (`worker.py`, `mapping.py`); this module
-starts it, judges what came back and writes `Cameras`, `SparsePoints` and the pinhole images.
+The output frame is that of the reconstruction, with arbitrary rotation, origin and scale, unless the input has poses.
+This module starts the worker process (`worker.py`, `mapping.py`), checks its result and writes the stage's files.
 """
 
 import os
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
-from twin.capture.camera_models import pinhole_of, undistortion_map, write_pinhole_image
+from twin.capture.camera_models import fitted_pinhole, undistortion_map, write_pinhole_image
 from twin.capture.capture_data import Capture
 from twin.capture.pycolmap_import import pycolmap
 from twin.capture.worker import run_worker
@@ -25,13 +24,11 @@ from twin.geometry.cameras import Cameras, SparsePoints
 from twin.scene import SceneDir
 
 _MAX_THREADS = 16
-_MAX_POINT_ERROR = 20.0  # [px]
+_MAX_POINT_ERROR = 20.0  # [px] points that bundle adjustment moved behind a camera exceed it by far
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
-    """Solves the cameras of a capture.
-
-    Writes `Cameras`, `SparsePoints`, `images/` and `masks/` into `out`.
+    """Reconstructs the cameras of a capture; writes `Cameras`, `SparsePoints`, `images/` and `masks/` to `out`.
 
     Returns:
         registered, total, reprojection_error_px, mean_track_length, points, focal_px (per source), pairs,
@@ -62,12 +59,12 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         },
         work,
     )
-    facts = read_json(work / "result.json")
+    summary = read_json(work / "result.json")
     with np.load(work / "result.npz", allow_pickle=False) as result:
         frames, poses = result["frames"], result["camera_to_world"]
-        points = _points(result, frames, len(capture.names))
-    _refuse(capture, frames, settings)
-    intrinsics, sizes = _write_images(capture, scene.stage("capture"), frames, facts["cameras"], out)
+        points = _sparse_points(result, frames, len(capture.names))
+    _check_registered(capture, frames, settings)
+    intrinsics, sizes = _write_images(capture, scene.stage("capture"), frames, summary["cameras"], out)
     source_of = [capture.sources[int(s)] for s in capture.source_index[frames]]
     cameras = Cameras(
         names=tuple(capture.names[i] for i in frames),
@@ -84,23 +81,26 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     cameras.save(out)
     points.save(out)
     shutil.rmtree(work)
-    return _metrics(capture, cameras, points, facts)
+    return _metrics(capture, cameras, points, summary)
 
 
-def _points(result: Any, frames: NDArray[np.int64], total: int) -> SparsePoints:
+def _sparse_points(result: Any, frames: NDArray[np.int64], total: int) -> SparsePoints:
     row = np.full(total, -1)
     row[frames] = np.arange(len(frames))
     frame = row[result["frame"]]
-    # A point that the last adjustment threw behind a camera has an error beyond any pixel, and no place.
-    sane = np.isfinite(result["xyz"]).all(1) & (result["error"] < _MAX_POINT_ERROR)
-    seen = (frame >= 0) & sane[result["point"]]
-    number = np.cumsum(sane) - 1
+    valid = np.isfinite(result["xyz"]).all(1) & (result["error"] < _MAX_POINT_ERROR)
+    observed = (frame >= 0) & valid[result["point"]]
+    number = np.cumsum(valid) - 1
     return SparsePoints(
-        result["xyz"][sane], result["rgb"][sane], result["error"][sane], number[result["point"][seen]], frame[seen]
+        result["xyz"][valid],
+        result["rgb"][valid],
+        result["error"][valid],
+        number[result["point"][observed]],
+        frame[observed],
     )
 
 
-def _refuse(capture: Capture, frames: NDArray[np.int64], settings: CamerasConfig) -> None:
+def _check_registered(capture: Capture, frames: NDArray[np.int64], settings: CamerasConfig) -> None:
     total = len(capture.names)
     if len(frames) < settings.min_registered * total or not len(frames):
         raise InputError(
@@ -118,29 +118,29 @@ def _refuse(capture: Capture, frames: NDArray[np.int64], settings: CamerasConfig
 def _write_images(
     capture: Capture, stage: Path, frames: NDArray[np.int64], lenses: list[dict[str, Any]], out: Path
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Writes the pinhole images and masks; returns intrinsics (n, 4) and sizes (n, 2)."""
+    """Writes the pinhole images and masks; returns intrinsics (n, 4) and sizes (n, 2) [px]."""
     intrinsics, sizes = np.zeros((len(frames), 4)), np.zeros((len(frames), 2), np.int64)
-    known: dict[str, tuple[tuple[float, float, float, float], NDArray[np.float32] | None]] = {}
+    cache: dict[str, tuple[tuple[float, float, float, float], NDArray[np.float32] | None]] = {}
     for k, i in enumerate(runtime.track(frames, "pinhole images", unit="frame")):
         lens = lenses[k]
         key = repr(lens)
-        if key not in known:
-            known.clear()  # maps are large, and frames come source by source
+        if key not in cache:
+            cache.clear()  # pixel maps are large, and frames are ordered by source
             camera = pycolmap.Camera(
                 model=lens["model"], params=lens["params"], width=lens["width"], height=lens["height"]
             )
-            pinhole = pinhole_of(camera)
-            known[key] = pinhole, undistortion_map(camera, pinhole)
-        pinhole, mapping = known[key]
+            pinhole = fitted_pinhole(camera)
+            cache[key] = pinhole, undistortion_map(camera, pinhole)
+        pinhole, pixel_map = cache[key]
         intrinsics[k], sizes[k] = pinhole, (lens["width"], lens["height"])
         name = f"{capture.names[int(i)]}.png"
-        write_pinhole_image(stage / "images" / name, out / "images" / name, mapping)
+        write_pinhole_image(stage / "images" / name, out / "images" / name, pixel_map)
         if (stage / "masks" / name).exists():
-            write_pinhole_image(stage / "masks" / name, out / "masks" / name, mapping, mask=True)
+            write_pinhole_image(stage / "masks" / name, out / "masks" / name, pixel_map, mask=True)
     return intrinsics, sizes
 
 
-def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, facts: dict[str, Any]) -> dict[str, Any]:
+def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, summary: dict[str, Any]) -> dict[str, Any]:
     counts = points.track_length
     sources = [source.name for source in capture.sources]
     of_source = np.array(cameras.sources)
@@ -152,15 +152,15 @@ def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, facts: di
             for s, name in enumerate(sources)
         },
         "points": len(points),
-        # Weighted by observations, as COLMAP does.
+        # Weighted by the number of observations, as in COLMAP.
         "reprojection_error_px": float(np.average(points.error, weights=counts)) if len(points) else None,
         "mean_track_length": float(counts.mean()) if len(points) else None,
         "focal_px": {name: round(float(np.median(cameras.intrinsics[of_source == name, :2])), 3) for name in sources},
-        "pairs": facts["pairs"],
-        "verified_pairs": facts["verified_pairs"],
-        "near_pairs": facts.get("near_pairs", 0),
-        "outliers": facts["outliers"],
-        "registered_anew": facts.get("registered_anew", []),
-        "mapper": facts["mapper"],
+        "pairs": summary["pairs"],
+        "verified_pairs": summary["verified_pairs"],
+        "near_pairs": summary.get("near_pairs", 0),
+        "outliers": summary["outliers"],
+        "registered_anew": summary.get("registered_anew", []),
+        "mapper": summary["mapper"],
         "note": None if len(points) else "no point was triangulated under the given poses",
     }

@@ -1,4 +1,7 @@
-"""What every kind of source has in common: one source's inputs, its kept frames, and the files they are written to."""
+"""One source while it is read: its inputs, its masks, its kept frames, and the writer of its image files.
+
+A mask marks the pixels of a frame that all later stages ignore: 0 = ignore, any other value = use.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -17,18 +20,19 @@ from twin.capture.capture_data import SourceInfo
 from twin.config import CaptureConfig, SourceConfig
 from twin.errors import InputError
 from twin.files import is_file, is_folder
-from twin.geometry.images import decoded, write_image
+from twin.geometry.images import decode_image, write_image
 from twin.types import Image
 
-# ---- Masks: which pixels of a frame are ignored by everything that follows. 0 = ignore, anything else = use.
-
-
-_LOSSY_THRESHOLD = 63  # a JPEG's zero is not quite zero
+_LOSSY_THRESHOLD = 63  # compression changes the zeros of a JPEG mask
+_QUEUE_SIZE = 4  # images decoded or encoded in the background; bounds the memory
+NO_GPS = (math.nan, math.nan, math.nan)
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
 class Masks:
-    """The masks of one source: one for all frames, or a folder with one for each."""
+    """The masks of one source: one image for all frames, or a folder with an image per frame."""
 
     path: Path
 
@@ -38,7 +42,7 @@ class Masks:
             raise InputError(f"{self.path}: this mask folder is empty; put one image per frame in it, 0 = ignore")
 
     def find(self, keys: tuple[str, ...]) -> Path | None:
-        """The file that masks a frame known under these names; None where the folder has none of them."""
+        """The mask of a frame that may be named by any of the keys; None if the folder has none of them."""
         if not self.path.is_dir():
             return self.path
         candidates = (self.path / f"{key}{suffix}" for key in keys for suffix in (".png", ".jpg", ".PNG", ".JPG"))
@@ -46,12 +50,11 @@ class Masks:
 
 
 def read_mask(path: Path, width: int, height: int) -> Image:
-    """A mask at a frame's size, 0 or 255, shape (height, width).
+    """Reads a mask at a frame's size: 0 or 255, shape (height, width).
 
-    Raises:
-        InputError: unreadable, of another aspect than the frame, or nothing left to use.
+    Raises InputError: unreadable, of another aspect than the frame, or all pixels ignored.
     """
-    mask = decoded(path, cv2.IMREAD_GRAYSCALE, "write the mask again as an 8-bit PNG")
+    mask = decode_image(path, cv2.IMREAD_GRAYSCALE, "write the mask again as an 8-bit PNG")
     if not same_aspect((mask.shape[1], mask.shape[0]), (width, height)):
         raise InputError(
             f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its frame has the aspect of {width}x{height}; "
@@ -64,19 +67,9 @@ def read_mask(path: Path, width: int, height: int) -> Image:
     return cv2.resize(binary, (width, height), interpolation=cv2.INTER_NEAREST).astype(np.uint8, copy=False)
 
 
-BLANK = 2.0
-"""A picture whose brightness varies less than this shows nothing [grey levels, standard deviation]."""
-
-_AHEAD = 4  # pictures decoded or encoded beside the one at hand; bounds the memory
-
-NO_GPS = (math.nan, math.nan, math.nan)
-T = TypeVar("T")
-R = TypeVar("R")
-
-
 @dataclass(frozen=True)
 class SourceTask:
-    """One source to read."""
+    """The inputs for reading one source."""
 
     path: Path
     name: str
@@ -88,15 +81,14 @@ class SourceTask:
     writer: "FrameWriter"
 
     @property
-    def parts(self) -> tuple[tuple[float, ...], ...]:
-        """The parts of the source that are used, [from, to] each [s]; empty = all of it."""
+    def segments(self) -> tuple[tuple[float, ...], ...]:
+        """Segments of the source to use, [from, to] each [s]; empty for all of it."""
         return self.source.keep or self.config.keep
 
     def given_lens(self, native: tuple[int, int]) -> Lens | None:
-        """The calibration of `scene.toml`, or None; `native` is the upright size of the input [px].
+        """The calibration in `scene.toml`, or None; `native` is the upright size of the input [px].
 
-        Raises:
-            InputError: an impossible calibration, or one for a picture of another shape.
+        Raises InputError: an impossible calibration, or one for another aspect.
         """
         camera = self.source.camera
         if camera is None:
@@ -112,39 +104,39 @@ class SourceTask:
         return lens
 
     def info(self, size: tuple[int, int], lens: Lens | None, calibrated: bool) -> SourceInfo:
-        """The source as the next stage sees it; where no lens is known, a model that fits most cameras."""
+        """The `SourceInfo` for a frame size [px]; without a lens, with SIMPLE_RADIAL, which fits most cameras."""
         model, params = (lens.model, lens.params) if lens else ("SIMPLE_RADIAL", ())
         height = self.source.camera_height
         return SourceInfo(self.name, self.lighting, self.kind, *size, model, params, calibrated, height)
 
     def check_masked(self, unmasked: int, count: int) -> None:
-        """Says how many frames have no mask of their own; refuses a mask folder that fits none."""
+        """Reports frames without a mask. Raises InputError if the mask folder fits none of the `count` frames."""
         if self.masks and unmasked == count:
             raise InputError(
                 f"{self.masks.path}: no mask here is named like a frame; "
                 "call them 000012.png (frame of the film, from 0) or like the photo"
             )
         if self.masks and unmasked:
-            runtime.say(f"  {self.masks.path.name}: {unmasked} of {count} frames have no mask and are used whole")
+            runtime.log_line(f"  {self.masks.path.name}: {unmasked} of {count} frames have no mask and are used whole")
 
 
 @dataclass
-class KeptFrame:
-    """The kept frames of one source, in order, and what is known of each."""
+class KeptFrames:
+    """The kept frames of one source in order, with their metadata."""
 
     info: SourceInfo
     index: list[int] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     gps: list[tuple[float, float, float]] = field(default_factory=list)
     poses: list[NDArray[np.float64]] = field(default_factory=list)
-    """camera_to_world (4, 4) per frame; empty where the source brings none."""
+    """camera_to_world (4, 4) per frame; empty for a source without poses."""
     intrinsics: list[NDArray[np.float64]] = field(default_factory=list)
-    """fx, fy, cx, cy [px] at the kept size, beside the poses."""
+    """fx, fy, cx, cy [px] at the kept size per pose."""
     metrics: dict[str, Any] = field(default_factory=dict)
 
 
 class FrameWriter:
-    """Encodes and writes a source's frames and masks in threads; a failure surfaces at the next frame or at the end."""
+    """Encodes and writes a source's frames and masks in threads; errors are raised at the next frame or at the end."""
 
     def __init__(self, out: Path, name: str) -> None:
         self._images, self._masks = out / "images" / name, out / "masks" / name
@@ -153,13 +145,13 @@ class FrameWriter:
 
     def put(self, index: int, image: Image, mask: Image | None) -> None:
         """Queues one frame and its mask; blocks while the queue is full."""
-        while len(self._waiting) >= _AHEAD:
+        while len(self._waiting) >= _QUEUE_SIZE:
             self._waiting.pop(0).result()
         self._waiting.append(self.pool.submit(self._write, f"{index:06d}.png", image, mask))
 
     def _write(self, file: str, image: Image, mask: Image | None) -> None:
-        grey = (image[..., 0] == image[..., 1]).all() and (image[..., 1] == image[..., 2]).all()
-        write_image(self._images / file, image[..., 0] if grey else image)
+        gray = (image[..., 0] == image[..., 1]).all() and (image[..., 1] == image[..., 2]).all()
+        write_image(self._images / file, image[..., 0] if gray else image)
         if mask is not None:
             write_image(self._masks / file, mask)
 
@@ -173,13 +165,13 @@ class FrameWriter:
                 future.result()
 
 
-def ahead(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Maps in threads, in order, never more than a few results ahead of the consumer."""
+def prefetch(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Maps items in threads and yields the results in order, at most `_QUEUE_SIZE` ahead of the consumer."""
     waiting: list[Future[R]] = []
     try:
         for item in items:
             waiting.append(pool.submit(work, item))
-            if len(waiting) >= _AHEAD:
+            if len(waiting) >= _QUEUE_SIZE:
                 yield waiting.pop(0).result()
         while waiting:
             yield waiting.pop(0).result()

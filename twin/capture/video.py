@@ -1,9 +1,9 @@
-"""Video files: decoded once, front to back, never held in memory as a whole.
+"""Frame selection from video files, decoded once from front to back and never held in memory as a whole.
 
-A *slot* is one of n equal spans of a film's duration; of each slot the sharpest frame is a *candidate*. A candidate
-that hardly moved from the last kept frame is a *duplicate* of a standing camera and is dropped. A frame's *index* is
-its place in the film, counted from 0 in order of presentation; its *time* runs from the first frame [s]. Where only
-*parts* of a film are used, slots divide these, as if the rest were cut out; indices and times stay those of the film.
+A *slot* is one of n equal time spans of a film; the sharpest frame of each slot is its *candidate*. A candidate that
+hardly moved since the last kept frame is a *duplicate* and is dropped. A frame's *index* is its position in the film,
+counted from 0 in order of presentation; its *time* [s] is measured from the first frame. If only *segments* of the film
+are kept, the slots divide these segments as if the rest were cut out; indices and times remain those of the whole film.
 """
 
 import contextlib
@@ -21,97 +21,90 @@ from numpy.typing import NDArray
 
 from twin.config import CaptureConfig
 from twin.errors import InputError
-from twin.files import regular
+from twin.files import regular_file
 from twin.geometry.images import resize
 from twin.types import Image
 
-# ---- How sharp a frame is, and how far the picture moved between two frames.
-#
-# Everything here works on small grey pictures (uint8, shape (h, w)), so that judging a frame costs about a millisecond.
-# A *flow* is the displacement of a picture's corners from one frame to the next [px]. A *mask* has 0 where the picture
-# is to be ignored.
-
-
-FLOW_WIDTH = 320
-"""Width at which motion is measured [px]."""
-
-SHARPNESS_WIDTH = 640
-"""Width at which sharpness is measured [px]; at full size the noise of the sensor would count as detail."""
-
+FLOW_WIDTH = 320  # [px] image width at which motion is measured
+SHARPNESS_WIDTH = 640  # [px] image width at which sharpness is measured; at full size sensor noise counts as detail
 _CORNERS = 200
-_MIN_TRACKED = 12  # fewer corners than this say nothing about the whole picture
-_MAX_RETURN_ERROR = 0.5  # [px], a corner tracked there and back must come home
-_STILL_DIFFERENCE = 1.5  # [grey levels of a picture stretched to 255], below it two texture-free frames are the same
+_MIN_TRACKED = 12  # corners needed to judge the motion of the whole image
+_MAX_RETURN_ERROR = 0.5  # [px] largest forward-backward tracking error
+_STILL_DIFFERENCE = 1.5  # [gray levels after contrast stretching] below it two texture-free frames are equal
+BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] shows nothing
+_LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
+_MIN_DECODED_FRACTION = 0.98  # of the frames declared by the container; below it the user gets a note
 
 
-def sharpness(grey: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian over the variance of the picture; comparable only between frames of one view.
+# ---- sharpness and motion, on small gray images (uint8, shape (h, w)) so that a frame takes about a millisecond
 
-    Pech-Pacheco et al. 2000 ("LAPV"). Dividing by the contrast keeps a brightening exposure from passing for focus.
+
+def sharpness(gray: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian over the variance of the image; comparable only between frames of one view.
+
+    Pech-Pacheco et al. 2000 ("LAPV"). The division by the contrast keeps a brighter exposure from scoring as sharper.
     """
-    laplacian = cv2.Laplacian(grey, cv2.CV_32F)
-    return float(laplacian.var() / (grey.astype(np.float32).var() + 1.0))
+    laplacian = cv2.Laplacian(gray, cv2.CV_32F)
+    return float(laplacian.var() / (gray.astype(np.float32).var() + 1.0))
 
 
 def median_motion(
     before: NDArray[np.uint8], after: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None
 ) -> float | None:
-    """Median length of the flow between two grey frames of equal size [px]; None where too few corners are found.
+    """Median optical flow between two gray frames of equal size [px]; None if too few corners are tracked.
 
-    Pyramidal Lucas-Kanade on Shi-Tomasi corners; only corners that come home when tracked back are counted.
+    Pyramidal Lucas-Kanade on Shi-Tomasi corners with a forward-backward check. The mask is 0 where pixels are ignored.
     """
-    before, after = _stretched(before), _stretched(after)
+    before, after = _contrast_stretched(before), _contrast_stretched(after)
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 5, mask=mask)
     if corners is None or len(corners) < _MIN_TRACKED:
         return None
     there, found_there, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)  # type: ignore[call-overload]
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None)  # type: ignore[call-overload]
-    home = np.linalg.norm(back - corners, axis=-1) < _MAX_RETURN_ERROR
-    good = (home & (found_there == 1) & (found_back == 1))[:, 0]
+    consistent = np.linalg.norm(back - corners, axis=-1) < _MAX_RETURN_ERROR
+    good = (consistent & (found_there == 1) & (found_back == 1))[:, 0]
     if good.sum() < _MIN_TRACKED:
         return None
     return float(np.median(np.linalg.norm(there - corners, axis=-1)[good]))
 
 
-def stands_still(
+def is_static(
     before: NDArray[np.uint8], after: NDArray[np.uint8], min_motion: float, mask: NDArray[np.uint8] | None = None
 ) -> bool:
-    """True where the picture moved less than `min_motion` [px]; without corners, where it did not change at all.
+    """True if the image moved less than `min_motion` [px] or, without corners to track, did not change.
 
-    A `min_motion` of 0 keeps every frame.
+    Always false for a `min_motion` of 0.
     """
     if min_motion <= 0.0:
         return False
     moved = median_motion(before, after, mask)
     if moved is not None:
         return moved < min_motion
-    difference = cv2.absdiff(_stretched(before), _stretched(after))
+    difference = cv2.absdiff(_contrast_stretched(before), _contrast_stretched(after))
     seen = difference if mask is None else difference[mask > 0]
     return float(seen.mean()) < _STILL_DIFFERENCE if seen.size else True
 
 
-def _stretched(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Contrast stretched to the whole range, so that a night frame has corners too."""
-    low, high = np.percentile(grey[::2, ::2], (1.0, 99.0))
-    gain = 255.0 / max(high - low, 16.0)  # a blank frame's noise is not blown up without bound
-    return np.clip((grey.astype(np.float32) - low) * gain, 0, 255).astype(np.uint8)
+def _contrast_stretched(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image with its contrast stretched to the whole range, so that night frames have corners too."""
+    low, high = np.percentile(gray[::2, ::2], (1.0, 99.0))
+    gain = 255.0 / max(high - low, 16.0)  # bounded: a blank frame has only noise
+    return np.clip((gray.astype(np.float32) - low) * gain, 0, 255).astype(np.uint8)
 
 
-_BLANK = 2.0  # [grey levels], a frame whose brightness varies less than this shows nothing
-_LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
-_DAMAGED = 0.98  # share of the frames a container promises, below which the user is told
+# ---- timing of a film
 
 
 @dataclass(frozen=True)
-class FilmFacts:
-    """What a file's packets say before anything is decoded."""
+class FilmTiming:
+    """Frame times of a film from its packets, read without decoding."""
 
     times: NDArray[np.float64]
-    """Presentation times from the first frame on [s], sorted, shape (n,)."""
+    """Presentation times since the first frame [s], sorted, shape (n,)."""
     start: float
     """Time stamp of the first frame in its stream [s]."""
-    promised: int
-    """Frames the container says it has; n where it does not say."""
+    declared: int
+    """Number of frames declared by the container; n if it declares none."""
 
     @property
     def interval(self) -> float:
@@ -125,73 +118,72 @@ class FilmFacts:
 
 
 @dataclass
-class FilmCount:
-    """What became of a film's frames; filled while it is read."""
+class FilmStatistics:
+    """Counts of decoded, kept and dropped frames; filled while a film is read."""
 
     decoded: int = 0
     damaged: int = 0
     duplicates: int = 0
     blank: int = 0
-    promised: int = 0
+    declared: int = 0
     duration: float = 0.0
     size: tuple[int, int] = (0, 0)
-    """Upright width and height as filmed [px]."""
+    """Upright width and height of the input [px]."""
     sharpness: list[float] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class FilmFrame:
-    """A chosen frame, upright, at the kept size."""
+    """A kept frame, upright and scaled to the kept size."""
 
     index: int
     time: float
     image: Image
     """RGB, shape (h, w, 3)."""
     mask: Image | None
-    """0 = ignore, shape (h, w); None where nothing is masked."""
+    """0 = ignore, shape (h, w); None without a mask."""
 
 
-def probe(path: Path) -> FilmFacts:
-    """Reads a film's packets without decoding them.
+def probe(path: Path) -> FilmTiming:
+    """Reads the timing of a film from its packets.
 
-    Raises:
-        InputError: not a video, or so damaged that it has no readable packet.
+    Raises InputError: not a video, or too damaged to have a readable packet.
     """
     times: list[float] = []
-    regular(path)
+    regular_file(path)
     try:
         with av.open(str(path)) as container:
             stream = _video_stream(container, path)
-            with contextlib.suppress(av.error.FFmpegError):  # cut off in the middle: what was read so far is used
+            with contextlib.suppress(av.error.FFmpegError):  # of a truncated file the packets before the end are used
                 for packet in container.demux(stream):
                     stamp = packet.pts if packet.pts is not None else packet.dts
                     if stamp is not None and not packet.is_discard:
                         times.append(float(stamp * packet.time_base))
-            promised = stream.frames
+            declared = stream.frames
             rate = float(stream.average_rate or 25)
     except (av.error.FFmpegError, ValueError, OSError) as error:
         raise _unreadable(path, error) from None
     if not times:
         raise InputError(f"{path}: the film has no readable frame; copy it again from the camera or re-encode it")
     at = np.sort(np.array(times))
-    if len(at) > 1 and at[-1] == at[0]:  # a raw stream without a clock
+    if len(at) > 1 and at[-1] == at[0]:  # a raw stream without time stamps
         at = np.arange(len(at)) / rate
-    return FilmFacts(at - at[0], float(at[0]), promised or len(at))
+    return FilmTiming(at - at[0], float(at[0]), declared or len(at))
 
 
-def decode(path: Path, count: FilmCount) -> Iterator[tuple[float | None, av.VideoFrame]]:
-    """Decodes a film front to back, skipping what is damaged.
+def decode(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
+    """Decodes a film from front to back and skips damaged frames.
 
-    A decoder repairs a damaged frame by guessing and predicts the next frames from the guess, so nothing is taken from
-    the damage on to the next key frame, nor the B frames shown before it that lean on it.
+    A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from the
+    damage to the next key frame are skipped, and the B frames before it that depend on it.
 
     Yields:
-        Each frame's time stamp in its stream [s] (None where it has none), and the frame.
+        The frame's time stamp in its stream [s] (None if it has none), and the frame.
     """
     with av.open(str(path)) as container:
         stream = _video_stream(container, path)
         stream.thread_type = "AUTO"
-        leaning: list[av.VideoFrame] = []  # B frames that wait for the frame after them to turn out sound
+        pending: list[av.VideoFrame] = []  # B frames, until the frame that they depend on is decoded without damage
         broken = False
         for packet in _packets(container, stream):
             frames: list[av.VideoFrame | None] = []
@@ -201,23 +193,20 @@ def decode(path: Path, count: FilmCount) -> Iterator[tuple[float | None, av.Vide
                 frames.append(None)
             for frame in frames:
                 if frame is None or frame.is_corrupt or (broken and not frame.key_frame):
-                    count.damaged += 1 + len(leaning)
-                    leaning.clear()
+                    count.damaged += 1 + len(pending)
+                    pending.clear()
                     broken = True
                     continue
                 broken = False
-                leaning.append(frame)
+                pending.append(frame)
                 if frame.pict_type != PictureType.B:
-                    yield from ((sound.time, sound) for sound in leaning)
-                    leaning.clear()
-        yield from ((sound.time, sound) for sound in leaning)
+                    yield from ((intact.time, intact) for intact in pending)
+                    pending.clear()
+        yield from ((intact.time, intact) for intact in pending)
 
 
 def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet]:
-    """A stream's packets, and an empty one at the end, upon which a decoder hands out what it held back.
-
-    A file that ends in the middle of a packet ends the stream like any other.
-    """
+    """A stream's packets and a final empty packet, which flushes the decoder; a truncated file just ends earlier."""
     last: av.Packet | None = None
     with contextlib.suppress(av.error.FFmpegError):
         for last in container.demux(stream):
@@ -230,100 +219,96 @@ def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> 
         yield end
 
 
-def index_of(time: float | None, facts: FilmFacts, last: int) -> int:
-    """A decoded frame's index, by its time [s] among the film's, above `last` always; damaged frames leave gaps."""
+def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
+    """A decoded frame's index from its time [s], always above the `last` one; damaged frames leave gaps."""
     if time is None:
         return last + 1
-    right = min(int(np.searchsorted(facts.times, time)), len(facts.times) - 1)
+    right = min(int(np.searchsorted(timing.times, time)), len(timing.times) - 1)
     left = max(right - 1, 0)
-    nearest = left if time - facts.times[left] < facts.times[right] - time else right
+    nearest = left if time - timing.times[left] < timing.times[right] - time else right
     return max(nearest, last + 1)
 
 
-def slot_of(index: int, time: float, facts: FilmFacts, slots: int) -> int:
-    """The slot a frame falls in.
+def slot_of(index: int, time: float, timing: FilmTiming, slots: int) -> int:
+    """The slot of a frame.
 
-    With as many slots as frames, each frame has its own. Otherwise slots are equal in time, and half a frame interval
-    is added so that rounded time stamps never push a frame over a slot's edge.
+    With as many slots as frames, each frame has its own. Otherwise slots have equal durations; half a frame interval is
+    added so that rounding of time stamps never moves a frame across the border of a slot.
     """
-    if slots >= len(facts.times):
+    if slots >= len(timing.times):
         return index
-    return min(int((time + 0.5 * facts.interval) / facts.duration * slots), slots - 1)
+    return min(int((time + 0.5 * timing.interval) / timing.duration * slots), slots - 1)
 
 
-def slot_count(facts: FilmFacts, config: CaptureConfig) -> int:
-    """How many slots a film is cut into."""
-    wanted = config.frames or max(2, round(facts.duration * config.fps))
-    return min(wanted, config.max_frames, len(facts.times))
+def slot_count(timing: FilmTiming, config: CaptureConfig) -> int:
+    """Number of slots into which a film is divided."""
+    wanted = config.frames or max(2, round(timing.duration * config.fps))
+    return min(wanted, config.max_frames, len(timing.times))
 
 
-def within(times: NDArray[np.float64], parts: tuple[tuple[float, ...], ...]) -> NDArray[np.bool_]:
-    """Which times (n,) [s] lie in one of some parts, [from, to] each; all of them where there are no parts."""
-    if not parts:
+def in_segments(times: NDArray[np.float64], segments: tuple[tuple[float, ...], ...]) -> NDArray[np.bool_]:
+    """Mask of the times (n,) [s] inside any of the segments [from, to]; all true without segments."""
+    if not segments:
         return np.ones(len(times), bool)
-    # Half a millisecond, to which Matroska rounds its clock.
-    return np.any([(times >= start - 5e-4) & (times <= end + 5e-4) for start, end in parts], axis=0)
+    # Matroska rounds its time stamps to milliseconds, an error of at most half of one.
+    return np.any([(times >= start - 5e-4) & (times <= end + 5e-4) for start, end in segments], axis=0)
 
 
-def _cut(facts: FilmFacts, parts: tuple[tuple[float, ...], ...], path: Path) -> tuple[FilmFacts, NDArray[np.int64]]:
-    """A film's facts as if only some parts were there, and by frame of the film its place among those, −1 if cut out.
+def _keep_segments(
+    timing: FilmTiming, segments: tuple[tuple[float, ...], ...], path: Path
+) -> tuple[FilmTiming, NDArray[np.int64]]:
+    """The timing of the kept segments joined, and each film frame's position in them (−1 if cut out).
 
-    Raises:
-        InputError: fewer than two frames are in these parts.
+    Raises InputError: fewer than two frames are in the segments.
     """
-    used = within(facts.times, parts)
-    if parts and used.sum() < 2:
+    used = in_segments(timing.times, segments)
+    if segments and used.sum() < 2:
         raise InputError(
-            f"{path}: keep = {[list(part) for part in parts]} leaves {used.sum()} of {len(used)} frames (need 2); the "
-            f"film runs from 0 to {facts.times[-1]:.2f} s"
+            f"{path}: keep = {[list(part) for part in segments]} leaves {used.sum()} of {len(used)} frames (need 2); "
+            f"the film runs from 0 to {timing.times[-1]:.2f} s"
         )
-    place = np.where(used, np.cumsum(used) - 1, -1)
+    position = np.where(used, np.cumsum(used) - 1, -1)
     if used.all():
-        return facts, place
-    # The clock stops where a part ends: its last frame lasts one interval more.
-    step = np.where(np.diff(np.flatnonzero(used)) > 1, facts.interval, np.diff(facts.times[used]))
-    return FilmFacts(np.concatenate([[0.0], np.cumsum(step)]), facts.start, int(used.sum())), place
+        return timing, position
+    # The last frame of a segment lasts one frame interval.
+    step = np.where(np.diff(np.flatnonzero(used)) > 1, timing.interval, np.diff(timing.times[used]))
+    return FilmTiming(np.concatenate([[0.0], np.cumsum(step)]), timing.start, int(used.sum())), position
 
 
 def read_film(
     path: Path,
     config: CaptureConfig,
-    count: FilmCount,
+    count: FilmStatistics,
     mask_of: Callable[[int, int, int], Image | None],
-    parts: tuple[tuple[float, ...], ...] = (),
+    segments: tuple[tuple[float, ...], ...] = (),
 ) -> Iterator[FilmFrame]:
-    """Yields a film's chosen frames in order: the sharpest of each slot, less the duplicates of a standing camera.
+    """Yields a film's kept frames in order: the sharpest of each slot, without duplicates of a standing camera.
 
-    Args:
-        path: The film.
-        config: Slots, size and smallest motion.
-        count: Filled with what became of the frames.
-        mask_of: From a frame's index, kept width and kept height to its mask (0 = ignore), or None.
-        parts: Of the film that are used, [from, to] each [s]; empty = all of it.
+    `count` is filled while reading. `mask_of` maps a frame's index, kept width and kept height to its mask or None.
+    `segments` are [from, to] each [s]; empty for the whole film.
 
-    Raises:
-        InputError: nothing readable, fewer than two frames, or nothing but blank frames.
+    Raises InputError: unreadable, fewer than two frames, or only blank frames.
     """
-    facts = probe(path)
-    shown, place = _cut(facts, parts, path)
-    last = int(np.flatnonzero(place >= 0)[-1])
-    slots = slot_count(shown, config)
-    count.promised = max(facts.promised, len(facts.times)) if not parts else len(shown.times)
-    count.duration = shown.duration
+    timing = probe(path)
+    kept_timing, position = _keep_segments(timing, segments, path)
+    last = int(np.flatnonzero(position >= 0)[-1])
+    slots = slot_count(kept_timing, config)
+    count.declared = max(timing.declared, len(timing.times)) if not segments else len(kept_timing.times)
+    count.duration = kept_timing.duration
     kept_small: Image | None = None
     kept_any = False
 
     def keep(candidate: "_Candidate") -> FilmFrame | None:
         nonlocal kept_small, kept_any
-        whole = upright(candidate.frame)
-        count.size = (whole.shape[1], whole.shape[0])
-        image = fit(whole, config.max_size)
-        small = _flow_picture(image)
+        full = upright(candidate.frame)
+        count.size = (full.shape[1], full.shape[0])
+        image = downscaled(full, config.max_size)
+        small = _flow_image(image)
         mask = mask_of(candidate.index, image.shape[1], image.shape[0])
         small_mask = None
         if mask is not None:
             small_mask = np.asarray(cv2.resize(mask, small.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
-        if kept_small is not None and stands_still(kept_small, small, config.min_motion, small_mask):
+        if kept_small is not None and is_static(kept_small, small, config.min_motion, small_mask):
             count.duplicates += 1
             return None
         kept_small, kept_any = small, True
@@ -334,25 +319,25 @@ def read_film(
     index = -1
     size: tuple[int, int] | None = None
     for stamp, frame in decode(path, count):
-        index = index_of(None if stamp is None else stamp - facts.start, facts, index)
-        if parts and index > last:
+        index = frame_index(None if stamp is None else stamp - timing.start, timing, index)
+        if segments and index > last:
             break
-        if parts and place[index] < 0:
+        if segments and position[index] < 0:
             continue
         count.decoded += 1
-        time = float(facts.times[index]) if index < len(facts.times) else index * facts.interval
+        time = float(timing.times[index]) if index < len(timing.times) else index * timing.interval
         if size is not None and size != (frame.width, frame.height):
             raise InputError(
                 f"{path}: the picture changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} "
                 f"at frame {index}; cut the film there into two sources"
             )
         size = (frame.width, frame.height)
-        grey = _sharpness_picture(frame)
-        if float(grey[::2, ::2].std()) < _BLANK:
+        gray = _sharpness_image(frame)
+        if float(gray[::2, ::2].std()) < BLANK_STD:
             count.blank += 1
             continue
-        order, at = (int(place[index]), float(shown.times[place[index]])) if parts else (index, time)
-        candidate = _Candidate(slot_of(order, at, shown, slots), index, time, sharpness(grey), frame)
+        order, at = (int(position[index]), float(kept_timing.times[position[index]])) if segments else (index, time)
+        candidate = _Candidate(slot_of(order, at, kept_timing, slots), index, time, sharpness(gray), frame)
         if best is not None and candidate.slot != best.slot:
             if (kept := keep(best)) is not None:
                 yield kept
@@ -361,21 +346,24 @@ def read_film(
             best = candidate
     if best is not None and (kept := keep(best)) is not None:
         yield kept
-    _refuse_poor(path, count, kept_any)
+    _check_usable(path, count, kept_any)
 
 
-def damage_note(path: Path, count: FilmCount) -> str | None:
-    """A line for the user where a film is cut off or damaged in part, else None."""
-    if count.decoded >= _DAMAGED * count.promised and not count.damaged:
+def damage_note(path: Path, count: FilmStatistics) -> str | None:
+    """A note for the user if a film is truncated or partly damaged, else None."""
+    if count.decoded >= _MIN_DECODED_FRACTION * count.declared and not count.damaged:
         return None
     return (
-        f"{path.name}: damaged; {count.decoded} of {count.promised} frames could be decoded and only those are used. "
+        f"{path.name}: damaged; {count.decoded} of {count.declared} frames could be decoded and only those are used. "
         "Copy it again from the camera if more was filmed"
     )
 
 
-def fit(image: Image, max_size: int) -> Image:
-    """Scales an image down so that its longer side is at most `max_size` [px]."""
+# ---- size and orientation
+
+
+def downscaled(image: Image, max_size: int) -> Image:
+    """Scales an image down to a longer side of at most `max_size` [px]."""
     height, width = image.shape[:2]
     new = fitted_size(width, height, max_size)
     return image if new == (width, height) else np.asarray(resize(image, *new), np.uint8)
@@ -388,14 +376,14 @@ def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
 
 
 def upright(frame: av.VideoFrame) -> Image:
-    """A frame as RGB, turned and mirrored as its display matrix says, to a multiple of 90°."""
+    """A frame as RGB, rotated and mirrored by its display matrix in multiples of 90°."""
     image = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     matrix = display_matrix(frame)
-    return image if matrix is None else oriented(image, matrix)
+    return image if matrix is None else apply_display_matrix(image, matrix)
 
 
 def display_matrix(frame: av.VideoFrame) -> NDArray[np.float64] | None:
-    """The 2×2 part of a frame's display matrix (pixel row vector × matrix = shown position), or None."""
+    """The 2×2 part of a frame's display matrix (pixel row vector × matrix = displayed position), or None."""
     side = frame.side_data.get(SideData.DISPLAYMATRIX)  # type: ignore[call-overload]
     if side is None:
         return None
@@ -403,10 +391,10 @@ def display_matrix(frame: av.VideoFrame) -> NDArray[np.float64] | None:
     return matrix if np.abs(np.linalg.det(matrix)) > 1e-3 else None
 
 
-def oriented(image: Image, matrix: NDArray[np.float64]) -> Image:
-    """An image moved by a display matrix: x' = a x + c y, y' = b x + d y with matrix [[a, b], [c, d]]."""
+def apply_display_matrix(image: Image, matrix: NDArray[np.float64]) -> Image:
+    """Applies a display matrix [[a, b], [c, d]] to an image: x' = a x + c y, y' = b x + d y."""
     (a, b), (c, d) = matrix
-    if abs(a) < abs(c):  # x' comes from y: a quarter turn
+    if abs(a) < abs(c):  # x' depends on y: a quarter turn
         image, sign_x, sign_y = image.swapaxes(0, 1), c, b
     else:
         sign_x, sign_y = a, d
@@ -424,17 +412,17 @@ class _Candidate:
     frame: av.VideoFrame
 
 
-def _sharpness_picture(frame: av.VideoFrame) -> Image:
+def _sharpness_image(frame: av.VideoFrame) -> Image:
     width = min(SHARPNESS_WIDTH, frame.width)
     height = max(1, round(frame.height * width / frame.width))
-    if frame.format.name in _LUMA_FIRST:  # the brightness is there already: no conversion
+    if frame.format.name in _LUMA_FIRST:  # the first plane is the brightness: no conversion needed
         plane = frame.planes[0]
         luma = np.frombuffer(bytes(plane), np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
         return np.asarray(resize(luma, width, height), np.uint8)
     return np.asarray(frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray(), np.uint8)
 
 
-def _flow_picture(image: Image) -> Image:
+def _flow_image(image: Image) -> Image:
     height, width = image.shape[:2]
     small = np.asarray(resize(image, FLOW_WIDTH, max(1, round(height * FLOW_WIDTH / width))), np.uint8)
     return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -442,7 +430,7 @@ def _flow_picture(image: Image) -> Image:
 
 def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
     if not container.streams.video:
-        raise InputError(f"{path}: no picture in this file; give a film, an image folder or a posed image set")
+        raise InputError(f"{path}: no video stream in this file; give a film, an image folder or a posed image set")
     return container.streams.video[0]
 
 
@@ -456,11 +444,13 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     )
 
 
-def _refuse_poor(path: Path, count: FilmCount, kept_any: bool) -> None:
+def _check_usable(path: Path, count: FilmStatistics, kept_any: bool) -> None:
     if count.decoded < 2:
         raise InputError(
-            f"{path}: {count.decoded} of {count.promised} frames could be decoded (need 2); "
+            f"{path}: {count.decoded} of {count.declared} frames could be decoded (need 2); "
             "copy it again from the camera or re-encode it"
         )
     if not kept_any:
-        raise InputError(f"{path}: all {count.blank} frames are blank (one colour); film with light and without a cap")
+        raise InputError(
+            f"{path}: all {count.blank} frames are blank (one color); film with enough light and without a lens cap"
+        )

@@ -1,10 +1,9 @@
-"""Runs structure from motion in a process of its own.
+"""Runs structure from motion in a separate process, because some failures inside COLMAP abort the whole process.
 
-Some failures inside COLMAP abort the whole process instead of raising. The *parent* (the stage) starts a *worker*
-(`python -m twin.capture.solver JOB`), reads its news line by line and turns an abort into an error that names a cure.
-
-A line of news on the worker's standard output is JSON: {"bar": name, "total": n} starts a bar, {"step": n} moves it,
-{"say": text} speaks, {"error": text} is bad input. COLMAP's own log comes on standard error and goes to a file.
+The parent (a stage) starts the *worker*, reads its messages line by line, shows their progress and turns an abort into
+an error with a cure. A message is one line of JSON on the worker's standard output: {"bar": name, "total": n} starts a
+progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports bad input. COLMAP's own log
+comes on standard error and goes to a file.
 """
 
 import contextlib
@@ -21,7 +20,7 @@ from typing import IO, Any
 
 from twin import runtime
 from twin.errors import InputError
-from twin.runtime import environment
+from twin.runtime import child_environment
 
 _LOG = "colmap.log"
 BAD_INPUT = 2
@@ -32,7 +31,7 @@ _CURES = {
     "SIGTERM": "stopped from outside: build again",
 }
 _DISK_FULL = ("no space left on device", "disk is full", "sqlite_full")
-_MAPPING_STEPS = (
+_MAPPING_LOG_STEPS = (
     "Rotation averaging done",
     "Track establishment done",
     "Global positioning done",
@@ -42,19 +41,19 @@ _MAPPING_STEPS = (
     "Iterative bundle adjustment done",
     "refinement done",
 )
-"""Parts of COLMAP's log lines after which the mapping bar moves."""
+"""Parts of COLMAP's log lines that advance the mapping bar."""
 
 
-def tell(**news: Any) -> None:
-    """The worker's news to its parent."""
-    print(json.dumps(news), flush=True)
+def send_message(**message: Any) -> None:
+    """Sends a message from the worker to its parent."""
+    print(json.dumps(message), flush=True)
 
 
 def run_worker(job: dict[str, Any], folder: Path) -> None:
-    """Runs one job to its end under progress bars. The worker leaves its result in `folder`.
+    """Runs one job with progress bars. The worker writes its result to `folder`.
 
     Raises:
-        InputError: the worker found the input bad, or died of a signal inside COLMAP.
+        InputError: the worker reported bad input or died of a signal inside COLMAP.
         OSError: the disk is full.
         RuntimeError: the worker failed for any other reason (a bug).
     """
@@ -63,24 +62,23 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     log_file = folder / _LOG
     process = subprocess.Popen(
         [sys.executable, "-m", "twin.capture.solver", str(job_file)],
-        stdin=subprocess.PIPE,  # closed by our death, however it comes; the worker then ends, too
+        stdin=subprocess.PIPE,  # closes when this process dies, whatever the cause; the worker then ends, too
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         errors="replace",
-        process_group=0,  # a signal to all of a terminal's is for us
-        env=environment(),
+        process_group=0,  # signals from the terminal reach only this process
+        env=child_environment(),
     )
     assert process.stdout and process.stderr
-    bars = _Bars()
-    last: deque[str] = deque(maxlen=30)
-    reader = threading.Thread(target=_keep_log, args=(process.stderr, log_file, bars, last), daemon=True)
+    bars = _ProgressBars()
+    recent: deque[str] = deque(maxlen=30)
+    reader = threading.Thread(target=_keep_log, args=(process.stderr, log_file, bars, recent), daemon=True)
     reader.start()
     error: str | None = None
     try:
         for line in process.stdout:
-            news = bars.show(line)
-            error = news.get("error", error)
+            error = bars.show(line).get("error", error)
         code = process.wait()
     finally:
         if process.poll() is None:
@@ -90,7 +88,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
         bars.close()
     if code == 0:
         return
-    tail = " | ".join(last)[-1500:]
+    tail = " | ".join(recent)[-1500:]
     if code == BAD_INPUT and error:
         raise InputError(error)
     if any(words in tail.lower() for words in _DISK_FULL):
@@ -103,8 +101,8 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     raise RuntimeError(f"structure from motion failed with exit status {code}: {tail}")
 
 
-class _Bars:
-    """One bar at a time, moved by the worker's news and by COLMAP's log; two threads use it."""
+class _ProgressBars:
+    """The current progress bar, advanced by the worker's messages and by COLMAP's log; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -112,26 +110,29 @@ class _Bars:
         self._mapping = False
 
     def show(self, line: str) -> dict[str, Any]:
+        """Parses and shows a message of the worker; returns {} for a line that is none."""
         try:
-            news = json.loads(line)
+            message = json.loads(line)
         except json.JSONDecodeError:
             return {}
-        if not isinstance(news, dict):
+        if not isinstance(message, dict):
             return {}
         with self._lock:
-            if "bar" in news:
+            if "bar" in message:
                 self._end()
-                self._mapping = news["bar"] == "mapping"
-                self._bar = runtime.bar(news["bar"], news["total"] or len(_MAPPING_STEPS))
-            if "step" in news and self._bar is not None:
-                self._bar.update(news["step"])
-            if "say" in news:
-                runtime.say(news["say"])
-        return news
+                self._mapping = message["bar"] == "mapping"
+                self._bar = runtime.bar(message["bar"], message["total"] or len(_MAPPING_LOG_STEPS))
+            if "step" in message and self._bar is not None:
+                self._bar.update(message["step"])
+            if "say" in message:
+                runtime.log_line(message["say"])
+        return message
 
     def log(self, line: str) -> None:
         with self._lock:
-            finished = self._mapping and "fixed-rotation" not in line and any(part in line for part in _MAPPING_STEPS)
+            finished = (
+                self._mapping and "fixed-rotation" not in line and any(part in line for part in _MAPPING_LOG_STEPS)
+            )
             if finished and self._bar is not None and self._bar.n < self._bar.total:
                 self._bar.update(1)
 
@@ -145,10 +146,10 @@ class _Bars:
             self._bar = None
 
 
-def _keep_log(stream: IO[str], path: Path, bars: _Bars, last: deque[str]) -> None:
+def _keep_log(stream: IO[str], path: Path, bars: _ProgressBars, recent: deque[str]) -> None:
     with path.open("wb", buffering=0) as log:
         for line in stream:
-            last.append(line.rstrip("\n"))
+            recent.append(line.rstrip("\n"))
             bars.log(line)
-            with contextlib.suppress(OSError):  # a full disk, on which the worker fails by itself
+            with contextlib.suppress(OSError):  # on a full disk the worker fails by itself
                 log.write(line.encode())

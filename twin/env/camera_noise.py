@@ -1,7 +1,6 @@
-"""What a real camera adds to a picture: it shakes, its exposure drifts, and what moves under an open shutter smears.
+"""Imperfections of a real camera: vibration, drifting exposure and motion blur. All are off by default.
 
-All are off by default; the robot's own rattling on the ground is in the physics and is no part of this. Delays of
-pictures and commands are the environment's.
+The robot's motion on the ground is part of the physics; delays of pictures and commands are part of the environment.
 """
 
 from dataclasses import dataclass
@@ -12,28 +11,28 @@ import numpy as np
 from twin.geometry.poses import inverse_pose
 from twin.types import Array, Array32
 
-_SHAKE_TIME = 0.05  # [s] over which vibration forgets where it was
-_DRIFT_TIME = 5.0  # [s] over which exposure does
-_MOST_SMEAR = 0.5  # of the time between two pictures that a shutter can be open
-_KNEE = 0.75  # film colours above roll off towards 1
+_VIBRATION_TIME = 0.05  # [s] correlation time of the vibration
+_DRIFT_TIME = 5.0  # [s] correlation time of the exposure
+_MAX_SHUTTER = 0.5  # fraction of the time between two pictures that the shutter can be open
+_KNEE = 0.75  # film colors above it are compressed towards 1
 
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """How imperfect a camera is."""
+    """Strength of a camera's imperfections."""
 
     vibration: float = 0.0
     """Standard deviation of the camera's direction about each of its axes [°]."""
     exposure: float = 0.0
-    """Standard deviation of the logarithm of the exposure, drifting over seconds."""
+    """Standard deviation of the logarithm of the exposure, which drifts over seconds."""
     shutter: float = 0.0
     """Time the shutter is open [s]."""
     blur_samples: int = 5
-    """Pictures that a smeared one is the mean of."""
+    """Number of pictures that are averaged for motion blur."""
 
 
 class CameraNoise:
-    """One camera in one episode; the same seed and the same times give the same effects."""
+    """Imperfections of one camera in one episode; the same seed and the same times give the same result."""
 
     def __init__(self, options: CameraOptions, rng: np.random.Generator):
         self._options, self._rng = options, rng
@@ -41,12 +40,12 @@ class CameraNoise:
         self._tilt, self._drift = np.zeros(3), 0.0
         self._last: tuple[float, Array] | None = None
 
-    def shaken(self, camera_to_world: Array, time: float) -> Array:
-        """The pose that the camera really has at a time [s] of the episode, shape (4, 4). Times must not go back."""
+    def perturb_pose(self, camera_to_world: Array, time: float) -> Array:
+        """The pose with vibration at a time [s] of the episode, shape (4, 4). Times must not decrease."""
         step = np.inf if self._time is None else max(time - self._time, 0.0)
         self._time = time
-        # Ornstein-Uhlenbeck, exact for any step.
-        keep = np.exp(-step / np.array([_SHAKE_TIME, _DRIFT_TIME]))
+        # Ornstein-Uhlenbeck process, exact for any step.
+        keep = np.exp(-step / np.array([_VIBRATION_TIME, _DRIFT_TIME]))
         fresh = np.sqrt(1.0 - keep**2)
         self._tilt = keep[0] * self._tilt + fresh[0] * self._rng.normal(size=3)
         self._drift = float(keep[1] * self._drift + fresh[1] * self._rng.normal())
@@ -57,34 +56,32 @@ class CameraNoise:
         out[:3, :3] = out[:3, :3] @ turn
         return out
 
-    def exposed(
-        self, rgb: Array32, depth: Array32, pose: Array, time: float, rays: Array, intrinsics: Array
-    ) -> Array32:
-        """The picture as exposed and smeared.
+    def apply(self, rgb: Array32, depth: Array32, pose: Array, time: float, rays: Array, intrinsics: Array) -> Array32:
+        """The picture with motion blur and exposure drift.
 
         Args:
-            rgb: Sharp, shape (height, width, 3).
+            rgb: Sharp picture, shape (height, width, 3).
             depth: z-depth [m], shape (height, width).
-            pose: camera_to_world, as `shaken` gave it, shape (4, 4).
-            time: [s].
-            rays: Of the pixels, in the camera, with z = 1, shape (height, width, 3).
+            pose: camera_to_world as `perturb_pose` returned it, shape (4, 4).
+            time: Time of the episode [s].
+            rays: Rays of the pixels in the camera frame, with z = 1, shape (height, width, 3).
             intrinsics: fx, fy, cx, cy [px], shape (4,).
         """
         last, self._last = self._last, (time, pose)
         if self._options.shutter > 0.0 and last is not None and time > last[0]:
-            share = min(self._options.shutter / (time - last[0]), _MOST_SMEAR)
-            rgb = smeared(rgb, depth, pose, last[1], share, rays, intrinsics, self._options.blur_samples)
+            share = min(self._options.shutter / (time - last[0]), _MAX_SHUTTER)
+            rgb = motion_blur(rgb, depth, pose, last[1], share, rays, intrinsics, self._options.blur_samples)
         if self._options.exposure > 0.0:
-            rgb = rolled_off(rgb * np.float32(np.exp(self._options.exposure * self._drift)))
+            rgb = soft_clip(rgb * np.float32(np.exp(self._options.exposure * self._drift)))
         return rgb
 
 
-def smeared(
+def motion_blur(
     rgb: Array32, depth: Array32, pose: Array, before: Array, share: float, rays: Array, intrinsics: Array, samples: int
 ) -> Array32:
-    """Mean of a picture over the last `share` of the way from the pose `before` to its own; the world stands still.
+    """Mean of a picture over the last `share` of the motion from the pose `before` to `pose`, in a static world.
 
-    Shapes and units as in `CameraEffects.exposed`.
+    Shapes and units as in `CameraNoise.apply`.
     """
     to_before = inverse_pose(before) @ pose
     points = (rays * depth[..., None]) @ to_before[:3, :3].T + to_before[:3, 3]
@@ -95,13 +92,13 @@ def smeared(
     flow = np.where(points[..., 2:] > 0.0, there - here, 0.0)
     out = np.zeros_like(rgb)
     for back in np.linspace(0.0, share, samples):
-        # OpenCV counts pixels from the middle of the first one.
+        # OpenCV counts pixels from the center of the first one.
         at = (here + back * flow - 0.5).astype(np.float32)
         out += cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out / np.float32(samples)
 
 
-def rolled_off(rgb: Array32) -> Array32:
-    """Film colours in [0, 1] of what may be brighter: a shoulder instead of a cut."""
+def soft_clip(rgb: Array32) -> Array32:
+    """Film colors in [0, 1], with a shoulder above `_KNEE` instead of a hard cut."""
     over = np.maximum(rgb - _KNEE, 0.0)
     return np.minimum(rgb, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

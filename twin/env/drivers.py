@@ -1,14 +1,12 @@
-"""Who drives: what an episode's observations are turned into actions by.
+"""Drivers: they convert an episode's observations to actions.
 
-A *driver* is asked with the environment and the newest `dm_env.TimeStep`, and answers with an action that the
-environment's `action_spec` allows. Drivers that are told the poses show what a task is worth; a policy is told
-pictures.
+A *driver* receives the environment and the newest `dm_env.TimeStep`, and returns an action within the environment's
+`action_spec`. Drivers that use poses serve as references; a policy uses images only.
 """
 
 import importlib
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -16,213 +14,37 @@ import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.controller import CONTROL_PERIOD
-from twin.env.options import STEERING, control
-from twin.env.physics import HuskyPhysics
-from twin.env.task import checked_actions
-from twin.errors import InputError, shown
-from twin.mjcf.world import World, arc_lengths, heading_error, nearest, point_at
+from twin.env.dm import control
+from twin.env.options import STEERING
+from twin.env.route_follower import PurePursuit
+from twin.env.task import check_actions
+from twin.errors import InputError, short_repr
 from twin.types import Array
 
-# ---- A scripted driver that follows a route from poses alone: the first proof that a scene can be driven.
-#
-# Pure pursuit (Coulter 1992): steer on the circle through a point of the route some way ahead. A skid-steered robot
-# turns faster or slower than commanded, by a factor that depends on ground and load, so the driver also compares the yaw
-# rate it asked for with what the poses show, and corrects its commands by the ratio.
-
-
-GOAL_RADIUS = 1.0  # [m]
-
-_LOOK_AHEAD = 1.0  # [m] on the route
-_GAIN_RATE = 0.15  # share of the observed ratio taken over per control step
-_GAIN_RANGE = (0.5, 2.5)
-_GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; below this the ratio is noise
-_SEARCH = (1.0, 3.0)  # [m] behind and ahead of the last foot point
-
-
-@dataclass(frozen=True)
-class FollowedDrive:
-    """A recorded drive of k instants, one per control step of 0.1 s, the first at rest at the start."""
-
-    times: Array
-    """[s], shape (k,)."""
-    base_to_world: Array
-    """Shape (k, 4, 4)."""
-    camera_to_world: Array
-    """Of the front camera, OpenCV axes, shape (k, 4, 4)."""
-    qpos: Array
-    """MuJoCo's positions, shape (k, nq), so that the drive can be drawn again."""
-    commands: Array
-    """v [m/s], ω [rad/s] given at each instant (the last row is zero), shape (k, 2)."""
-    cross_track: Array
-    """Distance from the route, left positive [m], shape (k,)."""
-    progress: Array
-    """Arc length of the nearest point of the route [m], shape (k,)."""
-    touched: tuple[str, ...]
-    """Names of what was touched besides the ground, sorted."""
-    outcome: str
-    """goal, touched, off_corridor or timeout."""
-
-    @property
-    def reached_goal(self) -> bool:
-        return self.outcome == "goal"
-
-    @property
-    def max_cross_track(self) -> float:
-        """[m]"""
-        return float(np.abs(self.cross_track).max())
-
-    @property
-    def mean_cross_track(self) -> float:
-        """[m]"""
-        return float(np.abs(self.cross_track).mean())
-
-
-def pursuit_curvature(pose: Array, target: Array) -> float:
-    """Curvature [1/m] of the circle that leaves `pose` (x, y, yaw) along its heading and passes `target` (x, y)."""
-    ahead = target - pose[:2]
-    lateral = np.cos(pose[2]) * ahead[1] - np.sin(pose[2]) * ahead[0]
-    return float(2.0 * lateral / max(ahead @ ahead, 1e-9))
-
-
-class PurePursuit:
-    """The driver: from one pose after the other to the commands that follow the route."""
-
-    def __init__(self, route: Array, speed: float, fastest_turn: float, start: float = 0.0) -> None:
-        """
-        Args:
-            route: Shape (m, ≥2) [m].
-            speed: [m/s]
-            fastest_turn: Largest yaw rate [rad/s].
-            start: Arc length near which it begins [m].
-        """
-        self._route, self._speed, self._fastest = route[:, :2], speed, fastest_turn
-        self._length = float(arc_lengths(route)[-1])
-        self.s = start
-        """Arc length reached so far [m]."""
-        self._gain = 1.0
-        self._last: tuple[Array, tuple[float, float]] | None = None
-
-    def look(self, pose: Array) -> tuple[float, float]:
-        """Arc length of the foot point and cross-track error [m] of a pose (x, y, yaw)."""
-        foot, error = nearest(self._route, pose[:2], (self.s - _SEARCH[0], self.s + _SEARCH[1]))
-        self.s = max(self.s, float(foot))
-        return float(foot), float(error)
-
-    def command(self, pose: Array) -> tuple[float, float]:
-        """v [m/s] and ω [rad/s] for the control step that begins at a pose (x, y, yaw)."""
-        if self._last is not None:
-            self._gain = _updated_gain(self._gain, self._last[0], pose, self._last[1])
-        target = _target(self._route, self.s + _LOOK_AHEAD, self._length)
-        wanted = np.clip(self._speed * pursuit_curvature(pose, target), -self._fastest, self._fastest)
-        command = (self._speed, float(np.clip(self._gain * wanted, -self._fastest, self._fastest)))
-        self._last = (pose, command)
-        return command
-
-
-def follow(world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: float | None = None) -> FollowedDrive:
-    """Drives from the start along the route until the goal, a touch, the corridor's edge or the time limit.
-
-    Args:
-        world: Route, goal and corridor.
-        physics: Of the world's model; it is reset.
-        speed: [m/s]; the robot itself does at most 1 m/s at a wheel, so less in a turn.
-        timeout: [s]; by default what three times the route takes, and 10 s.
-    """
-    speed = min(speed, physics.params.max_speed)
-    length = float(arc_lengths(world.route)[-1])
-    timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
-    physics.reset()
-
-    times, bases, cameras, positions, commands, errors, feet = [], [], [], [], [], [], []
-    touched: set[str] = set()
-    driver = PurePursuit(world.route, speed, physics.params.max_yaw_rate)
-    while True:
-        pose = physics.planar_pose
-        foot, error = driver.look(pose)
-        times.append(physics.time)
-        bases.append(physics.base_to_world)
-        cameras.append(physics.camera_to_world)
-        positions.append(physics.data.qpos.copy())
-        errors.append(error)
-        feet.append(foot)
-        outcome = _outcome(world, pose, driver.s, length, abs(error), touched, physics.time > timeout)
-        if outcome:
-            commands.append((0.0, 0.0))
-            break
-        command = driver.command(pose)
-        commands.append(command)
-        physics.command(*command)
-        physics.step()
-        touched |= set(physics.touched)
-    return FollowedDrive(
-        times=np.array(times),
-        base_to_world=np.array(bases),
-        camera_to_world=np.array(cameras),
-        qpos=np.array(positions),
-        commands=np.array(commands),
-        cross_track=np.array(errors),
-        progress=np.array(feet),
-        touched=tuple(sorted(touched)),
-        outcome=outcome,
-    )
-
-
-def _outcome(world: World, pose: Array, s: float, length: float, error: float, touched: set[str], late: bool) -> str:
-    """Why the drive ends here; empty while it goes on."""
-    if touched:
-        return "touched"
-    # A route that passes its own goal early is not done there.
-    if np.linalg.norm(pose[:2] - world.goal[:2]) < GOAL_RADIUS and s > length - 2 * GOAL_RADIUS:
-        return "goal"
-    if error > world.half_width:
-        return "off_corridor"
-    return "timeout" if late else ""
-
-
-def _target(route: Array, s: float, length: float) -> Array:
-    """The point of the route at s [m]; past its end the route goes on straight."""
-    if s <= length:
-        return point_at(route, s)
-    direction = route[-1] - point_at(route, length - 1.0)
-    return route[-1] + direction / max(float(np.linalg.norm(direction)), 1e-9) * (s - length)
-
-
-def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
-    """Follows the ratio of path curvature commanded to achieved, which for skid steering is not 1."""
-    turned = float(heading_error(pose[2], previous[2])) / CONTROL_PERIOD
-    moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
-    v, yaw_rate = command
-    if abs(yaw_rate) < _GAIN_MIN_YAW_RATE or abs(turned) < _GAIN_MIN_YAW_RATE or yaw_rate * turned < 0 or moved < 0.2:
-        return gain
-    ratio = (yaw_rate / v) / (turned / moved)
-    return float(np.clip(gain + _GAIN_RATE * (ratio - gain), *_GAIN_RANGE))
-
-
 Policy = Callable[[NDArray[np.uint8]], NDArray]
-"""Pictures (3 · stack, height, width), the newest three channels last → numbers in [-1, 1], one per action."""
+"""Maps images (3 · stack, height, width), the newest three channels last, to one number in [-1, 1] per action."""
 
 
 class Driver(Protocol):
-    """Asked once per control step; `step.first()` says that an episode begins."""
+    """Called once per control step; `step.first()` is true at the start of an episode."""
 
     def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array: ...
 
 
 class RouteDriver:
-    """Follows the route by its poses (`follower.Pursuit`), at the environment's speed."""
+    """Follows the route by `PurePursuit` from poses, at the environment's speed."""
 
     def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
         task, pose = environment.task, environment.physics.planar_pose
         if step.first():
-            self._pursuit = PurePursuit(task.world.route, task.options.speed, task.options.yaw_rate, task.stretch.start)
-        self._pursuit.look(pose)
+            self._pursuit = PurePursuit(task.world.route, task.options.speed, task.options.yaw_rate, task.segment.start)
+        self._pursuit.update(pose)
         v, yaw_rate = self._pursuit.command(pose)
         return np.array([yaw_rate]) if task.options.action == STEERING else np.array([v, yaw_rate])
 
 
 class BlindDriver:
-    """Straight on at full speed, whatever it sees."""
+    """Drives straight at full speed, regardless of the images."""
 
     def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
         spec = environment.action_spec()
@@ -230,30 +52,30 @@ class BlindDriver:
 
 
 class PolicyDriver:
-    """Lets a policy drive."""
+    """Drives by a policy."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
 
     def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
         pixels = step.observation["pixels"]
-        stack, height, width, three = pixels.shape
-        answer = self._policy(pixels.transpose(0, 3, 1, 2).reshape(stack * three, height, width))
+        stack, height, width, channels = pixels.shape
+        answer = self._policy(pixels.transpose(0, 3, 1, 2).reshape(stack * channels, height, width))
         spec = environment.action_spec()
         try:
-            action = checked_actions(answer, spec.shape)
+            action = check_actions(answer, spec.shape)
         except ValueError:
             raise InputError(
-                f"the policy answered {shown(answer)}; expected {spec.shape[0]} numbers in [-1, 1]"
+                f"the policy returned {short_repr(answer)}; expected {spec.shape[0]} numbers in [-1, 1]"
             ) from None
         return spec.minimum + (np.clip(action, -1.0, 1.0) + 1.0) / 2.0 * (spec.maximum - spec.minimum)
 
 
 def find_callable(name: str) -> Policy:
-    """The Python callable `module:function`; modules of the working folder are found.
+    """Imports the callable `module:function`; the search path includes the working folder.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: the import failed, or it is not callable.
     """
     module, _, function = name.partition(":")
     if not (module and function):
@@ -262,7 +84,7 @@ def find_callable(name: str) -> Policy:
         sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), function)
-    except (Exception, SystemExit) as error:  # whatever the user's own code raises when it is imported
+    except (Exception, SystemExit) as error:  # importing user code may raise anything
         raise InputError(f"policy {name!r}: {type(error).__name__}: {error}") from error
     if not callable(found):
         raise InputError(f"policy {name!r}: {found!r} cannot be called; expected a function of pixels")

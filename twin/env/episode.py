@@ -1,4 +1,4 @@
-"""A recorded episode: what was done, what became of it, and everything needed to see it again."""
+"""A recorded episode: actions, results, and the data for rendering it again."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -9,13 +9,13 @@ import dm_env
 import numpy as np
 
 from twin.config import ObstacleConfig
-from twin.config_file import parse
+from twin.config_file import parse_table
+from twin.env.dm import control
 from twin.env.drivers import Driver
-from twin.env.options import control
 from twin.files import read_json, write_json
 from twin.types import Array
 
-_ARRAYS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed", "cross_track", "progress", "trust")
+_ARRAY_FIELDS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed", "cross_track", "progress", "trust")
 
 
 @dataclass(frozen=True)
@@ -29,26 +29,26 @@ class Episode:
     qpos: Array
     """MuJoCo's positions, shape (k, nq)."""
     actions: Array
-    """Taken at each instant, in the units of the action spec; the last row is zero. Shape (k, actions)."""
+    """Action at each instant in the units of the action spec; the last row is zero. Shape (k, actions)."""
     rewards: Array
-    """For having come to each instant; the first is zero. Shape (k,)."""
+    """Reward of the step that ended at each instant; the first is zero. Shape (k,)."""
     speed: Array
     """[m/s], shape (k,)."""
     cross_track: Array
-    """Left positive [m], shape (k,)."""
+    """Distance from the route, left positive [m], shape (k,)."""
     progress: Array
-    """[m], shape (k,)."""
+    """Distance along the route segment [m], shape (k,)."""
     trust: Array
-    """Of the picture at each instant, in [0, 1]; nan without pictures. Shape (k,)."""
+    """Trust in the image at each instant, in [0, 1]; nan without images. Shape (k,)."""
     cause: str
-    """Why it ended; empty if it was cut off."""
+    """One of `CAUSES`; empty if the episode was cut off."""
     touched: tuple[str, ...]
-    """What the robot touched at its end."""
+    """Names of the geoms touched in the last step."""
     task: str
     lighting: str
-    """Empty without pictures."""
+    """Empty without images."""
     seed: int
-    """Of the episode."""
+    """The episode's own seed."""
     randomisation: dict[str, Any]
     obstacles: tuple[ObstacleConfig, ...]
 
@@ -59,40 +59,41 @@ class Episode:
     def save(self, folder: Path) -> None:
         """Writes `episode.npz` and `episode.json`."""
         folder.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(folder / "episode.npz", **{name: getattr(self, name) for name in _ARRAYS})
-        head = {k: v for k, v in asdict(self).items() if k not in _ARRAYS}
-        write_json(folder / "episode.json", head)
+        np.savez_compressed(folder / "episode.npz", **{name: getattr(self, name) for name in _ARRAY_FIELDS})
+        write_json(folder / "episode.json", {k: v for k, v in asdict(self).items() if k not in _ARRAY_FIELDS})
 
     @staticmethod
     def load(folder: Path) -> "Episode":
         head = read_json(folder / "episode.json")
         head["touched"] = tuple(head["touched"])
-        head["obstacles"] = tuple(parse(ObstacleConfig, one, str(folder / "episode.json")) for one in head["obstacles"])
+        head["obstacles"] = tuple(
+            parse_table(ObstacleConfig, one, str(folder / "episode.json")) for one in head["obstacles"]
+        )
         with np.load(folder / "episode.npz", allow_pickle=False) as data:
-            return Episode(**{name: data[name] for name in _ARRAYS}, **head)
+            return Episode(**{name: data[name] for name in _ARRAY_FIELDS}, **head)
 
 
-def record(
+def record_episode(
     environment: control.Environment,
     driver: Driver,
-    watch: Callable[[dm_env.TimeStep], None] | None = None,
-    most: int | None = None,
+    on_step: Callable[[dm_env.TimeStep], None] | None = None,
+    max_steps: int | None = None,
 ) -> Episode:
     """Drives one episode.
 
     Args:
         environment: See `twin.load`.
-        driver: Who drives.
-        watch: Is shown every time step.
-        most: Control steps after which it is cut off.
+        driver: Chooses the actions.
+        on_step: Called with every time step.
+        max_steps: Control steps after which the episode is cut off; None: no limit.
     """
     task, physics, pixels = environment.task, environment.physics, getattr(environment, "pixels", None)
     rows: list[tuple] = []
     actions: list[Array] = []
     step, info = environment.reset(), {"trust": np.nan, "lighting": ""}
     while True:
-        if watch:
-            watch(step)
+        if on_step:
+            on_step(step)
         if pixels:
             info = pixels.info(0)
         position = np.array(physics.data.qpos)
@@ -102,7 +103,7 @@ def record(
                 *(task.cross_track, task.progress, info["trust"]),
             )
         )
-        if step.last() or len(actions) == most:
+        if step.last() or len(actions) == max_steps:
             break
         actions.append(np.asarray(driver(environment, step), float))
         step = environment.step(actions[-1])
@@ -119,9 +120,9 @@ def record(
         trust=trust,
         cause=task.cause,
         touched=physics.touched,
-        task=task.stretch.name,
+        task=task.segment.name,
         lighting=str(info["lighting"]),
         seed=task.episode_seed,
-        randomisation=task.draw.record(),
+        randomisation=task.sample.record(),
         obstacles=task.obstacles,
     )

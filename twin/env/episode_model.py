@@ -1,8 +1,8 @@
-"""What of a scene's MJCF an episode needs: the ground, the robot, and the solid parts the robot can get at.
+"""The model of an episode: ground, robot, and the solid parts of the scene within the robot's reach.
 
-An episode ends when the robot leaves the *corridor*, so parts beyond its *reach* never touch it; leaving them out
-changes no number of the physics and saves a fifth of its time and most of its memory. The visual mesh goes, too, unless
-MuJoCo itself is to draw the scene.
+An episode ends when the robot leaves the *corridor*, so parts beyond its reach are never touched. Removing them changes
+no result and saves a fifth of the physics' time and most of its memory. The visual mesh is removed as well, unless
+MuJoCo itself renders the scene.
 """
 
 from pathlib import Path
@@ -13,26 +13,26 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.mjcf.husky import add_dry
+from twin.mjcf.husky import disable_fluid_drag
 from twin.mjcf.world import World, point_at
 from twin.types import Array
 
 PAYLOAD = "payload"
-"""Body on the top plate, without mass until an episode loads it."""
+"""Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
-_REACH = 1.5  # [m] beyond the corridor's edge: the robot's half length, and what it drives in a control step
+_REACH = 1.5  # [m] beyond the corridor's edge: the robot's half length plus its motion in a control step
 _ROUTE_STEP = 0.1  # [m]
 
 
-def episode_spec(world: World, start: float, end: float, half_width: float, looks: bool = False) -> mujoco.MjSpec:
-    """The scene for episodes between two arc lengths of its route.
+def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
+    """Returns the model of episodes between two arc lengths of a scene's route.
 
     Args:
         world: The scene.
-        start: Arc length from which is driven [m].
-        end: Arc length to which is driven [m].
-        half_width: Of the corridor [m].
-        looks: Keep what only pictures made by MuJoCo need: visual mesh and textures.
+        start: Arc length of the start [m].
+        end: Arc length of the end [m].
+        half_width: Half width of the corridor [m].
+        visuals: Keep the visual mesh and textures, which only MuJoCo's renderer needs.
     """
     tree = ElementTree.parse(world.model_path)
     root, assets = tree.getroot(), world.folder / "assets"
@@ -40,17 +40,17 @@ def episode_spec(world: World, start: float, end: float, half_width: float, look
 
     def wanted(geom: Element) -> bool:
         if geom.get("contype") == "0":
-            return looks
-        center, radius = _ball(assets / f"{geom.get('mesh')}.obj")
+            return visuals
+        center, radius = _bounding_sphere(assets / f"{geom.get('mesh')}.obj")
         return line.query(center[:2])[0] - radius <= half_width + _REACH
 
-    # Taken out of the XML: a compiled MjSpec needs milliseconds for every part that it drops.
-    scenery, kept = root.find("worldbody"), root.find("asset")
-    assert scenery is not None and kept is not None
-    for geom in [g for g in scenery.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:
-        scenery.remove(geom)
+    # Removed from the XML, as removing from a compiled MjSpec takes milliseconds per part.
+    worldbody, kept = root.find("worldbody"), root.find("asset")
+    assert worldbody is not None and kept is not None
+    for geom in [g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:
+        worldbody.remove(geom)
         kept.remove(next(m for m in kept.findall("mesh") if m.get("name") == geom.get("mesh")))
-    if not looks:
+    if not visuals:
         _strip_textures(root, kept)
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     spec.modelfiledir = str(world.folder.resolve())
@@ -58,12 +58,12 @@ def episode_spec(world: World, start: float, end: float, half_width: float, look
     payload = base.add_body(name=PAYLOAD, pos=world.robot.payload_position)
     payload.explicitinertial = True
     payload.mass, payload.ipos, payload.inertia = 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    add_dry(payload, PAYLOAD)
+    disable_fluid_drag(payload, PAYLOAD)
     return spec
 
 
-def _ball(path: Path) -> tuple[Array, float]:
-    """Centre and radius [m] of a ball around the vertices of an OBJ file."""
+def _bounding_sphere(path: Path) -> tuple[Array, float]:
+    """Center and radius [m] of a sphere around the vertices of an OBJ file."""
     lines = path.read_text(encoding="ascii").splitlines()
     vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
     center = (vertices.min(0) + vertices.max(0)) / 2

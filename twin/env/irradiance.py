@@ -1,15 +1,15 @@
-"""What light falls on things in a radiance field, estimated from the field itself.
+"""Irradiance on objects in a radiance field, estimated from the field itself for any lighting.
 
-A field knows colours, not light. *Irradiance* here is what a colour of 1 (perfect white, facing some way) would look
-like in the film of a lighting: an obstacle's own colour times the irradiance is what it looks like there. That of what
-faces up at a place is its *level*: the colour of the reconstructed ground around it, over the albedo taken for it.
+A field stores colors, not light. *Irradiance* is the color, in the film under a lighting, of a perfectly white surface
+of a given normal: an object's own color times the irradiance is its color in the picture. The irradiance of a
+horizontal surface is the *ground irradiance*: the color of the reconstructed ground nearby over an assumed albedo.
 
-How much reaches what faces elsewhere is learnt from *probes*, points of the field that stand and face all ways. Each is
-compared with itself under the mean of the filmed lightings, which cancels its albedo; that mean is taken for a uniform
-sky over a dim ground. Per direction of `SIDES` one share of the light grows with the level of the place, as that of the
-lamp or sun that lights the ground, too, and one does not, as that of the sky does.
+The irradiance of other normals is fitted to *probes*, surface points of the field. Each upright probe is compared with
+itself under the mean of the filmed lightings, which cancels its albedo; that mean is taken as a uniform sky over dim
+ground. For each direction of `SIDE_DIRECTIONS` one part is proportional to the ground irradiance, as the light of a
+lamp or sun is, and one part is constant, as the light of the sky is.
 
-Of the probes the composited features are kept, so that any embedding gives them colours in a millisecond.
+The composited features of the probes are stored, so that any embedding gives their colors in a millisecond.
 """
 
 import threading
@@ -28,197 +28,194 @@ from twin.nerf.baked import BakedField
 from twin.types import Array
 
 GROUND_ALBEDO = 0.37
-"""Reflectance assumed for the ground along the route, in film colours: worn asphalt reflects about 11 %, which the tone
+"""Reflectance assumed for the ground along the route, in film colors: worn asphalt reflects about 11 %, which the tone
 curve of a film (exponent 1 / 2.2) shows as 0.37. The value was tuned on the known-truth world: it was 0.38 (12 %), and
-became 0.37 when obstacles at night missed their bar of `benchmarks/overlay.py` (6 dB better than unshaded), which they
+became 0.37 when obstacles at night failed their bar of `benchmarks/overlay.py` (6 dB better than unshaded), which they
 meet with it. So that benchmark's figures are not independent of it."""
 
-SIDES = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-"""Directions that light comes from besides above and everywhere, shape (4, 3)."""
+SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+"""Horizontal directions that light is resolved into, shape (4, 3)."""
 
-_EYE_HEIGHT, _PITCH = 1.0, 8.0  # [m], [°] of the views that probes are taken from
-_EYE_STEP = 2.0  # [m] of the route
-_VIEW, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
-_GROUND_REACH, _REACH = 7.0, 12.0  # [m] depth up to which probes are taken
-_GROUND_SKIN = 0.12  # [m] from the ground
-_STANDING = 0.3  # [m] above the ground from where on a probe is none of it
-_MOST_GROUND, _MOST_STANDING = 3000, 1500  # probes
-_NEAR = 1.5  # [m] standard deviation of the ground's weights around a place
+_CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] of the views that probes are taken from
+_CAMERA_STEP = 2.0  # [m] along the route
+_VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
+_MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] up to which probes are taken
+_GROUND_TOLERANCE = 0.12  # [m] from the ground
+_MIN_UPRIGHT_HEIGHT = 0.3  # [m] above the ground from which on a probe does not belong to it
+_MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
+_KERNEL_STD = 1.5  # [m] of the ground probes' weights around a position
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
-_POLE = 0.5 * (1.0 + _BOUNCE)
-_MOST_SUN, _LOWEST_SUN = 0.8, 3.0  # share of one direction at most; cotangent of its elevation at most
-_DARK = 0.02  # a probe whose mean colour is below tells nothing
-_MOST = 1.5  # times the ground's brightest: what seems brighter shines by itself
-_NEIGHBOURS = 8  # of the ground's probes, around one that stands
-_FEW = 50  # probes of a kind are none
-_KEPT, _PLACES_KEPT = 64, 1000  # lightings; places of one
+_UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky, 1 facing up
+_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # share of one direction; cotangent of its elevation
+_MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
+_MAX_BRIGHTNESS = 1.5  # times the ground's brightest: brighter surfaces emit light
+_NEIGHBORS = 8  # ground probes around an upright one
+_MIN_PROBES = 50  # fewer are not used
+_LIGHTINGS_CACHED, _POSITIONS_CACHED = 64, 1000
 
 
 @dataclass(frozen=True)
 class Irradiance:
-    """One lighting's light."""
+    """Irradiance under one lighting, as a function of position and normal."""
 
     xy: Array
-    """Places of the ground's probes [m], shape (k, 2)."""
+    """Positions of the ground probes [m], shape (k, 2)."""
     up: Array
-    """Irradiance of what faces up there, shape (k, 3)."""
-    steady: Array
-    """What reaches all that does not face up, and what comes from each of `SIDES`, whatever the level, shape (5, 3)."""
-    growing: Array
-    """The same per unit of the level, shape (5, 3)."""
-    _known: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
-    """Levels of the last places asked for, as most things stand still."""
+    """Ground irradiance at them, shape (k, 3)."""
+    constant: Array
+    """Constant part of the light on normals that do not face up, and of that from each of `SIDE_DIRECTIONS`, shape
+    (5, 3)."""
+    proportional: Array
+    """The same per unit of ground irradiance, shape (5, 3)."""
+    _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
+    """Ground irradiance at recent positions, as most objects stand still."""
 
-    def level(self, xy: Array) -> Array:
-        """Irradiance of what faces up at places (n, 2) [m], shape (n, 3)."""
-        return np.stack([self._level_at(x, y) for x, y in np.asarray(xy).tolist()])
+    def ground(self, xy: Array) -> Array:
+        """Ground irradiance at positions (n, 2) [m], shape (n, 3)."""
+        return np.stack([self._ground_at(x, y) for x, y in np.asarray(xy).tolist()])
 
-    def _level_at(self, x: float, y: float) -> Array:
-        found = self._known.get((x, y))
+    def _ground_at(self, x: float, y: float) -> Array:
+        found = self._cache.get((x, y))
         if found is None:
             distance2 = (self.xy[:, 0] - x) ** 2 + (self.xy[:, 1] - y) ** 2
-            # Where no probe is near, the nearest ones count.
-            weight = np.exp(-0.5 * distance2 / _NEAR**2) + 1e-6 / (1.0 + distance2**2)
+            # Far from all probes the second term selects the nearest ones.
+            weight = np.exp(-0.5 * distance2 / _KERNEL_STD**2) + 1e-6 / (1.0 + distance2**2)
             found = weight @ self.up / weight.sum()
-            if len(self._known) >= _PLACES_KEPT:
-                self._known.clear()
-            self._known[x, y] = found
+            if len(self._cache) >= _POSITIONS_CACHED:
+                self._cache.clear()
+            self._cache[x, y] = found
         return found
 
-    def irradiance(self, level: Array, normals: Array) -> Array:
-        """Of unit normals (n, 3) where the level is (n, 3), shape (n, 3)."""
+    def irradiance(self, ground: Array, normals: Array) -> Array:
+        """Irradiance of unit normals (n, 3) where the ground irradiance is (n, 3), shape (n, 3)."""
         basis = _basis(normals)
         up = np.maximum(normals[:, 2:], 0.0)
-        return up * level + basis @ self.steady + (basis @ self.growing) * level
+        return up * ground + basis @ self.constant + (basis @ self.proportional) * ground
 
     def sun(self, xy: Array) -> tuple[float, Array]:
-        """Share of the light at a place (2,) that comes from one direction, and that direction, shape (3,).
+        """Share of the light at a position (2,) that comes from one direction, and that direction, shape (3,).
 
-        Around a vertical pole a uniform sky gives `_POLE` of what faces up, and a sun at elevation e gives cot e / π;
-        only the sun favours one side, by cot e. So both its share and e follow from the light on upright surfaces.
+        Averaged around a vertical pole, a uniform sky gives `_UPRIGHT_SKY` of the ground irradiance, and a sun at
+        elevation e gives cot e / π; only the sun favors one side, by cot e. So both its share and e follow from the
+        light on upright surfaces.
         """
-        level = self.level(np.asarray(xy)[None])[0]
-        parts = (self.steady + self.growing * level).mean(1) / max(float(level.mean()), 1e-6)
-        favour = np.array([parts[1] - parts[2], parts[3] - parts[4]])
-        strength = float(np.linalg.norm(favour))
+        ground = self.ground(np.asarray(xy)[None])[0]
+        parts = (self.constant + self.proportional * ground).mean(1) / max(float(ground.mean()), 1e-6)
+        difference = np.array([parts[1] - parts[2], parts[3] - parts[4]])
+        strength = float(np.linalg.norm(difference))
         around = float(parts[0] + parts[1:].sum() / np.pi)
-        share = float(np.clip((_POLE + strength / np.pi - around) / _POLE, 0.0, _MOST_SUN))
-        cotangent = min(strength / max(share, 1e-3), _LOWEST_SUN)
-        toward = np.append(favour / max(strength, 1e-9) * cotangent, 1.0)
+        share = float(np.clip((_UPRIGHT_SKY + strength / np.pi - around) / _UPRIGHT_SKY, 0.0, _MAX_SUN_SHARE))
+        cotangent = min(strength / max(share, 1e-3), _MAX_SUN_COTANGENT)
+        toward = np.append(difference / max(strength, 1e-9) * cotangent, 1.0)
         return share, toward / np.linalg.norm(toward)
 
 
 def _basis(normals: Array) -> Array:
-    """How much normals (n, 3) do not face up, and the cosines to `SIDES`, shape (n, 5)."""
-    return np.column_stack([1.0 - np.maximum(normals[:, 2], 0.0), np.maximum(normals @ SIDES.T, 0.0)])
+    """One minus the upward part of normals (n, 3), and their clipped cosines to `SIDE_DIRECTIONS`, shape (n, 5)."""
+    return np.column_stack([1.0 - np.maximum(normals[:, 2], 0.0), np.maximum(normals @ SIDE_DIRECTIONS.T, 0.0)])
 
 
 class IrradianceEstimator:
-    """Estimates the light of any lighting of a field."""
+    """Estimates the irradiance of any lighting of a field."""
 
     def __init__(self, baked: BakedField, route: Array):
-        """
-        Args:
-            baked: The field; looked at from along the route, once.
-            route: On the ground [m], shape (m, 3).
-
-        Raises:
-            InputError: no ground is seen there.
-        """
+        """Renders the field once from along a route on the ground (m, 3) [m]. Raises InputError: no ground is seen."""
         self._field = baked
         self._lock = threading.Lock()
-        self._kept: OrderedDict[bytes, Irradiance] = OrderedDict()
-        found = _look(baked, route)
-        height, lateral = _above(found.points, route)
-        flat = found.normals[:, 2] > 0.9
-        ground = (np.abs(height) < _GROUND_SKIN + 0.05 * np.abs(lateral)) & (found.depth < _GROUND_REACH) & flat
-        standing = (height > _STANDING) & (found.facing > 0.25)
+        self._cache: OrderedDict[bytes, Irradiance] = OrderedDict()
+        points = _surface_points(baked, route)
+        height, lateral = _height_above(points.positions, route)
+        flat = points.normals[:, 2] > 0.9
+        ground = (np.abs(height) < _GROUND_TOLERANCE + 0.05 * np.abs(lateral)) & (points.depth < _MAX_GROUND_DEPTH)
+        upright = (height > _MIN_UPRIGHT_HEIGHT) & (points.facing > 0.25)
         rng = np.random.default_rng(0)
-        self._ground = found.pick(_some(rng, ground, _MOST_GROUND))
-        self._standing = found.pick(_some(rng, standing, _MOST_STANDING))
-        if len(self._ground.points) < _FEW:
+        self._ground = points.subset(_random_indices(rng, ground & flat, _MAX_GROUND_PROBES))
+        self._upright = points.subset(_random_indices(rng, upright, _MAX_UPRIGHT_PROBES))
+        if len(self._ground.positions) < _MIN_PROBES:
             raise InputError(
-                "no ground is seen along the route, and so nothing to tell the light from; was the field built with "
-                "this scene? Overlay(..., shaded=False) does without"
+                "no ground is seen along the route, so the irradiance cannot be estimated; was the field built with "
+                "this scene? Compositor(..., shaded=False) works without"
             )
-        self._xy = self._ground.points[:, :2]
-        self._beside = _nearest_of(self._xy, self._standing.points[:, :2])
+        self._xy = self._ground.positions[:, :2]
+        self._neighbors = _nearest_indices(self._xy, self._upright.positions[:, :2])
         names = baked.lightings
         grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
-        standings = [self._standing.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
-        # Lightings are brought to one brightness of the ground before their mean is taken.
-        mean_ground = np.mean([picture / picture.mean(0) for picture in grounds], 0)
-        self._mean = np.mean([p / ground.mean(0) for p, ground in zip(standings, grounds, strict=True)], 0)
-        # What the mean lighting's irradiance is there, over albedo.
-        sky = _uniform_sky(self._standing.normals)[:, None]
-        self._reference = sky * mean_ground[self._beside].mean(1) / GROUND_ALBEDO
-        self._rows = _basis(self._standing.normals)
+        uprights = [self._upright.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
+        # Lightings are scaled to one brightness of the ground before their mean is taken.
+        mean_ground = np.mean([colors / colors.mean(0) for colors in grounds], 0)
+        self._mean = np.mean([c / ground.mean(0) for c, ground in zip(uprights, grounds, strict=True)], 0)
+        # Irradiance of the mean lighting at the upright probes.
+        sky = _uniform_sky_irradiance(self._upright.normals)[:, None]
+        self._reference = sky * mean_ground[self._neighbors].mean(1) / GROUND_ALBEDO
+        self._rows = _basis(self._upright.normals)
 
-    def under(self, lighting: str | NDArray) -> Irradiance:
-        """The light of a lighting, by name or embedding (dim,)."""
+    def estimate(self, lighting: str | NDArray) -> Irradiance:
+        """The irradiance of a lighting, by name or embedding (dim,). The last ones are cached."""
         embedding = self._field.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         key = embedding.tobytes()
         with self._lock:
-            if key not in self._kept:
-                self._kept[key] = self._estimate(embedding)
-                if len(self._kept) > _KEPT:
-                    self._kept.popitem(last=False)
-            return self._kept[key]
+            if key not in self._cache:
+                self._cache[key] = self._estimate(embedding)
+                if len(self._cache) > _LIGHTINGS_CACHED:
+                    self._cache.popitem(last=False)
+            return self._cache[key]
 
     def _estimate(self, embedding: NDArray) -> Irradiance:
         from scipy.optimize import nnls
 
         up = self._ground.probes.picture(embedding).astype(np.float64) / GROUND_ALBEDO
-        level = up[self._beside].mean(1)
-        colours = self._standing.probes.picture(embedding).astype(np.float64)
-        seen = colours / np.maximum(self._mean, _DARK) * self._reference
-        over = seen - np.maximum(self._standing.normals[:, 2:], 0.0) * level
-        if len(self._rows) < _FEW:  # nothing stands here to tell by: a uniform sky
+        ground = up[self._neighbors].mean(1)
+        colors = self._upright.probes.picture(embedding).astype(np.float64)
+        seen = colors / np.maximum(self._mean, _MIN_COLOR) * self._reference
+        sides = seen - np.maximum(self._upright.normals[:, 2:], 0.0) * ground
+        if len(self._rows) < _MIN_PROBES:  # too few upright surfaces: a uniform sky
             return Irradiance(
-                self._xy, up, np.zeros((5, 3)), np.array([_POLE, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3)
+                self._xy, up, np.zeros((5, 3)), np.array([_UPRIGHT_SKY, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3)
             )
         found = np.empty((10, 3))
         for c in range(3):
-            usable = (self._mean[:, c] > _DARK) & (seen[:, c] < _MOST * up[:, c].max())
-            rows = np.concatenate([self._rows, self._rows * level[:, c : c + 1]], 1)[usable]
-            # The same minimum as that of all rows, from their normal equations.
+            usable = (self._mean[:, c] > _MIN_COLOR) & (seen[:, c] < _MAX_BRIGHTNESS * up[:, c].max())
+            rows = np.concatenate([self._rows, self._rows * ground[:, c : c + 1]], 1)[usable]
+            # The normal equations have the same minimum as all the rows.
             square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
-            found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ over[usable, c]))
+            found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ sides[usable, c]))
         return Irradiance(self._xy, up, found[:5], found[5:])
 
 
 @dataclass(frozen=True)
-class _Found:
-    """Surface points of a field, with what gives them their colours."""
+class _SurfacePoints:
+    """n surface points of a field with their probes."""
 
     probes: Probes
-    points: Array
+    positions: Array
+    """[m], shape (n, 3)."""
     normals: Array
+    """Shape (n, 3)."""
     depth: Array
+    """z-depth in the view that shows the point [m], shape (n,)."""
     facing: Array
-    """Cosine between the normal and the way to the eye."""
+    """Cosine between the normal and the direction to the camera, shape (n,)."""
 
-    def pick(self, index: NDArray) -> "_Found":
+    def subset(self, index: NDArray) -> "_SurfacePoints":
         probes = Probes(self.probes.features[index], self.probes.harmonics[index], self.probes.network)
-        return _Found(probes, self.points[index], self.normals[index], self.depth[index], self.facing[index])
+        return _SurfacePoints(probes, self.positions[index], self.normals[index], self.depth[index], self.facing[index])
 
 
-def _look(field: BakedField, route: Array) -> _Found:
-    width, height = _VIEW
+def _surface_points(field: BakedField, route: Array) -> _SurfacePoints:
+    """Surface points in views of the field from along the route, without pixels at depth edges."""
+    width, height = _VIEW_SIZE
     poses = []
-    for s in np.arange(0.0, arc_lengths(route)[-1], _EYE_STEP):
-        eye = point_at(route, s) + np.array([0.0, 0.0, _EYE_HEIGHT])
-        yaw, pitch = float(heading_at(route, s)), np.deg2rad(_PITCH)
+    for s in np.arange(0.0, arc_lengths(route)[-1], _CAMERA_STEP):
+        eye = point_at(route, s) + np.array([0.0, 0.0, _CAMERA_HEIGHT])
+        yaw, pitch = float(heading_at(route, s)), np.deg2rad(_CAMERA_PITCH)
         ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
         poses.append(look_at(eye, eye + ahead))
     intrinsics = np.array([_FOCAL, _FOCAL, width / 2, height / 2])
     rays = unproject(pixel_grid(width, height), intrinsics)
-    network = {k.removeprefix("network."): v for k, v in field._arrays.items() if k.startswith("network.")}
     parts: list[list[NDArray]] = [[] for _ in range(6)]
     for pose in poses:
-        out = field.render(Viewpoints.of(pose, intrinsics, _VIEW), field.lightings[0])
-        # What the render has just composited, before it became colour.
-        features = field._picture(1, width, height, False).features.numpy()[0].reshape(-1, height, width)
+        out, channels = field.render_features(Viewpoints.of(pose, intrinsics, _VIEW_SIZE), field.lightings[0])
+        features = channels[0, 1:]
         depth = out.depth[0].astype(np.float64)
         points = (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
         across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
@@ -230,29 +227,27 @@ def _look(field: BakedField, route: Array) -> _Found:
         facing = (normals * toward).sum(-1)
         around = np.stack([depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]])
         z = depth[1:-1, 1:-1]
-        # At a rim the neighbours are of different things.
-        whole = (np.abs(around - z) < 0.15 * z).all(0) & (out.opacity[0, 1:-1, 1:-1] > 0.97) & (facing > 0.05)
-        whole &= z < _REACH
-        directions = (inner - pose[:3, 3])[whole]
+        # At a depth edge the neighbors belong to another surface.
+        valid = (np.abs(around - z) < 0.15 * z).all(0) & (out.opacity[0, 1:-1, 1:-1] > 0.97) & (facing > 0.05)
+        valid &= z < _MAX_DEPTH
+        directions = (inner - pose[:3, 3])[valid]
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        for kept, value in zip(
-            parts,
-            (
-                features[1:, 1:-1, 1:-1].transpose(1, 2, 0)[whole],
-                harmonics(directions),
-                inner[whole],
-                normals[whole],
-                z[whole],
-                facing[whole],
-            ),
-            strict=True,
-        ):
-            kept.append(value)
-    a, b, points, normals, depth, facing = (np.concatenate(part) for part in parts)
-    return _Found(Probes(a.astype(np.float32), b.astype(np.float32), network), points, normals, depth, facing)
+        values = (
+            features[:, 1:-1, 1:-1].transpose(1, 2, 0)[valid],
+            spherical_harmonics_numpy(directions),
+            inner[valid],
+            normals[valid],
+            z[valid],
+            facing[valid],
+        )
+        for part, value in zip(parts, values, strict=True):
+            part.append(value)
+    probe_features, harmonics, points, normals, depth, facing = (np.concatenate(part) for part in parts)
+    probes = Probes(probe_features.astype(np.float32), harmonics.astype(np.float32), field.network)
+    return _SurfacePoints(probes, points, normals, depth, facing)
 
 
-def harmonics(d: Array) -> Array:
+def spherical_harmonics_numpy(d: Array) -> Array:
     """`twin.nerf.network.spherical_harmonics` without torch: unit vectors (n, 3) → (n, 16)."""
     x, y, z = np.moveaxis(d, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
@@ -261,28 +256,28 @@ def harmonics(d: Array) -> Array:
     return np.stack([*first, *third, x * (5.0 * zz - 1.0), z * (xx - yy), x * (xx - 3.0 * yy)], -1)
 
 
-def _above(points: Array, route: Array) -> tuple[Array, Array]:
-    """Height over the nearest vertex of the route, and distance from it [m], both (n,)."""
+def _height_above(points: Array, route: Array) -> tuple[Array, Array]:
+    """Height above the nearest vertex of the route, and distance from it [m], both (n,)."""
     from scipy.spatial import cKDTree
 
     distance, index = cKDTree(route[:, :2]).query(points[:, :2])
     return points[:, 2] - route[index, 2], distance
 
 
-def _some(rng: np.random.Generator, which: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
-    index = np.flatnonzero(which)
+def _random_indices(rng: np.random.Generator, mask: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
+    index = np.flatnonzero(mask)
     return np.sort(rng.choice(index, min(most, len(index)), replace=False))
 
 
-def _nearest_of(places: Array, xy: Array) -> NDArray[np.int64]:
-    """Indices of the places (k, 2) nearest to points (n, 2), shape (n, `_NEIGHBOURS`)."""
+def _nearest_indices(positions: Array, xy: Array) -> NDArray[np.int64]:
+    """Indices of the positions (k, 2) nearest to points (n, 2), shape (n, `_NEIGHBORS`)."""
     from scipy.spatial import cKDTree
 
-    _, index = cKDTree(places).query(xy, min(_NEIGHBOURS, len(places)))
+    _, index = cKDTree(positions).query(xy, min(_NEIGHBORS, len(positions)))
     return index.reshape(len(xy), -1)
 
 
-def _uniform_sky(normals: Array) -> Array:
+def _uniform_sky_irradiance(normals: Array) -> Array:
     """Irradiance of unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`, 1 facing up, (n,)."""
     up = normals[:, 2]
     return 0.5 * (1.0 + up) + 0.5 * (1.0 - up) * _BOUNCE

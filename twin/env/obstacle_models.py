@@ -1,7 +1,7 @@
-"""What obstacles look like and bump with: plain primitives in plain colours, made here.
+"""Obstacle geometry: plain primitives and hulls in plain colors, without mesh or texture files.
 
-An obstacle's frame: x to its front, y to its left, z up, its origin on the ground below its middle. Its geoms are in
-group `OBSTACLE_GROUP`, seen and solid alike; what is solid but not drawn is in the robot's collision group.
+An obstacle's frame: x to its front, y to its left, z up, origin on the ground below its center. Its geoms are in group
+`OBSTACLE_GROUP`, both visible and solid; collision-only geoms are in the robot's collision group.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,16 +12,16 @@ import mujoco
 import numpy as np
 
 from twin.mjcf import husky
-from twin.mjcf.husky_visuals import add_look
+from twin.mjcf.husky_visuals import add_visuals
 
 Color = tuple[float, float, float]
 
 OBSTACLE_GROUP = 5
 
 RADIUS = {"cone": 0.2, "box": 0.35, "bollard": 0.1, "car": 2.2, "pedestrian": 0.3, "cyclist": 0.9, "husky": 0.6}
-"""What a vertical cylinder around an obstacle of a kind must measure at least [m]."""
+"""Radius of a vertical cylinder around an obstacle of each kind [m]."""
 
-_BOX_SIZE = (0.5, 0.4, 0.45)  # [m] length, width, height, unless the obstacle says
+_BOX_SIZE = (0.5, 0.4, 0.45)  # [m] default length, width, height
 _COLORS: dict[str, Color] = {
     "cone": (0.85, 0.30, 0.08),
     "box": (0.60, 0.46, 0.28),
@@ -37,15 +37,15 @@ _STEEL, _RED, _LAMP = (0.50, 0.51, 0.53), (0.60, 0.08, 0.06), (0.88, 0.87, 0.80)
 
 
 class ObstacleModel:
-    """Adds geoms to one body, named after it, with one group and one way of touching."""
+    """Adds geoms to one body, all in one group, and either all solid or all visual-only."""
 
     def __init__(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, group: int = OBSTACLE_GROUP, solid: bool = True):
         """
         Args:
-            spec: The model the body is in.
+            spec: The model that contains the body.
             body: Its geoms are named `<body>_<number>`.
-            group: Of what is drawn.
-            solid: Whether anything touches it.
+            group: Group of the geoms.
+            solid: False: visual-only, without contacts.
         """
         self.spec, self.body, self.group, self.solid, self.count = spec, body, group, solid, 0
 
@@ -69,15 +69,15 @@ class ObstacleModel:
         self.add(mujoco.mjtGeom.mjGEOM_CAPSULE, color, fromto=(*start, *end), size=(radius, 0, 0))
 
     def hull(self, points: np.ndarray, color: Color) -> None:
-        """The convex hull of points (n, 3)."""
+        """Adds the convex hull of points (n, 3)."""
         name = f"{self.body.name}_{self.count}"
         mesh = self.spec.add_mesh(name=name)
         mesh.uservert = points.astype(np.float32).ravel()
-        # MuJoCo moves a mesh to its own middle and the geom back, so that it stays where its points are.
+        # MuJoCo recenters a mesh and offsets its geom, so the points stay in place.
         self.add(mujoco.mjtGeom.mjGEOM_MESH, color, meshname=name)
 
     def frustum(self, low: float, high: float, radii: tuple[float, float], color: Color, sides: int = 20) -> None:
-        """An upright truncated cone between two heights."""
+        """Adds an upright truncated cone between two heights [m]."""
         angle = np.arange(sides) * 2 * np.pi / sides
         ring = np.stack([np.cos(angle), np.sin(angle)], 1)
         rings = [np.column_stack([r * ring, np.full(sides, z)]) for r, z in zip(radii, (low, high), strict=True)]
@@ -170,20 +170,20 @@ def _cyclist(shape: ObstacleModel, color: Color) -> None:
 
 
 def _husky(shape: ObstacleModel, color: Color) -> None:
-    """Another robot of the kind that drives: its looks, and boxes and cylinders to bump with."""
+    """A parked Husky: its visual geometry, with boxes and cylinders for collision."""
     spec, up = mujoco.MjSpec(), husky.BASE_HEIGHT
     base = spec.worldbody.add_body(name="look", pos=(0, 0, up))
     wheels = {}
     for name, center in zip(husky.WHEELS, husky.wheel_centers(), strict=True):
         wheels[name] = base.add_body(name=name, pos=center)
     params = husky.HuskyParams()
-    add_look(spec, base, wheels, params.camera_position, params.wheel_radius, husky.WHEEL_WIDTH)
+    add_visuals(spec, base, wheels, params.camera_position, params.wheel_radius, husky.WHEEL_WIDTH)
     for geom in spec.geoms:
         geom.group = shape.group
     shape.body.add_frame().attach_body(base, f"{shape.body.name}_", "")
     if not shape.solid:
         return
-    solid = ObstacleModel(shape.spec, shape.body, husky.ROBOT_GROUP)
+    solid = ObstacleModel(shape.spec, shape.body, husky.ROBOT_COLLISION_GROUP)
     solid.box((0.99, 0.57, 0.124), (0, 0, up + 0.062), _DARK)
     solid.box((0.79, 0.57, 0.104), (0, 0, up + 0.176), _DARK)
     for x, y, z in husky.wheel_centers():
@@ -191,7 +191,7 @@ def _husky(shape: ObstacleModel, color: Color) -> None:
         solid.cylinder((x, y - half, z + up), (x, y + half, z + up), husky.WHEEL_RADIUS, _DARK)
 
 
-_MAKERS: dict[str, Callable[..., None]] = {
+_BUILDERS: dict[str, Callable[..., None]] = {
     "cone": _cone,
     "box": _box,
     "bollard": _bollard,
@@ -202,15 +202,17 @@ _MAKERS: dict[str, Callable[..., None]] = {
 }
 
 
-def add_shape(shape: ObstacleModel, kind: str, color: Sequence[float] = (), size: Sequence[float] = ()) -> None:
-    """Gives a body the geoms of an obstacle of a kind.
+def add_obstacle_geoms(
+    shape: ObstacleModel, kind: str, color: Sequence[float] = (), size: Sequence[float] = ()
+) -> None:
+    """Adds the geoms of an obstacle to a body.
 
     Args:
-        shape: Of the body.
+        shape: The body's builder.
         kind: One of `twin.config.OBSTACLE_KINDS`.
-        color: Red, green, blue of its main colour, 0 to 1; the kind's own where empty.
-        size: Length, width, height of a box [m]; the usual one where empty.
+        color: Red, green, blue of its main color, 0 to 1; empty: the kind's default.
+        size: Length, width, height of a box [m]; empty: the default.
     """
     red, green, blue = color or _COLORS[kind]
-    make = partial(_MAKERS[kind], size=size) if kind == "box" else _MAKERS[kind]
-    make(shape, (red, green, blue))
+    build = partial(_BUILDERS[kind], size=size) if kind == "box" else _BUILDERS[kind]
+    build(shape, (red, green, blue))

@@ -1,9 +1,9 @@
-"""Obstacles on the route: put into a model before it is compiled, and moved while it runs.
+"""Obstacles on the route: added to a model before it is compiled, sampled per episode, moved during simulation.
 
-*Station* is the arc length on the route [m], *lateral* the distance from it, left positive [m]. Every obstacle is a
-mocap body `obstacle_<name>`, which no force moves; its geoms are `obstacle_<name>_<number>`. One model therefore serves
-many episodes: `place` puts its obstacles anywhere on the route, and those that an episode does without are *parked* far
-below the ground. The route itself is kept in the model, as the numeric `obstacle_route`.
+*Station* is the arc length on the route [m], *lateral* the distance from it, left positive [m]. An obstacle is a mocap
+body `obstacle_<name>`, which no force moves; its geoms are `obstacle_<name>_<number>`. One model serves many episodes:
+`place` sets the poses of an episode's obstacles and parks the others far below the ground. The model stores the route
+as the numeric `obstacle_route`.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,67 +13,67 @@ import mujoco
 import numpy as np
 
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
-from twin.env.obstacle_models import RADIUS, ObstacleModel, add_shape
+from twin.env.obstacle_models import RADIUS, ObstacleModel, add_obstacle_geoms
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.types import Array
 
 PREFIX = "obstacle_"
-STANDING = ("cone", "box", "bollard")
-"""What `random_obstacles` draws from unless told otherwise: things that stand on a path."""
+STATIC_KINDS = ("cone", "box", "bollard")
+"""Default kinds of `random_obstacles`: static objects that occur on a path."""
 
-_ROUTE = "obstacle_route"
-_PARKED = -100.0  # [m] below the ground, where nothing sees or touches it
+_ROUTE_NUMERIC = "obstacle_route"
+_PARKED_HEIGHT = -100.0  # [m], far below the ground
 _ROBOT_HALF_WIDTH = 0.34  # [m]
-_PASSAGE = 0.15  # [m] that a robot has to spare beside a random obstacle
-_BESIDE = 0.5  # [m] beyond the corridor's edge at which random obstacles still stand
-_TRIES = 20  # draws for a bystander
+_CLEARANCE = 0.15  # [m] between a passing robot and a random obstacle
+_RANDOM_MARGIN = 0.5  # [m] beyond the corridor's edge, up to which random obstacles stand
+_MAX_TRIES = 20  # samples of a distractor object's position
 _ROBOT_RADIUS = 0.6  # [m] from its base to the farthest corner
-_STRIP = 2.5  # [m] beside the corridor in which bystanders stand
-_CLEAR_ENDS = (4.0, 3.0)  # [m] of the route's start and end that random obstacles leave free
-_SPACING = 4.0  # [m] of the route between random obstacles, if there is room
-_SINK = 0.01  # [m] into the ground, so that no light shows below
+_DISTRACTOR_STRIP = 2.5  # [m] beside the corridor, where distractor objects stand
+_FREE_ENDS = (4.0, 3.0)  # [m] at the route's start and end without random obstacles
+_SPACING = 4.0  # [m] along the route between random obstacles, where the route is long enough
+_SINK_DEPTH = 0.01  # [m] into the ground, to avoid a visible gap below
 
 
 def body_name(obstacle: ObstacleConfig, number: int) -> str:
-    """Of the obstacle with this place in its list."""
+    """Body name of the obstacle at index `number` of its list."""
     return PREFIX + (obstacle.name or f"{obstacle.kind}_{number}")
 
 
 def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], world: World) -> None:
-    """Adds the bodies of obstacles to a world, where they are at the beginning of an episode.
+    """Adds the bodies of obstacles to a scene, parked.
 
     Args:
-        spec: Of the world, see `World.model_path`, not compiled yet.
-        obstacles: What to add; where each is can be changed later by `place`, its kind, colour and size cannot.
-        world: Has the route.
+        spec: The scene (`World.model_path`), not compiled yet.
+        obstacles: Their poses can be changed later by `place`; kind, color and size cannot.
+        world: Contains the route.
 
     Raises:
-        InputError: an unknown kind, or two of one name.
+        InputError: an unknown kind, or two obstacles of one name.
     """
     names = [body_name(one, k) for k, one in enumerate(obstacles)]
     if len(set(names)) < len(names):
-        raise InputError(f"two obstacles are named {max(names, key=names.count)!r}; give each a name of its own")
+        raise InputError(f"two obstacles are named {max(names, key=names.count)!r}; give each a different name")
     for name, one in zip(names, obstacles, strict=True):
         if one.kind not in OBSTACLE_KINDS:
             raise InputError(f"obstacle kind {one.kind!r}: expected one of {', '.join(OBSTACLE_KINDS)}")
-        body = spec.worldbody.add_body(name=name, mocap=True, pos=(0, 0, _PARKED))
-        add_shape(ObstacleModel(spec, body), one.kind, one.color, one.size)
-    if not any(numeric.name == _ROUTE for numeric in spec.numerics):
-        spec.add_numeric(name=_ROUTE, size=world.route.size, data=world.route.ravel())
+        body = spec.worldbody.add_body(name=name, mocap=True, pos=(0, 0, _PARKED_HEIGHT))
+        add_obstacle_geoms(ObstacleModel(spec, body), one.kind, one.color, one.size)
+    if not any(numeric.name == _ROUTE_NUMERIC for numeric in spec.numerics):
+        spec.add_numeric(name=_ROUTE_NUMERIC, size=world.route.size, data=world.route.ravel())
 
 
 def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float) -> None:
-    """Puts the obstacles where they are at a time of the episode, and parks the others of the model.
+    """Sets the poses of an episode's obstacles at a time, and parks the model's other obstacles.
 
-    Call it before every step where something moves, and once after a reset where all stand (`mj_resetData` moves mocap
-    bodies back to where they were compiled, which is parked).
+    Call it before every step if an obstacle moves, and otherwise once after a reset: `mj_resetData` moves mocap bodies
+    back to their compiled, parked poses.
 
     Args:
-        obstacles: Those of the episode, by the names they have in the model.
+        obstacles: The episode's obstacles, named as in the model.
         data: Its `mocap_pos` and `mocap_quat` are set.
-        time: Since the episode began [s].
+        time: Time since the episode began [s].
 
     Raises:
         InputError: the model has no such obstacle.
@@ -86,44 +86,41 @@ def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float)
             continue
         one = wanted.pop(model.body(body).name, None)
         data.mocap_quat[mocap] = (1.0, 0.0, 0.0, 0.0)
-        data.mocap_pos[mocap] = (0.0, 0.0, _PARKED)
+        data.mocap_pos[mocap] = (0.0, 0.0, _PARKED_HEIGHT)
         if one is not None:
-            x, y, yaw = pose_at(one, route_of(model), time)
-            data.mocap_pos[mocap] = (x, y, ground_height(model, x, y) - _SINK)
+            x, y, yaw = obstacle_pose(one, stored_route(model), time)
+            data.mocap_pos[mocap] = (x, y, ground_height(model, x, y) - _SINK_DEPTH)
             data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
     if wanted:
         raise InputError(f"the model has no {', '.join(wanted)}; name it in [[obstacle]], or add it with add_obstacles")
 
 
-def moves(obstacles: Sequence[ObstacleConfig]) -> bool:
-    """Whether `place` is needed before every step."""
+def any_moving(obstacles: Sequence[ObstacleConfig]) -> bool:
+    """True if any obstacle moves, so that `place` is needed before every step."""
     return any(one.to for one in obstacles)
 
 
-def pose_at(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:
-    """x, y [m] and yaw [rad] of an obstacle at a time [s]; one that moves goes to and fro along its line."""
+def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:
+    """x, y [m] and yaw [rad] of an obstacle at a time [s]; a moving one goes back and forth along its line."""
     start = np.array([obstacle.station, obstacle.lateral])
     turn = np.deg2rad(obstacle.yaw)
-    if not obstacle.to:
-        x, y = _spot(route, *start)
-        return x, y, float(heading_at(route, start[0])) + turn
-    step = np.array(obstacle.to) - start
+    step = np.array(obstacle.to) - start if obstacle.to else np.zeros(2)
     length = float(np.linalg.norm(step))
     if length < 1e-9:
-        return (*_spot(route, *start), float(heading_at(route, start[0])) + turn)
-    way = (time + obstacle.delay) * obstacle.speed / length
-    back = bool(int(way) % 2)
-    share = way % 1.0
+        return (*_route_point(route, *start), float(heading_at(route, start[0])) + turn)
+    passes = (time + obstacle.delay) * obstacle.speed / length
+    back = bool(int(passes) % 2)
+    share = passes % 1.0
     station, lateral = start + step * (1.0 - share if back else share)
-    x, y = _spot(route, station, lateral)
+    x, y = _route_point(route, station, lateral)
     direction = -step if back else step
     yaw = float(heading_at(route, station) + np.arctan2(direction[1], direction[0]))
     return x, y, yaw + turn
 
 
-def _spot(route: Array, station: float, lateral: float) -> tuple[float, float]:
+def _route_point(route: Array, station: float, lateral: float) -> tuple[float, float]:
+    """x, y [m] of a point given by station and lateral; the route continues straight beyond its ends."""
     point = point_at(route[:, :2], station)
-    # Beyond an end the route goes straight on.
     over = station - np.clip(station, 0.0, arc_lengths(route)[-1])
     heading = float(heading_at(route, station))
     along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
@@ -131,13 +128,13 @@ def _spot(route: Array, station: float, lateral: float) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def route_of(model: mujoco.MjModel) -> Array:
-    """The route that `add_obstacles` kept in the model [m], shape (m, 3)."""
-    return np.array(model.numeric(_ROUTE).data).reshape(-1, 3)
+def stored_route(model: mujoco.MjModel) -> Array:
+    """The route that `add_obstacles` stored in the model [m], shape (m, 3)."""
+    return np.array(model.numeric(_ROUTE_NUMERIC).data).reshape(-1, 3)
 
 
 def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
-    """Bilinear height [m] of the geom `ground`, an upright height field; beyond its edge, that of the edge."""
+    """Bilinear height [m] of the geom `ground`, an upright height field; beyond its edge, the height of the edge."""
     geom = model.geom("ground")
     k = int(geom.dataid[0])
     rows, columns, adr = int(model.hfield_nrow[k]), int(model.hfield_ncol[k]), int(model.hfield_adr[k])
@@ -152,139 +149,135 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 
 
 def random_obstacles(
-    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STANDING
+    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Obstacles that stand along the route, apart from each other, leaving a way past each within the corridor.
+    """Samples static obstacles along the route, apart from each other, with room to pass each within the corridor.
 
-    The same generator state gives the same obstacles; they are named `random_<number>`.
+    Names are `random_<number>`.
 
     Args:
-        world: Has route and corridor.
-        rng: Decides where and what.
-        count: How many.
-        kinds: Which kinds may be drawn.
+        world: Contains route and corridor.
+        rng: Determines the obstacles.
+        count: Number of obstacles.
+        kinds: Kinds to sample from.
 
     Raises:
-        InputError: the route is too short for so many.
+        InputError: the route is too short for that many.
     """
     length = float(arc_lengths(world.route)[-1])
-    room = length - sum(_CLEAR_ENDS)
+    room = length - sum(_FREE_ENDS)
     if room <= 0.0 or count > room:
         raise InputError(f"{count} obstacles on a route of {length:.1f} m; expected at most {max(0, int(room))}")
     spacing = min(_SPACING, 0.8 * room / max(count, 1))
-    # Uniform among all arrangements that keep the spacing: sort, then spread by it.
+    # Uniform over all arrangements that keep the spacing: sort, then add it.
     free = np.sort(rng.uniform(0.0, room - spacing * (count - 1), count)) if count else np.zeros(0)
     out = []
-    for k, station in enumerate(_CLEAR_ENDS[0] + free + spacing * np.arange(count)):
+    for k, station in enumerate(_FREE_ENDS[0] + free + spacing * np.arange(count)):
         kind = str(rng.choice(list(kinds)))
         radius = RADIUS[kind]
-        nearest = max(0.0, radius + _ROBOT_HALF_WIDTH + _PASSAGE - world.half_width)
-        lateral = rng.uniform(nearest, max(nearest, world.half_width + _BESIDE) + radius) * rng.choice([-1.0, 1.0])
-        yaw = float(rng.uniform(-180.0, 180.0)) if kind in STANDING else 0.0
+        nearest = max(0.0, radius + _ROBOT_HALF_WIDTH + _CLEARANCE - world.half_width)
+        farthest = max(nearest, world.half_width + _RANDOM_MARGIN) + radius
+        lateral = rng.uniform(nearest, farthest) * rng.choice([-1.0, 1.0])
+        yaw = float(rng.uniform(-180.0, 180.0)) if kind in STATIC_KINDS else 0.0
         out.append(ObstacleConfig(f"random_{k}", kind, float(station), float(lateral), yaw))
     return tuple(out)
 
 
-def bystanders(
-    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STANDING
+def random_distractors(
+    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Things that stand beside the corridor where no robot within it can touch them: as if they had been moved there.
+    """Samples distractor objects beside the corridor, where no robot within it can touch them.
 
-    The same generator state gives the same ones; they are named `random_<number>`.
-
-    Args:
-        world: Has route and corridor.
-        rng: Decides where and what.
-        count: How many; fewer where a winding route leaves no room.
-        kinds: Which kinds may be drawn.
+    Arguments and names as of `random_obstacles`. A winding route may leave room for fewer than `count`.
     """
     route, out = world.route[:, :2], []
     length = float(arc_lengths(world.route)[-1])
     for k in range(count):
         kind = str(rng.choice(list(kinds)))
         nearest = world.half_width + _ROBOT_RADIUS + RADIUS[kind]
-        for _ in range(_TRIES):
+        for _ in range(_MAX_TRIES):
             station = float(rng.uniform(0.0, length))
-            lateral = float(rng.uniform(nearest, nearest + _STRIP) * rng.choice([-1.0, 1.0]))
-            # Inside a bend, what is beside one part of the route may be on another.
-            if np.linalg.norm(route - _spot(route, station, lateral), axis=1).min() >= nearest:
+            lateral = float(rng.uniform(nearest, nearest + _DISTRACTOR_STRIP) * rng.choice([-1.0, 1.0]))
+            # Inside a bend, a point beside one part of the route may lie on another.
+            if np.linalg.norm(route - _route_point(route, station, lateral), axis=1).min() >= nearest:
                 out.append(ObstacleConfig(f"random_{k}", kind, station, lateral, float(rng.uniform(-180.0, 180.0))))
                 break
     return tuple(out)
 
 
-# ---- Which obstacles an episode has: those of `scene.toml`, given ones, or some drawn at random for it.
-#
-# A compiled model cannot gain bodies, so for random obstacles it holds a *pool*: as many of every kind as there may be.
+# ---- obstacles of an episode
 
-
-_COLORS = 7  # seed of what bystanders are painted with
-_STEP = 0.25  # [m] between points of a stretch's own route
+_COLOR_SEED = 7  # of distractor objects
+_ROUTE_STEP = 0.25  # [m] between points of a segment's route
 
 
 class EpisodeObstacles:
-    """The obstacles of a task's episodes."""
+    """Obstacles of a task's episodes: given ones, random ones along the segment, and distractor objects.
+
+    A compiled model cannot gain bodies, so it contains a *pool*: of every kind, as many as an episode may have.
+    """
 
     def __init__(
-        self, wanted: int | Sequence[ObstacleConfig], world: World, stretch: RouteSegment, beside: int = 0
+        self, wanted: int | Sequence[ObstacleConfig], world: World, segment: RouteSegment, beside: int = 0
     ) -> None:
         """
         Args:
-            wanted: How many to draw for every episode, or which there are in all of them.
-            world: Has the route.
-            stretch: Along which random ones stand.
-            beside: How many stand beside the corridor, at most.
+            wanted: Number of random obstacles per episode, or the obstacles of all episodes.
+            world: Contains the route.
+            segment: Route segment on which random obstacles stand.
+            beside: Largest number of distractor objects beside the corridor.
         """
         self._count = wanted if isinstance(wanted, int) else 0
         self._given = () if isinstance(wanted, int) else tuple(wanted)
         self._beside = beside
-        self._colors = np.random.default_rng(_COLORS).uniform(0.05, 0.9, (len(STANDING), beside, 3))
-        s = np.append(np.arange(stretch.start, stretch.end, _STEP), stretch.end)
-        self._along, self._start = replace(world, route=point_at(world.route, s)), stretch.start
+        self._colors = np.random.default_rng(_COLOR_SEED).uniform(0.05, 0.9, (len(STATIC_KINDS), beside, 3))
+        s = np.append(np.arange(segment.start, segment.end, _ROUTE_STEP), segment.end)
+        self._segment_world, self._start = replace(world, route=point_at(world.route, s)), segment.start
 
     @property
     def pool(self) -> tuple[ObstacleConfig, ...]:
-        """What the model must hold."""
-        standing = [_standing(kind, k) for kind in STANDING for k in range(self._count)]
-        return (*self._given, *standing, *(self._bystander(kind, k) for kind in STANDING for k in range(self._beside)))
+        """Obstacles that the model must contain."""
+        standing = [_static_obstacle(kind, k) for kind in STATIC_KINDS for k in range(self._count)]
+        distractors = [self._distractor(kind, k) for kind in STATIC_KINDS for k in range(self._beside)]
+        return (*self._given, *standing, *distractors)
 
-    def draw(self, rng: np.random.Generator, beside: int = 0) -> tuple[ObstacleConfig, ...]:
-        """Those of one episode, with so many beside the corridor."""
-        standing = random_obstacles(self._along, rng, self._count) if self._count else ()
+    def sample(self, rng: np.random.Generator, beside: int = 0) -> tuple[ObstacleConfig, ...]:
+        """Samples the obstacles of one episode, with `beside` distractor objects."""
+        standing = random_obstacles(self._segment_world, rng, self._count) if self._count else ()
+        distractors = random_distractors(self._segment_world, rng, beside)
         return (
             *self._given,
-            *self._placed(standing, _standing),
-            *self._placed(bystanders(self._along, rng, beside), self._bystander),
+            *self._from_pool(standing, _static_obstacle),
+            *self._from_pool(distractors, self._distractor),
         )
 
-    def _placed(
-        self, drawn: Sequence[ObstacleConfig], of_pool: Callable[[str, int], ObstacleConfig]
+    def _from_pool(
+        self, sampled: Sequence[ObstacleConfig], member: Callable[[str, int], ObstacleConfig]
     ) -> list[ObstacleConfig]:
-        """Those of the pool where others were drawn."""
+        """Members of the pool at the poses of sampled obstacles."""
         out: list[ObstacleConfig] = []
-        for one in drawn:
-            mine = of_pool(one.kind, sum(other.kind == one.kind for other in out))
+        for one in sampled:
+            mine = member(one.kind, sum(other.kind == one.kind for other in out))
             out.append(replace(mine, station=one.station + self._start, lateral=one.lateral, yaw=one.yaw))
         return out
 
-    def _bystander(self, kind: str, number: int) -> ObstacleConfig:
-        color = self._colors[STANDING.index(kind), number]
+    def _distractor(self, kind: str, number: int) -> ObstacleConfig:
+        color = self._colors[STATIC_KINDS.index(kind), number]
         return ObstacleConfig(f"beside_{kind}_{number}", kind, color=tuple(color.tolist()))
 
 
-def _standing(kind: str, number: int) -> ObstacleConfig:
+def _static_obstacle(kind: str, number: int) -> ObstacleConfig:
     return ObstacleConfig(f"{kind}_{number}", kind)
 
 
-class Surroundings:
-    """Keeps an episode's obstacles in their places."""
+class ObstacleMotion:
+    """Sets the poses of an episode's obstacles."""
 
     def __init__(self, obstacles: Sequence[ObstacleConfig], data: mujoco.MjData) -> None:
         self.obstacles, self._data = tuple(obstacles), data
-        self.moving = moves(self.obstacles)
-        """Whether any of them does."""
+        self.moving = any_moving(self.obstacles)
 
     def __call__(self, time: float) -> None:
-        """Moves what moves to where it is at a time [s]; at 0 everything."""
+        """Moves obstacles to their poses at a time [s]; static ones are set only at time 0."""
         if self.moving or time == 0.0:
             place(self.obstacles, self._data, time)

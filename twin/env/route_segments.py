@@ -1,8 +1,7 @@
-"""Which stretches of a scene's route are tasks.
+"""Tasks of a scene: segments of its route, each between two arc lengths.
 
-A *stretch* is a piece of the route between two arc lengths. The *standard tasks* are those of DriveEnv-NeRF:
-`straight` (30 m) and `right_turn` (60 m); they are looked for on the route. `[[task]]` entries of `scene.toml` name
-further ones, and `route` is the whole of it.
+The *standard tasks* of DriveEnv-NeRF, `straight` (30 m) and `right_turn` (60 m), are located on the route by shape.
+`[[task]]` entries of `scene.toml` define further ones, and `route` is the whole route.
 """
 
 from dataclasses import dataclass
@@ -17,71 +16,73 @@ from twin.types import Array
 
 @dataclass(frozen=True)
 class RouteSegment:
-    """What is driven in an episode."""
+    """A named part of the route; an episode drives it."""
 
     name: str
     start: float
-    """Arc length at which it begins [m]."""
+    """Arc length of its start [m]."""
     length: float
     """[m]"""
 
     @property
     def end(self) -> float:
-        """Arc length at which it ends [m]."""
+        """Arc length of its end [m]."""
         return self.start + self.length
 
 
 @dataclass(frozen=True)
 class _StandardTask:
     length: float  # [m]
-    turn: tuple[float, float]  # total turn it may have [rad], left positive
-    wander: float  # [rad] the heading may leave the range between its first and last value by
+    turn: tuple[float, float]  # range of the total turn [rad], left positive
+    max_excursion: float  # [rad] by which the heading may leave the range between its first and last value
 
 
-_STANDARD = {
+_STANDARD_SPECS = {
     "straight": _StandardTask(30.0, (-np.deg2rad(15), np.deg2rad(15)), np.deg2rad(10)),
     "right_turn": _StandardTask(60.0, (-np.deg2rad(120), -np.deg2rad(60)), np.deg2rad(20)),
 }
-STANDARD = tuple(_STANDARD)
+STANDARD_TASKS = tuple(_STANDARD_SPECS)
 """Names of the standard tasks."""
 
-_SHORTER = 0.05  # share by which a stretch may fall short of its standard length: scale and smoothing take their part
+_LENGTH_TOLERANCE = 0.05  # relative shortfall allowed for a standard task: scale and smoothing shorten a route
 _STEP = 0.25  # [m]
 
 
 def find_task(name: str, world: World, configured: tuple[TaskConfig, ...] = ()) -> RouteSegment:
-    """The stretch of a task by name.
+    """Returns the route segment of a task.
 
     Raises:
-        InputError: no such task, or the route has no such stretch; says which tasks there are.
+        InputError: no such task, or no such segment on the route; lists the tasks that exist.
     """
-    found = tasks(world, configured)
+    found = scene_tasks(world, configured)
     if name in found:
         return found[name]
     there = ", ".join(f"{s.name} ({s.length:.1f} m from {s.start:.1f} m)" for s in found.values())
     why = "unknown"
-    if name in _STANDARD:
-        longest = _longest(world.route, _STANDARD[name])
-        why = f"the route ({arc_lengths(world.route)[-1]:.1f} m) has no such stretch of {_STANDARD[name].length:g} m"
+    if name in _STANDARD_SPECS:
+        longest = _longest_fit(world.route, _STANDARD_SPECS[name])
+        total, length = arc_lengths(world.route)[-1], _STANDARD_SPECS[name].length
+        why = f"the route ({total:.1f} m) has no such segment of {length:g} m"
         if longest:
             why += f"; the longest is {longest[1]:.1f} m from {longest[0]:.1f} m"
     raise InputError(
-        f"task {name!r}: {why}; there are {there}; name another in scene.toml: "
+        f"task {name!r}: {why}; there are {there}; define another in scene.toml: "
         '[[task]] name = "mine", start = 0.0, length = 20.0'
     )
 
 
-def tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[str, RouteSegment]:
-    """All tasks of a scene by name; those of `scene.toml` replace standard ones of the same name.
+def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[str, RouteSegment]:
+    """Returns all tasks of a scene by name; a task of `scene.toml` replaces a standard one of the same name.
 
     Raises:
-        InputError: a configured one leaves the route.
+        InputError: a configured task extends beyond the route.
     """
     total = float(arc_lengths(world.route)[-1])
     found = {"route": RouteSegment("route", 0.0, total)}
-    for name, standard in _STANDARD.items():
+    for name, standard in _STANDARD_SPECS.items():
         length = min(standard.length, total)
-        if length >= (1.0 - _SHORTER) * standard.length and (starts := _fitting(world.route, standard, length)).size:
+        long_enough = length >= (1.0 - _LENGTH_TOLERANCE) * standard.length
+        if long_enough and (starts := _fitting_starts(world.route, standard, length)).size:
             found[name] = RouteSegment(name, float(starts[0]), length)
     for task in configured:
         if task.start + task.length > total + 1e-6:
@@ -93,27 +94,27 @@ def tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[str, Ro
     return found
 
 
-def _fitting(route: Array, standard: _StandardTask, length: float) -> Array:
-    """Arc lengths [m] at which stretches of a length that fit begin, best first: most of the turn in their middle."""
+def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:
+    """Arc lengths [m] at which a segment of this length fits; best first: most of the turn in the segment's middle."""
     total = float(arc_lengths(route)[-1])
     s = np.append(np.arange(0.0, total, _STEP), total)
     heading = np.unwrap(heading_at(route, s))
-    starts, off = [], []
+    starts, off_center = [], []
     for start in np.arange(0.0, total - length + 1e-9, _STEP):
         inside = heading[(s >= start - 1e-9) & (s <= start + length + 1e-9)]
         turn, low, high = inside[-1] - inside[0], min(inside[0], inside[-1]), max(inside[0], inside[-1])
-        wander = max(low - inside.min(), inside.max() - high)
-        if standard.turn[0] <= turn <= standard.turn[1] and wander <= standard.wander:
+        excursion = max(low - inside.min(), inside.max() - high)
+        if standard.turn[0] <= turn <= standard.turn[1] and excursion <= standard.max_excursion:
             starts.append(start)
             half = int(np.argmin(np.abs(inside - (inside[0] + inside[-1]) / 2)))
-            # A straight stretch has no middle of its turn; the first one will do.
-            off.append(abs(half / len(inside) - 0.5) if abs(turn) > np.deg2rad(30) else 0.0)
-    return np.array(starts)[np.argsort(np.array(off), kind="stable")] if starts else np.zeros(0)
+            # A straight segment has no turn to center, so its first fit is used.
+            off_center.append(abs(half / len(inside) - 0.5) if abs(turn) > np.deg2rad(30) else 0.0)
+    return np.array(starts)[np.argsort(np.array(off_center), kind="stable")] if starts else np.zeros(0)
 
 
-def _longest(route: Array, standard: _StandardTask) -> tuple[float, float] | None:
-    """Start and length [m] of the longest fitting stretch; None where there is none of 2 m."""
+def _longest_fit(route: Array, standard: _StandardTask) -> tuple[float, float] | None:
+    """Start and length [m] of the longest fitting segment; None if none reaches 2 m."""
     for length in np.arange(min(standard.length, float(arc_lengths(route)[-1])), 2.0, -1.0):
-        if (starts := _fitting(route, standard, float(length))).size:
+        if (starts := _fitting_starts(route, standard, float(length))).size:
             return float(starts[0]), float(length)
     return None

@@ -1,6 +1,7 @@
-"""`twin.load`: a built scene and a task as a dm_control environment.
+"""`twin.load`: a task in a built scene as a dm_control environment.
 
-Physics and task know nothing of pictures; `SeenDrive` adds them. Both are `dm_control.rl.control.Environment`s.
+`EnvFactory` reads the scene once and makes any number of environments. Physics and task do not depend on images;
+`DriveEnvironment` adds them.
 """
 
 import copy
@@ -14,17 +15,17 @@ import mujoco
 import numpy as np
 from dm_env import specs
 
-from twin.config import HELD_OUT, RANDOMISED, TRAINING
+from twin.config import HELD_OUT, RANDOMIZED, TRAINING
 from twin.config_file import load_config
 from twin.env import episode_lighting
 from twin.env.compositor import Compositor
-from twin.env.domain_randomization import ANOTHER_DAY, UNTOLD, VERSION, Ranges
+from twin.env.dm import DrivePhysics, control
+from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, VERSION, Ranges
 from twin.env.episode_model import episode_spec
 from twin.env.mujoco_renderer import ObjectRenderer, SceneRenderer, camera_pose
-from twin.env.observation import PixelObserver
+from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.obstacles import EpisodeObstacles, add_obstacles
-from twin.env.options import CPU, NERF, Options, control, parse_options
-from twin.env.physics import DrivePhysics
+from twin.env.options import CPU, NERF, Options, parse_options
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.task import DriveTask, RewardAndTermination
 from twin.env.trust import Trust
@@ -33,114 +34,118 @@ from twin.files import digest_file, digest_json
 from twin.loading import Twin, load_scene
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
-from twin.scene import finished, result_of
+from twin.scene import require_stage, stage_result
 
 
 @dataclass(frozen=True)
 class EnvFactory:
-    """A scene and a task, ready for any number of worlds."""
+    """A scene, a task and options, from which environments are made."""
 
     world: World
-    stretch: RouteSegment
+    segment: RouteSegment
     options: Options
     obstacles: EpisodeObstacles
     model: mujoco.MjModel
     field: BakedField | None
-    """None where no pictures of it are wanted."""
+    """None if no images are rendered from it."""
     trust: Trust | None
 
     @staticmethod
     def open(scene: str | Path | Twin, task: str, options: dict[str, Any]) -> "EnvFactory":
-        """Reads a built scene. Raises InputError: not built, no route, no such task or lighting, or unknown options."""
+        """Reads a built scene.
+
+        Raises:
+            InputError: the scene is not built or has no route, no such task or lighting, or invalid options.
+        """
         parsed = parse_options(options)
         twin = scene if isinstance(scene, Twin) else load_scene(scene)
-        finished(twin.scene, "mjcf")
+        require_stage(twin.scene, "mjcf")
         if not twin.scene.has_route:
-            raise InputError(f"{twin.scene.root}: nothing to drive, as its build has no route (mjcf.route)")
+            raise InputError(f"{twin.scene.root}: nothing to drive: its build has no route (mjcf.route)")
         world = twin.world()
         if parsed.randomise:
             parsed = dataclasses.replace(parsed, randomise=parsed.randomise.for_robot(world.robot))
         config = load_config(twin.scene.config_file)
-        stretch = find_task(task, world, config.task)
+        segment = find_task(task, world, config.task)
         wanted = config.obstacle if isinstance(parsed.obstacles, str) else parsed.obstacles
         beside = round(parsed.randomise.bystanders[1]) if parsed.randomise else 0
         half_width = parsed.half_width or world.half_width
-        obstacles = EpisodeObstacles(wanted, dataclasses.replace(world, half_width=half_width), stretch, beside)
-        spec = episode_spec(world, stretch.start, stretch.end, half_width)
+        obstacles = EpisodeObstacles(wanted, dataclasses.replace(world, half_width=half_width), segment, beside)
+        spec = episode_spec(world, segment.start, segment.end, half_width)
         add_obstacles(spec, obstacles.pool, world)
         trust = Trust(twin.cameras()) if parsed.pixels else None
         field = twin.field(parsed.device) if parsed.pixels and parsed.observe == NERF else None
         if field is not None:
-            episode_lighting.check_names(parsed.lighting, field)
-        return EnvFactory(world, stretch, parsed, obstacles, spec.compile(), field, trust)
+            episode_lighting.check_lighting_names(parsed.lighting, field)
+        return EnvFactory(world, segment, parsed, obstacles, spec.compile(), field, trust)
 
-    def drive(
-        self, seed: int | None, judge: tuple[RewardAndTermination, int] | None = None
+    def make_env(
+        self, seed: int | None, evaluator: tuple[RewardAndTermination, int] | None = None
     ) -> tuple[DrivePhysics, DriveTask]:
-        """One more world, with a model of its own; see `Drive`."""
+        """Returns physics, with its own copy of the model, and the task of a new environment; see `DriveTask`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
-        return physics, DriveTask(self.world, self.stretch, self.options, self.obstacles, self.model, seed, judge)
+        return physics, DriveTask(self.world, self.segment, self.options, self.obstacles, self.model, seed, evaluator)
 
     @property
-    def _bare(self) -> bool:
-        """Whether nothing is put into pictures of the field, not even the robot itself."""
+    def _field_only(self) -> bool:
+        """True if nothing is composited into the images of the field, not even the robot itself."""
         lighting = self.options.lighting
-        asked = (lighting,) if isinstance(lighting, str) else tuple(lighting)
-        airs = [self.field.air(name) for name in asked] if self.field else []
-        air = any(one and one.extinction for one in airs)
-        if self.options.randomise or self.options.camera or self.obstacles.pool or air:
+        names = (lighting,) if isinstance(lighting, str) else tuple(lighting)
+        fogs = [self.field.fog(name) for name in names] if self.field else []
+        has_fog = any(one and one.extinction for one in fogs)
+        if self.options.randomise or self.options.camera or self.obstacles.pool or has_fog:
             return False
         data, camera = mujoco.MjData(self.model), self.model.camera("front").id
         mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("spawn").id)
         mujoco.mj_forward(self.model, data)
-        return ObjectRenderer(self.model, camera, self.options.size).in_view(data, camera_pose(data, camera)) is None
+        renderer = ObjectRenderer(self.model, camera, self.options.size)
+        return renderer.visible_mask(data, camera_pose(data, camera)) is None
 
-    def pixels(self, worlds: list[tuple[DrivePhysics, DriveTask]]) -> PixelObserver | None:
+    def make_observer(self, envs: list[tuple[DrivePhysics, DriveTask]]) -> PixelObserver | None:
+        """Returns the observer that renders the images of environments; None without images."""
         if self.trust is None:
             return None
-        size, count = self.options.size, len(worlds)
-        if self.field is not None and self.options.device != CPU and self._bare:
-            from twin.env.observation import GpuPixelObserver  # its kernels are for that alone
-
-            return GpuPixelObserver(self.field, self.trust, self.options, worlds)
+        size, count = self.options.size, len(envs)
         if self.field is not None:
-            overlay = Compositor(self.model, self.field, size, count)
-            return PixelObserver(overlay, self.field, self.trust, self.options, worlds)
+            if self.options.device != CPU and self._field_only:
+                return GpuPixelObserver(self.field, self.trust, self.options, envs)
+            compositor = Compositor(self.model, self.field, size, count)
+            return PixelObserver(compositor, self.field, self.trust, self.options, envs)
         half_width = self.options.half_width or self.world.half_width
-        spec = episode_spec(self.world, self.stretch.start, self.stretch.end, half_width, looks=True)
+        spec = episode_spec(self.world, self.segment.start, self.segment.end, half_width, visuals=True)
         add_obstacles(spec, self.obstacles.pool, self.world)
-        return PixelObserver(SceneRenderer(spec.compile(), size, count), None, self.trust, self.options, worlds)
+        return PixelObserver(SceneRenderer(spec.compile(), size, count), None, self.trust, self.options, envs)
 
 
 def fingerprint(twin: Twin, task: str, lighting: str) -> str:
-    """What decides an episode besides its seed and who drives, as a digest.
+    """Returns a digest of everything that determines an episode, except for its seed and driver.
 
-    That is the field, the MJCF scene with its robot, the task's stretch, the obstacles of `scene.toml`, lightings from
-    photos that `lighting` names, how lights of a set are drawn, and what is drawn where it ends in `+randomised`.
+    It covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`, photo
+    lightings that `lighting` names, the version of lighting sets, and the randomization of a `+randomised` lighting.
 
     Raises:
-        InputError: as `Stage.open`.
+        InputError: see `EnvFactory.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
-    ranges = [dataclasses.asdict(one) for one in (Ranges(), ANOTHER_DAY)]  # of training and of judging
-    drawn = {"version": VERSION, "ranges": ranges} if lighting.endswith(RANDOMISED) else {}
-    plain = lighting.removesuffix(RANDOMISED)
+    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
+    randomization = {"version": VERSION, "ranges": ranges} if lighting.endswith(RANDOMIZED) else {}
+    plain = lighting.removesuffix(RANDOMIZED)
     photos = [path for name in plain.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()]
     return digest_json(
         {
-            "stages": [result_of(twin.scene, stage) for stage in ("field", "mjcf")],
+            "stages": [stage_result(twin.scene, factory) for factory in ("field", "mjcf")],
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
-            **({"randomise": drawn} if drawn else {}),
+            **({"randomise": randomization} if randomization else {}),
             **({"lights": episode_lighting.VERSION} if plain in (TRAINING, HELD_OUT) else {}),
             "photos": [digest_file(path) for path in photos],
-            **({"untold": UNTOLD} if photos and drawn else {}),
+            **({"untold": KNOWN_WEATHER_FRACTION} if photos and randomization else {}),
         }
     )
 
 
 class DriveEnvironment(control.Environment):
-    """A drive whose observations are pictures: `pixels`, uint8, shape (stack, height, width, 3), the newest last."""
+    """An environment with image observations: `pixels`, uint8, shape (stack, height, width, 3), the newest last."""
 
     def __init__(self, physics: DrivePhysics, task: DriveTask, pixels: PixelObserver) -> None:
         super().__init__(physics, task, control_timestep=task.options.control_timestep)
@@ -152,16 +157,16 @@ class DriveEnvironment(control.Environment):
         return self._with_pixels(step)
 
     def step(self, action: Any) -> dm_env.TimeStep:
-        begins = self._reset_next_step
-        step = super().step(action)  # calls reset() where an episode begins
-        if begins:
+        starts_episode = self._reset_next_step
+        step = super().step(action)  # calls reset() if an episode starts
+        if starts_episode:
             return step
-        self.pixels.look([0])
+        self.pixels.observe([0])
         return self._with_pixels(step)
 
     def observation_spec(self) -> dict[str, specs.BoundedArray]:
-        _, stack, three, height, width = self.pixels.stacks.shape
-        return {"pixels": specs.BoundedArray((stack, height, width, three), np.uint8, 0, 255, name="pixels")}
+        _, stack, channels, height, width = self.pixels.stacks.shape
+        return {"pixels": specs.BoundedArray((stack, height, width, channels), np.uint8, 0, 255, name="pixels")}
 
     def _with_pixels(self, step: dm_env.TimeStep) -> dm_env.TimeStep:
         return step._replace(observation={"pixels": np.ascontiguousarray(self.pixels.stacks[0].transpose(0, 2, 3, 1))})
@@ -170,20 +175,20 @@ class DriveEnvironment(control.Environment):
 def load(
     scene: str | Path | Twin, task: str = "right_turn", seed: int | None = None, **options: Any
 ) -> control.Environment:
-    """A task in a built scene as a dm_control environment.
+    """Loads a task in a built scene as a dm_control environment.
 
     Args:
-        scene: Its folder, or what `load_scene` returned.
+        scene: The scene's folder, or the result of `load_scene`.
         task: `straight`, `right_turn`, `route`, or a [[task]] of its scene.toml.
-        seed: Of the sequence of episodes; None: unpredictable.
+        seed: Seed of the sequence of episodes; None: unpredictable.
         options: See `twin.env.options.Options`.
 
     Raises:
-        InputError: the scene is not built or has no such task, or an option is not to be had.
+        InputError: the scene is not built or has no such task, or an option is invalid.
     """
-    stage = EnvFactory.open(scene, task, options)
-    physics, drive = stage.drive(seed)
-    pixels = stage.pixels([(physics, drive)])
+    factory = EnvFactory.open(scene, task, options)
+    physics, drive_task = factory.make_env(seed)
+    pixels = factory.make_observer([(physics, drive_task)])
     if pixels is None:
-        return control.Environment(physics, drive, control_timestep=drive.options.control_timestep)
-    return DriveEnvironment(physics, drive, pixels)
+        return control.Environment(physics, drive_task, control_timestep=drive_task.options.control_timestep)
+    return DriveEnvironment(physics, drive_task, pixels)

@@ -1,11 +1,9 @@
-"""A drive along a stretch of a route as a dm_control task. It knows poses and contacts, and nothing of pictures.
+"""Driving along a route segment as a dm_control task; it uses poses and contacts, never images.
 
-An *episode* starts at rest near the stretch's beginning and ends with a *cause*: `goal` (the robot's bumper crosses the
-end of the stretch), `collision`, `out_of_bounds` (the base left the corridor), `timeout`, `rollover` or `stuck`. Its
-*discount* at the end is 0, but 1 at a time limit, beyond which life would have gone on.
-
-An episode's *seed* decides all its randomness. Start, robot and light are drawn from generators of their own, so that
-changing one of them leaves the others as they were, and two policies can be compared on the same episodes.
+An *episode* starts at rest near the segment's start and ends with one of `CAUSES`. The discount at the end is 0; at a
+timeout it is 1, as the episode is only truncated. An episode's seed determines all its randomness. Start, robot,
+lighting, obstacles, camera and weather have separate generators: changing one leaves the others unchanged, so policies
+can be compared on the same episodes.
 """
 
 from collections import OrderedDict
@@ -19,40 +17,34 @@ from dm_env import specs
 from numpy.typing import NDArray
 
 from twin.config import ObstacleConfig
-from twin.env.domain_randomization import Nominal, RandomizationSample
-from twin.env.obstacles import EpisodeObstacles, Surroundings
-from twin.env.options import STEERING, Options, control
-from twin.env.physics import DrivePhysics
+from twin.env.dm import DrivePhysics, control
+from twin.env.domain_randomization import NominalModel, RandomizationSample
+from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
+from twin.env.options import CAUSES, STEERING, Options
 from twin.env.route_segments import RouteSegment
-from twin.errors import InputError, shown
-from twin.mjcf.world import World, heading_at, heading_error, nearest, point_at
+from twin.errors import InputError, short_repr
+from twin.mjcf.world import World, heading_at, heading_error, nearest_on_route, point_at
 from twin.types import Array
 
-# ---- What becomes of drives along a stretch of a route: where each is, why it ends, what a step of it is worth.
-#
-# Written for n drives at once: the task of one world is a judge of one drive, and the many worlds of a GPU share one
-# judge, so all are judged by the same arithmetic. The *foot* is the arc length of the route's point next to the robot's
-# base; *progress* is the foot's way from the beginning of the stretch.
+EnvIndices = Sequence[int] | NDArray[np.int64]
+
+STATE_SIZES = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": 3}
+"""Components of the state and their sizes; see `RewardAndTermination.state`."""
+
+_CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
+_BUMPER_OFFSET = 0.5  # [m] ahead of the base
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] behind and ahead of the last foot
+_ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
+_STUCK_TIME, _STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: stuck if it moves less than this distance in this time
+_LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route, at which the state contains the change of heading
 
 
-Which = Sequence[int] | NDArray[np.int64]
-
-CAUSES = ("", "rollover", "collision", "out_of_bounds", "goal", "timeout", "stuck")
-"""Why an episode ends; the first: it goes on. Where several hold, the earlier one is told."""
-STATE = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": 3}
-"""What a driver's state is made of, and how many numbers of each; see `Judge.state`."""
-
-_GOAL, _TIMEOUT = CAUSES.index("goal"), CAUSES.index("timeout")
-_BUMPER = 0.5  # [m] ahead of the base
-_SEARCH = (1.0, 3.0)  # [m] behind and ahead of the last foot
-_ROLLED = 0.5  # cosine of the tilt beyond which the robot has rolled over
-_STUCK_TIME, _STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: less way than this in that time
-_AHEAD = (1.0, 2.0, 4.0)  # [m] along the route, of which the state tells the curvature
+# ---- reward and termination of n drives at once
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Of k robots, at the end of a control step."""
+    """Motion of k robots at the end of a control step."""
 
     pose: Array
     """x, y [m] and yaw [rad] of the bases, shape (k, 3)."""
@@ -63,106 +55,112 @@ class Motion:
     uprightness: Array
     """Cosine of the tilt, shape (k,)."""
     touched: NDArray[np.bool_]
-    """Whether anything but the ground was touched during the step, shape (k,)."""
+    """True where the robot touched anything but the ground during the step, shape (k,)."""
     time: Array
-    """Of the episodes [s], shape (k,)."""
+    """Since the start of the episodes [s], shape (k,)."""
 
 
 class RewardAndTermination:
-    """Of n drives along one stretch. Drives are told by their numbers, `which`, shape (k,)."""
+    """Reward, termination and state of n drives along one route segment.
 
-    def __init__(self, world: World, stretch: RouteSegment, options: Options, count: int = 1) -> None:
-        """
-        Args:
-            world: Has the route.
-            stretch: What is driven.
-            options: Corridor, limits and rewards.
-            count: How many drives there are.
-        """
-        self.stretch, self.options = stretch, options
+    A task uses it for one drive, a GPU vector environment for all of its drives, so both compute the same numbers.
+    `which` selects k of the n drives. The *foot* is the arc length of the route's point nearest to the robot's base;
+    progress is the distance of the foot from the segment's start.
+    """
+
+    def __init__(self, world: World, segment: RouteSegment, options: Options, count: int = 1) -> None:
+        """`count`: number of drives n."""
+        self.segment, self.options = segment, options
         self.half_width = options.half_width or world.half_width
-        """Of the corridor [m]."""
-        self.time_limit = options.time_limit or 2.0 * stretch.length / options.speed
+        """Half width of the corridor [m]."""
+        self.time_limit = options.time_limit or 2.0 * segment.length / options.speed
         """[s]"""
         self.foot, self.cross_track = np.zeros(count), np.zeros(count)
         """Arc length and distance from the route, left positive [m], shape (n,)."""
-        self.cause = np.zeros(count, int)
-        """Why each ended, or that it goes on: index into `CAUSES`, shape (n,)."""
+        self._cause = np.zeros(count, int)
         self._route = world.route[:, :2]
-        self._before, self._steering = np.zeros(count), np.zeros(count)
-        self._last_moved, self._stood = np.zeros((count, 2)), np.zeros(count)
+        self._previous_foot, self._steering = np.zeros(count), np.zeros(count)
+        # Position and time of the last movement by _STUCK_DISTANCE.
+        self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
-        self._worth = np.array([getattr(terms, cause) if cause else 0.0 for cause in CAUSES])
-        self._worth[[0, _GOAL]] += terms.step
+        self._cause_rewards = np.array([0.0, *(getattr(terms, cause) for cause in CAUSES)])
+        self._cause_rewards[[0, _CODES["goal"]]] += terms.step
 
-    def begin(self, which: Which, foot: Array, position: Array) -> None:
-        """Drives begin: near which arc lengths, shape (k,), and where, shape (k, 2) [m]."""
-        self.cause[which], self._stood[which], self._steering[which] = 0, 0.0, 0.0
+    def begin(self, which: EnvIndices, foot: Array, position: Array) -> None:
+        """Starts episodes near arc lengths, shape (k,), at positions, shape (k, 2) [m]."""
+        self._cause[which], self._anchor_time[which], self._steering[which] = 0, 0.0, 0.0
         self.foot[which], self.cross_track[which] = self._nearest(position, foot)
-        self._before[which], self._last_moved[which] = self.foot[which], position
+        self._previous_foot[which], self._anchor[which] = self.foot[which], position
 
-    def act(self, which: Which, yaw_rate: Array) -> None:
-        """What is steered in the coming step [rad/s], shape (k,)."""
+    def set_steering(self, which: EnvIndices, yaw_rate: Array) -> None:
+        """Stores the yaw rates commanded for the coming step [rad/s], shape (k,); the steering reward uses them."""
         self._steering[which] = yaw_rate / self.options.yaw_rate
 
-    def judge(self, which: Which, motion: Motion) -> None:
-        """Takes in where a control step has led."""
+    def evaluate(self, which: EnvIndices, motion: Motion) -> None:
+        """Updates progress and termination after a control step."""
         position = motion.pose[:, :2]
-        self._before[which] = self.foot[which]
+        self._previous_foot[which] = self.foot[which]
         foot, cross = self.foot[which], self.cross_track[which] = self._nearest(position, self.foot[which])
-        moved = np.linalg.norm(position - self._last_moved[which], axis=-1) > _STUCK_DISTANCE
-        self._last_moved[which] = np.where(moved[:, None], position, self._last_moved[which])
-        self._stood[which] = np.where(moved, motion.time, self._stood[which])
-        holds = [  # in the order of CAUSES
-            motion.uprightness < _ROLLED,
-            motion.touched,
-            np.abs(cross) > self.half_width,
-            foot >= self.stretch.end - _BUMPER,
-            motion.time > self.time_limit - 1e-6,
-            motion.time - self._stood[which] >= _STUCK_TIME,
-        ]
-        self.cause[which] = np.select(holds, list(range(1, len(CAUSES))), 0)
+        moved = np.linalg.norm(position - self._anchor[which], axis=-1) > _STUCK_DISTANCE
+        self._anchor[which] = np.where(moved[:, None], position, self._anchor[which])
+        self._anchor_time[which] = np.where(moved, motion.time, self._anchor_time[which])
+        conditions = {  # the first that holds takes precedence
+            "rollover": motion.uprightness < _ROLLOVER_COSINE,
+            "collision": motion.touched,
+            "out_of_bounds": np.abs(cross) > self.half_width,
+            "goal": foot >= self.segment.end - _BUMPER_OFFSET,
+            "timeout": motion.time > self.time_limit - 1e-6,
+            "stuck": motion.time - self._anchor_time[which] >= _STUCK_TIME,
+        }
+        self._cause[which] = np.select(list(conditions.values()), [_CODES[cause] for cause in conditions], 0)
 
-    def reward(self, which: Which) -> Array:
-        """Of the step that was judged last, shape (k,)."""
+    def cause(self, i: int) -> str:
+        """The cause of drive i's end, one of `CAUSES`; empty while the episode goes on."""
+        code = self._cause[i]
+        return CAUSES[code - 1] if code else ""
+
+    def reward(self, which: EnvIndices) -> Array:
+        """Returns the reward of the last evaluated step, shape (k,)."""
         terms = self.options.rewards
         off = np.minimum(1.0, np.abs(self.cross_track[which]) / self.half_width)
-        way = terms.progress * (self.foot[which] - self._before[which]) + terms.cross_track * off
-        return self._worth[self.cause[which]] + way + terms.steering * self._steering[which] ** 2
+        motion = terms.progress * (self.foot[which] - self._previous_foot[which]) + terms.cross_track * off
+        return self._cause_rewards[self._cause[which]] + motion + terms.steering * self._steering[which] ** 2
 
-    def ended(self, which: Which) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Whether drives are over for good, and whether only their time is up, each shape (k,)."""
-        timeout = self.cause[which] == _TIMEOUT
-        return (self.cause[which] > 0) & ~timeout, timeout
+    def ended(self, which: EnvIndices) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Returns which drives are terminated, and which are truncated by the time limit, each shape (k,)."""
+        timeout = self._cause[which] == _CODES["timeout"]
+        return (self._cause[which] > 0) & ~timeout, timeout
 
-    def state(self, which: Which, motion: Motion) -> NDArray[np.float32]:
-        """What a driver that knows the map would know, shape (k, 7).
+    def state(self, which: EnvIndices, motion: Motion) -> NDArray[np.float32]:
+        """Returns the privileged state of a driver that knows the map, shape (k, 7).
 
         `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] left positive, `heading_error` [rad] of the robot against
-        the route, `turns` [rad]: how far the route's heading has turned 1, 2 and 4 m ahead.
+        the route, `turns` [rad]: change of the route's heading 1, 2 and 4 m ahead.
         """
         foot = self.foot[which]
         heading = heading_at(self._route, foot)
-        turns = heading_error(heading_at(self._route, foot[:, None] + np.array(_AHEAD)), heading[:, None])
+        turns = heading_error(heading_at(self._route, foot[:, None] + np.array(_LOOKAHEADS)), heading[:, None])
         error = heading_error(motion.pose[:, 2], heading)
         columns = (motion.speed, motion.yaw_rate, self.cross_track[which], error)
         return np.column_stack([*columns, turns]).astype(np.float32)
 
     def _nearest(self, position: Array, foot: Array) -> tuple[Array, Array]:
-        return nearest(self._route, position, (foot - _SEARCH[0], foot + _SEARCH[1]))
+        return nearest_on_route(self._route, position, (foot - _SEARCH_WINDOW[0], foot + _SEARCH_WINDOW[1]))
 
 
-START, ROBOT, LIGHT, OBSTACLES, CAMERA, WEATHER = range(6)
-"""Streams of an episode's randomness: `numpy.random.default_rng([seed, stream])`."""
+# ---- the task of one drive
+
+START, ROBOT, LIGHTING, OBSTACLES, CAMERA, WEATHER = range(6)
+"""Random streams of an episode: `numpy.random.default_rng([seed, stream])`."""
 
 _START_TRIES = 50
 
 
-def checked_actions(actions: Any, shape: tuple[int, ...]) -> Array:
-    """Actions as float64.
+def check_actions(actions: Any, shape: tuple[int, ...]) -> Array:
+    """Returns actions as float64.
 
     Raises:
-        ValueError: of another shape, no real numbers (booleans are none), or not finite.
+        ValueError: wrong shape, not real numbers (booleans are not accepted), or not finite.
     """
     try:
         given = np.asarray(actions)
@@ -170,115 +168,116 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> Array:
         given = np.empty(0, object)
     if given.dtype.kind not in "iuf" or given.shape != shape or not np.isfinite(given).all():
         kind = f"{given.dtype} of shape {given.shape}"
-        raise ValueError(f"action {shown(actions)} ({kind}); expected finite numbers of shape {shape}")
+        raise ValueError(f"action {short_repr(actions)} ({kind}); expected finite numbers of shape {shape}")
     return given.astype(np.float64, copy=False)
 
 
 class DriveTask(control.Task):
-    """Drives a stretch."""
+    """A dm_control task: driving along a route segment."""
 
     def __init__(
         self,
         world: World,
-        stretch: RouteSegment,
+        segment: RouteSegment,
         options: Options,
         obstacles: EpisodeObstacles,
         model: mujoco.MjModel,
         seed: int | None = None,
-        judge: tuple[RewardAndTermination, int] | None = None,
+        evaluator: tuple[RewardAndTermination, int] | None = None,
     ) -> None:
         """
         Args:
             world: Route and corridor.
-            stretch: What is driven.
-            options: How.
-            obstacles: What stands or moves in the way; the model holds its pool.
-            model: As compiled; the one that is driven in may be a copy.
-            seed: Of the sequence of episodes; None: unpredictable.
-            judge: Of many drives, and which of them this is; by default one of its own.
+            segment: Route segment to drive.
+            options: Start, action, limits, rewards, randomization.
+            obstacles: Samples an episode's obstacles; the model contains its pool.
+            model: The unmodified compiled model; physics may step a copy.
+            seed: Seed of the sequence of episodes; None: unpredictable.
+            evaluator: Shared reward and termination of many drives, and the index of this drive; None: its own.
         """
-        self.world, self.stretch, self.options = world, stretch, options
-        self._judge, self._number = judge or (RewardAndTermination(world, stretch, options), 0)
-        self.half_width, self.time_limit = self._judge.half_width, self._judge.time_limit
+        self.world, self.segment, self.options = world, segment, options
+        self._evaluator, self._index = evaluator or (RewardAndTermination(world, segment, options), 0)
+        self.half_width, self.time_limit = self._evaluator.half_width, self._evaluator.time_limit
         self._obstacles = obstacles
-        self._nominal = Nominal(model) if options.randomise else None
+        self._nominal = NominalModel(model) if options.randomise else None
         self.seed(seed)
         self.episode_seed = 0
-        """Of the episode under way."""
-        self.draw = RandomizationSample()
-        """Of the episode under way: its robot and its weather."""
-        self._record = self.draw.record()
+        """Seed of the current episode."""
+        self.sample = RandomizationSample()
+        """Robot and weather of the current episode."""
+        self._record = self.sample.record()
         self.obstacles: tuple[ObstacleConfig, ...] = ()
-        """Of the episode under way."""
-        self._began = stretch.start
+        """Obstacles of the current episode."""
+        self._start_station = segment.start
 
     def seed(self, seed: int | None) -> None:
         """Starts another sequence of episodes."""
         self._rng = np.random.default_rng(seed)
 
-    def weathered(self, draw: RandomizationSample) -> None:
-        """Takes another draw for that of the episode under way, which differs from it in the weather alone."""
-        self.draw, self._record = draw, draw.record()
+    def set_weather(self, sample: RandomizationSample) -> None:
+        """Replaces the current episode's sample by one that differs only in its weather."""
+        self.sample, self._record = sample, sample.record()
 
     def rng(self, stream: int) -> np.random.Generator:
-        """A generator of the episode under way."""
+        """Returns a new generator of one stream of the current episode."""
         return np.random.default_rng([self.episode_seed, stream])
 
-    # ---- what dm_control calls
+    # ---- interface of dm_control
 
     def initialize_episode(self, physics: DrivePhysics) -> None:
         self.episode_seed = int(self._rng.integers(2**63))
-        self.draw = self.options.randomise.draw(self.rng(ROBOT)) if self.options.randomise else RandomizationSample()
-        self._record = self.draw.record()
+        ranges = self.options.randomise
+        self.sample = ranges.sample(self.rng(ROBOT)) if ranges else RandomizationSample()
+        self._record = self.sample.record()
         if self._nominal:
-            self._nominal.apply(self.draw, physics.model.ptr)
+            self._nominal.apply(self.sample, physics.model.ptr)
         params = self.world.robot
-        physics.set_robot(replace(params, command_latency=params.command_latency + self.draw.latency))
-        self.obstacles = self._obstacles.draw(self.rng(OBSTACLES), self.draw.bystanders)
-        physics.robot.surroundings = Surroundings(self.obstacles, physics.data.ptr)
+        physics.set_robot(replace(params, command_latency=params.command_latency + self.sample.latency))
+        self.obstacles = self._obstacles.sample(self.rng(OBSTACLES), self.sample.bystanders)
+        physics.robot.move_obstacles = ObstacleMotion(self.obstacles, physics.data.ptr)
         rng = self.rng(START)
         for _ in range(_START_TRIES):
-            physics.robot.place(*self._start(rng))
+            physics.robot.set_pose(*self._sample_start(rng))
             if not physics.touched:
                 break
         else:
             raise InputError(
-                f"task {self.stretch.name!r}: the robot touches {', '.join(physics.touched)} wherever it starts; "
-                "move the obstacle or the start"
+                f"task {self.segment.name!r}: the robot touches {', '.join(physics.touched)} at each of {_START_TRIES} "
+                "sampled starts; move the obstacle or the start"
             )
-        self._judge.begin(self._me, np.array([self._began]), physics.planar_pose[None, :2])
+        self._evaluator.begin([self._index], np.array([self._start_station]), physics.planar_pose[None, :2])
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
-        """Raises ValueError: no action; the episode is as it was."""
+        """Raises ValueError: not a valid action; the episode is unchanged."""
         width = 1 if self.options.action == STEERING else 2
-        commands = self.commands(checked_actions(action, (width,))[None])
-        self._judge.act(self._me, commands[:, 1])
+        commands = self.commands(check_actions(action, (width,))[None])
+        self._evaluator.set_steering([self._index], commands[:, 1])
         physics.robot.command(*commands[0].tolist())
 
     def after_step(self, physics: DrivePhysics) -> None:
-        self._judge.judge(self._me, _motion(physics))
+        self._evaluator.evaluate([self._index], _robot_motion(physics))
 
     def get_reward(self, physics: DrivePhysics) -> float:
-        return float(self._judge.reward(self._me)[0])
+        return float(self._evaluator.reward([self._index])[0])
 
     def get_termination(self, physics: DrivePhysics) -> float | None:
-        failed_or_arrived, timeout = self._judge.ended(self._me)
-        return 0.0 if failed_or_arrived[0] else 1.0 if timeout[0] else None
+        terminated, truncated = self._evaluator.ended([self._index])
+        return 0.0 if terminated[0] else 1.0 if truncated[0] else None
 
     def get_observation(self, physics: DrivePhysics) -> "OrderedDict[str, Array]":
-        """What a driver that knows the map would know, see `Judge.state`."""
-        state = self._judge.state(self._me, _motion(physics))[0]
-        ends = np.cumsum(list(STATE.values()))
-        return OrderedDict(zip(STATE, np.split(state, ends[:-1]), strict=True))
+        """Returns the privileged state, see `RewardAndTermination.state`."""
+        state = self._evaluator.state([self._index], _robot_motion(physics))[0]
+        ends = np.cumsum(list(STATE_SIZES.values()))
+        return OrderedDict(zip(STATE_SIZES, np.split(state, ends[:-1]), strict=True))
 
     def observation_spec(self, physics: DrivePhysics) -> "OrderedDict[str, specs.Array]":
-        return OrderedDict((name, specs.Array((n,), np.float32, name)) for name, n in STATE.items())
+        return OrderedDict((name, specs.Array((n,), np.float32, name)) for name, n in STATE_SIZES.items())
 
     def action_spec(self, physics: DrivePhysics) -> specs.BoundedArray:
         low, high = self._bounds()
         return specs.BoundedArray(low.shape, np.float64, low, high, name="\t".join(self.action_names))
 
-    # ---- what else may be asked
+    # ---- state of the episode
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -286,36 +285,36 @@ class DriveTask(control.Task):
 
     @property
     def cause(self) -> str:
-        """Why the episode ended; empty while it goes on."""
-        return CAUSES[self._judge.cause[self._number]]
+        """The cause of the episode's end; empty while it goes on."""
+        return self._evaluator.cause(self._index)
 
     @property
     def cross_track(self) -> float:
         """Distance from the route [m], left positive."""
-        return float(self._judge.cross_track[self._number])
+        return float(self._evaluator.cross_track[self._index])
 
     @property
     def progress(self) -> float:
-        """Way along the stretch [m]; may be slightly negative."""
-        return float(self._judge.foot[self._number]) - self.stretch.start
+        """Distance along the segment [m]; may be slightly negative."""
+        return float(self._evaluator.foot[self._index]) - self.segment.start
 
     def commands(self, actions: Array) -> Array:
-        """What actions, shape (k, 1 or 2), ask of the robot: v [m/s] and ω [rad/s], shape (k, 2)."""
+        """Converts actions, shape (k, 1 or 2), to commands v [m/s] and ω [rad/s], shape (k, 2)."""
         actions = np.clip(actions, *self._bounds())
         if self.options.action == STEERING:
             return np.column_stack([np.full(len(actions), self.options.speed), actions])
         return actions
 
     def info(self, physics: DrivePhysics) -> dict[str, Any]:
-        """The episode so far, JSON-able."""
-        return self.told(physics.speed, physics.touched)
+        """Returns the episode's info so far, JSON-able."""
+        return self.episode_info(physics.speed, physics.touched)
 
-    def told(self, speed: float, touched: Sequence[str]) -> dict[str, Any]:
-        """The same, where the robot's speed [m/s] and what it touched are known."""
+    def episode_info(self, speed: float, touched: Sequence[str]) -> dict[str, Any]:
+        """Returns the same info for a given speed [m/s] and touched geoms."""
         return {
             "cause": self.cause,
             "is_success": self.cause == "goal",
-            "start": self._began - self.stretch.start,
+            "start": self._start_station - self.segment.start,
             "progress": self.progress,
             "cross_track": self.cross_track,
             "speed": speed,
@@ -330,23 +329,18 @@ class DriveTask(control.Task):
             return np.array([-o.yaw_rate]), np.array([o.yaw_rate])
         return np.array([0.0, -o.yaw_rate]), np.array([o.speed, o.yaw_rate])
 
-    def _start(self, rng: np.random.Generator) -> tuple[float, float, float]:
-        """x, y [m] and yaw [rad]."""
+    def _sample_start(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Samples a start pose: x, y [m] and yaw [rad]."""
         o = self.options
         offset = rng.uniform(-o.start_offset, o.start_offset)
         turn = np.deg2rad(rng.uniform(-o.start_heading, o.start_heading))
-        on_the_way = max(0.0, rng.uniform(-1.0, 1.0)) if o.start_along else 0.0
-        s = self._began = self.stretch.start + on_the_way * o.start_along * self.stretch.length
+        share = max(0.0, rng.uniform(-1.0, 1.0)) if o.start_along else 0.0
+        s = self._start_station = self.segment.start + share * o.start_along * self.segment.length
         heading = float(heading_at(self.world.route[:, :2], s))
         x, y = point_at(self.world.route[:, :2], s) + offset * np.array([-np.sin(heading), np.cos(heading)])
         return float(x), float(y), heading + float(turn)
 
-    @property
-    def _me(self) -> list[int]:
-        return [self._number]
 
-
-def _motion(physics: DrivePhysics) -> Motion:
-    """Of one robot."""
+def _robot_motion(physics: DrivePhysics) -> Motion:
     values = physics.speed, physics.yaw_rate, physics.uprightness, bool(physics.touched), physics.time()
     return Motion(physics.planar_pose[None], *(np.array([value]) for value in values))

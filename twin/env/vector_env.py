@@ -1,4 +1,4 @@
-"""Many worlds at once: in this process, in several processes, or on a GPU; the options' device and the CPU cores decide."""
+"""Vector environments: `make_vector_env` steps them in one process, in several processes, or on a GPU."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +10,9 @@ from twin.env.vector_env_local import LocalVectorEnv
 from twin.env.vector_env_processes import ProcessVectorEnv
 from twin.errors import InputError
 from twin.loading import Twin
-from twin.runtime import cores
+from twin.runtime import available_cores
 
-_FEWEST, _MOST = 2, 8  # worlds of a process, and processes unless asked for: each takes its memory
+_MIN_ENVS, _MAX_PROCESSES = 2, 8  # defaults: environments per process, and processes, as each needs its own memory
 
 
 def make_vector_env(
@@ -22,28 +22,27 @@ def make_vector_env(
     seeds: Sequence[int | None],
     processes: int | None = None,
 ) -> LocalVectorEnv | ProcessVectorEnv:
-    """n worlds on the device that the options say, see `LocalVectorEnv`; on a CPU in several processes where that is faster.
+    """Returns n environments on the device of the options; see `LocalVectorEnv` for their interface.
 
     Args:
         scene: See `twin.load`.
         task: See `twin.load`.
         options: See `twin.env.options.Options`.
-        seeds: One per world, of its sequence of episodes; None: unpredictable.
-        processes: How many step the worlds on a CPU; None: one per core, at most 8, and no more than half
-                as many as worlds.
+        seeds: Seed of each environment's sequence of episodes; None: unpredictable.
+        processes: Number of processes on a CPU; None: one per core, at most 8, with at least two environments in each.
 
     Raises:
-        InputError: as `Stage.open`, or no process at all.
+        InputError: see `EnvFactory.open`; or `processes` is below 1.
     """
     if processes is not None and processes < 1:
         raise InputError(f"processes = {processes}; expected at least 1")
     if parse_options(options).device == CPU:
         if processes is None:
-            processes = min(cores(), len(seeds) // _FEWEST, _MOST)
+            processes = min(available_cores(), len(seeds) // _MIN_ENVS, _MAX_PROCESSES)
         if processes > 1:
             return ProcessVectorEnv(scene, task, options, seeds, min(processes, len(seeds)))
         return LocalVectorEnv(EnvFactory.open(scene, task, options), seeds)
     from twin.env.vector_env_gpu import GpuVectorEnv  # slow to import
 
-    stage = EnvFactory.open(scene, task, options)
-    return GpuVectorEnv(stage, seeds, stage.options.device)
+    factory = EnvFactory.open(scene, task, options)
+    return GpuVectorEnv(factory, seeds, factory.options.device)

@@ -1,4 +1,4 @@
-"""A process with some of the worlds of `ProcessWorlds`, whose requests it answers.
+"""Child process of `ProcessVectorEnv`: executes the parent's requests on some of its environments.
 
 python -m twin.env.vector_env_child SOCKET PARENT CORES
 """
@@ -18,61 +18,62 @@ from numpy.typing import NDArray
 from twin import runtime
 from twin.env.suite import EnvFactory
 from twin.env.vector_env_local import LocalVectorEnv, StepResult
-from twin.env.vector_env_processes import StepMessage, pickled
+from twin.env.vector_env_processes import StepMessage, serialize
 
-_LOOK = 2.0  # [s] between two looks whether the parent is still there
+_PARENT_CHECK_PERIOD = 2.0  # [s] between two checks that the parent runs
 
 
 class VectorEnvServer:
-    """What a child does: a request is a method's name and arguments, of its own or of its worlds."""
+    """Executes requests: name and arguments of a method of this class or of its `LocalVectorEnv`."""
 
-    worlds: LocalVectorEnv
+    envs: LocalVectorEnv
 
     def answer(self, request: bytes) -> bytes:
-        """What came of a request: an exception or None, and what was asked for."""
+        """Executes a request and returns an exception or None, and the result."""
         try:
-            what, *args, kwargs = pickle.loads(request)
-            owner = self if what in ("open", "begin", "step") else self.worlds
-            return pickled((None, getattr(owner, what)(*args, **kwargs)))
+            method, *args, kwargs = pickle.loads(request)
+            owner = self if method in ("open", "begin", "step") else self.envs
+            return serialize((None, getattr(owner, method)(*args, **kwargs)))
         except Exception as error:
-            error.add_note(f"in a process of worlds:\n{traceback.format_exc()}")
+            error.add_note(f"in a process of the vector environment:\n{traceback.format_exc()}")
             with contextlib.suppress(Exception):
-                reply = pickled((error, None))
-                pickle.loads(reply)  # which not every exception bears
+                reply = serialize((error, None))
+                pickle.loads(reply)  # fails for some exceptions
                 return reply
-            return pickled((RuntimeError(error.__notes__[-1]), None))
+            return serialize((RuntimeError(error.__notes__[-1]), None))
 
-    def open(self, quiet: bool, *stage: Any) -> tuple[int, int]:
+    def open(
+        self, quiet: bool, scene: Any, task: str, options: dict[str, Any], seeds: list[int | None]
+    ) -> tuple[int, int]:
         runtime.set_quiet(quiet)
-        *opened, seeds = stage
-        self.worlds = LocalVectorEnv(EnvFactory.open(*opened), seeds)
-        return self.worlds.actions, self.worlds.states
+        self.envs = LocalVectorEnv(EnvFactory.open(scene, task, options), seeds)
+        return self.envs.action_size, self.envs.state_size
 
     def begin(self, which: list[int]) -> StepMessage:
-        self.worlds.begin(which)
-        return self._news(which)
+        self.envs.begin(which)
+        return self._message(which)
 
     def step(self, actions: NDArray, which: list[int]) -> StepMessage:
-        return self._news(which, self.worlds.step(actions, which))
+        return self._message(which, self.envs.step(actions, which))
 
-    def _news(self, which: list[int], outcome: StepResult | None = None) -> StepMessage:
-        worlds, pixels = self.worlds, self.worlds.pixels
-        pictures = pixels.stacks[which, -1] if pixels else None
+    def _message(self, which: list[int], result: StepResult | None = None) -> StepMessage:
+        envs, pixels = self.envs, self.envs.pixels
+        images = pixels.stacks[which, -1] if pixels else None
         trust = pixels.trust[which] if pixels else np.zeros(len(which))
-        states = np.stack([worlds.state(i) for i in which])
-        return StepMessage(pictures, trust, states, [worlds.info(i) for i in which], outcome)
+        states = np.stack([envs.state(i) for i in which])
+        return StepMessage(images, trust, states, [envs.info(i) for i in which], result)
 
 
 def main() -> None:
     socket, parent, share = map(int, sys.argv[1:])
     os.set_inheritable(socket, False)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # where all processes get it: the parent may want to save first
-    runtime.use(share)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # may reach all processes; the parent saves first and ends this one
+    runtime.limit_cores(share)
     server = VectorEnvServer()
-    with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent has closed it
+    with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent closed it
         while True:
-            while not pipe.poll(_LOOK):
-                if os.getppid() != parent:  # gone, though somebody it forked may still have the socket
+            while not pipe.poll(_PARENT_CHECK_PERIOD):
+                if os.getppid() != parent:  # ended, though a process that it forked may keep the socket open
                     return
             pipe.send_bytes(server.answer(pipe.recv_bytes()))
 

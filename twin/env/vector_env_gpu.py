@@ -1,8 +1,7 @@
-"""Many worlds on a GPU: stepped, judged and, where the field alone is in view, seen all at once.
+"""Vector environment on a GPU: `mujoco_warp` steps all environments at once.
 
-An episode begins on the host, world by world, as everywhere. After that nothing is done world by world but for those
-who ask for one of them: `mujoco_warp` steps all (`vector_env_gpu.py`), one `Judge` judges all, and pictures stay on the
-device (`observation.py`).
+Episodes start on the host, one by one. After that, reward and termination are computed for all environments together,
+and images stay on the device where only the field is in view (`GpuPixelObserver`).
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
@@ -13,377 +12,362 @@ from typing import Any
 
 import mujoco_warp as mjw
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from twin.env.controller import SubstepSchedules, VectorController
+from twin.env.dm import DrivePhysics, control
 from twin.env.observation import GpuPixelObserver
-from twin.env.obstacles import Surroundings
-from twin.env.options import control
-from twin.env.physics import DrivePhysics
+from twin.env.obstacles import ObstacleMotion
+from twin.env.physics import TIME_TOLERANCE
 from twin.env.suite import EnvFactory
 from twin.env.task import DriveTask, Motion, RewardAndTermination
 from twin.env.vector_env_local import LocalVectorEnv, StepResult
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.types import Array, Indices
+from twin.warp_runtime import wp
 
-# ---- The physics of many worlds in one go on a GPU, by `mujoco_warp`.
-#
-# Episodes begin on the host, in the same code as everywhere. From then on their *state* (positions, velocities, the
-# solver's last accelerations) is kept here in arrays over all worlds: a control step takes it to the device, lets the
-# small steps pass there under the courses of the robots' controllers (`controller.py`), and brings it back with the geoms
-# that were touched. The worlds' own `MjData` are brought up to it when they are asked for (`sync`), as that takes far
-# longer. Numbers are of single precision on the device, and of another solver: episodes are those of MuJoCo in kind, not
-# bit for bit. On a GPU contacts are found in any order, so there they are not the same twice, either.
-#
-# The device is a GPU, or for tests the CPU, where this is slower than MuJoCo itself.
-
-
-_DRAWN = (
+_RANDOMIZED_FIELDS = (
     *("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "cam_pos", "cam_quat", "body_mass", "body_inertia"),
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0"),
 )
-"""What `Nominal.apply` makes different from world to world, with what MuJoCo derives from it."""
+"""Model fields that `NominalModel.apply` changes per environment, and those that MuJoCo derives from them."""
 
-_SENT = ("qpos", "qvel", "act", "qacc_warmstart")
-_STATE = (*_SENT, "ctrl", "sensordata", "actuator_force")
+_UPLOADED_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart")
+_STATE_FIELDS = (*_UPLOADED_FIELDS, "ctrl", "sensordata", "actuator_force")
 
-_SAME_TIME = 1e-6  # [s] apart are rounding errors of the clock
-
-_CONTACTS, _ROWS = 96, 384  # room per world for contacts and for the solver's rows; the demo needs a third
+_MAX_CONTACTS, _MAX_ROWS = 96, 384  # capacity per environment; the demo needs a third
 _OVERFLOWS = mjw.OverflowType.NEFC | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD
 
 
 @wp.kernel
-def _before(
+def _apply_commands(
     k: int,
-    piece: wp.array2d(dtype=int),
+    segment: wp.array2d(dtype=int),
     speeds: wp.array3d(dtype=float),
     positions: wp.array3d(dtype=wp.vec3),
-    turns: wp.array3d(dtype=wp.quat),
+    quaternions: wp.array3d(dtype=wp.quat),
     ctrl: wp.array2d(dtype=float),
     mocap_pos: wp.array2d(dtype=wp.vec3),
     mocap_quat: wp.array2d(dtype=wp.quat),
 ):
-    """Commands of small step k, and where what moves by itself is in it."""
-    world = wp.tid()
-    mine = piece[k, world]
+    """Commands of small step k, and device what moves by itself is in it."""
+    env = wp.tid()
+    s = segment[k, env]
     for i in range(ctrl.shape[1]):
-        ctrl[world, i] = speeds[mine, world, i]
+        ctrl[env, i] = speeds[s, env, i]
     for i in range(mocap_pos.shape[1]):
-        mocap_pos[world, i] = positions[mine, world, i]
-        mocap_quat[world, i] = turns[mine, world, i]
+        mocap_pos[env, i] = positions[s, env, i]
+        mocap_quat[env, i] = quaternions[s, env, i]
 
 
 @wp.kernel
-def _keep(
+def _record_positions(
     k: int,
-    piece: wp.array2d(dtype=int),
+    segment: wp.array2d(dtype=int),
     qpos: wp.array2d(dtype=float),
     history: wp.array3d(dtype=float),
 ):
-    """Where worlds are at the ends of their pieces: the last small step of a piece writes last."""
-    world, i = wp.tid()
-    history[piece[k, world], world, i] = qpos[world, i]
+    """Records positions at the end of each segment: the last substep of a segment writes last."""
+    env, i = wp.tid()
+    history[segment[k, env], env, i] = qpos[env, i]
 
 
 @wp.kernel
-def _touch(
+def _mark_contacts(
     k: int,
-    looks: wp.array2d(dtype=int),
+    checks: wp.array2d(dtype=int),
     count: wp.array(dtype=int),
     geoms: wp.array(dtype=wp.vec2i),
-    worlds: wp.array(dtype=int),
+    envs: wp.array(dtype=int),
     robot: wp.array(dtype=int),
-    counts: wp.array(dtype=int),
+    is_collidable: wp.array(dtype=int),
     touched: wp.array2d(dtype=int),
 ):
-    """Marks both geoms of contacts between the robot and what counts, where small step k ends with a look."""
+    """Marks both geoms of contacts between the robot and collidable geoms, if substep k ends a segment."""
     contact = wp.tid()
     if contact >= count[0]:
         return
-    world, pair = worlds[contact], geoms[contact]
-    if looks[k, world] == 0 or pair[0] < 0 or pair[1] < 0:
+    env, pair = envs[contact], geoms[contact]
+    if checks[k, env] == 0 or pair[0] < 0 or pair[1] < 0:
         return
-    if (robot[pair[0]] == 1 and counts[pair[1]] == 1) or (robot[pair[1]] == 1 and counts[pair[0]] == 1):
-        touched[world, pair[0]] = 1
-        touched[world, pair[1]] = 1
+    if (robot[pair[0]] == 1 and is_collidable[pair[1]] == 1) or (robot[pair[1]] == 1 and is_collidable[pair[0]] == 1):
+        touched[env, pair[0]] = 1
+        touched[env, pair[1]] = 1
 
 
 class GpuSimulation:
-    """Steps n worlds of one compiled scene; the models may differ in what an episode draws."""
+    """Steps the physics of n environments of one compiled scene; their models may differ in randomized fields.
 
-    def __init__(self, worlds: Sequence[DrivePhysics], period: float, where: str) -> None:
-        """
-        Args:
-            worlds: Their physics.
-            period: Between two commands [s].
-            where: Warp's name of the device.
-        """
-        self._worlds, self._where = list(worlds), where
-        robot, n = worlds[0].robot, len(worlds)
+    Episodes start on the host. Afterwards the state (positions, velocities, the solver's last accelerations) is kept in
+    arrays over all environments. A control step uploads it, runs the substeps under the controllers' schedules, and
+    downloads it with the touched geoms. The environments' own `MjData` are updated only on request (`sync`), as that
+    takes far longer. The device computes in single precision with another solver: episodes resemble those of MuJoCo but
+    are not bit-identical, and on a GPU the varying order of contacts makes them not repeatable. Tests use a CPU device,
+    where this is slower than MuJoCo.
+    """
+
+    def __init__(self, envs: Sequence[DrivePhysics], period: float, device: str) -> None:
+        """`period`: time between two commands [s]; `device`: Warp's name of the device."""
+        self._envs, self._device = list(envs), device
+        robot, n = envs[0].robot, len(envs)
         model, self._params = robot.model, robot.params
         self._steps = round(period / model.opt.timestep)
-        self._controllers = VectorController(self._params, n, period, model.opt.timestep, robot.look_steps)
-        pieces = self._controllers.pieces
-        self._state = {name: np.stack([getattr(world.robot.data, name) for world in worlds]) for name in _STATE}
+        self._controllers = VectorController(self._params, n, period, model.opt.timestep, robot.check_steps)
+        max_segments = self._controllers.max_segments
+        self._state = {name: np.stack([getattr(env.robot.data, name) for env in envs]) for name in _STATE_FIELDS}
         self._stale = np.zeros(n, bool)
         self._touched = np.zeros((n, model.ngeom), bool)
-        self._moving = np.zeros(n, bool)  # whether anything moves by itself
-        mocap = [
-            np.stack([getattr(world.robot.data, name) for world in worlds]) for name in ("mocap_pos", "mocap_quat")
-        ]
-        self._mocap = [np.tile(values, (pieces, 1, 1, 1)) for values in mocap]  # of each piece
-        # Of the last looks, the newest last, and in the same order: what `HuskyPhysics.seen` goes by.
-        kept = pieces * (int(np.ceil(self._params.camera_latency / period)) + 2) if self._params.camera_latency else 0
-        self._look_times = np.full((kept, n), np.inf)
-        self._looks = [np.zeros((kept, *values.shape)) for values in (self._state["qpos"], *mocap)]
-        self._drawn = {name: np.stack([getattr(world.robot.model, name) for world in worlds]) for name in _DRAWN}
+        self._moving = np.zeros(n, bool)  # True if an obstacle moves
+        mocap = [np.stack([getattr(env.robot.data, name) for env in envs]) for name in ("mocap_pos", "mocap_quat")]
+        self._mocap = [np.tile(values, (max_segments, 1, 1, 1)) for values in mocap]  # at the end of each segment
+        # Snapshots of the last contact checks, the newest last, from which the delayed camera poses follow.
+        latency = self._params.camera_latency
+        kept = max_segments * (int(np.ceil(latency / period)) + 2) if latency else 0
+        self._snapshot_times = np.full((kept, n), np.inf)
+        self._snapshots = [np.zeros((kept, *values.shape)) for values in (self._state["qpos"], *mocap)]
+        self._randomized = {
+            name: np.stack([getattr(env.robot.model, name) for env in envs]) for name in _RANDOMIZED_FIELDS
+        }
         self._camera, self._actuators = model.camera("front").id, robot.actuators
-        with wp.ScopedDevice(where):
-            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(_DRAWN, n))
-            self._model.opt.warn_overflow = 0  # what it prints from kernels; `_fetch` says it once
-            if where != "cpu":
+        with wp.ScopedDevice(device):
+            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(_RANDOMIZED_FIELDS, n))
+            self._model.opt.warn_overflow = 0  # kernels would print warnings; `_download` raises an error
+            if device != "cpu":
                 self._model.opt.graph_conditional = wp.is_conditional_graph_supported()
-            self._data = mjw.make_data(model, nworld=n, nconmax=_CONTACTS, njmax=_ROWS)
-            self._piece, self._look = (wp.zeros((self._steps, n), dtype=int) for _ in range(2))
-            self._speeds = wp.zeros((pieces, n, model.nu), dtype=float)
+            self._data = mjw.make_data(model, nworld=n, nconmax=_MAX_CONTACTS, njmax=_MAX_ROWS)
+            self._segment, self._checks = (wp.zeros((self._steps, n), dtype=int) for _ in range(2))
+            self._speeds = wp.zeros((max_segments, n, model.nu), dtype=float)
             kinds = zip(self._mocap, (wp.vec3, wp.quat), strict=True)
-            self._mocap_there = [wp.array(values.astype(np.float32), dtype=kind) for values, kind in kinds]
-            self._history = wp.zeros((pieces, n, model.nq), dtype=float)
-            self._touched_there = wp.zeros((n, model.ngeom), dtype=int)
-            masks = (robot.is_robot, robot.counts)
-            self._is_robot, self._counts = (wp.array(mask.astype(np.int32), dtype=int) for mask in masks)
-            self._send()
+            self._mocap_on_device = [wp.array(values.astype(np.float32), dtype=kind) for values, kind in kinds]
+            self._history = wp.zeros((max_segments, n, model.nq), dtype=float)
+            self._touched_on_device = wp.zeros((n, model.ngeom), dtype=int)
+            masks = (robot.is_robot, robot.is_collidable)
+            self._is_robot, self._is_collidable = (wp.array(mask.astype(np.int32), dtype=int) for mask in masks)
+            self._upload()
             self._graph: Any = None
-            if where != "cpu":
-                # Now, as nothing else may use the GPU while a graph is captured; once before, as that compiles.
+            if device != "cpu":
+                # Captured now, while nothing else uses the GPU; the first run compiles the kernels.
                 self._advance()
                 with wp.ScopedCapture() as capture:
                     self._advance()
                 self._graph = capture.graph
 
     def begin(self, which: Indices) -> None:
-        """Takes over the models and states of worlds whose episodes have just begun."""
+        """Uploads the models and states of environments whose episodes have just begun."""
         if not len(which):
             return
-        robots = [self._worlds[i].robot for i in which]
-        for name, values in self._drawn.items():
+        robots = [self._envs[i].robot for i in which]
+        for name, values in self._randomized.items():
             values[which] = [getattr(robot.model, name) for robot in robots]
             array = getattr(self._model, name)
-            # Vectors and quaternions are one element each there.
+            # Warp stores a vector or quaternion as one element.
             array.assign(values.reshape(array.shape + getattr(array.dtype, "_shape_", ())))
         for name, values in self._state.items():
             values[which] = [getattr(robot.data, name) for robot in robots]
         mocap = [np.stack([getattr(robot.data, name) for robot in robots]) for name in ("mocap_pos", "mocap_quat")]
-        for values, there, new in zip(self._mocap, self._mocap_there, mocap, strict=True):
+        for values, array, new in zip(self._mocap, self._mocap_on_device, mocap, strict=True):
             values[:, which] = new
-            there.assign(values.astype(np.float32))
-        self._look_times[:, which] = np.inf
-        if len(self._look_times):
-            self._look_times[-1, which] = 0.0
-            for values, new in zip(self._looks, (self._state["qpos"][which], *mocap), strict=True):
+            array.assign(values.astype(np.float32))
+        self._snapshot_times[:, which] = np.inf
+        if len(self._snapshot_times):
+            self._snapshot_times[-1, which] = 0.0
+            for values, new in zip(self._snapshots, (self._state["qpos"][which], *mocap), strict=True):
                 values[-1, which] = new
         self._stale[which] = False
-        self._touched[which] = [np.isin(np.arange(len(robot.is_robot)), list(robot.touching)) for robot in robots]
-        self._moving[which] = [isinstance(r.surroundings, Surroundings) and r.surroundings.moving for r in robots]
+        self._touched[which] = [np.isin(np.arange(len(robot.is_robot)), list(robot.touched_geoms)) for robot in robots]
+        self._moving[which] = [isinstance(r.move_obstacles, ObstacleMotion) and r.move_obstacles.moving for r in robots]
         latency = np.array([robot.params.command_latency for robot in robots])
-        self._controllers.begin(which, latency, np.array([robot.until_update for robot in robots]))
+        self._controllers.begin(which, latency, np.array([robot.steps_to_update for robot in robots]))
 
     def step(self, which: Indices, commands: Array) -> None:
-        """Lets a control step pass in some worlds under commands, v [m/s] and ω [rad/s], shape (k, 2).
+        """Runs a control step of k environments under commands, v [m/s] and ω [rad/s], shape (k, 2).
 
         Raises:
-            RuntimeError: more contacts than there is room for.
-            PhysicsError: dm_control's; a world came apart.
+            RuntimeError: more contacts than the capacity.
+            PhysicsError: dm_control's; positions or velocities diverged.
         """
-        courses = self._controllers.courses(which, commands)
-        self._surround(which, courses)
+        schedules = self._controllers.schedules(which, commands)
+        self._move_obstacles(which, schedules)
         speeds = np.zeros(self._speeds.shape, np.float32)
-        speeds[:, :, self._actuators] = courses.speeds
-        for there, values in ((self._piece, courses.piece), (self._look, courses.looks), (self._speeds, speeds)):
-            there.assign(values)
-        self._send()
-        with wp.ScopedDevice(self._where):
+        speeds[:, :, self._actuators] = schedules.speeds
+        self._segment.assign(schedules.segment)
+        self._checks.assign(schedules.checks)
+        self._speeds.assign(speeds)
+        self._upload()
+        with wp.ScopedDevice(self._device):
             if self._graph is None:
                 self._advance()
             else:
                 wp.capture_launch(self._graph)
-        self._fetch(which, courses)
+        self._download(which, schedules)
 
     def motion(self, which: Indices) -> Motion:
-        """Of the robots of some worlds."""
+        """Present motion of the robots of some environments."""
         qpos, qvel = self._state["qpos"][which], self._state["qvel"][which]
-        matrix = _matrices(qpos[:, 3:7])
+        matrix = _rotation_matrices(qpos[:, 3:7])
         pose = np.column_stack([qpos[:, :2], np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0])])
         speed = (qvel[:, :3] * matrix[:, :, 0]).sum(-1)
         touched = self._touched[which].any(1)
         return Motion(pose, speed, qvel[:, 5], matrix[:, 2, 2], touched, self._controllers.time[which].copy())
 
     def touched(self, i: int) -> tuple[str, ...]:
-        """Names of the geoms touched in world i during the last control step, sorted."""
-        model = self._worlds[i].robot.model
+        """Names of the geoms touched in environment i during the last control step, sorted."""
+        model = self._envs[i].robot.model
         return tuple(sorted(model.geom(k).name for k in np.flatnonzero(self._touched[i])))
 
-    def eyes(self, which: Indices) -> tuple[Array, Array]:
-        """OpenCV poses of the front cameras when their newest pictures were taken, shape (k, 4, 4), and when that was
-        [s], shape (k,)."""
+    def camera_poses(self, which: Indices) -> tuple[Array, Array]:
+        """Front camera poses, OpenCV axes, shape (k, 4, 4), and times [s], shape (k,), of the newest images."""
         qpos, time = self._state["qpos"][which, :7], self._controllers.time[which]
-        if len(self._look_times):
-            qpos, time = self._before(which)
-        matrix, pose = _matrices(qpos[:, 3:]), np.tile(np.eye(4), (len(which), 1, 1))
-        pose[:, :3, :3] = matrix @ _matrices(self._drawn["cam_quat"][which, self._camera])
-        pose[:, :3, 3] = qpos[:, :3] + (matrix @ self._drawn["cam_pos"][which, self._camera, :, None])[..., 0]
+        if len(self._snapshot_times):
+            qpos, time = self._delayed_base_poses(which)
+        matrix, pose = _rotation_matrices(qpos[:, 3:]), np.tile(np.eye(4), (len(which), 1, 1))
+        pose[:, :3, :3] = matrix @ _rotation_matrices(self._randomized["cam_quat"][which, self._camera])
+        pose[:, :3, 3] = qpos[:, :3] + (matrix @ self._randomized["cam_pos"][which, self._camera, :, None])[..., 0]
         return opencv_to_mujoco(pose), time
 
     def sync(self, which: Indices) -> None:
-        """Brings the `MjData` of some worlds to where they are."""
+        """Updates the `MjData` of some environments to their present state."""
         for i in which[self._stale[which]].tolist():
-            robot = self._worlds[i].robot
+            robot = self._envs[i].robot
             for name, values in self._state.items():
                 getattr(robot.data, name)[:] = values[i]
             robot.data.mocap_pos[:], robot.data.mocap_quat[:] = (values[-1, i] for values in self._mocap)
             robot.data.time = self._controllers.time[i]
-            looks = [
-                (float(time), *(values[k, i].copy() for values in self._looks))
-                for k, time in enumerate(self._look_times[:, i])
+            snapshots = [
+                (float(time), *(values[k, i].copy() for values in self._snapshots))
+                for k, time in enumerate(self._snapshot_times[:, i])
                 if np.isfinite(time)
             ]
-            robot.take_over(set(np.flatnonzero(self._touched[i]).tolist()), looks)
+            robot.load_state(set(np.flatnonzero(self._touched[i]).tolist()), snapshots)
         self._stale[which] = False
 
-    def _before(self, which: Indices) -> tuple[Array, Array]:
-        """Positions, shape (k, 7), and times [s] of the bases when the newest pictures were taken, as `seen` says."""
-        looks, qpos = self._look_times[:, which], self._looks[0][:, which, :7]
+    def _delayed_base_poses(self, which: Indices) -> tuple[Array, Array]:
+        """Base poses, shape (k, 7), and times [s] of the newest images; see `HuskyPhysics.delayed_data`."""
+        times, qpos = self._snapshot_times[:, which], self._snapshots[0][:, which, :7]
         time = self._controllers.time[which] - self._params.camera_latency
         row = np.arange(len(which))
-        past = looks <= time + _SAME_TIME
-        past[np.argmin(looks, 0), row] = True  # nothing is older than the beginning
-        first = np.argmax(np.where(past, looks, -np.inf), 0)
-        coming = np.where(past, np.inf, looks)
+        past = times <= time + TIME_TOLERANCE
+        past[np.argmin(times, 0), row] = True  # not before the episode's start
+        first = np.argmax(np.where(past, times, -np.inf), 0)
+        coming = np.where(past, np.inf, times)
         last = np.argmin(coming, 0)
-        start, end = looks[first, row], coming[last, row]
+        start, end = times[first, row], coming[last, row]
         a, b = qpos[first, row], qpos[last, row]
-        between = (start + _SAME_TIME < time) & np.isfinite(end)
+        between = (start + TIME_TOLERANCE < time) & np.isfinite(end)
         share = np.zeros(len(which))
         share[between] = ((time - start) / (end - start))[between]
-        # Between two looks, 10 ms apart, the straight line between two attitudes is as good as the arc.
+        # Snapshots are 10 ms apart, so linear interpolation of quaternions is accurate enough.
         b[:, 3:] *= np.sign((a[:, 3:] * b[:, 3:]).sum(-1, keepdims=True))
         return a + share[:, None] * (b - a), np.where(between, time, start)
 
-    def _surround(self, which: Indices, courses: SubstepSchedules) -> None:
-        """Moves what moves by itself to where it is at the end of each piece."""
+    def _move_obstacles(self, which: Indices, schedules: SubstepSchedules) -> None:
+        """Sets the poses of moving obstacles at the end of each segment."""
         moving = which[self._moving[which]]
         for i in moving.tolist():
-            robot = self._worlds[i].robot
-            times = courses.times[:, i]
+            robot = self._envs[i].robot
+            times = schedules.times[:, i]
             for p, time in enumerate(times[np.isfinite(times)].tolist()):
-                assert robot.surroundings
-                robot.surroundings(time)
+                assert robot.move_obstacles
+                robot.move_obstacles(time)
                 self._mocap[0][p:, i], self._mocap[1][p:, i] = robot.data.mocap_pos, robot.data.mocap_quat
         if len(moving):
-            for values, there in zip(self._mocap, self._mocap_there, strict=True):
-                there.assign(values.astype(np.float32))
+            for values, array in zip(self._mocap, self._mocap_on_device, strict=True):
+                array.assign(values.astype(np.float32))
 
-    def _send(self) -> None:
-        for name in _SENT:
+    def _upload(self) -> None:
+        for name in _UPLOADED_FIELDS:
             getattr(self._data, name).assign(self._state[name].astype(np.float32))
-        self._touched_there.zero_()
+        self._touched_on_device.zero_()
         self._data.overflow.zero_()
 
     def _advance(self) -> None:
         d, contact = self._data, self._data.contact
-        commands = [self._piece, self._speeds, *self._mocap_there]
+        commands = [self._segment, self._speeds, *self._mocap_on_device]
         for k in range(self._steps):
-            wp.launch(_before, d.nworld, [k, *commands], [d.ctrl, d.mocap_pos, d.mocap_quat])
+            wp.launch(_apply_commands, d.nworld, [k, *commands], [d.ctrl, d.mocap_pos, d.mocap_quat])
             mjw.step(self._model, d)
-            wp.launch(_keep, d.qpos.shape, [k, self._piece, d.qpos], [self._history])
-            pairs = [d.nacon, contact.geom, contact.worldid, self._is_robot, self._counts]
-            wp.launch(_touch, d.naconmax, [k, self._look, *pairs], [self._touched_there])
+            wp.launch(_record_positions, d.qpos.shape, [k, self._segment, d.qpos], [self._history])
+            pairs = [d.nacon, contact.geom, contact.worldid, self._is_robot, self._is_collidable]
+            wp.launch(_mark_contacts, d.naconmax, [k, self._checks, *pairs], [self._touched_on_device])
 
-    def _fetch(self, which: Indices, courses: SubstepSchedules) -> None:
+    def _download(self, which: Indices, schedules: SubstepSchedules) -> None:
         over = self._data.overflow.numpy()[which] & int(_OVERFLOWS)
         if over.any():
             raise RuntimeError(
-                f"worlds {which[over != 0].tolist()}: more than {_CONTACTS} contacts or {_ROWS} rows of constraints, "
-                "for which mujoco_warp has no room; use device='cpu'"
+                f"environments {which[over != 0].tolist()}: more than {_MAX_CONTACTS} contacts or {_MAX_ROWS} "
+                "constraint rows, for which mujoco_warp has no room; use device='cpu'"
             )
-        new = {name: getattr(self._data, name).numpy()[which] for name in _STATE}
+        new = {name: getattr(self._data, name).numpy()[which] for name in _STATE_FIELDS}
         finite = np.isfinite(new["qpos"]).all(1) & np.isfinite(new["qvel"]).all(1)
         if not finite.all():
             raise control.PhysicsError(
-                f"worlds {which[~finite].tolist()}: positions or velocities are no longer numbers"
+                f"environments {which[~finite].tolist()}: positions or velocities are not finite"
             )
         for name, values in self._state.items():
             values[which] = new[name]
-        self._touched[which] = self._touched_there.numpy()[which] > 0
+        self._touched[which] = self._touched_on_device.numpy()[which] > 0
         self._stale[which] = True
-        if len(self._look_times):
+        if len(self._snapshot_times):
             newest = (
-                courses.times[:, which],
+                schedules.times[:, which],
                 self._history.numpy()[:, which],
                 *(values[:, which] for values in self._mocap),
             )
-            for kept, some in zip((self._look_times, *self._looks), newest, strict=True):
+            for kept, some in zip((self._snapshot_times, *self._snapshots), newest, strict=True):
                 kept[: -len(some), which] = kept[len(some) :, which]
                 kept[-len(some) :, which] = some
 
 
-def _matrices(quaternions: Array) -> Array:
+def _rotation_matrices(quaternions: Array) -> Array:
     """Rotation matrices (k, 3, 3) of quaternions w, x, y, z, shape (k, 4), of any length."""
     return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
 
 
 class GpuVectorEnv(LocalVectorEnv):
-    """n worlds of one scene and task that `mujoco_warp` steps."""
+    """n environments of one scene and task that `mujoco_warp` steps."""
 
-    def __init__(self, stage: EnvFactory, seeds: Sequence[int | None], device: str) -> None:
-        """
-        Args:
-            stage: Scene, task and options.
-            seeds: One per world, of its sequence of episodes; None: unpredictable.
-            device: Warp's name of the device.
-        """
-        self._judge = RewardAndTermination(stage.world, stage.stretch, stage.options, len(seeds))
+    def __init__(self, factory: EnvFactory, seeds: Sequence[int | None], device: str) -> None:
+        """`seeds` as of `LocalVectorEnv`; `device`: Warp's name of the device."""
+        self._evaluator = RewardAndTermination(factory.world, factory.segment, factory.options, len(seeds))
         self._speed = np.zeros(len(seeds))
-        super().__init__(stage, seeds)
-        self._device = GpuSimulation(self._physics, stage.options.control_timestep, device)
+        super().__init__(factory, seeds)
+        self._simulation = GpuSimulation(self._physics, factory.options.control_timestep, device)
         if isinstance(self.pixels, GpuPixelObserver):
-            self.pixels.eyes = self._device.eyes
+            self.pixels.camera_poses = self._simulation.camera_poses
 
-    def _parts(self, stage: EnvFactory, seeds: Sequence[int | None]) -> list[tuple[DrivePhysics, DriveTask]]:
-        return [stage.drive(seed, (self._judge, i)) for i, seed in enumerate(seeds)]
+    def _make_envs(self, factory: EnvFactory, seeds: Sequence[int | None]) -> list[tuple[DrivePhysics, DriveTask]]:
+        return [factory.make_env(seed, (self._evaluator, i)) for i, seed in enumerate(seeds)]
 
     @property
     def physics(self) -> list[DrivePhysics]:
-        """Of every world, as it is now: they are brought up to it, which is no matter of course here."""
-        self._device.sync(np.arange(len(self)))
+        """Present physics of every environment; the access synchronizes them, which takes long."""
+        self._simulation.sync(np.arange(len(self)))
         return self._physics
 
     def begin(self, which: Sequence[int]) -> None:
         self._each(lambda i: self._environments[i].reset(), which)
         some = np.array(which, int)
-        self._device.begin(some)
-        self._remember(some, self._device.motion(some))
+        self._simulation.begin(some)
+        self._store(some, self._simulation.motion(some))
         if self.pixels:
             self.pixels.begin(which)
 
     def info(self, i: int) -> dict[str, Any]:
-        told = self.tasks[i].told(float(self._speed[i]), self._device.touched(i))
-        return told | (self.pixels.info(i) if self.pixels else {})
+        info = self.tasks[i].episode_info(float(self._speed[i]), self._simulation.touched(i))
+        return info | (self.pixels.info(i) if self.pixels else {})
 
     def _advance(self, wanted: Array, which: Sequence[int]) -> StepResult:
         some = np.array(which, int)
         commands = self.tasks[0].commands(wanted)
-        self._judge.act(some, commands[:, 1])
-        self._device.step(some, commands)
-        motion = self._device.motion(some)
-        self._judge.judge(some, motion)
-        self._remember(some, motion)
+        self._evaluator.set_steering(some, commands[:, 1])
+        self._simulation.step(some, commands)
+        motion = self._simulation.motion(some)
+        self._evaluator.evaluate(some, motion)
+        self._store(some, motion)
         if self.pixels and not isinstance(self.pixels, GpuPixelObserver):
-            self._device.sync(some)  # the host draws what is in view
-        return StepResult(self._judge.reward(some), *self._judge.ended(some))
+            self._simulation.sync(some)  # the host renders the objects in view
+        return StepResult(self._evaluator.reward(some), *self._evaluator.ended(some))
 
-    def _remember(self, which: NDArray[np.int64], motion: Motion) -> None:
-        self._states[which], self._speed[which] = self._judge.state(which, motion), motion.speed
+    def _store(self, which: NDArray[np.int64], motion: Motion) -> None:
+        self._states[which], self._speed[which] = self._evaluator.state(which, motion), motion.speed

@@ -1,8 +1,8 @@
-"""Many worlds on a CPU, a few in each of several processes.
+"""Vector environment on a CPU, spread over several processes.
 
-Much of a step is Python, which does one thing at a time in a process however many cores there are: what is in view,
-what is touched, the judge. So each *child* (`vector_env_child.py`) has `Worlds` of its own and does with them what its
-parent asks. They talk in pickles, over a socket of their own. A world goes through the same in any process.
+Much of a step is Python (visibility, contacts, reward), which the interpreter's lock confines to one core per process.
+So each *child* (`vector_env_child.py`) has a `LocalVectorEnv` and executes its parent's requests, exchanged as pickles
+over a socket. The number of processes does not change any result.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from twin import runtime
 from twin.env.options import parse_options
-from twin.env.task import checked_actions
+from twin.env.task import check_actions
 from twin.env.vector_env_local import StepResult, frame_stack
 from twin.errors import InputError
 from twin.loading import Twin
@@ -32,27 +32,29 @@ from twin.loading import Twin
 
 @dataclass(frozen=True)
 class StepMessage:
-    """What a child's worlds came to."""
+    """A child's reply to `begin` and `step` for k environments."""
 
-    pictures: NDArray[np.uint8] | None
-    """The newest of each, shape (k, 3, height, width)."""
+    images: NDArray[np.uint8] | None
+    """The newest image of each, shape (k, 3, height, width)."""
     trust: NDArray[np.float64]
     states: NDArray[np.float32]
     infos: list[dict[str, Any]]
-    outcome: StepResult | None = None
+    result: StepResult | None = None
 
 
 @dataclass(frozen=True)
-class StackedPictures:
-    """What the worlds' cameras saw; see `Pixels`."""
+class StackedImages:
+    """Frame stacks and trust of all environments; see `PixelObserver`."""
 
     stacks: NDArray[np.uint8]
     trust: NDArray[np.float64]
 
 
 class ProcessVectorEnv:
-    """n worlds of one scene and task, spread over processes: `Worlds`, but for `physics`, `tasks` and most of `pixels`,
-    which are elsewhere."""
+    """n environments of one scene and task in several processes.
+
+    The interface is that of `LocalVectorEnv`, without `physics`, `tasks` and most of `pixels`.
+    """
 
     def __init__(
         self,
@@ -62,62 +64,52 @@ class ProcessVectorEnv:
         seeds: Sequence[int | None],
         processes: int,
     ) -> None:
-        """
-        Args:
-            scene: See `twin.load`.
-            task: See `twin.load`.
-            options: See `twin.env.options.Options`.
-            seeds: One per world, of its sequence of episodes; None: unpredictable.
-            processes: How many, at most as many as worlds.
-
-        Raises:
-            InputError: as `Stage.open`.
-        """
+        """Arguments as of `make_vector_env`; `processes` is at most the number of environments."""
         self.options, self.processes, count = parse_options(options), processes, len(seeds)
         parts = np.array_split(np.arange(count), processes)
-        self._home = [(c, k) for c, part in enumerate(parts) for k in range(len(part))]
+        self._location = [(c, k) for c, part in enumerate(parts) for k in range(len(part))]
         self._lock = threading.Lock()
         self._children: list[_Child] = []
-        self._end = weakref.finalize(self, _end, self._children)
+        self._end = weakref.finalize(self, _kill, self._children)
         try:
             for _ in parts:
-                self._children.append(_Child(max(1, runtime.cores() // processes)))
-            quiet = [runtime.is_quiet() or c > 0 for c in range(processes)]  # one shows what all of them wait for
+                self._children.append(_Child(max(1, runtime.available_cores() // processes)))
+            quiet = [runtime.is_quiet() or c > 0 for c in range(processes)]  # only one shows progress
             mine = [[seeds[i] for i in part] for part in parts]
-            opened = self._ask({c: ("open", quiet[c], scene, task, options, mine[c]) for c in range(processes)})
+            opened = self._request({c: ("open", quiet[c], scene, task, options, mine[c]) for c in range(processes)})
         except BaseException:
             self.close()
             raise
-        self.actions, self.states = opened[0]
+        self.action_size, self.state_size = opened[0]
         width, height = self.options.size
         shape = count, self.options.stack, 3, height, width
-        self.pixels = StackedPictures(np.zeros(shape, np.uint8), np.zeros(count)) if self.options.pixels else None
-        self._states = np.zeros((count, self.states), np.float32)
+        self.pixels = StackedImages(np.zeros(shape, np.uint8), np.zeros(count)) if self.options.pixels else None
+        self._states = np.zeros((count, self.state_size), np.float32)
         self._infos: list[dict[str, Any] | None] = [None] * count
-        """As last told; None where it may be another by now."""
+        """The last received info; None where it may have changed since."""
 
     def __len__(self) -> int:
-        return len(self._home)
+        return len(self._location)
 
     def seed(self, i: int, seed: int | None) -> None:
-        self._of(i, "seed", seed)
+        self._call_child(i, "seed", seed)
 
     def begin(self, which: Sequence[int]) -> None:
         some = np.asarray(which, int)
         parts = list(self._split(some))
-        news = self._ask({c: ("begin", local) for c, _, local in parts})
+        messages = self._request({c: ("begin", local) for c, _, local in parts})
         for c, at, _ in parts:
-            self._take(some[at], news[c], fills=True)
+            self._store(some[at], messages[c], fill=True)
 
     def step(self, actions: NDArray, which: Sequence[int] | None = None) -> StepResult:
         some = np.arange(len(self)) if which is None else np.asarray(which, int)
-        actions = checked_actions(actions, (len(some), self.actions))
+        actions = check_actions(actions, (len(some), self.action_size))
         parts = list(self._split(some))
-        news = self._ask({c: ("step", actions[at], local) for c, at, local in parts})
+        messages = self._request({c: ("step", actions[at], local) for c, at, local in parts})
         out = StepResult(np.zeros(len(some)), np.zeros(len(some), bool), np.zeros(len(some), bool))
         for c, at, _ in parts:
-            self._take(some[at], news[c], fills=False)
-            part = news[c].outcome
+            self._store(some[at], messages[c], fill=False)
+            part = messages[c].result
             out.reward[at], out.terminated[at], out.truncated[at] = part.reward, part.terminated, part.truncated
         return out
 
@@ -128,74 +120,75 @@ class ProcessVectorEnv:
         return self._states[i].copy()
 
     def info(self, i: int) -> dict[str, Any]:
-        told = self._infos[i]
-        return self._of(i, "info") if told is None else copy.deepcopy(told)
+        known = self._infos[i]
+        return self._call_child(i, "info") if known is None else copy.deepcopy(known)
 
     def get(self, i: int, name: str) -> Any:
-        return self._of(i, "get", name)
+        return self._call_child(i, "get", name)
 
     def set(self, i: int, name: str, value: Any) -> None:
         self._infos[i] = None
-        self._of(i, "set", name, value)
+        self._call_child(i, "set", name, value)
 
     def call(self, i: int, name: str, *args: Any, **kwargs: Any) -> Any:
         self._infos[i] = None
-        return self._of(i, "call", name, *args, **kwargs)
+        return self._call_child(i, "call", name, *args, **kwargs)
 
     def close(self) -> None:
         self._end()
 
     def _split(self, some: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], list[int]]]:
-        """Children that have some of these worlds: which of `some` these are, and their numbers there."""
-        homes = np.array([self._home[i] for i in some.tolist()]).reshape(-1, 2)
-        for c in np.unique(homes[:, 0]).tolist():
-            at = np.flatnonzero(homes[:, 0] == c)
-            yield c, at, homes[at, 1].tolist()
+        """Yields each child that has some of these environments, their positions in `some`, and their indices there."""
+        locations = np.array([self._location[i] for i in some.tolist()]).reshape(-1, 2)
+        for c in np.unique(locations[:, 0]).tolist():
+            at = np.flatnonzero(locations[:, 0] == c)
+            yield c, at, locations[at, 1].tolist()
 
-    def _of(self, i: int, what: str, *args: Any, **kwargs: Any) -> Any:
-        c, local = self._home[i]
-        return self._ask({c: (what, local, *args)}, kwargs)[c]
+    def _call_child(self, i: int, method: str, *args: Any, **kwargs: Any) -> Any:
+        c, local = self._location[i]
+        return self._request({c: (method, local, *args)}, kwargs)[c]
 
-    def _ask(self, requests: dict[int, tuple[Any, ...]], keywords: dict[str, Any] | None = None) -> dict[int, Any]:
-        """Has children do something, all at the same time; what came of it."""
-        messages = {c: pickled((*request, keywords or {})) for c, request in requests.items()}
+    def _request(self, requests: dict[int, tuple[Any, ...]], keywords: dict[str, Any] | None = None) -> dict[int, Any]:
+        """Sends requests to children, waits for all replies, and returns their results."""
+        messages = {c: serialize((*request, keywords or {})) for c, request in requests.items()}
         with self._lock:
             if not self._end.alive:
                 raise InputError(
-                    "these worlds are closed, be it that a step was interrupted or one of their processes ended; "
-                    "expected open ones, so make them anew"
+                    "the vector environment is closed: by close(), by an interrupted step, or because one of its "
+                    "processes ended; expected an open one, so make a new one"
                 )
             try:
                 for c, message in messages.items():
-                    self._children[c].tell(message)
-                replies = {c: self._children[c].hear() for c in requests}  # of all, even if one fails
-            except BaseException:  # some have been told, or heard, and others not
+                    self._children[c].send(message)
+                replies = {c: self._children[c].receive() for c in requests}  # of all, even if one failed
+            except BaseException:  # some requests may be sent, or replies pending
                 self.close()
                 raise
-        for failed, _ in replies.values():
-            if failed:
-                raise failed
-        return {c: said for c, (_, said) in replies.items()}
+        for error, _ in replies.values():
+            if error:
+                raise error
+        return {c: result for c, (_, result) in replies.items()}
 
-    def _take(self, which: NDArray[np.int64], news: StepMessage, fills: bool) -> None:
-        if self.pixels and news.pictures is not None:
-            stacks, new = self.pixels.stacks, news.pictures[:, None]
-            stacks[which] = new if fills else np.concatenate([stacks[which][:, 1:], new], 1)
-            self.pixels.trust[which] = news.trust
-        self._states[which] = news.states
-        for i, info in zip(which.tolist(), news.infos, strict=True):
+    def _store(self, which: NDArray[np.int64], message: StepMessage, fill: bool) -> None:
+        """Stores a reply; `fill` repeats the new image in the whole stack."""
+        if self.pixels and message.images is not None:
+            stacks, new = self.pixels.stacks, message.images[:, None]
+            stacks[which] = new if fill else np.concatenate([stacks[which][:, 1:], new], 1)
+            self.pixels.trust[which] = message.trust
+        self._states[which] = message.states
+        for i, info in zip(which.tolist(), message.infos, strict=True):
             self._infos[i] = info
 
 
 class _Child:
-    """The parent's end of a child."""
+    """A child process and the parent's end of its socket."""
 
     def __init__(self, share: int) -> None:
         self.pipe, theirs = Pipe()
         path = os.pathsep.join(str(folder or Path.cwd()) for folder in sys.path)
         with theirs:
             self.process = subprocess.Popen(
-                # -P: it imports what this process would, not what else lies in the current folder.
+                # -P: imports are those of this process, not modules of the current folder.
                 [
                     sys.executable,
                     "-P",
@@ -206,27 +199,27 @@ class _Child:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
-                process_group=0,  # Ctrl-C is for the parent, who may want to save first
+                process_group=0,  # Ctrl-C reaches only the parent, which may save first
                 env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": str(share)},
             )
 
-    def tell(self, message: bytes) -> None:
-        with contextlib.suppress(OSError):  # `hear` says why
+    def send(self, message: bytes) -> None:
+        with contextlib.suppress(OSError):  # `receive` reports the cause
             self.pipe.send_bytes(message)
 
-    def hear(self) -> tuple[Exception | None, Any]:
+    def receive(self) -> tuple[Exception | None, Any]:
         try:
             return pickle.loads(self.pipe.recv_bytes())
         except (EOFError, OSError):
             code = self.process.wait()
             raise InputError(
-                f"a process of worlds ended with exit status {code}; expected it to go on. "
-                + ("If memory ran out, take fewer processes (1: none)" if code == -9 else "It may have said why above")
+                f"a process of the vector environment ended with exit status {code}; expected it to run. "
+                + ("If memory ran out, use fewer processes (1: none)" if code == -9 else "See its messages above")
             ) from None
 
 
-def _end(children: list[_Child]) -> None:
-    """Ends children, which have nothing to save."""
+def _kill(children: list[_Child]) -> None:
+    """Kills children, which have nothing to save."""
     for child in children:
         child.pipe.close()
         child.process.kill()
@@ -234,5 +227,5 @@ def _end(children: list[_Child]) -> None:
         child.process.wait()
 
 
-def pickled(thing: Any) -> bytes:
-    return pickle.dumps(thing, pickle.HIGHEST_PROTOCOL)
+def serialize(value: Any) -> bytes:
+    return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)

@@ -1,19 +1,19 @@
-"""What the same experiment would show if it were done again: resampling of policies and of trials.
+"""Bootstrap intervals of statistics over policies: policies and trials are resampled.
 
-Policies are drawn with replacement, within each task, as policies of the same kind would be drawn; then every trial of
-theirs, in both worlds, is driven again at its cell's rate (shrunk by half a trial towards one half, Jeffreys' posterior
-mean, so that a rate of 0 or 1 is not taken for certain). A statistic's *interval* is the middle 90 % of its values,
-widened to what was seen where that lies outside: a repetition of a repetition adds the noise of the trials once more.
+Policies are resampled with replacement within each task; then every trial of theirs, in both worlds, is resampled from
+its cell's rate (shrunk by half a trial towards one half, Jeffreys' posterior mean, so that a rate of 0 or 1 still
+varies). The interval of a statistic is the central 90 % of its replicates, extended to the observed value if that lies
+outside, as a replicate contains the noise of the trials twice.
 
-It aims at what the statistic is on average over such experiments, with as many trials a cell. The noise of few trials
-is part of it and takes from a correlation as it always does: nothing is claimed that was not seen. With few cells of
-ten trials or more it errs to the wide side, except where the twin hardly tells a good policy from a bad one: 0.80 at
-least. With twenty days of five trials, most of them all or none, it is too narrow: cells driven again at a shrunk rate
-agree less than what was seen, and it contains Spearman's in 0.6, Pearson's in 0.75 to 0.8 and MMRV in 0.5 to 0.6 of the
+The interval is for the statistic's mean over such experiments with as many trials per cell. The noise of few trials is
+part of the statistic and lowers a correlation as usual. With few cells of ten trials or more the interval errs to the
+wide side, except where the twin hardly separates good policies from bad ones: coverage 0.80 at least. With twenty days
+of five trials, most of them with a single outcome, it is too narrow, since cells resampled at a shrunk rate agree less
+than the observed ones: it covers Spearman's correlation in 0.6, Pearson's in 0.75 to 0.8 and MMRV in 0.5 to 0.6 of the
 experiments instead of in 0.9 (`benchmarks/intervals.py`, without and with `--record`).
-Narrower ones were tried: resampling policies alone covers 0.6 to 0.9 with a dozen of them, moving the interval's middle
-to what was seen 0.73 to 0.9 for Spearman's correlation, and freeing the rates of noise by a hierarchical model gives
-what its prior says.
+Narrower intervals were tried: resampling policies alone covers 0.6 to 0.9 with a dozen of them; centering the interval
+on the observed value covers 0.73 to 0.9 for Spearman's correlation; removing the noise from the rates by a hierarchical
+model returns its prior.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,29 +25,29 @@ from twin.evaluation.statistics import CONFIDENCE, rate_difference
 from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
-DRAWS = 2000
-"""Experiments resampled."""
+REPLICATES = 2000
+"""Number of resampled experiments."""
 
 
 @dataclass(frozen=True)
-class Paired:
-    """n policies driven in both worlds, on one task or several; each has up to k real cells and their twin's cells.
+class PairedCells:
+    """Cells of n policies driven in both worlds: up to k real cells each, and the twin cells they are compared with.
 
-    A policy driven on two tasks is two of them. Rows shorter than k are filled with cells of weight 0.
+    A policy driven on two tasks counts as two policies. Rows shorter than k are padded with cells of weight 0.
     """
 
     twin_trials: Indices
-    """Of each policy's cells in the twin, each cell once; shape (n, t)."""
+    """Trials of each policy's twin cells, each cell once; shape (n, t)."""
     twin_successes: Indices
     """Shape (n, t)."""
-    twin_of: Indices
-    """Which twin cell each real cell is compared with; shape (n, k)."""
+    twin_index: Indices
+    """Column of the twin cell that each real cell is compared with; shape (n, k)."""
     real_trials: Indices
     """Shape (n, k)."""
     real_successes: Indices
     """Shape (n, k)."""
     weight: Array
-    """1 where there is a cell, else 0; shape (n, k)."""
+    """1 for a cell, 0 for padding; shape (n, k)."""
     strata: tuple[Indices, ...]
     """Indices of the policies of each task."""
 
@@ -62,28 +62,29 @@ class Paired:
 
 @dataclass(frozen=True)
 class Rates:
-    """What one experiment, or each of many, has seen."""
+    """Rates of one experiment, or of many along leading axes."""
 
     twin: Array
-    """Score of each policy, the mean over its cells; shape (..., n)."""
+    """Twin score of each policy, the mean over its cells; shape (..., n)."""
     real: Array
-    """Shape (..., n)."""
-    inside: Array
-    """Share of the cells whose difference is compatible with none (`rate_difference`), shape (...)."""
+    """Real score of each policy, shape (..., n)."""
+    compatible: Array
+    """Fraction of the cells whose `rate_difference` has an interval that contains 0, shape (...)."""
     difference: Array
-    """Mean over cells of real minus twin, shape (...)."""
+    """Mean over cells of real minus twin rate, shape (...)."""
     strata: tuple[Indices, ...]
+    """As in `PairedCells`."""
 
 
-def paired(real: Sequence[Cell], twin: Sequence[Cell]) -> Paired:
-    """Real cells with the twin's cells they are compared with, policies in order of first occurrence, task by task."""
+def pair_cells(real: Sequence[Cell], twin: Sequence[Cell]) -> PairedCells:
+    """Pairs real cells with their twin cells; policies are in order of first occurrence, task by task."""
     found = {cell.key: cell for cell in twin}
     tasks = dict.fromkeys(cell.task for cell in real)
     policies = [p for task in tasks for p in dict.fromkeys((c.policy, c.task) for c in real if c.task == task)]
     rows = [[cell for cell in real if (cell.policy, cell.task) == policy] for policy in policies]
     shape = len(rows), max(map(len, rows))
-    twin_of, weight = np.zeros(shape, np.int64), np.zeros(shape)
-    # Trials of 1 where there is no cell: it must divide, and counts for nothing.
+    twin_index, weight = np.zeros(shape, np.int64), np.zeros(shape)
+    # Padding has 1 trial, as trials are divided by.
     counts = {name: np.full(shape, int("trials" in name), np.int64) for name in ("rt_trials", "rs", "tt_trials", "ts")}
     for i, row in enumerate(rows):
         keys = list(dict.fromkeys(cell.twin_key for cell in row))
@@ -91,45 +92,41 @@ def paired(real: Sequence[Cell], twin: Sequence[Cell]) -> Paired:
             counts["tt_trials"][i, j], counts["ts"][i, j] = found[key].trials, found[key].successes
         for j, cell in enumerate(row):
             counts["rt_trials"][i, j], counts["rs"][i, j] = cell.trials, cell.successes
-            twin_of[i, j], weight[i, j] = keys.index(cell.twin_key), 1.0
+            twin_index[i, j], weight[i, j] = keys.index(cell.twin_key), 1.0
     strata = tuple(np.array([i for i, (_, t) in enumerate(policies) if t == task]) for task in tasks)
-    return Paired(counts["tt_trials"], counts["ts"], twin_of, counts["rt_trials"], counts["rs"], weight, strata)
+    return PairedCells(counts["tt_trials"], counts["ts"], twin_index, counts["rt_trials"], counts["rs"], weight, strata)
 
 
-def seen(data: Paired, confidence: float = CONFIDENCE) -> Rates:
-    """What the experiment itself has seen; shapes (n,) and ()."""
+def observed_rates(data: PairedCells, confidence: float = CONFIDENCE) -> Rates:
+    """Rates of the experiment itself; shapes (n,) and ()."""
     return _rates(data, data.twin_successes, data.real_successes, np.arange(data.policies), confidence)
 
 
-def resample(data: Paired, rng: np.random.Generator, draws: int = DRAWS, confidence: float = CONFIDENCE) -> Rates:
-    """What `draws` repetitions see; shapes (draws, n) and (draws,). See the module."""
-    which = np.empty((draws, data.policies), np.int64)
+def resample(
+    data: PairedCells, rng: np.random.Generator, replicates: int = REPLICATES, confidence: float = CONFIDENCE
+) -> Rates:
+    """Rates of bootstrap replicates, see the module; shapes (replicates, n) and (replicates,)."""
+    which = np.empty((replicates, data.policies), np.int64)
     for members in data.strata:
-        which[:, members] = members[rng.integers(len(members), size=(draws, len(members)))]
+        which[:, members] = members[rng.integers(len(members), size=(replicates, len(members)))]
     twin = rng.binomial(data.twin_trials[which], _shrunk(data.twin_successes, data.twin_trials)[which])
     real = rng.binomial(data.real_trials[which], _shrunk(data.real_successes, data.real_trials)[which])
     return _rates(data, twin, real, which, confidence)
 
 
-def interval(value: float, again: Array, confidence: float = CONFIDENCE) -> tuple[float, float] | None:
-    """Ends of the interval of a statistic that came out as `value`; see the module.
+def bootstrap_interval(value: float, replicates: Array, confidence: float = CONFIDENCE) -> tuple[float, float] | None:
+    """Ends of the interval of a statistic; see the module.
 
-    Args:
-        value: Of the experiment itself.
-        again: Of its repetitions, shape (draws,); nan where it is not defined.
-        confidence: Of the interval.
-
-    Returns:
-        None where less than half of the repetitions are defined.
+    `value` is the observed one; replicates are nan where undefined. Returns None if less than half are defined.
     """
-    if np.isfinite(again).mean() < 0.5:
+    if np.isfinite(replicates).mean() < 0.5:
         return None
-    low, high = np.nanquantile(again, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    low, high = np.nanquantile(replicates, [0.5 - confidence / 2, 0.5 + confidence / 2])
     return min(float(low), value), max(float(high), value)
 
 
-def by_task(statistic: Callable[..., tuple[Array, Array]], rates: Rates) -> tuple[Array, Array]:
-    """A pair of statistics that makes sense within a task only, averaged over tasks."""
+def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], rates: Rates) -> tuple[Array, Array]:
+    """Mean over tasks of a pair of statistics that are defined within a task only."""
     each = [statistic(twin=rates.twin[..., members], real=rates.real[..., members]) for members in rates.strata]
     return np.mean([one[0] for one in each], 0), np.mean([one[1] for one in each], 0)
 
@@ -138,11 +135,11 @@ def _shrunk(successes: Indices, trials: Indices) -> Array:
     return (successes + 0.5) / (trials + 1.0)
 
 
-def _rates(data: Paired, twin: Indices, real: Indices, which: Indices, confidence: float) -> Rates:
-    """`twin` (..., n, t) and `real` (..., n, k) are successes of the policies `which` (..., n)."""
-    weight, of = data.weight[which], data.twin_of[which]
-    twin_trials = np.take_along_axis(data.twin_trials[which], of, -1)
-    twin_here = np.take_along_axis(twin, of, -1)
+def _rates(data: PairedCells, twin: Indices, real: Indices, which: Indices, confidence: float) -> Rates:
+    """Rates from successes `twin` (..., n, t) and `real` (..., n, k) of the policies `which` (..., n)."""
+    weight, index = data.weight[which], data.twin_index[which]
+    twin_trials = np.take_along_axis(data.twin_trials[which], index, -1)
+    twin_here = np.take_along_axis(twin, index, -1)
     difference, low, high = rate_difference(
         twin_successes=twin_here,
         twin_trials=twin_trials,
@@ -154,7 +151,7 @@ def _rates(data: Paired, twin: Indices, real: Indices, which: Indices, confidenc
     return Rates(
         twin=(weight * twin_here / twin_trials).sum(-1) / weight.sum(-1),
         real=(weight * real / data.real_trials[which]).sum(-1) / weight.sum(-1),
-        inside=(weight * ((low <= 0.0) & (high >= 0.0))).sum((-1, -2)) / total,
+        compatible=(weight * ((low <= 0.0) & (high >= 0.0))).sum((-1, -2)) / total,
         difference=(weight * difference).sum((-1, -2)) / total,
         strata=data.strata,
     )

@@ -1,9 +1,9 @@
-"""`Forecast`: what rates in the twin say about the real runs. Numbers only; pages and tables are drawn from it.
+"""Forecast of real success rates from rates in the twin. Numbers only; `report/` makes pages and tables of it.
 
-A *candidate* is a policy on a task. Its twin score is the mean of its rates under the *compared lightings*: those of
-the twin that real cells of the task are compared with, or all of them where there are no real trials yet. It is
-*driven* if it has real trials. A *group* is the driven candidates of one task, or of all of them. Every number stands
-in an `Estimate` with its count and its interval, or with what is missing for it.
+A *candidate* is a policy on a task. Its twin score is the mean of its rates under the *compared lightings*: the twin's
+lightings that real cells of the task are compared with, or all of them without real trials. It is *driven* if it has
+real trials. A *group* is the driven candidates of one task, or of all tasks. Every number is an `Estimate` with its
+count and its interval, or with the data that are missing for it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,29 +15,38 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from twin.config_file import parse
-from twin.errors import InputError, listing
+from twin.config_file import parse_table
+from twin.errors import InputError, join_names
 from twin.evaluation import prediction_powered, ranking
-from twin.evaluation.bootstrap import DRAWS, Paired, Rates, by_task, interval, paired, resample, seen
-from twin.evaluation.ranking import Tallies
+from twin.evaluation.bootstrap import (
+    REPLICATES,
+    PairedCells,
+    Rates,
+    bootstrap_interval,
+    mean_over_tasks,
+    observed_rates,
+    pair_cells,
+    resample,
+)
+from twin.evaluation.ranking import TrialCounts
 from twin.evaluation.statistics import (
     CONFIDENCE,
     MIN_POLICIES,
     MIN_TRIALS,
-    Refused,
+    UndefinedStatistic,
     mean_rate,
     mmrv,
-    mmrv_rows,
+    mmrv_batched,
     pearson,
-    pearson_rows,
+    pearson_batched,
     rate_difference,
     spearman,
-    spearman_rows,
+    spearman_batched,
     wilson,
-    winner_rows,
+    winner_batched,
 )
 from twin.evaluation.trials import Cell
-from twin.files import damaged, exists, read_json, write_json
+from twin.files import exists, read_json, wrap_read_errors, write_json
 
 ALL_TASKS = "all tasks"
 _FILE = "forecast.json"
@@ -45,23 +54,23 @@ _FILE = "forecast.json"
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval, or why there is none."""
+    """A number with its interval, or the reason for its absence."""
 
     value: float | None = None
     low: float | None = None
     high: float | None = None
     n: int = 0
-    """Trials behind a rate, policies or cells behind a statistic."""
+    """Number of trials for a rate, of policies or cells for a statistic."""
     missing: str = ""
-    """What it would take; empty where there is a value."""
+    """Data that are missing; empty if there is a value."""
 
 
 UNKNOWN_TRAINING = Estimate(missing="its training on this task is not known")
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A real cell beside the twin's."""
+class CellPair:
+    """A real cell and the twin cell it is compared with."""
 
     policy: str
     task: str
@@ -74,29 +83,32 @@ class Pair:
 
     @property
     def within_chance(self) -> bool:
-        """Whether its bias may be none."""
+        """True if the interval of the bias contains 0."""
         return (self.bias.low or 0.0) <= 0.0 <= (self.bias.high or 0.0)
 
 
 @dataclass(frozen=True)
 class Candidate:
+    """A policy on a task."""
+
     policy: str
     task: str
     lightings: tuple[str, ...]
-    """Of the twin, that its score is the mean over."""
+    """The twin's lightings that its score is the mean over."""
     twin: Estimate
+    """Twin score."""
     twin_rank: Estimate
-    """Among the task's candidates, 1 is best: expected, and interval."""
+    """Expected rank among the task's candidates (1 is best), and its interval."""
     twin_ranks: tuple[float, ...]
     """Probability of each rank in the twin."""
     real: Estimate
     """Mean over its real cells."""
     real_ranks: tuple[float, ...]
-    """Probability of each rank on the road among the driven; empty where it was not driven or is the only one."""
+    """Probability of each rank on the road among the driven candidates; empty if not driven, or the only one."""
     corrected: Estimate
-    """Real rate expected, from its twin score and the other driven candidates; its own real trials are not used."""
+    """Real rate predicted from its twin score and the other driven candidates, without its own real trials."""
     trained: Estimate = UNKNOWN_TRAINING
-    """Rate in its training, on this task, before it was saved."""
+    """Success rate in training on this task before it was saved."""
 
     @property
     def driven(self) -> bool:
@@ -104,80 +116,83 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Group:
-    """How well the twin foretold the road for the driven candidates of a task, or of all tasks."""
+class Agreement:
+    """Agreement of twin and road for the driven candidates of a task, or of all tasks."""
 
     task: str
     policies: int
     cells: int
     missing: tuple[str, ...]
-    """What it would take; nothing below is given before."""
+    """Data that are missing; the estimates below have no values until then."""
     pearson: Estimate
     spearman: Estimate
     mmrv: Estimate
     winner_agreement: Estimate
     winner_regret: Estimate
     bias: Estimate
-    """Mean over cells of real minus twin."""
+    """Mean over cells of real minus twin rate."""
     coverage: Estimate
-    """Share of the cells whose difference between twin and road is no more than chance (interval of `Pair.bias`)."""
+    """Fraction of the cells whose `CellPair.bias` has an interval that contains 0."""
     corrected_coverage: Estimate
-    """Share of the candidates whose real rate lies in the interval predicted without them."""
+    """Fraction of the candidates whose real rate lies in the interval predicted without them."""
     mean_real: Estimate
-    """Mean real rate of policies such as these, driven or not (prediction-powered)."""
+    """Mean real rate of policies such as these, driven or not (prediction-powered estimate)."""
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """One real lighting, foretold from all others of the task."""
+class LeftOutLighting:
+    """Prediction of one real lighting from all others of the task."""
 
     task: str
     lighting: str
     cells: int
     twin_error: Estimate
-    """Mean distance of the twin's rates from the real ones."""
+    """Mean absolute difference of twin and real rates."""
     corrected_error: Estimate
-    """The same after the correction learnt under the other lightings."""
+    """The same after the correction fitted under the other lightings."""
     coverage: Estimate
-    """Share of the cells within the interval predicted."""
+    """Fraction of the cells within the predicted interval."""
 
 
 @dataclass(frozen=True)
 class TrialAllocation:
-    """What more real trials would bring. `ranking` states the rule."""
+    """Number of further real trials that would settle the ranking of a task's policies; see `ranking.py`."""
 
     task: str
     policies: int
     basis: str
-    """road: trials are added to those driven; twin: none so far, and the road is taken to be like the twin."""
+    """`road`: further trials are added to the real ones; `twin`: without real trials, the twin's rates are assumed."""
     winner_now: float | None = None
     """Probability that the leading policy is the best, or within `ranking.MARGIN` of it."""
     order_now: float | None = None
-    """Share of the pairs that matter expected in the right order."""
+    """Expected fraction of the pairs further apart than `ranking.MARGIN` that are in the right order."""
     more_for_winner: int | None = None
-    """Real trials per policy until `winner_now` is expected to be `sure`; None: more than `ranking.MOST_TRIALS`."""
+    """Real trials per policy until `winner_now` is expected to reach `sure`; None: more than `ranking.MAX_TRIALS`."""
     more_for_order: int | None = None
+    """The same for `order_now`."""
 
 
 @dataclass(frozen=True)
 class Forecast:
+    """All numbers of a scene's forecast. Field names are the keys of `forecast.json`."""
+
     scene: str
     twin_trials: int
     real_trials: int
     tasks: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     """Task by task, best in the twin first."""
-    pairs: tuple[Pair, ...]
-    groups: tuple[Group, ...]
-    left_out: tuple[LeftOut, ...]
+    pairs: tuple[CellPair, ...]
+    groups: tuple[Agreement, ...]
+    left_out: tuple[LeftOutLighting, ...]
     plans: tuple[TrialAllocation, ...]
     confidence: float = CONFIDENCE
-    draws: int = DRAWS
+    draws: int = REPLICATES
     seed: int = 0
-    sure: float = ranking.SURE
+    sure: float = ranking.SETTLED_PROBABILITY
     margin: float = ranking.MARGIN
 
-    def of(self, task: str) -> list[Candidate]:
+    def candidates_of(self, task: str) -> list[Candidate]:
         return [c for c in self.candidates if c.task == task]
 
     def save(self, folder: Path) -> None:
@@ -187,25 +202,25 @@ class Forecast:
 
     @staticmethod
     def load(folder: Path) -> "Forecast":
-        """Raises InputError: no such file, or not one that `save` wrote."""
+        """Reads `forecast.json`. Raises InputError: no such file, or an invalid one."""
         path = folder / _FILE
         if not exists(path):
             raise InputError(f"{path} does not exist; run python -m twin.forecast SCENE")
-        with damaged(path, "run python -m twin.forecast SCENE anew"):
+        with wrap_read_errors(path, "run python -m twin.forecast SCENE anew"):
             try:
-                return parse(Forecast, _given(read_json(path)), str(path))
+                return parse_table(Forecast, _without_nulls(read_json(path)), str(path))
             except InputError as error:
                 raise InputError(f"{error}; run python -m twin.forecast SCENE anew") from None
 
 
-def _given(value: Any) -> Any:
-    """A JSON value without its nulls, which a dataclass has as defaults."""
+def _without_nulls(value: Any) -> Any:
+    """A JSON value without its nulls, for which the dataclasses have defaults."""
     if isinstance(value, dict):
-        return {key: _given(item) for key, item in value.items() if item is not None}
-    return [_given(item) for item in value] if isinstance(value, list) else value
+        return {key: _without_nulls(item) for key, item in value.items() if item is not None}
+    return [_without_nulls(item) for item in value] if isinstance(value, list) else value
 
 
-# ---- How a `Forecast` is computed from the cells of the twin and of the road; see `forecasting.py` for the words.
+# ---- computation
 
 
 def make_forecast(
@@ -215,31 +230,33 @@ def make_forecast(
     seed: int = 0,
     trained: Mapping[tuple[str, str], Estimate] | None = None,
 ) -> Forecast:
-    """Computes everything.
+    """Computes a forecast.
 
     Args:
-        scene: Its name.
+        scene: Name of the scene.
         twin: Cells of the twin.
-        real: Real cells, each with a cell of the twin to compare with; may be none.
-        seed: Of the resampling.
-        trained: Rates in training by policy and task, where they are known.
+        real: Real cells, each with a twin cell to compare with; may be empty.
+        seed: Seed of the resampling.
+        trained: Success rates in training by (policy, task), where known.
     """
     tasks = tuple(dict.fromkeys(cell.task for cell in twin))
     candidates: list[Candidate] = []
     comparable: list[Candidate] = []
-    groups, left_out, plans = [], [], []
+    groups, left_out, allocations = [], [], []
     for task in tasks:
-        here = [cell for cell in real if cell.task == task]
-        mine, lightings = _candidates(task, [c for c in twin if c.task == task], here, seed)
-        if here:
-            alike = [c for c in mine if set(c.lightings) == set(lightings)]
-            groups.append(_group(task, here, twin, alike, seed))
-            comparable += alike
-            left_out += _left_out(task, here, twin)
-        plans.append(_plan(task, [c for c in twin if c.task == task and c.lighting in lightings], here, seed))
-        candidates += [replace(c, trained=(trained or {}).get((c.policy, task), c.trained)) for c in mine]
+        task_real = [cell for cell in real if cell.task == task]
+        task_candidates, lightings = _candidates(task, [c for c in twin if c.task == task], task_real, seed)
+        if task_real:
+            task_comparable = [c for c in task_candidates if set(c.lightings) == set(lightings)]
+            groups.append(_agreement(task, task_real, twin, task_comparable, seed))
+            comparable += task_comparable
+            left_out += _left_out(task, task_real, twin)
+        allocations.append(
+            _allocation(task, [c for c in twin if c.task == task and c.lighting in lightings], task_real, seed)
+        )
+        candidates += [replace(c, trained=(trained or {}).get((c.policy, task), c.trained)) for c in task_candidates]
     if len(groups) > 1:
-        groups.append(_group(ALL_TASKS, real, twin, comparable, seed))
+        groups.append(_agreement(ALL_TASKS, real, twin, comparable, seed))
     return Forecast(
         scene=scene,
         twin_trials=sum(cell.trials for cell in twin),
@@ -248,7 +265,7 @@ def make_forecast(
         pairs=tuple(_pair(cell, twin) for cell in real),
         groups=tuple(groups),
         left_out=tuple(left_out),
-        plans=tuple(plans),
+        plans=tuple(allocations),
         seed=seed,
         tasks=tasks,
     )
@@ -260,22 +277,22 @@ def make_forecast(
 def _candidates(
     task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
 ) -> tuple[list[Candidate], tuple[str, ...]]:
-    """The task's candidates, best first, and the compared lightings; `twin` and `real` are the task's cells."""
+    """The candidates, best first, and the compared lightings; `twin` and `real` are the task's cells."""
     lightings = tuple(dict.fromkeys(cell.lighting for cell in twin))
     if real:
         compared = {cell.twin_key[2] for cell in real}
         lightings = tuple(name for name in lightings if name in compared)
     policies = list(dict.fromkeys(cell.policy for cell in twin))
     cells = [[c for c in twin if c.policy == p and c.lighting in lightings] for p in policies]
-    # Not validated under any compared lighting: it has a score of its own, which is not compared with the others'.
+    # A policy not validated under any compared lighting gets a score over its own lightings, which is not compared.
     cells = [mine or [c for c in twin if c.policy == p] for p, mine in zip(policies, cells, strict=True)]
     rng = np.random.default_rng([seed, 1])
-    ranks = ranking.rank_probabilities(_tallies(cells), rng)
+    ranks = ranking.rank_probabilities(_trial_counts(cells), rng)
     driven = [[c for c in real if c.policy == p] for p in policies]
     with_real = [i for i, mine in enumerate(driven) if mine]
     real_ranks: dict[int, NDArray[np.float64]] = {}
     if len(with_real) > 1:
-        each = ranking.rank_probabilities(_tallies([driven[i] for i in with_real]), rng)
+        each = ranking.rank_probabilities(_trial_counts([driven[i] for i in with_real]), rng)
         real_ranks = dict(zip(with_real, each, strict=True))
     corrected = _corrected(cells, driven, lightings, twin)
     out = []
@@ -300,22 +317,22 @@ def _candidates(
 def _corrected(
     cells: list[list[Cell]], driven: list[list[Cell]], lightings: tuple[str, ...], twin: Sequence[Cell]
 ) -> list[Estimate]:
-    """What each candidate is expected to do on the road, from the other driven ones."""
+    """Predicted real rate of each candidate, from the other driven ones."""
     pairs = [(i, *_scores(mine, twin)) for i, mine in enumerate(driven) if mine]
-    few = _few([cell for mine in driven for cell in mine], twin)
+    missing = _missing_data([cell for mine in driven for cell in mine], twin)
     out = []
     for i, mine in enumerate(cells):
         others = [(f, y) for j, f, y in pairs if j != i]
-        if few or len(others) < MIN_POLICIES:
+        if missing or len(others) < MIN_POLICIES:
             out.append(
-                Estimate(missing="; ".join(few) or f"{len(others)} other policies driven, {MIN_POLICIES} needed")
+                Estimate(missing="; ".join(missing) or f"{len(others)} other policies driven, {MIN_POLICIES} needed")
             )
             continue
         score = _scores(driven[i], twin)[0] if driven[i] else _mean_rate(mine).value
         if {c.lighting for c in mine} != set(lightings):
-            out.append(Estimate(missing=f"not validated under {listing(lightings)}, as the driven policies are"))
+            out.append(Estimate(missing=f"not validated under {join_names(lightings)}, as the driven policies are"))
             continue
-        line = prediction_powered.Correction.fit(twin=[f for f, _ in others], real=[y for _, y in others])
+        line = prediction_powered.LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
         value, low, high = (float(x) for x in line.predict(np.array(score)))
         out.append(Estimate(value, low, high, line.n))
     return out
@@ -332,15 +349,15 @@ def _mean_rate(cells: Sequence[Cell]) -> Estimate:
     return Estimate(mean, low, high, sum(c.trials for c in cells))
 
 
-def _tallies(rows: Sequence[Sequence[Cell]]) -> Tallies:
-    return Tallies.of([[(c.successes, c.trials) for c in row] for row in rows])
+def _trial_counts(rows: Sequence[Sequence[Cell]]) -> TrialCounts:
+    return TrialCounts.from_rows([[(c.successes, c.trials) for c in row] for row in rows])
 
 
-# ---- agreement of the worlds
+# ---- agreement
 
 
-def _few(real: Sequence[Cell], twin: Sequence[Cell]) -> list[str]:
-    """What is missing for a statistic over these real cells."""
+def _missing_data(real: Sequence[Cell], twin: Sequence[Cell]) -> list[str]:
+    """Data that are missing for a statistic over these real cells."""
     found = {cell.key: cell for cell in twin}
     policies = len({cell.policy for cell in real})
     out = []
@@ -359,71 +376,78 @@ def _few(real: Sequence[Cell], twin: Sequence[Cell]) -> list[str]:
         if c.trials < MIN_TRIALS
     ]
     if short:
-        out.append(f"cells of fewer than {MIN_TRIALS} trials: {listing(short)}; or leave these cells out")
+        out.append(f"cells of fewer than {MIN_TRIALS} trials: {join_names(short)}; or leave these cells out")
     return out
 
 
-def _group(task: str, real: Sequence[Cell], twin: Sequence[Cell], candidates: list[Candidate], seed: int) -> Group:
-    few = _few(real, twin)
-    data = paired(real, twin)
-    if few:
-        none = Estimate(n=data.policies, missing="; ".join(few))
-        return Group(task, data.policies, data.cells, tuple(few), *(none,) * 9)
-    own, again, n = seen(data), resample(data, np.random.default_rng([seed, 2])), data.policies
-    return Group(
+def _agreement(
+    task: str, real: Sequence[Cell], twin: Sequence[Cell], candidates: list[Candidate], seed: int
+) -> Agreement:
+    missing = _missing_data(real, twin)
+    data = pair_cells(real, twin)
+    if missing:
+        none = Estimate(n=data.policies, missing="; ".join(missing))
+        return Agreement(task, data.policies, data.cells, tuple(missing), *(none,) * 9)
+    observed, replicates, n = observed_rates(data), resample(data, np.random.default_rng([seed, 2])), data.policies
+    return Agreement(
         task=task,
         policies=data.policies,
         cells=data.cells,
         missing=(),
-        pearson=_correlation(pearson, pearson_rows, own, again),
-        spearman=_correlation(spearman, spearman_rows, own, again),
-        mmrv=_bootstrapped(mmrv(twin=own.twin, real=own.real), mmrv_rows(twin=again.twin, real=again.real), n),
-        **_winner(own, again, data),
-        bias=_bootstrapped(float(own.difference), again.difference, data.cells),
-        coverage=_bootstrapped(float(own.inside), again.inside, data.cells),
-        corrected_coverage=_corrected_coverage(data, own),
-        mean_real=_mean_real(own, candidates),
+        pearson=_correlation(pearson, pearson_batched, observed, replicates),
+        spearman=_correlation(spearman, spearman_batched, observed, replicates),
+        mmrv=_bootstrapped(
+            mmrv(twin=observed.twin, real=observed.real), mmrv_batched(twin=replicates.twin, real=replicates.real), n
+        ),
+        **_winner(observed, replicates, data),
+        bias=_bootstrapped(float(observed.difference), replicates.difference, data.cells),
+        coverage=_bootstrapped(float(observed.compatible), replicates.compatible, data.cells),
+        corrected_coverage=_corrected_coverage(data, observed),
+        mean_real=_mean_real(observed, candidates),
     )
 
 
 def _correlation(
-    of: Callable[..., float], rows: Callable[..., NDArray[np.float64]], own: Rates, again: Rates
+    of: Callable[..., float], batched: Callable[..., NDArray[np.float64]], observed: Rates, replicates: Rates
 ) -> Estimate:
-    n = len(own.twin)
+    n = len(observed.twin)
     try:
-        value = of(twin=own.twin, real=own.real)
-    except Refused as refusal:
+        value = of(twin=observed.twin, real=observed.real)
+    except UndefinedStatistic as refusal:
         return Estimate(n=n, missing=str(refusal))
-    return _bootstrapped(value, rows(twin=again.twin, real=again.real), n)
+    return _bootstrapped(value, batched(twin=replicates.twin, real=replicates.real), n)
 
 
-def _bootstrapped(value: float, again: NDArray[np.float64], n: int) -> Estimate:
-    ends = interval(value, again)
+def _bootstrapped(value: float, replicates: NDArray[np.float64], n: int) -> Estimate:
+    ends = bootstrap_interval(value, replicates)
     if ends is None:
         return Estimate(n=n, missing="most resampled experiments have rates that are all the same")
     return Estimate(value, *ends, n)
 
 
-def _winner(own: Rates, again: Rates, data: Paired) -> dict[str, Estimate]:
-    """Compared within each task that has two candidates or more."""
+def _winner(observed: Rates, replicates: Rates, data: PairedCells) -> dict[str, Estimate]:
+    """Agreement and regret of the winner, as means over tasks."""
     if all(len(members) < 2 for members in data.strata):
         none = Estimate(n=data.policies, missing="no task has two policies")
         return {"winner_agreement": none, "winner_regret": none}
-    (agreement, regret), (agreements, regrets) = by_task(winner_rows, own), by_task(winner_rows, again)
+    (agreement, regret), (agreements, regrets) = (
+        mean_over_tasks(winner_batched, observed),
+        mean_over_tasks(winner_batched, replicates),
+    )
     return {
         "winner_agreement": _bootstrapped(float(agreement), agreements, data.policies),
         "winner_regret": _bootstrapped(float(regret), regrets, data.policies),
     }
 
 
-def _corrected_coverage(data: Paired, own: Rates) -> Estimate:
-    """Task by task, each candidate predicted without itself."""
+def _corrected_coverage(data: PairedCells, observed: Rates) -> Estimate:
+    """Coverage of leave-one-out predictions, task by task."""
     hits: list[bool] = []
     for members in data.strata:
-        twin, real = own.twin[members], own.real[members]
+        twin, real = observed.twin[members], observed.real[members]
         try:
-            _, low, high = prediction_powered.left_out_predictions(twin=twin, real=real, groups=range(len(members)))
-        except Refused:
+            _, low, high = prediction_powered.leave_one_group_out(twin=twin, real=real, groups=range(len(members)))
+        except UndefinedStatistic:
             continue
         hits += list((low <= real) & (real <= high))
     if not hits:
@@ -432,44 +456,44 @@ def _corrected_coverage(data: Paired, own: Rates) -> Estimate:
     return Estimate(float(np.mean(hits)), float(low_), float(high_), len(hits))
 
 
-def _mean_real(own: Rates, candidates: list[Candidate]) -> Estimate:
+def _mean_real(observed: Rates, candidates: list[Candidate]) -> Estimate:
     further = [c.twin.value for c in candidates if not c.driven and c.twin.value is not None]
     try:
-        mean = prediction_powered.powered_mean(twin=own.twin, real=own.real, twin_only=further)
-    except Refused as refusal:
+        mean = prediction_powered.prediction_powered_mean(twin=observed.twin, real=observed.real, twin_only=further)
+    except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
-    return Estimate(mean.value, max(mean.low, 0.0), min(mean.high, 1.0), mean.labelled + mean.unlabelled)
+    return Estimate(mean.value, max(mean.low, 0.0), min(mean.high, 1.0), mean.labeled + mean.unlabeled)
 
 
-def _left_out(task: str, real: Sequence[Cell], twin: Sequence[Cell]) -> list[LeftOut]:
+def _left_out(task: str, real: Sequence[Cell], twin: Sequence[Cell]) -> list[LeftOutLighting]:
     lightings = [cell.lighting for cell in real]
     names = list(dict.fromkeys(lightings))
     twin_rate, real_rate = np.array([_scores([cell], twin) for cell in real]).T
-    few = _few(real, twin) or (["a second real lighting is needed"] if len(names) < 2 else [])
-    if few:
-        none = Estimate(missing="; ".join(few))
-        return [LeftOut(task, name, lightings.count(name), none, none, none) for name in names]
+    missing = _missing_data(real, twin) or (["a second real lighting is needed"] if len(names) < 2 else [])
+    if missing:
+        none = Estimate(missing="; ".join(missing))
+        return [LeftOutLighting(task, name, lightings.count(name), none, none, none) for name in names]
     out = []
     for name in names:
         mine = np.array([other == name for other in lightings])
         n = int(mine.sum())
         try:
-            line = prediction_powered.Correction.fit(twin=twin_rate[~mine], real=real_rate[~mine])
-        except Refused:
+            line = prediction_powered.LinearCorrection.fit(twin=twin_rate[~mine], real=real_rate[~mine])
+        except UndefinedStatistic:
             none = Estimate(missing=f"the other lightings have fewer than {MIN_POLICIES} cells")
-            out.append(LeftOut(task, name, n, none, none, none))
+            out.append(LeftOutLighting(task, name, n, none, none, none))
             continue
         value, low, high = line.predict(twin_rate[mine])
         inside = (low <= real_rate[mine]) & (real_rate[mine] <= high)
         ends = wilson(inside.sum(), n)
         twin_error, error = np.abs(twin_rate - real_rate)[mine], np.abs(value - real_rate[mine])
         covered = Estimate(float(inside.mean()), float(ends[0]), float(ends[1]), n)
-        out.append(LeftOut(task, name, n, _mean(twin_error), _mean(error), covered))
+        out.append(LeftOutLighting(task, name, n, _mean(twin_error), _mean(error), covered))
     return out
 
 
 def _mean(values: NDArray[np.float64]) -> Estimate:
-    """Mean of distances, with the interval of Student's t, cut off at 0."""
+    """Mean of absolute differences, with Student's t interval, clipped at 0."""
     n = len(values)
     if n < 2:
         return Estimate(float(values.mean()), None, None, n)
@@ -478,7 +502,7 @@ def _mean(values: NDArray[np.float64]) -> Estimate:
     return Estimate(mean, max(mean - half, 0.0), mean + half, n)
 
 
-def _pair(cell: Cell, twin: Sequence[Cell]) -> Pair:
+def _pair(cell: Cell, twin: Sequence[Cell]) -> CellPair:
     mate = next(c for c in twin if c.key == cell.twin_key)
     difference = rate_difference(
         twin_successes=mate.successes,
@@ -488,7 +512,7 @@ def _pair(cell: Cell, twin: Sequence[Cell]) -> Pair:
     )
     value, low, high = (float(x) for x in difference)
     bias = Estimate(value, low, high, cell.trials)
-    return Pair(cell.policy, cell.task, cell.lighting, mate.lighting, _rate(mate), _rate(cell), bias)
+    return CellPair(cell.policy, cell.task, cell.lighting, mate.lighting, _rate(mate), _rate(cell), bias)
 
 
 def _rate(cell: Cell) -> Estimate:
@@ -496,14 +520,14 @@ def _rate(cell: Cell) -> Estimate:
     return Estimate(cell.rate, float(low), float(high), cell.trials)
 
 
-def _plan(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int) -> TrialAllocation:
+def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int) -> TrialAllocation:
     basis = "road" if len({cell.policy for cell in real}) > 1 else "twin"
     cells = real if basis == "road" else twin
     policies = list(dict.fromkeys(cell.policy for cell in cells))
     if len(policies) < 2:
         return TrialAllocation(task, len(policies), basis, None, None, 0, 0)
-    tallies = _tallies([[c for c in cells if c.policy == policy] for policy in policies])
+    counts = _trial_counts([[c for c in cells if c.policy == policy] for policy in policies])
     so_far = basis == "road"
-    now = ranking.expected_after(tallies, 0, seed, so_far)
-    more = [ranking.trials_to_settle(tallies, what, seed, so_far) for what in ("winner", "order")]
+    now = ranking.expected_confidence(counts, 0, seed, so_far)
+    more = [ranking.trials_needed(counts, what, seed, so_far) for what in ("winner", "order")]
     return TrialAllocation(task, len(policies), basis, now.winner, now.order, *more)

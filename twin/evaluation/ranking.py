@@ -1,8 +1,8 @@
-"""Which policy is best, how sure that is, and how many more trials would make it sure.
+"""Bayesian ranking of policies: probabilities of ranks, and the number of further trials that would settle the ranking.
 
-The true rate of a cell is drawn from Jeffreys' posterior, Beta(successes + ½, trials − successes + ½), and a policy's
-score is the mean of its cells'. The *probability of a rank* is the share of draws in which a policy has it. All this is
-about the world in which the trials were driven: how the twin ranks is no evidence yet of how the road does.
+The true rate of a cell is sampled from Jeffreys' posterior, Beta(successes + ½, trials − successes + ½); a policy's
+score is the mean over its cells. The probability of a rank is the fraction of samples in which a policy has it. All
+statements hold for the world in which the trials were driven: a ranking in the twin is no evidence of one on the road.
 """
 
 from dataclasses import dataclass
@@ -13,134 +13,129 @@ from numpy.typing import NDArray
 from twin.evaluation.statistics import CONFIDENCE
 from twin.types import Array
 
-SURE = 0.95
-"""Probability from which on a ranking is settled."""
+SETTLED_PROBABILITY = 0.95
+"""Probability from which on a ranking counts as settled."""
 MARGIN = 0.05
-"""Policies whose true scores differ by less are equally good."""
-MOST_TRIALS = 1000
-"""Per policy; beyond, more trials are no answer."""
+"""Policies whose true scores differ by less count as equally good."""
+MAX_TRIALS = 1000
+"""Largest number of further trials per policy that is considered."""
 
-_DRAWS = 4000
+_SAMPLES = 4000  # of the posterior
 _STEP = 5  # trials
 
 
 @dataclass(frozen=True)
-class Tallies:
-    """The cells of n policies on one task, up to k each; rows are filled with cells of weight 0."""
+class TrialCounts:
+    """Trials of n policies on one task in up to k cells each; rows are padded with cells of weight 0."""
 
     successes: NDArray[np.int64]
     """Shape (n, k)."""
     trials: NDArray[np.int64]
     """Shape (n, k)."""
     weight: Array
-    """1 where there is a cell, else 0; shape (n, k)."""
+    """1 for a cell, 0 for padding; shape (n, k)."""
 
     @staticmethod
-    def of(rows: list[list[tuple[int, int]]]) -> "Tallies":
-        """From (successes, trials) of each policy's cells."""
+    def from_rows(rows: list[list[tuple[int, int]]]) -> "TrialCounts":
+        """Counts from (successes, trials) of each policy's cells."""
         shape = len(rows), max(map(len, rows))
         successes, trials, weight = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
         for i, row in enumerate(rows):
             for j, (won, driven) in enumerate(row):
                 successes[i, j], trials[i, j], weight[i, j] = won, driven, 1.0
-        return Tallies(successes, trials, weight)
+        return TrialCounts(successes, trials, weight)
 
-    def mean(self, rates: Array) -> Array:
-        """Scores (..., n) of cells' rates (..., n, k)."""
+    def scores(self, rates: Array) -> Array:
+        """Scores (..., n) from rates of cells (..., n, k)."""
         return (rates * self.weight).sum(-1) / self.weight.sum(-1)
 
-    def posterior(self, rng: np.random.Generator, draws: int) -> Array:
-        """True rates, shape (draws, n, k)."""
-        shape = (draws, *self.successes.shape)
+    def sample_posterior(self, rng: np.random.Generator, samples: int) -> Array:
+        """Samples of the true rates, shape (samples, n, k)."""
+        shape = (samples, *self.successes.shape)
         return rng.beta(self.successes + 0.5, self.trials - self.successes + 0.5, shape)
 
 
-def rank_probabilities(tallies: Tallies, rng: np.random.Generator, draws: int = _DRAWS) -> Array:
+def rank_probabilities(counts: TrialCounts, rng: np.random.Generator, samples: int = _SAMPLES) -> Array:
     """Probability that policy i has rank k + 1, shape (n, n); rows and columns sum to 1."""
-    scores = tallies.mean(tallies.posterior(rng, draws))
+    scores = counts.scores(counts.sample_posterior(rng, samples))
     ranks = np.argsort(np.argsort(-scores, axis=-1), axis=-1)
     n = scores.shape[-1]
     return np.stack([(ranks == k).mean(0) for k in range(n)], -1)
 
 
 def rank_interval(probabilities: Array, confidence: float = CONFIDENCE) -> tuple[float, int, int]:
-    """Expected rank of a policy, 1 is best, and the ranks between which it lies with `confidence`; probabilities (n,).
+    """Expected rank of a policy (1 is best) from rank probabilities (n,), and the ends of its credible interval.
 
-    From either end, ranks are left out as long as they come to no more than half of what may be missed.
+    At either end, ranks are excluded as long as their total probability is at most (1 − confidence) / 2.
     """
     ranks = np.arange(1, len(probabilities) + 1)
-    spare = (1.0 - confidence) / 2 + 1e-12
+    tail = (1.0 - confidence) / 2 + 1e-12
     below = np.cumsum(probabilities)
     above = np.cumsum(probabilities[::-1])[::-1]
-    return float(probabilities @ ranks), int(ranks[below > spare][0]), int(ranks[above > spare][-1])
+    return float(probabilities @ ranks), int(ranks[below > tail][0]), int(ranks[above > tail][-1])
 
 
 @dataclass(frozen=True)
-class Settled:
-    """What a number of further trials per policy would do, on average over what the rates may be."""
+class RankingConfidence:
+    """Expected confidence in a ranking after further trials, averaged over the posterior of the rates."""
 
     winner: float
-    """Probability that the policy then leading is within `MARGIN` of the truly best."""
+    """Probability that the leading policy is within `MARGIN` of the truly best."""
     order: float
-    """Expected share of the pairs whose true scores differ by more than `MARGIN` that are then in the right order."""
+    """Expected fraction of the pairs with true scores more than `MARGIN` apart that are ranked in the right order."""
 
 
-def expected_after(tallies: Tallies, more: int, seed: int, so_far: bool = True, draws: int = _DRAWS) -> Settled:
-    """How sure the ranking is after `more` trials per policy, spread evenly over its cells.
+def expected_confidence(
+    counts: TrialCounts, more: int, seed: int, so_far: bool = True, samples: int = _SAMPLES
+) -> RankingConfidence:
+    """Expected confidence in the ranking after `more` trials per policy, spread evenly over its cells.
 
-    True rates are drawn from the posterior, the trials from the rates, and the policies ranked by what would then be
-    known (the posterior mean).
+    True rates are sampled from the posterior and trials from these rates; policies are ranked by the posterior mean.
 
     Args:
-        tallies: Trials so far.
+        counts: Trials so far.
         more: Further trials per policy.
-        seed: The same one compares numbers of trials on the same draws.
-        so_far: Whether the trials so far count as seen; if not, they only tell which rates to expect.
-        draws: Of the true rates.
+        seed: Equal seeds compare numbers of trials on the same samples.
+        so_far: False: the trials so far are only the prior of the rates, and do not count for the ranking.
+        samples: Number of samples of the true rates.
     """
     rng = np.random.default_rng(seed)
-    true = tallies.posterior(rng, draws)
-    per_cell = np.broadcast_to(more / tallies.weight.sum(-1, keepdims=True), tallies.weight.shape)
-    extra = np.ceil(per_cell * tallies.weight).astype(np.int64)
+    true = counts.sample_posterior(rng, samples)
+    per_cell = np.broadcast_to(more / counts.weight.sum(-1, keepdims=True), counts.weight.shape)
+    extra = np.ceil(per_cell * counts.weight).astype(np.int64)
     won = rng.binomial(extra, true)
-    base_won, base = (tallies.successes, tallies.trials) if so_far else (0, 0)
-    known = tallies.mean((base_won + won + 0.5) / (base + extra + 1.0))
-    score = tallies.mean(true)
-    # Of policies that are tied in what is known, any may be chosen.
+    base_won, base = (counts.successes, counts.trials) if so_far else (0, 0)
+    known = counts.scores((base_won + won + 0.5) / (base + extra + 1.0))
+    score = counts.scores(true)
+    # Each of the policies tied in the posterior mean is equally likely to be chosen.
     leading = np.isclose(known, known.max(-1, keepdims=True), rtol=0.0, atol=1e-12)
     good = score >= score.max(-1, keepdims=True) - MARGIN
     winner = ((leading & good).sum(-1) / leading.sum(-1)).mean()
-    gap, shown = score[:, :, None] - score[:, None, :], known[:, :, None] - known[:, None, :]
+    gap, known_gap = score[:, :, None] - score[:, None, :], known[:, :, None] - known[:, None, :]
     apart = gap > MARGIN
-    right = np.where(np.isclose(shown, 0.0, rtol=0.0, atol=1e-12), 0.5, shown > 0)
+    right = np.where(np.isclose(known_gap, 0.0, rtol=0.0, atol=1e-12), 0.5, known_gap > 0)
     order = (right * apart).sum() / apart.sum() if apart.any() else 1.0
-    return Settled(float(winner), float(order))
+    return RankingConfidence(float(winner), float(order))
 
 
-def trials_to_settle(tallies: Tallies, what: str, seed: int, so_far: bool = True) -> int | None:
-    """Further trials per policy, a multiple of 5, after which `Settled.winner` or `.order` is expected at `SURE`.
+def trials_needed(counts: TrialCounts, what: str, seed: int, so_far: bool = True) -> int | None:
+    """Further trials per policy, a multiple of 5, until an expected confidence reaches `SETTLED_PROBABILITY`.
 
-    Args:
-        tallies: Trials so far.
-        what: "winner" or "order".
-        seed: Of the draws.
-        so_far: See `expected_after`.
-
-    Returns:
-        None where `MOST_TRIALS` would not do.
+    `what` is the field of `RankingConfidence`, "winner" or "order"; other arguments as of `expected_confidence`.
+    Returns None if `MAX_TRIALS` do not suffice.
     """
 
     def enough(more: int) -> bool:
-        return bool(getattr(expected_after(tallies, more, seed, so_far), what) >= SURE)
+        return bool(getattr(expected_confidence(counts, more, seed, so_far), what) >= SETTLED_PROBABILITY)
 
     low, high = 0, _STEP
     if enough(0):
         return 0
     while not enough(high):
         low, high = high, 2 * high
-        if low >= MOST_TRIALS:
+        if low >= MAX_TRIALS:
             return None
-    while high - low > _STEP:  # in between: expected to grow with the trials
+    while high - low > _STEP:  # bisection: the confidence is expected to grow with the trials
         middle = (low + high) // (2 * _STEP) * _STEP
         low, high = (low, middle) if enough(middle) else (middle, high)
-    return high if high <= MOST_TRIALS else None
+    return high if high <= MAX_TRIALS else None

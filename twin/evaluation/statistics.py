@@ -1,12 +1,12 @@
-"""Success rates and how well one set of them predicts another: closed forms, no randomness, no files.
+"""Success rates with intervals, and statistics of the agreement of twin and real scores. Closed forms, no randomness.
 
-A *rate* is successes over trials; its *interval* is meant to hold the true rate with probability `CONFIDENCE`. *Twin
-scores* and *real scores* are the rates of the same policies in the twin and on the road, in the same order, along the
-last axis; any leading axes are separate experiments. The two worlds are not interchangeable (regret and rank violations
-are counted in real points), so every function takes them by keyword only.
+A *rate* is successes over trials; its interval contains the true rate with probability `CONFIDENCE`. *Twin scores* and
+*real scores* are rates of the same policies in the twin and on the road, in the same order, along the last axis;
+leading axes are separate experiments. Twin and real are keyword-only, as they are not interchangeable (regret and rank
+violations are differences of real rates).
 
-A statistic that the numbers do not allow is *refused*: `Refused` says why. The functions ending in `_rows` are the same
-statistics over leading axes and give nan there instead; they are for resampling.
+Functions raise `UndefinedStatistic` where the data do not determine the statistic. Those ending in `_batched` compute
+it over leading axes for resampling, and return nan there instead.
 """
 
 from typing import Any
@@ -18,18 +18,18 @@ from scipy.stats import norm, rankdata
 from twin.types import Array
 
 CONFIDENCE = 0.9
-"""Of every interval."""
+"""Confidence level of every interval."""
 MIN_POLICIES = 5
-"""Fewer are refused a correlation."""
+"""Number of policies below which no correlation is given."""
 MIN_TRIALS = 5
-"""Cells of fewer trials are refused a correlation."""
+"""Number of trials per cell below which no correlation is given."""
 
-_DEFINED = 3  # points below which a correlation is no statement at all
-_DIGITS = 12  # scores that agree to so many decimals are tied, however they were summed
+_MIN_POINTS = 3  # below it a correlation says nothing
+_DECIMALS = 12  # scores equal to so many decimals are tied, in whatever order they were summed
 
 
-class Refused(ValueError):
-    """A statistic that these numbers do not allow; the message says why and what is missing."""
+class UndefinedStatistic(ValueError):
+    """The data do not determine a statistic; the message gives the reason and what is missing."""
 
 
 # ---- rates
@@ -38,35 +38,22 @@ class Refused(ValueError):
 def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
     """Score interval of a rate: Wilson (1927); eq. 4 of Brown, Cai and DasGupta, Statistical Science 16 (2001).
 
-    Args:
-        successes: Need not be whole (see `mean_rate`), any shape.
-        trials: Positive, same shape.
-        confidence: Of the interval.
-
-    Returns:
-        Lower and upper end, in [0, 1].
+    Successes (any shape) need not be integers, see `mean_rate`; trials are positive. Returns lower and upper end.
     """
     n = np.asarray(trials, float)
     p = np.asarray(successes, float) / n
     z2 = norm.ppf(0.5 + confidence / 2) ** 2
-    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
+    center = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = np.sqrt(z2 * (p * (1 - p) / n + z2 / (4 * n**2))) / (1 + z2 / n)
-    return np.maximum(centre - half, 0.0), np.minimum(centre + half, 1.0)
+    return np.maximum(center - half, 0.0), np.minimum(center + half, 1.0)
 
 
 def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
-    """Mean of the rates of k cells (lightings), each counting alike whatever its trials, and its interval.
+    """Unweighted mean of the rates of k cells (lightings), and its interval.
 
-    The interval is Wilson's for the number of trials whose binomial variance the mean would have if all rates were
-    equal, k² / Σ 1/nᵢ; unequal rates have less variance, so it errs to the wide side.
-
-    Args:
-        successes: Shape (k,).
-        trials: Positive, shape (k,).
-        confidence: Of the interval.
-
-    Returns:
-        Mean, lower and upper end.
+    The interval is Wilson's for the effective number of trials k² / Σ 1/nᵢ, at which a binomial rate has the mean's
+    variance if all rates are equal; unequal rates have less variance, so the interval errs to the wide side.
+    Successes and trials (positive) have shape (k,). Returns mean, lower and upper end.
     """
     n = np.asarray(trials, float)
     mean = float(np.mean(np.asarray(successes, float) / n))
@@ -75,7 +62,7 @@ def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     return mean, float(low), float(high)
 
 
-def share(won: int, trials: int) -> dict[str, Any]:
+def rate_summary(won: int, trials: int) -> dict[str, Any]:
     """Successes, trials, rate and its interval, JSON-able; the rate is None without trials."""
     if not trials:
         return {"successes": 0, "trials": 0, "rate": None, "low": 0.0, "high": 1.0}
@@ -84,23 +71,17 @@ def share(won: int, trials: int) -> dict[str, Any]:
 
 
 def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
-    """Mean of the rates of k days, each counting alike, and its interval with the day as the unit.
+    """Unweighted mean of the rates of k days, and its interval with the day as the unit.
 
-    Trials of one day share its light and weather and tend to end alike. The interval allows them to agree entirely:
-    with an intra-class correlation of 1 the design effect 1 + (m − 1) ρ equals the m trials of a day (Kish, Survey
-    Sampling, 1965, section 5.4), so k days count as k trials, and the interval is Wilson's for these. Rates between
-    0 and 1 have less variance than successes and failures of the same mean, so it errs to the wide side. It is about
-    further days for the same policies, not about further policies.
-
-    Args:
-        rates: In [0, 1], one per day, shape (k,). A day's rate is the mean over all its trials, of all policies.
-        confidence: Of the interval.
-
-    Returns:
-        Mean, lower and upper end.
+    Trials of one day share its lighting and weather and tend to have the same outcome. The interval assumes that they
+    agree entirely: with an intra-class correlation of 1 the design effect 1 + (m − 1) ρ equals the m trials of a day
+    (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials, and the interval is Wilson's for these.
+    Rates between 0 and 1 have less variance than successes and failures of the same mean, so it errs to the wide side.
+    It holds for further days of the same policies, not for further policies. `rates` (k,) has one rate per day in
+    [0, 1], the mean over all its trials of all policies. Returns mean, lower and upper end.
 
     Raises:
-        ValueError: no day, or a rate outside [0, 1].
+        ValueError: `rates` is empty, or a rate is outside [0, 1].
     """
     days = np.asarray(rates, float)
     if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
@@ -120,16 +101,7 @@ def rate_difference(
     """Real rate minus twin rate, and its interval: Newcombe's hybrid score (method 10).
 
     R. G. Newcombe, Interval estimation for the difference between independent proportions, Stat. in Medicine 17 (1998).
-
-    Args:
-        twin_successes: Any shape; the others have the same.
-        twin_trials: Positive.
-        real_successes: Likewise.
-        real_trials: Positive.
-        confidence: Of the interval.
-
-    Returns:
-        Difference, lower and upper end, in [−1, 1].
+    All counts have the same shape, trials are positive. Returns difference, lower and upper end, in [−1, 1].
     """
     twin = np.asarray(twin_successes, float) / np.asarray(twin_trials, float)
     real = np.asarray(real_successes, float) / np.asarray(real_trials, float)
@@ -144,54 +116,50 @@ def rate_difference(
 
 
 def pearson(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Pearson's correlation of scores, shapes (n,). Raises Refused: n < 3, or scores that are all the same."""
-    twin, real = _checked(twin, real)
-    return float(pearson_rows(twin=twin, real=real))
+    """Pearson's correlation of scores, shapes (n,). Raises UndefinedStatistic: n < 3, or all scores are equal."""
+    twin, real = _validated(twin, real)
+    return float(pearson_batched(twin=twin, real=real))
 
 
 def spearman(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Pearson's correlation of ranks, tied scores sharing their mean rank. Raises Refused as `pearson` does."""
-    twin, real = _checked(twin, real)
-    return float(spearman_rows(twin=twin, real=real))
+    """Pearson's correlation of ranks; tied scores share their mean rank. Raises UndefinedStatistic as `pearson`."""
+    twin, real = _validated(twin, real)
+    return float(spearman_batched(twin=twin, real=real))
 
 
 def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Mean maximum rank violation, 0 at best and 1 at worst: SIMPLER (Li et al., arXiv 2405.05941), section on metrics.
+    """Mean maximum rank violation in [0, 1], 0 is best: SIMPLER (Li et al., arXiv 2405.05941), section on metrics.
 
-    A pair of policies is violated where the twin orders it otherwise than the road, by as much as their real scores
-    differ: |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]; MMRV is the mean over i of the largest over j. It is not symmetric in
-    its arguments, and code in circulation names them in both orders. Policies tied in the twin, but not on the road,
-    count as a violation of the worse of the two; code published with the paper compares by > and charges the better.
+    The violation of a pair of policies that twin and road order differently is the difference of their real scores:
+    |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]; MMRV is the mean over i of the largest over j. It is not symmetric in its
+    arguments, and published code names them in both orders. Policies tied in the twin, but not on the road, count as a
+    violation of the worse of the two; code published with the paper compares by > and charges the better.
 
     Raises:
-        Refused: fewer than two policies.
+        UndefinedStatistic: fewer than two policies.
     """
-    twin, real = _checked(twin, real, needed=2, varied=False)
-    return float(mmrv_rows(twin=twin, real=real))
+    twin, real = _validated(twin, real, needed=2, varied=False)
+    return float(mmrv_batched(twin=twin, real=real))
 
 
 def winner_agreement(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Whether the twin's best policy is the road's best: 1 or 0; of policies tied in the twin, the share that is.
-
-    Raises:
-        Refused: fewer than two policies.
+    """1 if the twin's best policy is the road's best, else 0; the mean over policies tied as best in the twin.
+    Raises UndefinedStatistic: fewer than two policies.
     """
-    twin, real = _checked(twin, real, needed=2, varied=False)
-    return float(winner_rows(twin=twin, real=real)[0])
+    twin, real = _validated(twin, real, needed=2, varied=False)
+    return float(winner_batched(twin=twin, real=real)[0])
 
 
 def winner_regret(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Real success lost by taking the twin's best policy instead of the road's, in [0, 1]; the mean over twin's ties.
-
-    Raises:
-        Refused: fewer than two policies.
+    """Regret in [0, 1]: real rate of the road's best policy minus that of the twin's best; the mean over twin's ties.
+    Raises UndefinedStatistic: fewer than two policies.
     """
-    twin, real = _checked(twin, real, needed=2, varied=False)
-    return float(winner_rows(twin=twin, real=real)[1])
+    twin, real = _validated(twin, real, needed=2, varied=False)
+    return float(winner_batched(twin=twin, real=real)[1])
 
 
-def pearson_rows(*, twin: Array, real: Array) -> Array:
-    """`pearson` over leading axes, shape (..., n) → (...); nan where scores are all the same."""
+def pearson_batched(*, twin: Array, real: Array) -> Array:
+    """`pearson` over leading axes, shape (..., n) → (...); nan where all scores are equal."""
     x = twin - twin.mean(-1, keepdims=True)
     y = real - real.mean(-1, keepdims=True)
     scale = np.sqrt((x * x).sum(-1) * (y * y).sum(-1))
@@ -199,20 +167,20 @@ def pearson_rows(*, twin: Array, real: Array) -> Array:
     return np.where(flat, np.nan, np.clip((x * y).sum(-1) / np.where(flat, 1.0, scale), -1.0, 1.0))
 
 
-def spearman_rows(*, twin: Array, real: Array) -> Array:
-    """`spearman` over leading axes, shape (..., n) → (...); nan where scores are all the same."""
-    return pearson_rows(twin=rankdata(_rounded(twin), axis=-1), real=rankdata(_rounded(real), axis=-1))
+def spearman_batched(*, twin: Array, real: Array) -> Array:
+    """`spearman` over leading axes, shape (..., n) → (...); nan where all scores are equal."""
+    return pearson_batched(twin=rankdata(_rounded(twin), axis=-1), real=rankdata(_rounded(real), axis=-1))
 
 
-def mmrv_rows(*, twin: Array, real: Array) -> Array:
+def mmrv_batched(*, twin: Array, real: Array) -> Array:
     """`mmrv` over leading axes, shape (..., n) → (...)."""
     twin, real = _rounded(twin), _rounded(real)
     violated = (twin[..., :, None] < twin[..., None, :]) != (real[..., :, None] < real[..., None, :])
-    by = np.abs(real[..., :, None] - real[..., None, :])
-    return (by * violated).max(-1).mean(-1)
+    size = np.abs(real[..., :, None] - real[..., None, :])
+    return (size * violated).max(-1).mean(-1)
 
 
-def winner_rows(*, twin: Array, real: Array) -> tuple[Array, Array]:
+def winner_batched(*, twin: Array, real: Array) -> tuple[Array, Array]:
     """`winner_agreement` and `winner_regret` over leading axes, shape (..., n) → (...) each."""
     twin, real = _rounded(twin), _rounded(real)
     chosen = twin == twin.max(-1, keepdims=True)
@@ -222,18 +190,18 @@ def winner_rows(*, twin: Array, real: Array) -> tuple[Array, Array]:
 
 
 def _rounded(scores: Array) -> Array:
-    return np.round(scores, _DIGITS)
+    return np.round(scores, _DECIMALS)
 
 
-def _checked(twin: ArrayLike, real: ArrayLike, needed: int = _DEFINED, varied: bool = True) -> tuple[Array, Array]:
+def _validated(twin: ArrayLike, real: ArrayLike, needed: int = _MIN_POINTS, varied: bool = True) -> tuple[Array, Array]:
     twin, real = np.asarray(twin, float), np.asarray(real, float)
     if twin.ndim != 1 or twin.shape != real.shape:
         raise ValueError(f"scores of shapes {twin.shape} and {real.shape}: expected one per policy in each, (n,)")
     if not (np.isfinite(twin).all() and np.isfinite(real).all()):
         raise ValueError("a score is not a number")
     if len(twin) < needed:
-        raise Refused(f"{len(twin)} policies; at least {needed} are needed for this to be defined")
+        raise UndefinedStatistic(f"{len(twin)} policies; at least {needed} are needed for this to be defined")
     for name, scores in (("in the twin", twin), ("on the road", real)):
         if varied and np.ptp(_rounded(scores)) == 0:
-            raise Refused(f"all rates {name} are {scores[0]:.3g}; a correlation needs rates that differ")
+            raise UndefinedStatistic(f"all rates {name} are {scores[0]:.3g}; a correlation needs rates that differ")
     return twin, real

@@ -1,14 +1,13 @@
-"""Tables of trials: what `twin.validate` writes, what the user brings from the road, and where they meet.
+"""Tables of trials: those that `twin.validate` writes, and the user's results from the road.
 
-A *trial* is one drive of one policy, on a task, under a lighting; it succeeds or not. A *cell* is the trials of one
-policy, task and lighting. In the twin every trial is a row of `validation/episodes.csv`; from the road come cells,
-`results.csv`:
+A *trial* is one drive of one policy, on a task, under a lighting; it succeeds or fails. A *cell* is the trials of one
+policy, task and lighting. In the twin every trial is a row of `validation/episodes.csv`; real trials are given as cells
+in `results.csv`:
 
-    policy,lighting,trials,successes            further columns, if wanted: task, twin_lighting
+    policy,lighting,trials,successes            optional columns: task, twin_lighting
 
-`task` is needed only where a policy was validated on several. `twin_lighting` names the lighting of the twin that the
-cell is compared with, for light that the twin does not know by name: `dusk_on_monday` compared with
-`held-out+randomised`.
+`task` is required only if a policy was validated on several. `twin_lighting` names the twin's lighting that the cell is
+compared with, for a lighting whose name the twin does not have: `dusk_on_monday` compared with `held-out+randomised`.
 """
 
 import csv
@@ -24,17 +23,18 @@ from twin.evaluation.statistics import wilson
 from twin.files import read_text
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
-"""Of `validation/episodes.csv`. `trust` is the mean of the trial's pictures, empty without pictures."""
+"""Columns of `validation/episodes.csv`. `trust` is the mean over the trial's pictures, empty without pictures."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
-"""Of `validation/cells.csv`: episodes summed up, with Wilson's interval."""
+"""Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
-"""That `results.csv` must have."""
+"""Required columns of `results.csv`."""
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting")
-RECENT = 20
-"""Whole episodes that a success rate in training is taken over; a training on a CPU has some 40."""
+"""Optional columns of `results.csv`."""
+RECENT_EPISODES = 20
+"""Complete episodes that a success rate in training is taken over; a training on a CPU has about 40."""
 
-_MOST_COUNT, _MOST_SEED = 10**6, 2**63 - 1  # of trials and steps in a cell; of a seed
-_VALIDATE = "python -m twin.validate"
+_MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # of trials and steps in a cell; of a seed
+_VALIDATE_COMMAND = "python -m twin.validate"
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Trial:
     cause: str
     """One of `twin.env.options.CAUSES`; only `goal` is a success."""
     progress: float
-    """Way along the task's stretch [m]."""
+    """Distance along the task's route segment [m]."""
     steps: int
-    """Of control."""
+    """Control steps."""
     trust: float | None = None
     """Mean over the pictures, in [0, 1]; None without pictures."""
 
@@ -59,7 +59,7 @@ class Trial:
         return self.cause == "goal"
 
     def row(self) -> tuple[str, ...]:
-        """As in `EPISODE_COLUMNS`."""
+        """Fields of `EPISODE_COLUMNS`."""
         trust = "" if self.trust is None else f"{self.trust:.4f}"
         head = (self.policy, self.task, self.lighting, str(self.seed), str(int(self.success)), self.cause)
         return (*head, f"{self.progress:.3f}", str(self.steps), trust)
@@ -75,7 +75,7 @@ class Cell:
     trials: int
     successes: int
     twin_lighting: str = ""
-    """Of a real cell: the lighting of the twin that it is compared with. Empty for a cell of the twin."""
+    """The twin's lighting that a real cell is compared with; empty for a cell of the twin."""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -83,7 +83,7 @@ class Cell:
 
     @property
     def twin_key(self) -> tuple[str, str, str]:
-        """The twin's cell that a real cell is compared with."""
+        """Key of the twin's cell that a real cell is compared with."""
         return self.policy, self.task, self.twin_lighting or self.lighting
 
     @property
@@ -92,14 +92,14 @@ class Cell:
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table as CSV, with its header."""
+    """A table as CSV text with a header."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([columns, *rows])
     return out.getvalue()
 
 
 def tally(trials: Iterable[Trial]) -> list[Cell]:
-    """Trials summed up by cell, in the order in which the cells first occur."""
+    """Counts trials by cell, in the order in which the cells first occur."""
     counts: dict[tuple[str, str, str], list[int]] = {}
     for trial in trials:
         count = counts.setdefault((trial.policy, trial.task, trial.lighting), [0, 0])
@@ -108,8 +108,8 @@ def tally(trials: Iterable[Trial]) -> list[Cell]:
     return [Cell(*key, trials=n, successes=k) for key, (n, k) in counts.items()]
 
 
-def cells_text(cells: Iterable[Cell]) -> str:
-    """`validation/cells.csv`."""
+def cells_csv(cells: Iterable[Cell]) -> str:
+    """Text of `validation/cells.csv`."""
     rows = []
     for c in cells:
         low, high = wilson(c.successes, c.trials)
@@ -119,42 +119,49 @@ def cells_text(cells: Iterable[Cell]) -> str:
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """The rows of `validation/episodes.csv`.
+    """Reads `validation/episodes.csv`.
 
     Raises:
-        InputError: no such file, or a row that `twin.validate` would not write; names its line.
+        InputError: no such file, or an invalid row; names its line.
     """
     if not path.exists():
-        raise InputError(f"{path} does not exist; drive the policies in the twin first: {_VALIDATE} SCENE --policy RUN")
-    trials, seen = [], set()
+        raise InputError(
+            f"{path} does not exist; drive the policies in the twin first: {_VALIDATE_COMMAND} SCENE --policy RUN"
+        )
+    trials, keys = [], set()
     for where, row in _rows(path, EPISODE_COLUMNS, ()):
         if row["cause"] not in CAUSES:
             raise InputError(f"{where}: cause = {row['cause']!r}; expected one of {', '.join(CAUSES)}")
         if row["success"] != str(int(row["cause"] == "goal")):
             raise InputError(
                 f"{where}: success = {row['success']!r} with cause {row['cause']!r}; expected 1 where the cause is "
-                f"goal, else 0; run {_VALIDATE} anew"
+                f"goal, else 0; run {_VALIDATE_COMMAND} anew"
             )
-        trust = _real(where, row, "trust") if row["trust"] else None
-        numbers = _whole(where, row, "seed"), row["cause"], _real(where, row, "progress_m"), _whole(where, row, "steps")
+        trust = _parse_float(where, row, "trust") if row["trust"] else None
+        numbers = (
+            _parse_int(where, row, "seed"),
+            row["cause"],
+            _parse_float(where, row, "progress_m"),
+            _parse_int(where, row, "steps"),
+        )
         trial = Trial(row["policy"], row["task"], row["lighting"], *numbers, trust)
         key = (trial.policy, trial.task, trial.lighting, trial.seed)
-        if key in seen:
+        if key in keys:
             raise InputError(f"{where}: seed {trial.seed} of this policy, task and lighting is there twice; delete one")
-        seen.add(key)
+        keys.add(key)
         trials.append(trial)
     return trials
 
 
 def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
-    """The user's real trials, each cell with the twin's cell that it is compared with.
+    """Reads the user's real cells and checks that each has a twin cell to be compared with.
 
     Args:
-        path: `results.csv`.
+        path: Path of `results.csv`.
         twin: Cells of the twin.
 
     Raises:
-        InputError: no such file, wrong header, unknown names, impossible or duplicated counts; names the line.
+        InputError: no such file, wrong header, unknown names, impossible counts or duplicates; names the line.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
@@ -162,7 +169,7 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
     known = {cell.key for cell in twin}
     for where, row in _rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS):
         policy, task = _policy_and_task(where, row, twin)
-        trials, successes = _whole(where, row, "trials"), _whole(where, row, "successes")
+        trials, successes = _parse_int(where, row, "trials"), _parse_int(where, row, "successes")
         if trials == 0:
             raise InputError(f"{where}: trials = 0; expected at least 1; delete the line until there are trials")
         if successes > trials:
@@ -182,7 +189,7 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
 def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> tuple[str, str]:
     policies = list(dict.fromkeys(cell.policy for cell in twin))
     if row["policy"] not in policies:
-        raise InputError(f"{where}: policy {row['policy']!r} was not validated; {nearest(row['policy'], policies)}")
+        raise InputError(f"{where}: policy {row['policy']!r} was not validated; {name_hint(row['policy'], policies)}")
     tasks = list(dict.fromkeys(cell.task for cell in twin if cell.policy == row["policy"]))
     task = row.get("task", "")
     if not task and len(tasks) > 1:
@@ -191,7 +198,7 @@ def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> t
         )
     if task and task not in tasks:
         raise InputError(
-            f"{where}: policy {row['policy']!r} was not validated on task {task!r}; {nearest(task, tasks)}"
+            f"{where}: policy {row['policy']!r} was not validated on task {task!r}; {name_hint(task, tasks)}"
         )
     return row["policy"], task or tasks[0]
 
@@ -200,15 +207,17 @@ def _unknown_lighting(cell: Cell, known: set[tuple[str, str, str]]) -> str:
     name = cell.twin_key[2]
     here = sorted(lighting for policy, task, lighting in known if (policy, task) == (cell.policy, cell.task))
     if any(name == lighting for _, _, lighting in known):
-        return f"policy {cell.policy!r} was not validated under {name!r}; run {_VALIDATE} with --lightings {name}"
+        return (
+            f"policy {cell.policy!r} was not validated under {name!r}; run {_VALIDATE_COMMAND} with --lightings {name}"
+        )
     return (
-        f"lighting {name!r} is not in the twin; {nearest(name, here)}; for light the twin does not know, "
+        f"lighting {name!r} is not in the twin; {name_hint(name, here)}; for light the twin does not know, "
         "name the one to compare with in a column twin_lighting"
     )
 
 
-def nearest(name: str, valid: Sequence[str]) -> str:
-    """ "did you mean ...?", or which names there are."""
+def name_hint(name: str, valid: Sequence[str]) -> str:
+    """End of an error message: "did you mean ...?", or the valid names."""
     near = difflib.get_close_matches(name, valid, n=1)
     if near:
         return f"did you mean {near[0]!r}?"
@@ -216,7 +225,7 @@ def nearest(name: str, valid: Sequence[str]) -> str:
 
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
-    """Where each row stands, and its fields by column name."""
+    """Yields the location of each row, and its fields by column name."""
     text = read_text(path)
     reader = csv.reader(io.StringIO(text))
     wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
@@ -225,12 +234,12 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
         if not header:
             raise InputError(f"{path} is empty; its first line must be {wanted}")
         missing = [name for name in needed if name not in header]
-        strange = [name for name in header if name not in (*needed, *optional)]
-        if missing or strange or len(set(header)) != len(header):
-            what = (
-                f"no column {missing[0]}" if missing else f"{(strange or ['a column'])[0]!r} is unknown or there twice"
+        unknown = [name for name in header if name not in (*needed, *optional)]
+        if missing or unknown or len(set(header)) != len(header):
+            fault = (
+                f"no column {missing[0]}" if missing else f"{(unknown or ['a column'])[0]!r} is unknown or there twice"
             )
-            raise InputError(f"{path}: header {','.join(header)!r}: {what}; expected {wanted}")
+            raise InputError(f"{path}: header {','.join(header)!r}: {fault}; expected {wanted}")
         count = 0
         for fields in reader:
             if not any(field.strip() for field in fields):
@@ -250,9 +259,9 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
         raise InputError(f"{path} has a header and no rows; add one line per policy and lighting")
 
 
-def _whole(where: str, row: dict[str, str], name: str) -> int:
+def _parse_int(where: str, row: dict[str, str], name: str) -> int:
     text = row[name]
-    most = _MOST_SEED if name == "seed" else _MOST_COUNT
+    most = _MAX_SEED if name == "seed" else _MAX_COUNT
     if not (text.isascii() and text.isdecimal()):
         raise InputError(f"{where}: {name} = {text!r}; expected a whole number, 0 or more")
     if len(text) > len(str(most)) or int(text) > most:
@@ -260,7 +269,7 @@ def _whole(where: str, row: dict[str, str], name: str) -> int:
     return int(text)
 
 
-def _real(where: str, row: dict[str, str], name: str) -> float:
+def _parse_float(where: str, row: dict[str, str], name: str) -> float:
     try:
         value = float(row[name])
     except ValueError:

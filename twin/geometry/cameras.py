@@ -1,8 +1,8 @@
-"""Posed pinhole cameras.
+"""Posed pinhole cameras, sparse points and projection.
 
-OpenCV axes: x right, y down, z forward. Pixel (0, 0) is the *corner* of the top-left pixel, whose centre is (0.5, 0.5)
-as in COLMAP. *depth* is the z coordinate in the camera, *distance* runs along the ray. The world is metric with z up
-once the metric stage has run; in `2_cameras` it is still the reconstruction's own frame.
+OpenCV axes: x right, y down, z forward. Pixel (0, 0) is the *corner* of the top-left pixel, whose center is (0.5, 0.5)
+as in COLMAP. *Depth* is the z coordinate in the camera frame, *distance* is measured along the ray. The world frame is
+metric with z up after stage `metric`; in `2_cameras` it is the frame of the reconstruction.
 """
 
 import os
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import InputError
-from twin.files import check_shapes, checked_text, damaged, load_arrays, read_json, write_json
+from twin.files import check_shapes, load_arrays, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.poses import Similarity, inverse_pose
 from twin.types import Array
 
@@ -22,13 +22,13 @@ _CV_TO_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def opencv_to_mujoco(camera_to_world: Array) -> Array:
-    """Turns OpenCV camera axes into MuJoCo's (x right, y up, looking along −z); its own inverse. Shape (..., 4, 4)."""
+    """Converts OpenCV camera axes to MuJoCo's (x right, y up, looking along −z). Self-inverse; shape (..., 4, 4)."""
     return camera_to_world @ _CV_TO_GL
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """n undistorted pinhole views, with what is known of each frame. Order: by source, then by time."""
+    """n undistorted, posed pinhole frames with their metadata, ordered by source and then by time."""
 
     names: tuple[str, ...]
     """Frame names, `<source>/<six digits>`; unique."""
@@ -45,11 +45,11 @@ class Cameras:
     times: Array
     """Time within its source [s], shape (n,)."""
     held_out: NDArray[np.bool_]
-    """True: never trained on, shape (n,)."""
+    """True for test frames, which are never trained on; shape (n,)."""
     images: Path
-    """Folder with `<name>.png`, undistorted, 8-bit RGB (or grey, read as RGB)."""
+    """Folder with `<name>.png`, undistorted, 8-bit RGB (or gray, read as RGB)."""
     masks: Path | None = None
-    """Folder with `<name>.png`, 0 = ignore; None where nothing is masked."""
+    """Folder with `<name>.png`, 0 = ignore; None if no frame has a mask."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -58,17 +58,17 @@ class Cameras:
         return self.images / f"{self.names[i]}.png"
 
     def mask_path(self, i: int) -> Path | None:
-        """The mask of frame i, or None where it has none."""
+        """The mask file of frame i, or None."""
         path = self.masks / f"{self.names[i]}.png" if self.masks else None
         return path if path and path.exists() else None
 
     @property
     def positions(self) -> Array:
-        """Camera centres, shape (n, 3)."""
+        """Camera centers, shape (n, 3)."""
         return self.camera_to_world[:, :3, 3]
 
     def select(self, index: NDArray) -> "Cameras":
-        """The frames of an index array or boolean mask."""
+        """The frames selected by an index array or boolean mask."""
         i = np.arange(len(self))[index]
         return replace(
             self,
@@ -86,7 +86,7 @@ class Cameras:
         return replace(self, camera_to_world=similarity.poses(self.camera_to_world))
 
     def save(self, folder: Path) -> None:
-        """Writes `cameras.json` and `cameras.npz`; image folders are kept as relative paths."""
+        """Writes `cameras.json` and `cameras.npz`; image folders are stored as relative paths."""
         np.savez(
             folder / "cameras.npz",
             camera_to_world=self.camera_to_world,
@@ -111,20 +111,20 @@ class Cameras:
 
     @staticmethod
     def load(folder: Path) -> "Cameras":
-        """Raises InputError: no such files, or not those that `save` wrote."""
+        """Reads the files that `save` wrote. Raises InputError if they are missing or damaged."""
         head, data = read_json(folder / "cameras.json"), load_arrays(folder / "cameras.npz")
         base = folder.resolve().parent
         missing = {"camera_to_world", "intrinsics", "sizes", "times", "held_out"} - data.keys()
         if missing:
             raise InputError(f"{folder / 'cameras.npz'}: no {', '.join(sorted(missing))}; build the scene again")
-        with damaged(folder / "cameras.json", "build the scene again"):
+        with wrap_read_errors(folder / "cameras.json", "build the scene again"):
             cameras = Cameras(
-                names=tuple(map(checked_text, head["names"])),
+                names=tuple(map(require_text, head["names"])),
                 camera_to_world=data["camera_to_world"],
                 intrinsics=data["intrinsics"],
                 sizes=data["sizes"],
-                lightings=tuple(map(checked_text, head["lightings"])),
-                sources=tuple(map(checked_text, head["sources"])),
+                lightings=tuple(map(require_text, head["lightings"])),
+                sources=tuple(map(require_text, head["sources"])),
                 times=data["times"],
                 held_out=data["held_out"],
                 images=base / head["images"],
@@ -133,7 +133,7 @@ class Cameras:
             n = len(cameras.names)
             if not len(cameras.lightings) == len(cameras.sources) == n:
                 raise ValueError(f"{n} names, {len(cameras.lightings)} lightings, {len(cameras.sources)} sources")
-        with damaged(folder / "cameras.npz", "build the scene again"):
+        with wrap_read_errors(folder / "cameras.npz", "build the scene again"):
             check_shapes(
                 {
                     "camera_to_world": (cameras.camera_to_world, (n, 4, 4), "f"),
@@ -147,17 +147,17 @@ class Cameras:
 
 
 def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
-    """The frame of a lighting that was taken closest to frame i and looks the same way; None where none does."""
+    """Index of the frame under `lighting` whose pose is closest to frame i's; None if that lighting has no frame."""
     offset = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
     forward = cameras.camera_to_world[:, :3, 2]
-    # Looking elsewhere counts as far away: 10 m for a right angle.
+    # A different view direction adds to the distance: 10 m for a right angle.
     cost = offset + 10.0 * (1.0 - forward @ forward[i])
     candidates = [k for k, name in enumerate(cameras.lightings) if name == lighting]
     return min(candidates, key=lambda k: float(cost[k])) if candidates else None
 
 
-class Posed(Protocol):
-    """What a renderer needs of cameras: `Cameras` and `Viewpoints` are such."""
+class PosedCameras(Protocol):
+    """Cameras as a renderer needs them; `Cameras` and `Viewpoints` match this protocol."""
 
     @property
     def camera_to_world(self) -> Array: ...
@@ -169,7 +169,7 @@ class Posed(Protocol):
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """n pinhole views that nobody filmed."""
+    """n virtual pinhole views."""
 
     camera_to_world: Array
     """Shape (n, 4, 4)."""
@@ -180,23 +180,16 @@ class Viewpoints:
 
     @staticmethod
     def of(camera_to_world: Array, intrinsics: Array, size: tuple[int, int]) -> "Viewpoints":
-        """One or many views from one camera.
-
-        Args:
-            camera_to_world: Shape (4, 4) or (n, 4, 4).
-            intrinsics: fx, fy, cx, cy [px], shape (4,), or (n, 4) where they differ.
-            size: Width, height [px] that the intrinsics are for.
-        """
+        """Views from one pose (4, 4) or many (n, 4, 4), with shared (4,) or individual intrinsics (n, 4) for `size`."""
         pose = np.asarray(camera_to_world, np.float64).reshape(-1, 4, 4)
         k = np.broadcast_to(np.asarray(intrinsics, np.float64), (len(pose), 4))
         return Viewpoints(pose, k, np.broadcast_to(np.array(size, np.int64), (len(pose), 2)))
 
 
-def resized(cameras: Posed, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
-    """Intrinsics (n, 4) for pictures of one size, and that size: the one given, else that of the cameras.
+def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
+    """Intrinsics (n, 4) scaled to one image size, and that size: `size`, or by default the cameras' common size.
 
-    Raises:
-        InputError: no size given, and the cameras' differ.
+    Raises InputError: no size is given and the cameras' sizes differ.
     """
     own = np.asarray(cameras.sizes)
     if size is None:
@@ -207,20 +200,20 @@ def resized(cameras: Posed, size: tuple[int, int] | None) -> tuple[Array, tuple[
 
 
 def pixel_grid(width: int, height: int) -> Array:
-    """Pixel centres (u, v) [px], shape (height, width, 2)."""
+    """Pixel centers (u, v) [px], shape (height, width, 2)."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([u, v], -1)
 
 
 def unproject(pixels: Array, intrinsics: Array) -> Array:
-    """Rays through pixels, in the camera, with z = 1 (so that ray × depth is a point). Shapes (..., 2) → (..., 3)."""
+    """Rays through pixels in the camera frame with z = 1, so ray × depth is a point. Shapes (..., 2) → (..., 3)."""
     fx, fy, cx, cy = np.moveaxis(np.asarray(intrinsics), -1, 0)
     x, y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
     return np.stack([x, y, np.ones_like(x)], -1)
 
 
 def project(points: Array, camera_to_world: Array, intrinsics: Array) -> tuple[Array, Array]:
-    """World points into one camera: pixels (..., 2) and depth (...). Behind the camera depth is negative."""
+    """Projects world points (..., 3) into one camera: pixels (..., 2) and depth (...), negative behind the camera."""
     local = points @ inverse_pose(camera_to_world)[:3, :3].T + inverse_pose(camera_to_world)[:3, 3]
     depth = local[..., 2]
     fx, fy, cx, cy = intrinsics
@@ -234,15 +227,15 @@ def scaled_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[
     return np.asarray(intrinsics) * np.array([sx, sy, sx, sy])
 
 
-# ---- The sparse points of structure from motion, and which frames saw them.
+# ---- sparse points of structure from motion
 
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """m points and their k observations (one row per point and frame that sees it)."""
+    """m points and their k observations (one per point and frame in which it was matched)."""
 
     xyz: NDArray[np.float64]
-    """Shape (m, 3), in the frame of the `Cameras` beside them."""
+    """Shape (m, 3), in the same frame as the `Cameras` stored beside them."""
     rgb: NDArray[np.uint8]
     """Shape (m, 3)."""
     error: NDArray[np.float64]
@@ -250,14 +243,14 @@ class SparsePoints:
     point: NDArray[np.int64]
     """Point index per observation, shape (k,)."""
     frame: NDArray[np.int64]
-    """Frame index (into the `Cameras` beside them) per observation, shape (k,)."""
+    """Index into the `Cameras` stored beside them per observation, shape (k,)."""
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     @property
     def track_length(self) -> NDArray[np.int64]:
-        """How many frames saw each point, shape (m,)."""
+        """Number of observations of each point, shape (m,)."""
         return np.bincount(self.point, minlength=len(self.xyz))
 
     def transformed(self, similarity: Similarity) -> "SparsePoints":
@@ -274,9 +267,9 @@ class SparsePoints:
 
     @staticmethod
     def load(folder: Path) -> "SparsePoints":
-        """Raises InputError: no such file, or not one that `save` wrote."""
+        """Reads the file that `save` wrote. Raises InputError if it is missing or damaged."""
         path = folder / "points.npz"
-        with damaged(path, "build the scene again"):
+        with wrap_read_errors(path, "build the scene again"):
             points = SparsePoints(**load_arrays(path))
             m, k = len(points.xyz), len(points.point)
             check_shapes(

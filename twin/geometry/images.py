@@ -1,4 +1,7 @@
-"""Images as arrays, and how alike two are. RGB order, shape (height, width, 3), float in [0, 1] unless uint8."""
+"""Image files as arrays, resizing and similarity metrics.
+
+RGB order, shape (height, width, 3), float in [0, 1] unless uint8.
+"""
 
 import re
 import struct
@@ -13,98 +16,89 @@ from PIL import Image as PillowImage
 from skimage.metrics import structural_similarity
 
 from twin.errors import InputError
-from twin.files import read_bytes, regular, write_bytes
+from twin.files import read_bytes, regular_file, write_bytes
 
-MOST_PIXELS = 2 * 89_478_485
-"""Of an image, by its header; beyond it Pillow takes the file for an attack."""
-BROKEN = (
+MAX_PIXELS = 2 * 89_478_485  # largest accepted image by its header; Pillow rejects larger ones as decompression bombs
+DECODE_ERRORS = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, OSError, SyntaxError, TypeError, ValueError),
     *(AssertionError, MemoryError, NotImplementedError, RuntimeError, struct.error, zlib.error, cv2.error),
 )
-"""What Pillow and OpenCV raise upon a damaged file."""
-_MOST_BYTES = 2 << 30  # of an image file
+"""Exceptions that Pillow and OpenCV raise for damaged files."""
+_MAX_BYTES = 2 << 30  # size of an image file
 _CURE = "replace or remove it"
-warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # half of what is refused here
-warnings.filterwarnings("ignore", module="PIL")  # headers with a flaw, which are unknown then
+warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # issued at half of MAX_PIXELS
+warnings.filterwarnings("ignore", module="PIL")  # flawed headers; their values then count as unknown
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """An image file as RGB uint8; grey becomes RGB, alpha is dropped, EXIF rotation is applied.
+    """Reads an image file as RGB uint8; gray becomes RGB, alpha is dropped, EXIF rotation is applied.
 
-    Raises:
-        InputError: missing, empty, too large or undecodable file.
+    Raises InputError: missing, empty, too large or undecodable file.
     """
-    return cv2.cvtColor(decoded(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    return cv2.cvtColor(decode_image(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
-def decoded(path: Path, flags: int, cure: str = _CURE) -> NDArray[np.uint8]:
-    """An image file as OpenCV decodes it: shape (h, w), or (h, w, 3) in the order blue, green, red.
+def decode_image(path: Path, flags: int, cure: str = _CURE) -> NDArray[np.uint8]:
+    """Decodes an image file with OpenCV's `IMREAD_...` flags: uint8, shape (h, w), or (h, w, 3) in BGR order.
 
-    Args:
-        path: The file.
-        flags: OpenCV's `IMREAD_...`.
-        cure: Ends the message where the file is not readable.
-
-    Raises:
-        InputError: missing, empty, too large or undecodable file.
+    Raises InputError: missing, empty, too large or undecodable file; `cure` ends the message.
     """
-    if (header := opened(path, cure)) is not None:
+    if (header := open_header(path, cure)) is not None:
         header.close()
-    data = read_bytes(path, _MOST_BYTES)
+    data = read_bytes(path, _MAX_BYTES)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except BROKEN:
+    except DECODE_ERRORS:
         image = None
     if image is None:
-        raise unreadable(path, cure)
+        raise unreadable_error(path, cure)
     return np.asarray(image, np.uint8)
 
 
-def opened(path: Path, cure: str = _CURE) -> PillowImage.Image | None:
-    """An image file opened by Pillow, of which only the header is read; None where Pillow does not know the format.
+def open_header(path: Path, cure: str = _CURE) -> PillowImage.Image | None:
+    """Opens an image file with Pillow, reading only the header; None for a format unknown to Pillow.
 
-    Raises:
-        InputError: no file, or more than `MOST_PIXELS`.
+    Raises InputError: no file, an empty one, or more than `MAX_PIXELS`.
     """
     try:
-        if not regular(path).stat().st_size:
-            raise unreadable(path, cure)
+        if not regular_file(path).stat().st_size:
+            raise unreadable_error(path, cure)
         image = PillowImage.open(path)
     except PillowImage.DecompressionBombError as error:
         count = re.search(r"\d+", str(error))
         raise _too_large(path, f"{int(count[0]) / 1e6:,.0f} megapixels" if count else "too many pixels") from None
     except InputError:
         raise
-    except BROKEN:
+    except DECODE_ERRORS:
         return None
     width, height = image.size
-    if width * height > MOST_PIXELS:
+    if width * height > MAX_PIXELS:
         image.close()
         raise _too_large(path, f"{width}x{height}, {width * height / 1e6:,.0f} megapixels")
     return image
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file as stored [px], from its header. Raises InputError: see `decoded`."""
-    image = opened(path)
+    """Width and height of an image file as stored [px], from its header. Raises InputError as `decode_image` does."""
+    image = open_header(path)
     if image is None:
-        raise unreadable(path)
+        raise unreadable_error(path)
     with image:
         return image.size
 
 
-def unreadable(path: Path, cure: str = _CURE) -> InputError:
-    """What is said of an image that cannot be decoded."""
+def unreadable_error(path: Path, cure: str = _CURE) -> InputError:
+    """The error for an image file that cannot be decoded."""
     return InputError(f"{path}: not a readable image ({path.stat().st_size} bytes); {cure}")
 
 
 def _too_large(path: Path, size: str) -> InputError:
-    most = MOST_PIXELS / 1e6
+    most = MAX_PIXELS / 1e6
     return InputError(f"{path}: the image has {size}; expected at most {most:.0f} megapixels: scale it down")
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """Writes RGB or grey (uint8, or float in [0, 1]) as PNG or JPEG, by suffix."""
+    """Writes RGB or gray (uint8, or float in [0, 1]) as PNG or JPEG, chosen by the suffix."""
     if image.dtype != np.uint8:
         image = (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     if image.ndim == 3:
@@ -118,13 +112,13 @@ def write_image(path: Path, image: NDArray) -> None:
 
 
 def resize(image: NDArray, width: int, height: int) -> NDArray:
-    """Resizes by area averaging when shrinking, linear when growing."""
+    """Resizes by area averaging when shrinking and by linear interpolation when growing."""
     shrinking = width * height < image.shape[0] * image.shape[1]
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
 
 
 def psnr(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> float:
-    """Peak signal-to-noise ratio [dB] of float images in [0, 1], over the pixels where the mask is true."""
+    """Peak signal-to-noise ratio [dB] of float images in [0, 1] over the pixels where `mask` is true."""
     error = (image.astype(np.float64) - reference) ** 2
     mse = float(error[mask].mean() if mask is not None else error.mean())
     return float("inf") if mse == 0.0 else -10.0 * np.log10(mse)

@@ -1,7 +1,7 @@
 """Rigid and similarity transforms.
 
-A *pose* is a 4×4 matrix that maps one frame's homogeneous points to another's, and its name says both ends:
-`camera_to_world`. A *similarity* additionally scales: x ↦ s·R·x + t.
+A *pose* is a 4×4 matrix that maps homogeneous points from one frame to another; its name gives both frames, as in
+`camera_to_world`. A *similarity* also scales: x ↦ s·R·x + t.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Similarity:
         return self.scale * x @ self.rotation.T + self.translation
 
     def poses(self, pose: Array) -> Array:
-        """Maps camera-to-source poses to camera-to-target poses (rotation stays orthonormal), shape (..., 4, 4)."""
+        """Maps camera-to-source to camera-to-target poses; rotations stay orthonormal. Shape (..., 4, 4)."""
         out = np.array(pose, dtype=np.float64)
         out[..., :3, :3] = self.rotation @ out[..., :3, :3]
         out[..., :3, 3] = self.points(out[..., :3, 3])
@@ -39,19 +39,14 @@ class Similarity:
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
     def compose(self, first: "Similarity") -> "Similarity":
-        """The similarity that applies `first` and then this one."""
+        """The similarity that applies `first`, then this one."""
         return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
 
 
 def umeyama(source: Array, target: Array, with_scale: bool = True) -> Similarity:
-    """Least-squares similarity (or rigid transform) that maps source points on to target points.
+    """Least-squares similarity (rigid if `with_scale` is false) from source to target; Umeyama 1991, eqs. 34 to 42.
 
-    Umeyama 1991, eqs. 34 to 42.
-
-    Args:
-        source: Points, shape (n, 3), n ≥ 3 and not all on one line.
-        target: Their counterparts, shape (n, 3).
-        with_scale: Whether to estimate the scale, too.
+    Source and target are corresponding points, shape (n, 3), n ≥ 3 and not collinear.
     """
     mean_source, mean_target = source.mean(0), target.mean(0)
     a, b = source - mean_source, target - mean_target
@@ -73,9 +68,9 @@ def inverse_pose(pose: Array) -> Array:
 
 
 def rotation_between(a: Array, b: Array) -> Array:
-    """The smallest rotation that turns unit vector a into unit vector b, shape (3, 3)."""
+    """The smallest rotation from unit vector a to unit vector b, shape (3, 3)."""
     v, c = np.cross(a, b), float(a @ b)
-    if c < -1 + 1e-12:  # opposite: half a turn about any axis across a
+    if c < -1 + 1e-12:  # opposite: half a turn about any axis perpendicular to a
         axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
         axis /= np.linalg.norm(axis)
         return 2.0 * np.outer(axis, axis) - np.eye(3)
@@ -85,7 +80,7 @@ def rotation_between(a: Array, b: Array) -> Array:
 
 def rotation_angle(rotation: Array) -> Array:
     """Angle of rotation matrices [rad], shape (..., 3, 3) → (...)."""
-    # From the skew part as well as the trace: arccos alone loses half the digits near zero.
+    # Uses the skew part beside the trace: arccos of the trace alone loses half the digits near zero.
     skew = np.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],

@@ -1,9 +1,8 @@
-"""The filmed path as a line to drive.
+"""The filmed path and the route derived from it.
 
-The *path* is where the lens was, (x, y, z), in driving order. The *route* is the path seen from above, (x, y): without
-outliers, standing parts and rocking to and fro, smoothed, with points every `SPACING` metres. *Station* [m] is the
-length along it. The *corridor* is what lies within a half width of the route: the camera went through it, so it is
-free.
+The *path* is the sequence of camera centers (x, y, z) in driving order. The *route* is the path seen from above (x, y),
+without outliers, stops and rocking, smoothed, with points every `SPACING` meters. *Station* [m] is the arc length along
+it. The *corridor* is the area within a half width of the route; it is free, since the camera passed through it.
 """
 
 import math
@@ -20,89 +19,86 @@ from twin.types import Array
 
 SPACING = 0.25  # [m]
 _SMOOTHING = 0.5  # [m] standard deviation; moves a 5 m turn by 0.5²/(2·5) = 2.5 cm
-_ROCKING = 0.4  # [m] returns within this are standing or rocking, not driving
-_LEFT = 1.6  # [m] further away than this it has left for good: a round trip passes here again
+_STATIONARY_RADIUS = 0.4  # [m] motion within this is standing or rocking
+_DEPARTURE_RADIUS = 1.6  # [m] beyond this the camera has left: a later return is a second pass, as in a round trip
 _MIN_LENGTH = 2.0  # [m]
-_JUMP = 8.0  # usual steps; frames of uneven slots and sudden starts stay below 4
+_JUMP_RATIO = 8.0  # times the typical step; uneven frame intervals and sudden starts stay below 4
 _MIN_JUMP = 5.0  # [m]
-_BESIDE = 4  # steps before and after that say what is usual
-_MOST_LOST = 20.0  # frames in a row; a longer gap in time explains no longer step
+_JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
+_MAX_MISSING = 20.0  # frames in a row; longer gaps in time do not raise the allowed step further
 
 
 def filmed_route(cameras: Cameras) -> Array:
     """The route of the longest source (the first of those within 2 % of it), shape (m, 2) [m].
 
-    Raises:
-        InputError: the cameras hardly moved, or the path jumps.
+    Raises InputError: the route is shorter than 2 m, or its path jumps.
     """
-    frames = source_frames(cameras)
-    routes = [smooth_route(cameras.positions[index]) for index in frames]
-    lengths = np.array([route_length(route) for route in routes])
-    if not len(lengths) or lengths.max() < _MIN_LENGTH:
-        longest = lengths.max() if len(lengths) else 0.0
+    route, length, index = _longest_route(cameras)
+    if length < _MIN_LENGTH:
         raise InputError(
-            f"the filmed path is {longest:.2f} m long, expected at least {_MIN_LENGTH:g} m; "
+            f"the filmed path is {length:.2f} m long, expected at least {_MIN_LENGTH:g} m; "
             "film a drive, correct [metric], or set mjcf.route = false"
         )
-    chosen = int(np.argmax(lengths >= 0.98 * lengths.max()))
-    _refuse_jumps(cameras, frames[chosen])
-    return routes[chosen]
+    _check_source_jumps(cameras, index)
+    return route
 
 
-def refuse_jumps(cameras: Cameras) -> None:
-    """Refuses a film of several passes as early as its cameras are metric; a path too short for a route is let pass.
+def check_no_jumps(cameras: Cameras) -> None:
+    """Rejects a film of several passes as soon as its cameras are metric; a path too short for a route passes.
 
-    Raises:
-        InputError: the path that makes the route jumps, see `path_jumps`; names the frames.
+    Raises InputError: the path of the route jumps, see `path_jumps`; the message names the frames.
     """
+    _, length, index = _longest_route(cameras)
+    if length >= _MIN_LENGTH:
+        _check_source_jumps(cameras, index)
+
+
+def _longest_route(cameras: Cameras) -> tuple[Array, float, NDArray[np.int64]]:
+    """The first route within 2 % of the longest, the longest length [m], and the route's frames in order of time."""
     frames = source_frames(cameras)
-    lengths = np.array([route_length(smooth_route(cameras.positions[index])) for index in frames])
-    if len(lengths) and lengths.max() >= _MIN_LENGTH:
-        _refuse_jumps(cameras, frames[int(np.argmax(lengths >= 0.98 * lengths.max()))])
+    routes = [smooth_route(cameras.positions[index]) for index in frames]
+    if not routes:
+        return np.zeros((0, 2)), 0.0, np.zeros(0, np.int64)
+    lengths = np.array([route_length(route) for route in routes])
+    chosen = int(np.argmax(lengths >= 0.98 * lengths.max()))
+    return routes[chosen], float(lengths.max()), frames[chosen]
 
 
 def path_jumps(positions: Array, times: Array) -> NDArray[np.int64]:
-    """Where a path steps much further than it usually does: between two passes that were filmed one after the other.
+    """Finds steps much longer than the typical step of a path, as between two passes filmed one after the other.
 
-    A step is usual where it is at most 8 of those before and after it, or less than 5 m. Frames that are missing in
-    between lengthen it.
-
-    Args:
-        positions: Camera centres in order of time, shape (n, 3) [m].
-        times: Of these [s], or the place of photos without a clock, shape (n,).
-
-    Returns:
-        Indices i such that the path jumps from i to i + 1, shape (k,).
+    A jump is longer than 5 m and than 8 typical steps of its neighborhood, allowing for missing frames. Takes camera
+    centers (n, 3) [m] in order of time, with times [s] or indices (n,); returns the indices i of jumps from i to i + 1.
     """
     if len(positions) < 3:
         return np.zeros(0, np.int64)
     step = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
-    wait = np.diff(times)
-    lost = np.clip(wait / max(float(np.median(wait)), 1e-9), 1.0, _MOST_LOST)  # intervals that a step spans
-    pace = step / lost
-    usual = np.full(len(step), np.median(pace))
+    gap = np.diff(times)
+    intervals = np.clip(gap / max(float(np.median(gap)), 1e-9), 1.0, _MAX_MISSING)  # frame intervals per step
+    pace = step / intervals
+    typical = np.full(len(step), np.median(pace))
     for i in range(len(step)):
-        beside = np.concatenate([pace[max(i - _BESIDE, 0) : i], pace[i + 1 : i + 1 + _BESIDE]])
-        # An upper quartile, since a film may start, stop and speed up at any frame.
-        usual[i] = max(usual[i], float(np.quantile(beside, 0.75)))
-    return np.flatnonzero((step > _MIN_JUMP) & (step > usual * np.maximum(_JUMP, 2.0 * lost)))
+        neighbors = np.concatenate([pace[max(i - _JUMP_WINDOW, 0) : i], pace[i + 1 : i + 1 + _JUMP_WINDOW]])
+        # The upper quartile, since a film may start, stop and speed up at any frame.
+        typical[i] = max(typical[i], float(np.quantile(neighbors, 0.75)))
+    return np.flatnonzero((step > _MIN_JUMP) & (step > typical * np.maximum(_JUMP_RATIO, 2.0 * intervals)))
 
 
-def _refuse_jumps(cameras: Cameras, index: NDArray[np.int64]) -> None:
-    """Refuses a source, given its frames in order of time, whose path jumps."""
+def _check_source_jumps(cameras: Cameras, index: NDArray[np.int64]) -> None:
+    """Raises InputError if the path of a source jumps; `index` has its frames in order of time."""
     index = index[path_inliers(cameras.positions[index])]
     xy, times = cameras.positions[index, :2], cameras.times[index]
     jumps = path_jumps(cameras.positions[index], times)
     if not len(jumps):
         return
     first = int(jumps[0])
-    metres = float(np.linalg.norm(xy[first + 1] - xy[first]))
+    length = float(np.linalg.norm(xy[first + 1] - xy[first]))
     starts, ends = [0, *(int(k) + 1 for k in jumps)], [*(int(k) for k in jumps), len(index) - 1]
     passes = list(zip(starts, ends, strict=True))
     a, b = max(passes, key=lambda ends: route_length(xy[ends[0] : ends[1] + 1]))
     keep = f"[[{math.floor(100 * times[a]) / 100:g}, {math.ceil(100 * times[b]) / 100:g}]]"
     raise InputError(
-        f"the filmed path jumps {metres:.1f} m from frame {cameras.names[index[first]]} to "
+        f"the filmed path jumps {length:.1f} m from frame {cameras.names[index[first]]} to "
         f"{cameras.names[index[first + 1]]}: a route is one pass without cuts; choose a pass, for the longest write "
         f"keep = {keep} [s] under [capture], or under its [[source]] where there are several; put photos of one pass "
         "into a folder of their own; or set mjcf.route = false"
@@ -120,8 +116,8 @@ def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:
 
 
 def smooth_route(positions: Array) -> Array:
-    """Camera centres in order of time (n, 3) → points of the route (m, 2), `SPACING` apart; (1, 2) if still."""
-    xy = without_rocking(positions[path_inliers(positions)][:, :2])
+    """Route (m, 2) with points `SPACING` apart from camera centers in order of time (n, 3); (1, 2) if standing."""
+    xy = remove_stationary(positions[path_inliers(positions)][:, :2])
     if len(xy) < 2:
         return xy[:1]
     dense = _resample(xy, SPACING, curved=len(xy) > 4)
@@ -129,28 +125,28 @@ def smooth_route(positions: Array) -> Array:
 
 
 def path_inliers(positions: Array) -> NDArray[np.bool_]:
-    """Which camera centres (n, 3) lie along the path: false where one jumps aside and its neighbours do not."""
+    """Mask (n,) of the camera centers (n, 3) that agree with their neighbors in time; false for single outliers."""
     n = len(positions)
     if n < 5:
         return np.ones(n, bool)
     step = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
     typical = np.stack([median_filter(positions[:, k], size=5, mode="nearest") for k in range(3)], -1)
-    # A component-wise median lags by up to two steps along the path, also in a turn; aside of that it must agree.
+    # A component-wise median lags by up to two steps along the path, also in a turn; 2.5 steps allow for that.
     return np.linalg.norm(positions - typical, axis=1) <= 2.5 * step + 0.3
 
 
-def without_rocking(xy: Array) -> Array:
-    """Drops standing parts and short trips to and fro from a path in order of time, (n, 2) → (k, 2).
+def remove_stationary(xy: Array) -> Array:
+    """Removes stops and rocking from a path in order of time, (n, 2) → (k, 2).
 
-    From each kept point the walk goes on at the path's last exit from a disc of radius `_ROCKING` around it. Returns
-    after it has been `_LEFT` away are another visit, as in a round trip, and stay.
+    The point kept after each kept point is the first one past the path's last exit from a disc of radius
+    `_STATIONARY_RADIUS` around it. Returns after the path was `_DEPARTURE_RADIUS` away are another pass and are kept.
     """
     kept, i = [0], 0
     while True:
         distance = np.linalg.norm(xy[i:] - xy[i], axis=1)
-        gone = np.flatnonzero(distance > _LEFT)
-        stay = distance[: gone[0] if len(gone) else len(distance)]
-        i += int(np.flatnonzero(stay <= _ROCKING)[-1]) + 1
+        departed = np.flatnonzero(distance > _DEPARTURE_RADIUS)
+        visit = distance[: departed[0] if len(departed) else len(distance)]
+        i += int(np.flatnonzero(visit <= _STATIONARY_RADIUS)[-1]) + 1
         if i >= len(xy):
             return xy[kept]
         kept.append(i)
@@ -162,20 +158,20 @@ def route_length(route: Array) -> float:
 
 
 def distance_to_route(route: Array, xy: Array) -> Array:
-    """Distance [m] of points (..., 2) to a polyline (m, 2), shape (...); beyond its ends, to the ends."""
+    """Distance [m] of points (..., 2) to a polyline (m, 2) including its end points, shape (...)."""
     if len(route) < 2:
         return np.linalg.norm(xy - route[0], axis=-1)
     best = np.full(np.shape(xy)[:-1], np.inf)
     for start, end in pairwise(route):
         along = end - start
-        share = np.clip((xy - start) @ along / (along @ along), 0.0, 1.0)
-        best = np.minimum(best, np.linalg.norm(xy - start - share[..., None] * along, axis=-1))
+        fraction = np.clip((xy - start) @ along / (along @ along), 0.0, 1.0)
+        best = np.minimum(best, np.linalg.norm(xy - start - fraction[..., None] * along, axis=-1))
     return best
 
 
 def _resample(xy: Array, spacing: float, curved: bool) -> Array:
     station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
-    # Equal steps as near to the spacing as the length allows, so that the end of the path stays its end.
+    # Equal steps close to the spacing, so that the last point is the end of the path.
     count = max(round(float(station[-1]) / spacing), 1)
     at = np.linspace(0.0, station[-1], count + 1)
     if curved:
@@ -184,7 +180,7 @@ def _resample(xy: Array, spacing: float, curved: bool) -> Array:
 
 
 def _smooth(xy: Array, sigma: float) -> Array:
-    """Gaussian smoothing along the line; odd extension about the ends keeps straight ends straight and in place."""
+    """Gaussian smoothing along a polyline; odd extension keeps straight ends straight and end points in place."""
     reach = min(int(4 * sigma) + 1, len(xy) - 1)
     before = 2 * xy[0] - xy[reach:0:-1]
     after = 2 * xy[-1] - xy[-2 : -reach - 2 : -1]

@@ -1,17 +1,12 @@
-"""A policy as files: what drives, without torch and without the library it was trained by.
+"""Trained policies: reading, writing and running them, without torch and stable-baselines3.
 
     policy = load_policy("scenes/demo/runs/night_owl")
     action = policy(pixels)                 # uint8 (12, 90, 160), the newest picture last → numbers in [-1, 1]
     v, yaw_rate = policy.command(action)    # m/s, rad/s
 
-A *policy folder* holds
-
-    policy.json          what it expects and what its numbers mean (`Control`), sizes of the network, how it was trained
-    policy.safetensors   its weights
-    policy.onnx          both in one file, for a robot's computer that has ONNX Runtime and nothing of this package
-
-The first two are what is loaded; the network runs in ONNX Runtime. Files of others drive, too (see `load_policy`). None
-of these files can run code, except where the user says that a file is to be trusted.
+A *policy folder* holds `policy.json` (control, sizes of the network, how it was trained), `policy.safetensors`
+(weights) and `policy.onnx` (both in one file, for a robot with ONNX Runtime and without this package). Loading runs no
+code, except where the user trusts a file; see `load_policy` for other files.
 """
 
 import contextlib
@@ -30,34 +25,34 @@ from safetensors.numpy import save as safetensors_save
 
 from twin.env.drivers import find_callable
 from twin.env.options import STEERING, TWIST
-from twin.errors import InputError, shown
-from twin.files import aside, digest_file, json_bytes, parse_json, read_bytes, read_json
+from twin.errors import InputError, short_repr
+from twin.files import atomic_path, digest_file, json_bytes, parse_json, read_bytes, read_json
 from twin.learn.policy_network import Architecture, onnx_bytes
 from twin.types import Array32, Image
 
-Act = Callable[[Image], Array32]
+ActFunction = Callable[[Image], Array32]
 """Stacks (n, 3 · stack, height, width) → actions (n, actions)."""
 
 JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
 FORMAT, VERSION = "twin policy", 2
 
-_MOST_SIDE, _MOST_STACK = 4096, 64  # [px] of a picture, and pictures, that a policy may ask for
-_LARGEST = 256 << 20  # [bytes] of a file that is read
-_NOTE = "twin"  # key of our metadata in an ONNX file
+_MAX_SIDE, _MAX_STACK = 4096, 64  # largest side of a picture [px], most pictures in a stack
+_MAX_BYTES = 256 << 20  # [bytes] of a file
+_METADATA_KEY = "twin"  # in an ONNX file
 
 
 @dataclass(frozen=True)
 class Control:
-    """What a policy expects, and what its numbers mean. A policy of unknown origin gets the defaults."""
+    """Meaning and timing of a policy's actions. A policy of unknown origin has the defaults."""
 
     action: str = STEERING
     """steering: one number, the yaw rate; twist: two, speed and yaw rate."""
     speed: float = 1.0
-    """The speed when steering; of a twist the highest, -1 meaning standstill [m/s]."""
+    """Constant speed of steering; highest speed of a twist, whose -1 is standstill [m/s]."""
     yaw_rate: float = 1.0
-    """What 1 means, to the left [rad/s]."""
+    """Yaw rate of the value 1, to the left [rad/s]."""
     control_timestep: float = 0.1
-    """Between two actions, and between two pictures of a stack [s]."""
+    """Between actions, and between the pictures of a stack [s]."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a number out of range."""
@@ -76,23 +71,22 @@ class Control:
 
 @dataclass(frozen=True)
 class Policy:
-    """What drives. Deterministic: the same pictures give the same action."""
+    """A deterministic policy."""
 
     name: str
-    act: Act
-    """Stacks uint8 (n, 3 · stack, height, width) → actions float32 (n, actions), before they are checked."""
+    act: ActFunction
+    """Stacks uint8 (n, 3 · stack, height, width) → actions float32 (n, actions), not yet checked."""
     control: Control
     size: tuple[int, int] = (160, 90)
     """Width, height of the pictures [px]."""
     stack: int = 4
     trained: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Of a policy folder: scene, task, run, step, and so on."""
+    """Scene, task, run, step and so on; empty for other files."""
 
     def actions(self, stacks: Image) -> Array32:
         """Stacks uint8 (n, 3 · stack, height, width) → actions (n, actions), each number in [-1, 1].
 
-        Raises:
-            InputError: stacks it does not take, or an answer that is no action.
+        Raises InputError: stacks of another shape, or an output that is not an action.
         """
         width, height = self.size
         expected = (3 * self.stack, height, width)
@@ -104,7 +98,7 @@ class Policy:
         out = np.asarray(self.act(stacks), np.float32)
         if out.shape != (len(stacks), self.control.actions) or not np.isfinite(out).all():
             raise InputError(
-                f"policy {self.name}: answered {out.shape} to {len(stacks)} stacks; expected "
+                f"policy {self.name}: output {out.shape} for {len(stacks)} stacks; expected "
                 f"{(len(stacks), self.control.actions)}, finite ({self.control.action})"
             )
         return np.clip(out, -1.0, 1.0)
@@ -114,77 +108,73 @@ class Policy:
         return self.actions(stack[None])[0]
 
     def command(self, action: Array32) -> tuple[float, float]:
-        """Speed [m/s] and yaw rate [rad/s] that an action (actions,) means."""
+        """An action (actions,) as speed [m/s] and yaw rate [rad/s]."""
         c = self.control
         v = c.speed if c.action == STEERING else (float(action[0]) + 1.0) / 2.0 * c.speed
         return v, float(action[-1]) * c.yaw_rate
 
     def options(self) -> dict[str, Any]:
-        """Keywords for `twin.load`: the environment that it can drive in."""
+        """Keywords for `twin.load` of an environment that fits the policy."""
         return {**dataclasses.asdict(self.control), "size": self.size, "stack": self.stack}
 
 
 def save_policy(
     folder: Path, architecture: Architecture, control: Control, weights: dict[str, Array32], trained: dict[str, Any]
 ) -> None:
-    """Writes a policy folder's files; policy.json comes last, without which there is no policy.
+    """Writes a policy folder's files, policy.json last; a folder without it is not a policy.
 
     Args:
-        folder: Made if need be.
-        architecture: Sizes of the network.
-        control: What its numbers mean.
         weights: See `Architecture.shapes`.
-        trained: How it came about, JSON-able.
+        trained: How it was trained, JSON-able.
     """
     folder.mkdir(parents=True, exist_ok=True)
     weights = {name: np.ascontiguousarray(weights[name], np.float32) for name in architecture.shapes()}
     head = {"control": dataclasses.asdict(control), "network": dataclasses.asdict(architecture)}
     blob = safetensors_save(weights)
-    note = json.dumps({"format": FORMAT, "version": VERSION, **head, "trained": trained})
+    metadata = json.dumps({"format": FORMAT, "version": VERSION, **head, "trained": trained})
     sums = {"weights_sha256": hashlib.sha256(blob).hexdigest()}
-    about = {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained}
-    files = {WEIGHTS: blob, ONNX: onnx_bytes(architecture, weights, {_NOTE: note}), JSON: json_bytes(about)}
+    table = {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained}
+    files = {WEIGHTS: blob, ONNX: onnx_bytes(architecture, weights, {_METADATA_KEY: metadata}), JSON: json_bytes(table)}
     _replace_policy(folder, files)
 
 
 def copy_policy(source: Path, folder: Path) -> None:
-    """Puts a policy folder's files in the place of another's; policy.json comes last, as in `save_policy`."""
+    """Replaces the files of a policy folder by another's, policy.json last."""
     _replace_policy(folder, {name: read_bytes(source / name) for name in (WEIGHTS, ONNX, JSON)})
 
 
 def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
-    """Writes all files aside before the first takes its place: on a full disk the policy before stays whole."""
+    """Writes all files to temporary ones before it replaces the first: a full disk leaves the old policy whole."""
     with contextlib.ExitStack() as asides:
-        written = {name: asides.enter_context(aside(folder / name)) for name in reversed(files)}
+        written = {name: asides.enter_context(atomic_path(folder / name)) for name in reversed(files)}
         for name, content in files.items():
             written[name].write_bytes(content)
-        (folder / JSON).unlink(missing_ok=True)  # or it would be of other weights for a moment
+        (folder / JSON).unlink(missing_ok=True)  # otherwise it would describe other weights for a moment
 
 
 def find_policy(root: Path, source: str) -> str:
-    """What `load_policy` takes for a scene's policy: `run` and `run/checkpoint`, as in tables, mean their folders."""
+    """Source of a scene's policy for `load_policy`; `run` and `run/checkpoint`, as in tables, become their folders."""
     run, _, checkpoint = source.partition("/")
     folder = root / "runs" / run
     folder = folder / "checkpoints" / checkpoint if checkpoint else folder
     where = folder if not Path(source).exists() and (folder / JSON).exists() else Path(source)
-    return str(where.resolve()) if where.exists() else source  # absolute: a node of a cluster works elsewhere
+    return str(where.resolve()) if where.exists() else source  # absolute: nodes of a cluster have other working folders
 
 
 def load_policy(source: str | Path, trust: bool = False) -> Policy:
-    """The policy that is meant by
+    """Loads a policy from
 
-    - a policy folder, such as a run, or a checkpoint of one (or its policy.json);
+    - a policy folder, such as a run or a checkpoint of one (or its policy.json);
     - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) of values 0 to 255, and one output
       (n, 1 or 2) in [-1, 1];
-    - `module:function`, a callable of one stack uint8 (3 · stack, height, width); it is the user's own code;
-    - a zip of stable-baselines3, where it is to be trusted: loading one runs what code is in it.
+    - `module:function`, a callable of one stack uint8 (3 · stack, height, width), the user's own code;
+    - a zip of stable-baselines3, which runs its code when it is loaded and needs `trust`.
 
     Args:
-        source: A path, or `module:function`.
-        trust: Whether a file may run code.
+        trust: Files may run code.
 
     Raises:
-        InputError: there is none, or it is not whole, or not what it should be.
+        InputError: no such policy, or one that is damaged or of another format.
     """
     path = Path(source)
     if path.name == JSON:
@@ -229,44 +219,44 @@ def _from_onnx(path: Path) -> Policy:
 
     try:
         model = onnx.load_model_from_string(_read(path))
-        # Before the checker, which would look for the files.
+        # Before the checker, which would open the files.
         if any(one.data_location == onnx.TensorProto.EXTERNAL for one in _tensors(model)):
-            raise InputError(f"{path} keeps its weights in other files; save it with its weights inside")
+            raise InputError(f"{path}: its weights are in other files; save it with its weights inside")
         onnx.checker.check_model(model)
     except InputError:
         raise
-    except Exception as error:  # of protobuf, of the checker, and of Python where it is nested deep
-        raise InputError(f"{path} is no ONNX file: {type(error).__name__}: {error}") from None
+    except Exception as error:  # errors of protobuf, of the checker, and Python's for deep nesting
+        raise InputError(f"{path}: not an ONNX file: {type(error).__name__}: {error}") from None
     names = {one.name for one in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in names]
     shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
     fits = len(inputs) == 1 and [len(shape) for shape in shapes] == [4, 2]
-    # 0 is a size that the file leaves open.
+    # A size of 0 is open.
     if not fits or shapes[0][1] % 3 or 0 in shapes[0][1:] or shapes[0][0] > 1 or shapes[1][1] not in (1, 2):
         raise InputError(
             f"{path}: inputs and outputs {shapes}; expected one input (n, 3 · stack, height, width) and one output "
             "(n, 1 or 2), n open or 1"
         )
     _, channels, height, width = shapes[0]
-    if channels > 3 * _MOST_STACK or max(height, width) > _MOST_SIDE:
+    if channels > 3 * _MAX_STACK or max(height, width) > _MAX_SIDE:
         raise InputError(
-            f"{path}: takes pictures of {width} × {height} px in {channels} channels; expected at most {_MOST_SIDE} px "
-            f"a side and {_MOST_STACK} pictures of 3"
+            f"{path}: takes pictures of {width} × {height} px in {channels} channels; expected at most {_MAX_SIDE} px "
+            f"a side and {_MAX_STACK} pictures of 3"
         )
     notes = {one.key: one.value for one in model.metadata_props}
     control, trained = Control(STEERING if shapes[1][1] == 1 else TWIST), {}
-    if _NOTE in notes:
+    if _METADATA_KEY in notes:
         try:
-            head = _head(parse_json(notes[_NOTE], f"{path}: its metadata"), path)
+            head = _head(parse_json(notes[_METADATA_KEY], f"{path}: its metadata"), path)
         except UnicodeError as error:
-            raise InputError(f"{path}: its metadata are no text: {error}") from None
+            raise InputError(f"{path}: its metadata are not text: {error}") from None
         control, trained = _parts(head, path)[1], head.get("trained", {})
     act = _session(model.SerializeToString(), path)
     return Policy(path.stem, act, control, (width, height), channels // 3, trained)
 
 
 def _tensors(model: Any) -> Iterator[Any]:
-    """Every tensor of an ONNX model, wherever it is: initialisers, sparse ones too, attributes, functions, training."""
+    """Every tensor of an ONNX model: initializers, sparse ones, attributes, functions, training info."""
     waiting = [model]
     while waiting:
         message = waiting.pop()
@@ -280,24 +270,26 @@ def _tensors(model: Any) -> Iterator[Any]:
 def _from_callable(name: str) -> Policy:
     function = find_callable(name)
 
-    def answered(stack: Image) -> Array32:
+    def output_of(stack: Image) -> Array32:
         try:
             return np.asarray(function(stack), np.float32)
-        except (Exception, SystemExit) as error:  # whatever the user's own code raises
+        except (Exception, SystemExit) as error:  # any error of the user's own code
             raise InputError(f"policy {name}: raised {type(error).__name__}: {error}") from error
 
     def act(stacks: Image) -> Array32:
-        each = [answered(stack) for stack in stacks]
-        if any(one.shape != answer.shape for one in each):
-            raise InputError(f"policy {name}: answered {shown(each)}; expected {answer.shape[0]} number(s) as before")
-        return np.stack(each)
+        outputs = [output_of(stack) for stack in stacks]
+        if any(one.shape != example.shape for one in outputs):
+            raise InputError(
+                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s) as before"
+            )
+        return np.stack(outputs)
 
-    answer = answered(np.zeros((12, 90, 160), np.uint8))
-    if answer.shape not in ((1,), (2,)):
+    example = output_of(np.zeros((12, 90, 160), np.uint8))
+    if example.shape not in ((1,), (2,)):
         raise InputError(
-            f"policy {name}: answered {shown(answer)}; expected 1 number in [-1, 1] (steering) or 2 (twist)"
+            f"policy {name}: returned {short_repr(example)}; expected 1 number in [-1, 1] (steering) or 2 (twist)"
         )
-    return Policy(name, act, Control(STEERING if answer.shape == (1,) else TWIST))
+    return Policy(name, act, Control(STEERING if example.shape == (1,) else TWIST))
 
 
 def _from_zip(path: Path) -> Policy:
@@ -307,8 +299,8 @@ def _from_zip(path: Path) -> Policy:
         raise InputError(f"{path}: needs stable-baselines3; pip install twin[learn]") from None
     try:
         model = SAC.load(path, device="cpu")
-    except Exception as error:  # whatever is in the zip: any of a pickle's and a zip's errors
-        raise InputError(f"{path}: no SAC of stable-baselines3: {type(error).__name__}: {error}") from None
+    except Exception as error:  # any error of a zip or a pickle
+        raise InputError(f"{path}: not a SAC of stable-baselines3: {type(error).__name__}: {error}") from None
     shape, actions = model.observation_space.shape, model.action_space.shape
     if shape is None or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
         raise InputError(f"{path}: takes {shape}, gives {actions}; expected (3 · stack, height, width), 1 or 2 numbers")
@@ -320,24 +312,26 @@ def _from_zip(path: Path) -> Policy:
     return Policy(path.stem, act, control, (shape[2], shape[1]), shape[0] // 3)
 
 
-def _session(model: bytes, path: Path) -> Act:
+def _session(model: bytes, path: Path) -> ActFunction:
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
-    settings.intra_op_num_threads = settings.inter_op_num_threads = 1  # worlds run in parallel, and order is fixed
+    settings.intra_op_num_threads = settings.inter_op_num_threads = (
+        1  # environments run in parallel, and the order of sums is fixed
+    )
     settings.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's exceptions share no base but this
-        raise InputError(f"{path}: ONNX Runtime refuses it: {error}") from None
-    (given,) = session.get_inputs()
-    kinds = {"tensor(uint8)": np.uint8, "tensor(float)": np.float32}
-    if given.type not in kinds:
-        raise InputError(f"{path}: takes {given.type}; expected uint8 or float32 pictures of values 0 to 255")
+    except Exception as error:  # ONNX Runtime's exceptions have no other common base
+        raise InputError(f"{path}: ONNX Runtime cannot load it: {error}") from None
+    (source,) = session.get_inputs()
+    dtypes = {"tensor(uint8)": np.uint8, "tensor(float)": np.float32}
+    if source.type not in dtypes:
+        raise InputError(f"{path}: takes {source.type}; expected uint8 or float32 pictures of values 0 to 255")
 
     def act(stacks: Image) -> Array32:
         try:
-            return session.run(None, {given.name: stacks.astype(kinds[given.type], copy=False)})[0]
+            return session.run(None, {source.name: stacks.astype(dtypes[source.type], copy=False)})[0]
         except Exception as error:
             raise InputError(f"{path}: ONNX Runtime fails on pictures {stacks.shape}: {error}") from None
 
@@ -348,7 +342,9 @@ def _head(head: Any, path: Path) -> dict[str, Any]:
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         raise InputError(f"{path}: not a policy of twin (format {FORMAT!r})")
     if head.get("version") != VERSION:
-        raise InputError(f"{path}: version {head.get('version')!r}; expected {VERSION}: it was written by another twin")
+        raise InputError(
+            f"{path}: version {head.get('version')!r}; expected {VERSION}: it was written by another version of twin"
+        )
     return head
 
 
@@ -367,17 +363,17 @@ def _parts(head: dict[str, Any], path: Path) -> tuple[Architecture, Control]:
 
 def _json_of(path: Path) -> Any:
     if not path.exists():
-        raise InputError(f"{path.parent} holds no {JSON}: not a policy folder, or a run that has not come to one yet")
+        raise InputError(f"{path.parent} has no {JSON}: not a policy folder, or a run that has not saved a policy yet")
     return read_json(path)
 
 
 def _read(path: Path) -> bytes:
     if not path.is_file():
         raise InputError(f"{path} is missing; copy the whole run")
-    return read_bytes(path, _LARGEST)
+    return read_bytes(path, _MAX_BYTES)
 
 
 def _name(folder: Path) -> str:
-    """`run`, or `run/checkpoint`."""
+    """Name of a policy folder: `run`, or `run/checkpoint`."""
     folder = folder.resolve()
     return f"{folder.parent.parent.name}/{folder.name}" if folder.parent.name == "checkpoints" else folder.name

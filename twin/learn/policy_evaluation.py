@@ -1,8 +1,8 @@
-"""Driving policies through numbered episodes of a task, to judge them.
+"""Evaluation of policies on numbered episodes of a task, on this machine or a cluster, and selection of a checkpoint.
 
-An *episode* is decided by its seed and its lighting; whoever drives it, on whatever machine, beside whichever others,
-meets the same start, robot and light. So policies are compared on the same episodes, and a campaign can be cut into
-*chunks*, done in any order and anywhere, and put together again.
+An *episode* is determined by its seed and lighting: start, robot and light do not depend on the policy, the machine or
+the episodes beside it. So all policies drive the same episodes, and a campaign can be cut into *chunks* that run in any
+order.
 """
 
 import dataclasses
@@ -25,25 +25,25 @@ import numpy as np
 
 from twin import runtime
 from twin.cli import signals_held, signals_kept
-from twin.env.domain_randomization import Ranges, asked
+from twin.env.domain_randomization import Ranges, lighting_options
 from twin.env.suite import EnvFactory
 from twin.env.vector_env import make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.env.vector_env_processes import ProcessVectorEnv
 from twin.errors import InputError
-from twin.evaluation.training_curves import CHOICE
-from twin.files import damaged, read_json, write_json
+from twin.evaluation.training_curves import CHOICE_FILE
+from twin.files import read_json, wrap_read_errors, write_json
 from twin.learn.checkpoint import saved_steps
 from twin.learn.policy import Policy, copy_policy, load_policy
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin, load_scene
-from twin.runtime import die_with_parent, ignore_stops
+from twin.runtime import die_with_parent, ignore_terminal_signals
 
 CHUNK = 16
-"""Episodes at most that are driven by one process in one go."""
+"""Most episodes of a chunk, which one process drives."""
 
-_WORLDS = 8  # at once
-_DRAWN = re.compile(r"drawn_(\d+)")
+_ENVS = 8  # episodes driven at once
+_SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,14 @@ class EpisodeChunk:
     """See `load_policy`."""
     trust: bool
     lighting: str
-    """See `env/episode_lighting.py`; or `drawn_<number>`: the light that this seed draws, see `drawn_light`. With
-    `+randomised` robot, weather and bystanders are drawn for every episode, too, as far as they are not known, see
-    `env/domain_randomization.py`."""
+    """See `env/episode_lighting.py`; or `drawn_<number>`, see `with_sampled_lighting`. With `+randomised`, robot,
+    weather and distractor objects are randomized as far as they are not known, see `env/domain_randomization.py`."""
     seeds: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What became of one episode."""
+    """Result of one episode."""
 
     seed: int
     cause: str
@@ -72,56 +71,53 @@ class EpisodeResult:
     """[m]"""
     steps: int
     trust: float
-    """Mean over its pictures."""
+    """Mean over the episode's pictures."""
     reward: float
-    """Sum."""
+    """Sum over the episode."""
 
 
 def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:
-    """Drives the episodes of a chunk; in the order of their seeds.
+    """Drives the episodes of a chunk; returns results in the order of its seeds.
 
-    Raises:
-        InputError: the policy, scene, task or lighting is not to be had.
+    Raises InputError: the policy, scene, task or lighting does not exist.
     """
-    worlds = _worlds(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting)
-    return episodes(_policy(chunk.source, chunk.trust), worlds, chunk.seeds)
+    envs = _vector_env(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting)
+    return run_episodes(_policy(chunk.source, chunk.trust), envs, chunk.seeds)
 
 
-def episodes(
+def run_episodes(
     policy: Policy,
-    worlds: LocalVectorEnv | ProcessVectorEnv,
+    envs: LocalVectorEnv | ProcessVectorEnv,
     seeds: Sequence[int],
     watch: Callable[[], object] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Drives an episode of every seed, as many at once as there are worlds; in the order of the seeds.
+    """Drives an episode per seed, in all environments at once; returns results in the order of the seeds.
 
     Args:
-        policy: What drives.
-        worlds: With pictures; what they are at is dropped.
+        envs: With pictures; their current episodes are abandoned.
         seeds: Of the episodes.
-        watch: Is called when an episode has ended.
     """
-    assert worlds.pixels is not None
+    assert envs.pixels is not None
     waiting = list(range(len(seeds)))
-    driving: dict[int, int] = {}  # world → number of its episode
+    driving: dict[int, int] = {}  # environment → number of its episode
     trusts: list[list[float]] = [[] for _ in seeds]
     rewards = np.zeros(len(seeds))
     done: dict[int, EpisodeResult] = {}
     while waiting or driving:
-        free = [i for i in range(len(worlds)) if i not in driving][: len(waiting)]
+        free = [i for i in range(len(envs)) if i not in driving][: len(waiting)]
         for i in free:
             driving[i] = waiting.pop(0)
-            worlds.seed(i, seeds[driving[i]])
-        worlds.begin(free)
+            envs.seed(i, seeds[driving[i]])
+        envs.begin(free)
         which = sorted(driving)
         for i in which:
-            trusts[driving[i]].append(float(worlds.pixels.trust[i]))
-        pictures = worlds.observation()
-        # One by one: in a batch the sums are done in another order, and the last bit decides who meets the kerb.
-        out = worlds.step(np.stack([policy(pictures[i]) for i in which]), which)
+            trusts[driving[i]].append(float(envs.pixels.trust[i]))
+        pictures = envs.observation()
+        # One by one: a batch sums in another order, and the last bit can decide whether a robot hits the kerb.
+        out = envs.step(np.stack([policy(pictures[i]) for i in which]), which)
         rewards[[driving[i] for i in which]] += out.reward
         for i in [i for i, ended in zip(which, out.over, strict=True) if ended]:
-            number, info = driving.pop(i), worlds.info(i)
+            number, info = driving.pop(i), envs.info(i)
             seen = trusts[number]
             outcome = info["cause"], info["progress"], len(seen), float(np.mean(seen)), float(rewards[number])
             done[number] = EpisodeResult(seeds[number], *outcome)
@@ -130,49 +126,49 @@ def episodes(
 
 
 def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[list[EpisodeResult]]:
-    """Drives chunks; what became of them, in their order, each as soon as it and those before it are done.
+    """Drives chunks; yields their results in order, each as soon as it and all earlier ones are done.
 
     Args:
-        chunks: What to drive.
-        processes: How many on this machine. They end when this one does, however it does.
+        processes: Worker processes on this machine; they end with this one, however it ends.
 
     Raises:
-        InputError: as `drive`, or a process ended, for want of memory most likely.
+        InputError: an error of `run_chunk`, or a process ended, most likely because memory ran out.
     """
     if processes == 1:
         yield from map(run_chunk, chunks)
     else:
-        # Warp and MuJoCo have threads, which a fork would not survive.
-        pool = ProcessPoolExecutor(min(processes, max(1, len(chunks))), get_context("spawn"), _begin, (os.getpid(),))
+        # Spawned, since the threads of Warp and MuJoCo do not survive a fork.
+        count = min(processes, max(1, len(chunks)))
+        pool = ProcessPoolExecutor(count, get_context("spawn"), _init_worker, (os.getpid(),))
         try:
-            with signals_held():  # the workers are started here; a signal to all of a terminal's is for us
+            with signals_held():  # workers start here; this process handles a terminal's signals
                 driven = pool.map(run_chunk, chunks)
             yield from driven
         except BrokenProcessPool:
             raise InputError(
-                f"one of {processes} processes ended; if memory ran out, take fewer (--processes 1: none)"
+                f"one of {processes} processes ended; if memory ran out, use fewer (--processes 1: none)"
             ) from None
         finally:
-            if sys.exc_info()[0] is not None:  # no waiting for chunks that nobody wants
+            if sys.exc_info()[0] is not None:  # do not wait for the remaining chunks
                 for worker in active_children():
                     worker.kill()
             pool.shutdown(cancel_futures=True)
 
 
-def drawn_light(stage: EnvFactory, number: int) -> EnvFactory:
-    """The stage with a light `drawn_<number>` in its field: one that could have been filmed, drawn with that seed."""
-    assert stage.field is not None
+def with_sampled_lighting(factory: EnvFactory, number: int) -> EnvFactory:
+    """Adds a lighting `drawn_<number>` to the factory's field, sampled from the filmed ones with that seed."""
+    assert factory.field is not None
     name = f"drawn_{number}"
-    if name not in stage.field.lightings:
-        # Of the filmed ones: lights drawn before must not change what this number draws.
-        filmed = stage.field.lightings_by_name.filmed()
-        stage.field.add_lightings({name: filmed.sample(np.random.default_rng(number))})
-    return stage
+    if name not in factory.field.lightings:
+        # Of the filmed ones, so that lightings sampled before do not change the result.
+        filmed = factory.field.lightings_by_name.filmed()
+        factory.field.add_lightings({name: filmed.sample(np.random.default_rng(number))})
+    return factory
 
 
-def _begin(parent: int) -> None:
-    """In a worker, before its first chunk."""
-    ignore_stops()
+def _init_worker(parent: int) -> None:
+    """Initializes a worker process."""
+    ignore_terminal_signals()
     die_with_parent(parent)
 
 
@@ -182,56 +178,55 @@ def _policy(source: str, trust: bool) -> Policy:
 
 
 @lru_cache(maxsize=1)
-def _stage(scene: str, task: str, source: str, trust: bool, randomise: Ranges | None) -> EnvFactory:
+def _factory(scene: str, task: str, source: str, trust: bool, randomise: Ranges | None) -> EnvFactory:
     return EnvFactory.open(load_scene(scene), task, {**_policy(source, trust).options(), "randomise": randomise})
 
 
 @lru_cache(maxsize=1)
-def _worlds(scene: str, task: str, source: str, trust: bool, lighting: str) -> LocalVectorEnv:
-    options = asked(lighting)
-    stage = _stage(scene, task, source, trust, options["randomise"])
-    drawn = _DRAWN.fullmatch(options["lighting"])
-    if drawn:
-        stage = drawn_light(stage, int(drawn[1]))
-    lit = dataclasses.replace(stage.options, lighting=options["lighting"])
-    return LocalVectorEnv(dataclasses.replace(stage, options=lit), [None] * _WORLDS)
+def _vector_env(scene: str, task: str, source: str, trust: bool, lighting: str) -> LocalVectorEnv:
+    options = lighting_options(lighting)
+    factory = _factory(scene, task, source, trust, options["randomise"])
+    sampled = _SAMPLED_LIGHTING.fullmatch(options["lighting"])
+    if sampled:
+        factory = with_sampled_lighting(factory, int(sampled[1]))
+    lit = dataclasses.replace(factory.options, lighting=options["lighting"])
+    return LocalVectorEnv(dataclasses.replace(factory, options=lit), [None] * _ENVS)
 
 
-# ---- Campaigns larger than one machine, on a Ray cluster.
-#
-# Its nodes need `twin`, and see the scene and the policies under the same paths, as on a shared disk.
+# ---- campaigns on a Ray cluster
 
-
-_CORES = 2  # that driving a chunk keeps busy
-_PATIENCE = 5.0  # [s]
+_CORES = 2  # that a chunk uses
+_CONNECT_TIMEOUT = 5.0  # [s]
 
 
 def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
-    """As `judging.campaign`, on the cluster at an address (`auto`: the one that runs on this machine).
+    """Same as `campaign`, on the cluster at an address (`auto`: the one that runs on this machine).
+
+    Its nodes need `twin` and the scene and the policies under the same paths, such as on a shared disk.
 
     Raises:
-        InputError: Ray is not installed, there is no such cluster, or what `drive` raises.
+        InputError: Ray is not installed, there is no such cluster, or an error of `run_chunk`.
     """
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns that it will leave GPUs alone
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # silences a warning of Ray on GPUs
     try:
         import ray
     except ImportError:
         raise InputError("--ray needs more: pip install .[ray]") from None
     try:
-        if address != "auto":  # Ray itself would try for minutes
+        if address != "auto":  # Ray itself retries for minutes
             host, _, port = address.rpartition(":")
-            socket.create_connection((host, int(port)), _PATIENCE).close()
-        with signals_kept():  # Ray takes SIGTERM for itself
+            socket.create_connection((host, int(port)), _CONNECT_TIMEOUT).close()
+        with signals_kept():  # Ray replaces the handler of SIGTERM
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         first = str(error).splitlines()[0]
         raise InputError(f"--ray {address}: no cluster there ({first}); start one with `ray start --head`") from None
     try:
-        # No more than the largest node has, or the tasks would wait for ever.
+        # No more cores than the largest node has, or the tasks would wait for ever.
         cores = max((node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
         if cores < 1:
             raise InputError(f"--ray {address}: no node of the cluster has a core to give; start one with `ray start`")
-        # Spread: by default Ray fills one node before it uses the next.
+        # By default Ray fills one node before it uses the next.
         remote = ray.remote(num_cpus=int(min(_CORES, cores)), scheduling_strategy="SPREAD")(run_chunk)
         for driven in [remote.remote(chunk) for chunk in chunks]:
             yield ray.get(driven)
@@ -243,69 +238,69 @@ def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[li
         ray.shutdown()
 
 
-# ---- Which of a training's policies is its best; the last need not be.
-#
-# When all steps are done, *candidates*, policies saved in the second half, drive the same episodes without exploring.
-# These are whole episodes of the kind that was trained on, in its lights and with its robots, of seeds of their own. The
-# one that arrives most often is the run's policy; of those alike, the one that earns most. Because the best of several
-# was lucky, too, it drives *fresh* episodes at the end, and its rate in training is told of these alone.
+# ---- selection of a checkpoint
 
-
-FRESH = 20
-"""Episodes that the chosen one drives at the end."""
+FRESH_EPISODES = 20
+"""Fresh episodes of the selected policy."""
 
 _CANDIDATES = 4
-_STREAM = 7  # with a run's seed, what the seeds of these episodes are drawn from
+_SEED_STREAM = 7  # seeds of these episodes come from the run's seed and this
 
 
 def select_checkpoint(twin: Twin, folder: Path, config: TrainConfig, processes: int | None = None) -> dict[str, Any]:
-    """Makes the best policy of a finished training the run's; does nothing where that is done.
+    """Selects the best policy of a finished training as the run's; keeps an earlier selection of the same training.
+
+    *Candidates*, policies saved in the second half of the training, drive the same episodes without exploration: whole
+    ones with the training's lighting and randomization and their own seeds. The one with most successes is selected,
+    among equals the one with the highest mean reward. Since the best of several was also lucky, its reported success
+    rate comes from fresh episodes.
 
     Args:
-        twin: What was trained in.
-        folder: Of the run.
-        config: Of the run; `trials` is the number of episodes each candidate drives.
-        processes: See `worlds_of`.
+        config: Of the run; `trials` is the number of episodes per candidate.
 
     Returns:
-        What `choice.json` holds: steps that were trained; for every candidate its step, trials, successes and mean
-        reward; step, trials and successes of the chosen one, of fresh episodes.
+        The content of `choice.json`: steps of the training; step, trials, successes and mean reward of every candidate,
+        and of the selected one on fresh episodes.
     """
     trained = saved_steps(folder / "state")
-    if (folder / CHOICE).exists():
-        with damaged(folder / CHOICE, "delete it, and the best policy is chosen again"):
-            before = read_json(folder / CHOICE)
+    if (folder / CHOICE_FILE).exists():
+        with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is selected again"):
+            before = read_json(folder / CHOICE_FILE)
             if before["steps"] == trained:
                 _ = [before["chosen"][name] + 0 for name in ("step", "trials", "successes")]
                 return before
     candidates = _candidates(folder / "checkpoints", trained)
-    drawn = np.random.SeedSequence([config.seed, _STREAM]).generate_state(config.trials + FRESH)
-    seeds = tuple(int(seed) for seed in drawn)
+    samples = np.random.SeedSequence([config.seed, _SEED_STREAM]).generate_state(config.trials + FRESH_EPISODES)
+    seeds = tuple(int(seed) for seed in samples)
     shared, fresh = seeds[: config.trials], seeds[config.trials :]
     options = {**config.options(), "start_along": 0.0}
-    tried = []
+    results = []
     bar = runtime.bar("choose", len(candidates) * len(shared) + len(fresh), "episode")
-    with closing(make_vector_env(twin, config.task, options, [None] * config.worlds, processes)) as worlds, bar:
+    with closing(make_vector_env(twin, config.task, options, [None] * config.worlds, processes)) as envs, bar:
 
-        def told(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
-            return {"step": int(path.name)} | _summed(episodes(load_policy(path), worlds, which, bar.update))
+        def evaluate(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
+            return {"step": int(path.name)} | _totals(run_episodes(load_policy(path), envs, which, bar.update))
 
         for path in candidates:
-            tried.append(told(path, shared))
-        best = max(range(len(tried)), key=lambda i: (tried[i]["successes"], tried[i]["reward"]))
-        last = told(candidates[best], fresh)
+            results.append(evaluate(path, shared))
+        best = max(range(len(results)), key=lambda i: (results[i]["successes"], results[i]["reward"]))
+        last = evaluate(candidates[best], fresh)
     copy_policy(candidates[best], folder)
-    out = {"steps": trained, "candidates": tried, "chosen": last}
-    write_json(folder / CHOICE, out)
+    out = {"steps": trained, "candidates": results, "chosen": last}
+    write_json(folder / CHOICE_FILE, out)
     return out
 
 
 def _candidates(folder: Path, steps: int) -> list[Path]:
-    """Of the second half, as far apart as gives few enough; the last one always."""
+    """At most `_CANDIDATES` evenly spaced policies of the second half, the last one included."""
     late = sorted(path for path in folder.iterdir() if steps / 2 < int(path.name))
     return late[:: -max(1, -(-len(late) // _CANDIDATES))][::-1]
 
 
-def _summed(driven: list[EpisodeResult]) -> dict[str, Any]:
-    won = sum(one.cause == "goal" for one in driven)
-    return {"trials": len(driven), "successes": won, "reward": round(float(np.mean([d.reward for d in driven])), 3)}
+def _totals(results: list[EpisodeResult]) -> dict[str, Any]:
+    won = sum(one.cause == "goal" for one in results)
+    return {
+        "trials": len(results),
+        "successes": won,
+        "reward": round(float(np.mean([one.reward for one in results])), 3),
+    }

@@ -1,12 +1,11 @@
-"""The network that a policy is: from a stack of pictures to an action, and the same as an ONNX graph.
+"""The policy network, from a stack of pictures to an action, and its export as an ONNX graph.
 
-A *stack* is uint8, (3 · stack, height, width), the newest three channels last. It is shrunk by averaging squares of
-`pool` pixels and rounding, and *levelled*: every colour of every picture is given the same mean and spread in the lower
-half, where the ground is. So the road looks much the same by day and by night, in haze and under a red sky, whatever
-the camera's exposure and white balance. Both end in bytes: what a policy was trained on is what it acts on.
-
-Convolutions with ReLU follow, then a linear layer with layer normalisation and tanh (Kostrikov et al. 2020, DrQ, whose
-encoder this is but for its size), hidden layers with ReLU, and a tanh: an action, each of its numbers in [-1, 1].
+A *stack* is uint8, (3 · stack, height, width), the newest three channels last. Preprocessing averages squares of `pool`
+pixels and normalizes each color of each picture to a fixed mean and standard deviation in the lower half, where the
+ground is; that removes exposure, white balance and most of the lighting. Both steps return bytes, so that training and
+driving use the same values. Then follow convolutions with ReLU, a linear layer with layer normalization and tanh (the
+encoder of DrQ, Kostrikov et al. 2020, at another size), hidden layers with ReLU, and a tanh: an action with numbers in
+[-1, 1].
 """
 
 from dataclasses import dataclass
@@ -18,34 +17,32 @@ from numpy.typing import NDArray
 from twin.types import Array32
 
 NORM_EPSILON = 1e-5
-LEVEL, SPREAD = 128.0, 48.0
-"""Mean and standard deviation of a levelled colour in the lower half of a picture."""
-NOISE = 4.0
-"""Added to the spread that a colour has, so that a camera's noise is not blown up where there is nothing else."""
-_OPSET, _IR = 17, 8  # old enough for the ONNX Runtime of a robot's computer
+GROUND_MEAN, GROUND_STD = 128.0, 48.0
+"""Mean and standard deviation of a normalized color in the lower half of a picture."""
+NOISE_STD = 4.0
+"""Added to the standard deviation of a color, so that normalization does not amplify camera noise in plain pictures."""
+_OPSET, _IR = 17, 8  # old enough for the ONNX Runtime on a robot
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """Sizes of a network."""
+    """Sizes of a policy network."""
 
     size: tuple[int, int] = (160, 90)
     """Width, height of the pictures [px]."""
     stack: int = 4
-    """Pictures in a stack."""
     pool: int = 2
-    """Side of the squares that are averaged [px]: 1, 2 or 4, which are exact in floating point."""
+    """Side of the averaged squares [px]: 1, 2 or 4, which are exact in floating point."""
     convolutions: tuple[tuple[int, int, int], ...] = ((32, 4, 4), (64, 3, 2))
     """Channels, kernel, stride of each."""
     features: int = 64
-    """Numbers that the pictures become."""
+    """Size of the encoder's output."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers."""
     actions: int = 1
-    """Numbers in an action."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: sizes that fit no network, or one that fits no robot's computer."""
+        """Raises ValueError: sizes that do not fit together, or are too large for a robot's computer."""
         if len(self.size) != 2:
             raise ValueError(f"size = {self.size} is not a width and a height")
         numbers = [*self.size, self.stack, self.features, self.actions, *self.hidden, *sum(self.convolutions, ())]
@@ -63,20 +60,20 @@ class Architecture:
         return 3 * self.stack
 
     @property
-    def small(self) -> tuple[int, int]:
-        """Width, height of the shrunken pictures [px]."""
+    def pooled_size(self) -> tuple[int, int]:
+        """Width, height of the pooled pictures [px]."""
         return self.size[0] // self.pool, self.size[1] // self.pool
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Width, height of what the last convolution gives."""
-        width, height = self.small
+        """Width, height of the last convolution's output."""
+        width, height = self.pooled_size
         for _, kernel, stride in self.convolutions:
             width, height = (width - kernel) // stride + 1, (height - kernel) // stride + 1
         return width, height
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Every weight's name and shape, as torch lays them out."""
+        """Name and shape of every weight, in torch's layout."""
         out: dict[str, tuple[int, ...]] = {}
         before = self.channels
         for i, (channels, kernel, _) in enumerate(self.convolutions):
@@ -91,7 +88,7 @@ class Architecture:
         return out | {"mean.weight": (self.actions, before), "mean.bias": (self.actions,)}
 
 
-def shrink(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
+def average_pool(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
     """Means of squares of `pool` pixels, halves rounded up; shapes (..., h, w) → (..., h/pool, w/pool)."""
     if pool == 1:
         return pictures
@@ -104,33 +101,32 @@ def shrink(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
     return ((total + pool * pool // 2) // (pool * pool)).astype(np.uint8)
 
 
-def normalized(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Every channel with `LEVEL` and about `SPREAD` in the lower half of its rows; shape (..., height, width)."""
+def normalize_colors(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Channels (..., height, width) scaled to mean `GROUND_MEAN` and std of about `GROUND_STD` in the lower half."""
     ground = pictures[..., pictures.shape[-2] // 2 :, :].astype(np.float32)
-    mean, spread = ground.mean((-2, -1), keepdims=True), ground.std((-2, -1), keepdims=True)
-    scaled = (pictures.astype(np.float32) - mean) * (np.float32(SPREAD) / (spread + np.float32(NOISE)))
-    return (scaled + np.float32(LEVEL + 0.5)).clip(0.0, 255.0).astype(np.uint8)
+    mean, std = ground.mean((-2, -1), keepdims=True), ground.std((-2, -1), keepdims=True)
+    scaled = (pictures.astype(np.float32) - mean) * (np.float32(GROUND_STD) / (std + np.float32(NOISE_STD)))
+    return (scaled + np.float32(GROUND_MEAN + 0.5)).clip(0.0, 255.0).astype(np.uint8)
 
 
-def prepared(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
-    """What the convolutions are given: shrunk and levelled; shapes (..., h, w) → (..., h/pool, w/pool)."""
-    return normalized(shrink(pictures, pool))
+def preprocess(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
+    """Input of the convolutions: pooled and normalized; shapes (..., h, w) → (..., h/pool, w/pool)."""
+    return normalize_colors(average_pool(pictures, pool))
 
 
 def onnx_bytes(architecture: Architecture, weights: dict[str, Array32], notes: dict[str, str]) -> bytes:
-    """The network as an ONNX file: `pixels` uint8 (n, 3 · stack, height, width) → `action` float32 (n, actions).
+    """The network with its preprocessing as an ONNX file: `pixels` uint8 (n, 3 · stack, height, width) → `action`
+    float32 (n, actions).
 
     Args:
-        architecture: Sizes.
         weights: See `Architecture.shapes`.
-        notes: Go into the file's metadata.
     """
     from onnx import TensorProto, helper, numpy_helper
 
     a = architecture
     nodes: list[Any] = []
-    constants = {"half": 0.5, "scale": 1.0 / 255.0, "noise": NOISE, "spread": SPREAD, "level": LEVEL + 0.5}
-    constants |= {"least": 0.0, "most": 255.0}
+    constants = {"half": 0.5, "scale": 1.0 / 255.0, "noise": NOISE_STD, "spread": GROUND_STD}
+    constants |= {"level": GROUND_MEAN + 0.5, "least": 0.0, "most": 255.0}
     tensors = [numpy_helper.from_array(np.array(value, np.float32), name) for name, value in constants.items()]
     tensors += [numpy_helper.from_array(np.ascontiguousarray(weights[name]), name) for name in a.shapes()]
     last = "pixels"
@@ -145,8 +141,8 @@ def onnx_bytes(architecture: Architecture, weights: dict[str, Array32], notes: d
         add("AveragePool", kernel_shape=[a.pool, a.pool], strides=[a.pool, a.pool])
         add("Add", "half")
         add("Floor")
-    small = last
-    rows = {"from": [a.small[1] // 2], "to": [a.small[1]], "axis": [2]}
+    pooled = last
+    rows = {"from": [a.pooled_size[1] // 2], "to": [a.pooled_size[1]], "axis": [2]}
     tensors += [numpy_helper.from_array(np.array(value, np.int64), name) for name, value in rows.items()]
     add("Slice", *rows)
     ground = last
@@ -157,10 +153,10 @@ def onnx_bytes(architecture: Architecture, weights: dict[str, Array32], notes: d
     add("ReduceMean", axes=[2, 3])
     add("Sqrt")
     add("Add", "noise")
-    spread, last = last, small
+    std, last = last, pooled
     add("Sub", mean)
     add("Mul", "spread")
-    add("Div", spread)
+    add("Div", std)
     add("Add", "level")
     add("Clip", "least", "most")
     add("Floor")

@@ -1,17 +1,11 @@
 """SAC from pixels (Haarnoja et al. 2018) on stable-baselines3, with one encoder for actor and critics.
 
-The *encoder* turns stacks into features. It learns nothing from the actor's loss; the actor takes its features as they
-are (Yarats et al. 2019; Kostrikov et al. 2020); next states are encoded by it, too, and not by a slowly following
-copy (Yarats et al. 2021, DrQ-v2). So an update runs it forward twice and backward once, where stable-baselines3's own
-update, in which actor and critics have encoders of their own, has five passes forward and three backward.
+The encoder turns stacks into features. The actor's loss does not train it (Yarats et al. 2019; Kostrikov et al. 2020),
+and it has no target network (Yarats et al. 2021, DrQ-v2). An update runs it forward twice and backward once; in
+stable-baselines3, with separate encoders, it is five and three times.
 
-The simulator knows where its robot is. That *state* is privileged: the critics, which are not needed for driving, take
-it beside the features (Pinto et al. 2018, asymmetric actor-critic), so they need not first learn to see before they can
-say what anything is worth; and a linear *teller* has to tell it from the features, which shows the encoder what there
-is to see. The actor has pictures alone.
-
-What drives in the end is the *steady* actor, the running mean of the actor and its encoder: from one update to the next
-the actor swings, and a policy file written at the wrong moment leaves the road where the ones before and after do not.
+The critics receive the robot's privileged *state* beside the features (Pinto et al. 2018, asymmetric actor-critic); the
+actor never does. A linear *state head* predicts the state from the features, as an auxiliary loss for the encoder.
 """
 
 import copy
@@ -32,12 +26,12 @@ from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.types import Array32
 
 _LOGGED = ("critic_loss", "actor_loss", "state_loss", "ent_coef", "value")
-_FARTHEST = 3.0  # times its scale: what a state is cut at
-_STEADY = 1e-3  # share of an update in the steady actor
+_MAX_STATE = 3.0  # times its scale, at which a state is clamped
+_AVERAGING_RATE = 1e-3  # of the averaged actor, per update
 
 
 class Encoder(BaseFeaturesExtractor):
-    """The part of `architecture` from shrunken stacks of values 0 to 255 to features."""
+    """The layers of `Architecture` from preprocessed stacks of values 0 to 255 to features."""
 
     def __init__(self, observation_space: spaces.Box, architecture: Architecture) -> None:
         super().__init__(observation_space, architecture.features)
@@ -61,17 +55,17 @@ class Encoder(BaseFeaturesExtractor):
 
 
 class DrivePolicy(SACPolicy):
-    """Actor and critics with one encoder, which the critics' optimiser has."""
+    """Actor and critics with one encoder, which the critics' optimizer trains."""
 
-    def __init__(self, *arguments: Any, states: int = 0, **rest: Any) -> None:
-        self._states = states
+    def __init__(self, *arguments: Any, state_size: int = 0, **rest: Any) -> None:
+        self._state_size = state_size
         super().__init__(*arguments, **rest)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        """Critics take features and states."""
-        asked = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        asked["features_dim"] += self._states
-        return ContinuousCritic(**asked).to(self.device)
+        """Critics of features and states."""
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        kwargs["features_dim"] += self._state_size
+        return ContinuousCritic(**kwargs).to(self.device)
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
@@ -83,28 +77,30 @@ class DrivePolicy(SACPolicy):
 
 
 class PixelSAC(SAC):
-    """SAC whose update runs the encoder as seldom as can be."""
+    """SAC with a shared encoder and privileged states."""
 
-    steady: Actor
+    averaged_actor: Actor
+    """Running mean of the actor and its encoder. It becomes the policy: single updates make the actor swing, and a
+    policy saved at the wrong moment leaves the road where the ones before and after do not."""
 
-    def __init__(self, *arguments: Any, states: tuple[float, ...] = (), **rest: Any) -> None:
+    def __init__(self, *arguments: Any, state_scales: tuple[float, ...] = (), **rest: Any) -> None:
         """
         Args:
             arguments: Of `SAC`.
-            states: Of every number of the replay buffer's states, how far it usually goes; none: nothing is privileged.
+            state_scales: Typical magnitudes of the numbers in the replay buffer's states; empty: no privileged states.
             rest: Of `SAC`.
         """
-        self._scales = states
+        self._scales = state_scales
         super().__init__(*arguments, **rest)
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.steady = copy.deepcopy(self.actor).requires_grad_(False)
+        self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self._scale = torch.tensor(self._scales, device=self.device)
-        self.teller: nn.Module = nn.Identity()
+        self.state_head: nn.Module = nn.Identity()
         if self._scales:
-            self.teller = nn.Linear(self.actor.features_extractor.features_dim, len(self._scales)).to(self.device)
-            self.critic.optimizer.add_param_group({"params": list(self.teller.parameters())})
+            self.state_head = nn.Linear(self.actor.features_extractor.features_dim, len(self._scales)).to(self.device)
+            self.critic.optimizer.add_param_group({"params": list(self.state_head.parameters())})
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Updates all networks `gradient_steps` times."""
@@ -112,7 +108,9 @@ class PixelSAC(SAC):
         assert self.ent_coef_optimizer is not None and self.log_ent_coef is not None
         assert isinstance(self.target_entropy, float)
         self.policy.set_training_mode(True)
-        lead, follow = ([p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target))
+        critics, targets = (
+            [p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target)
+        )
         sums = np.zeros(len(_LOGGED))
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         for step in range(gradient_steps):
@@ -120,25 +118,25 @@ class PixelSAC(SAC):
             features = self.actor.features_extractor(data.observations)
             with torch.no_grad():
                 alpha = self.log_ent_coef.exp()
-                after = self.actor.features_extractor(data.next_observations)
-                action, log_prob = self._act(after)
-                known = torch.cat([after, self._scaled(data.next_states), action], 1)
-                best = torch.cat([q(known) for q in self.critic_target.q_networks], 1)
+                next_features = self.actor.features_extractor(data.next_observations)
+                action, log_prob = self._act(next_features)
+                next_inputs = torch.cat([next_features, self._scaled(data.next_states), action], 1)
+                best = torch.cat([q(next_inputs) for q in self.critic_target.q_networks], 1)
                 value = best.min(1, keepdim=True).values - alpha * log_prob
                 target = data.rewards + (1.0 - data.dones) * self.gamma * value
             states = self._scaled(data.states)
-            given = torch.cat([features, states.nan_to_num(), data.actions], 1)
-            critic_loss = sum(nn.functional.mse_loss(q(given), target) for q in self.critic.q_networks) / 2
+            inputs = torch.cat([features, states.nan_to_num(), data.actions], 1)
+            critic_loss = sum(nn.functional.mse_loss(q(inputs), target) for q in self.critic.q_networks) / 2
             assert isinstance(critic_loss, torch.Tensor)
             self.critic.optimizer.zero_grad()
-            state_loss = self._told(features, states)
+            state_loss = self._state_loss(features, states)
             (critic_loss + state_loss).backward()
             self.critic.optimizer.step()
 
             features = features.detach()
             action, log_prob = self._act(features)
-            chosen = torch.cat([features, states.nan_to_num(), action], 1)
-            best = torch.cat([q(chosen) for q in self.critic.q_networks], 1).min(1, keepdim=True).values
+            actor_inputs = torch.cat([features, states.nan_to_num(), action], 1)
+            best = torch.cat([q(actor_inputs) for q in self.critic.q_networks], 1).min(1, keepdim=True).values
             actor_loss = (alpha * log_prob - best).mean()
             self.actor.optimizer.zero_grad()
             actor_loss.backward()
@@ -148,9 +146,11 @@ class PixelSAC(SAC):
             self.ent_coef_optimizer.zero_grad()
             entropy_loss.backward()
             self.ent_coef_optimizer.step()
-            polyak_update(lead, follow, self.tau)
+            polyak_update(critics, targets, self.tau)
             done = self._n_updates + step
-            polyak_update(self.actor.parameters(), self.steady.parameters(), max(_STEADY, 1.0 / (done + 1)))
+            polyak_update(
+                self.actor.parameters(), self.averaged_actor.parameters(), max(_AVERAGING_RATE, 1.0 / (done + 1))
+            )
             losses = critic_loss, actor_loss, state_loss
             sums += [*(loss.item() for loss in losses), alpha.item(), best.mean().item()]
         self._n_updates += gradient_steps
@@ -158,17 +158,17 @@ class PixelSAC(SAC):
             self.logger.record(f"train/{name}", value)
 
     def _scaled(self, states: torch.Tensor) -> torch.Tensor:
-        return (states / self._scale).clamp(-_FARTHEST, _FARTHEST)
+        return (states / self._scale).clamp(-_MAX_STATE, _MAX_STATE)
 
-    def _told(self, features: torch.Tensor, states: torch.Tensor) -> torch.Tensor:
-        """How far what is told from features is from the states, where those are known; mean of squares."""
+    def _state_loss(self, features: torch.Tensor, states: torch.Tensor) -> torch.Tensor:
+        """Mean squared error of the state head, over the samples whose states are known."""
         known = ~states.isnan().any(1)
         if not (self._scales and known.any()):
             return features.new_zeros(())
-        return nn.functional.mse_loss(self.teller(features[known]), states[known])
+        return nn.functional.mse_loss(self.state_head(features[known]), states[known])
 
     def _act(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Drawn actions (n, actions) and the logarithm of their density (n, 1)."""
+        """Sampled actions (n, actions) and their log densities (n, 1)."""
         latent = self.actor.latent_pi(features)
         log_std = self.actor.log_std(latent).clamp(LOG_STD_MIN, LOG_STD_MAX)  # type: ignore[operator]
         action, log_prob = self.actor.action_dist.log_prob_from_params(self.actor.mu(latent), log_std)  # type: ignore[call-arg]
@@ -176,8 +176,8 @@ class PixelSAC(SAC):
 
 
 def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Array32]:
-    """The steady, deterministic actor's weights by the names of `Architecture.shapes`."""
-    actor = model.steady
+    """Weights of the averaged, deterministic actor, by the names of `Architecture.shapes`."""
+    actor = model.averaged_actor
     encoder = actor.features_extractor
     assert isinstance(encoder, Encoder)
     convolutions = [encoder.first, *(m for m in encoder.further if isinstance(m, nn.Conv2d))]

@@ -1,16 +1,12 @@
-"""A training run: SAC in many worlds at once, in a folder that holds all that is known of it.
+"""A training run: SAC in many environments, in a folder that contains all its results.
 
-    runs/<name>/
-      config.json                what was asked for
-      policy.json .safetensors .onnx     the newest policy (see `policy.py`); in the end the chosen one
-      choice.json                which that is (see `policy_evaluation.py`)
-      checkpoints/<steps>/       policies along the way, of varied quality
-      episodes.csv               every episode driven in training
-      log.csv                    speed, memory and losses at every save
-      tensorboard/
-      state/                     what the training goes on from (see `checkpoint.py`), and its pictures
-
-*Steps* are control steps of all worlds together. *Updates* are steps of the optimisers.
+runs/<name>/
+  config.json                             the configuration
+  policy.json .safetensors .onnx          the newest policy (`policy.py`); after the training the selected one
+  choice.json                             the selection (`policy_evaluation.py`)
+  checkpoints/<steps>/                    policies saved during the training
+  episodes.csv, log.csv, tensorboard/     episodes driven in training; speed, memory and losses at every save
+  state/                                  the saved state (`checkpoint.py`) and the replay buffer's pictures
 """
 
 import csv
@@ -33,48 +29,50 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin.cli import StopNotice, Stopped, stop_noted
-from twin.config import RANDOMISED
+from twin.config import RANDOMIZED
 from twin.env.suite import fingerprint
 from twin.errors import InputError
-from twin.evaluation.training_curves import CHOICE
-from twin.evaluation.trials import RECENT, csv_text
-from twin.files import damaged, read_json, write_json, write_text
+from twin.evaluation.training_curves import CHOICE_FILE
+from twin.evaluation.trials import RECENT_EPISODES, csv_text
+from twin.files import read_json, wrap_read_errors, write_json, write_text
 from twin.learn.checkpoint import has_state, load_state, save_state
 from twin.learn.policy import save_policy
-from twin.learn.policy_network import prepared
+from twin.learn.policy_network import preprocess
 from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
-from twin.runtime import resident
+from twin.runtime import resident_memory
 
-EPISODE_COLUMNS = ("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m")
+TRAINING_EPISODE_COLUMNS = (
+    *("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m"),
+)
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
-_LEAST_RATE = 0.1  # of the learning rate, at the end
-_SEEDS = 6  # with a run's seed and its resumptions so far, what worlds draw from; none drives what another drove
+_FINAL_RATE = 0.1  # of the learning rate, at the end
+_SEED_STREAM = 6  # seeds of environments come from the run's seed, its resumptions and this; they never repeat
 
 
-class PreparedVecEnv(VecEnvWrapper):
-    """Worlds whose pictures are prepared as the policy does it; while they are stepped, the networks can learn."""
+class PreprocessedVecEnv(VecEnvWrapper):
+    """Environments with the policy's preprocessing; the networks can learn while the environments are stepped."""
 
-    def __init__(self, worlds: DriveVecEnv, pool: int) -> None:
-        channels, height, width = worlds.observation_space.shape  # type: ignore[misc]
-        super().__init__(worlds, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
+    def __init__(self, envs: DriveVecEnv, pool: int) -> None:
+        channels, height, width = envs.observation_space.shape  # type: ignore[misc]
+        super().__init__(envs, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
         self._pool, self._thread = pool, ThreadPoolExecutor(1)
         self.meanwhile: Callable[[], None] = lambda: None
-        """Called while the worlds are stepped. Neither sees anything of the other, so their order does not matter."""
+        """Called while the environments are stepped; the two are independent, so their order does not matter."""
 
     def reset(self) -> NDArray:
-        return prepared(np.asarray(self.venv.reset()), self._pool)
+        return preprocess(np.asarray(self.venv.reset()), self._pool)
 
     def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
         stepped = self._thread.submit(self.venv.step_wait)
         self.meanwhile()
         pictures, rewards, dones, infos = stepped.result()
         for i in np.flatnonzero(dones):
-            infos[i]["terminal_observation"] = prepared(infos[i]["terminal_observation"], self._pool)
-        return prepared(np.asarray(pictures), self._pool), rewards, dones, infos
+            infos[i]["terminal_observation"] = preprocess(infos[i]["terminal_observation"], self._pool)
+        return preprocess(np.asarray(pictures), self._pool), rewards, dones, infos
 
     def close(self) -> None:
         self._thread.shutdown()
@@ -82,87 +80,85 @@ class PreparedVecEnv(VecEnvWrapper):
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Where a training stands."""
+class TrainingProgress:
+    """Progress of a training."""
 
     steps: int
     recent: tuple[bool, ...]
-    """Success of the last episodes from the beginning of the stretch, `RECENT` at most."""
+    """Success of the last episodes, at most `RECENT`, that started at the beginning of the segment."""
 
 
 def train(
     twin: Twin,
     folder: Path,
     config: TrainConfig,
-    watch: Callable[[Progress], None] | None = None,
+    watch: Callable[[TrainingProgress], None] | None = None,
     processes: int | None = None,
 ) -> None:
-    """Trains a policy, or goes on where it was stopped or killed.
+    """Trains a policy, or resumes a training that was stopped or killed.
+
+    SIGINT, SIGTERM and SIGHUP save the state and then raise `Stopped`, a KeyboardInterrupt. A folder that is not a run
+    is left alone; a run has a folder `state`, the first thing that a training creates.
 
     Args:
-        twin: A built scene.
-        folder: Of the run.
-        config: Of the run; a run that is there must have the same but for `steps`.
-        watch: Is told at every step of the worlds.
-        processes: That step the worlds; see `worlds_of`. What is learnt is the same.
-
-    SIGINT, SIGTERM and SIGHUP save, and then raise `Stopped`, a KeyboardInterrupt. Nothing is deleted in a folder that
-    is not a run: a run has a folder `state`, which is the first thing that a training makes in it.
+        config: Of the run; an existing run must have the same apart from `steps`.
+        processes: See `make_vector_env`; the number does not change the result.
 
     Raises:
-        InputError: the run is another, or damaged, or the folder is no run; or what `twin.load` raises.
-        OSError: the disk is full; what was saved before is whole.
+        InputError: an existing run has another configuration or is damaged, the folder is not a run, or an error of
+            `twin.load`.
+        OSError: the disk is full; the last saved state is intact.
     """
-    road = fingerprint(twin, config.task, config.lighting + (RANDOMISED if config.randomise else ""))
-    said = _as_json({**dataclasses.asdict(config), "road": road})
-    go_on = has_state(folder / "state")
-    if go_on:
-        _check_same(folder, said)
+    road = fingerprint(twin, config.task, config.lighting + (RANDOMIZED if config.randomise else ""))
+    settings = json.loads(json.dumps({**dataclasses.asdict(config), "road": road}))  # as they are read again
+    resume = has_state(folder / "state")
+    if resume:
+        _check_same(folder, settings)
     else:
         _check_run(folder)
         (folder / "state").mkdir(parents=True, exist_ok=True)
         for stale in ("episodes.csv", "log.csv", "state/pictures.bin"):
             (folder / stale).unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    if go_on and not (folder / "state" / "pictures.bin").exists():
+    if resume and not (folder / "state" / "pictures.bin").exists():
         raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
-    vectors = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, **config.options())
-    with closing(PreparedVecEnv(vectors, config.pool)) as worlds:
-        model = _model(worlds, config, folder / "state" / "pictures.bin")
-        before: dict[str, Any] = load_state(folder / "state", model) if go_on else {"wall": 0.0, "resumed": -1}
+    vec_env = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, **config.options())
+    with closing(PreprocessedVecEnv(vec_env, config.pool)) as envs:
+        model = _model(envs, config, folder / "state" / "pictures.bin")
+        before: dict[str, Any] = load_state(folder / "state", model) if resume else {"wall": 0.0, "resumed": -1}
         resumed = before["resumed"] + 1
-        worlds.seed(int(np.random.SeedSequence([config.seed, resumed, _SEEDS]).generate_state(1, np.uint64)[0]))
+        envs.seed(int(np.random.SeedSequence([config.seed, resumed, _SEED_STREAM]).generate_state(1, np.uint64)[0]))
         updates = max(1, round(config.updates * config.worlds))
 
         def learn() -> None:
             if model.num_timesteps > config.starts:
                 model.train(updates, config.batch)
 
-        worlds.meanwhile = learn
+        envs.meanwhile = learn
         with stop_noted() as stop:
-            keeper = _Keeper(folder, config, said, twin, before["wall"], resumed, watch, stop)
+            recorder = _RunRecorder(folder, config, settings, twin, before["wall"], resumed, watch, stop)
             left = config.steps - model.num_timesteps
             if left > 0:
-                (folder / CHOICE).unlink(missing_ok=True)  # what it says will not be so
-                model.learn(left, keeper, log_interval=10, reset_num_timesteps=False)
-                keeper.end()
+                (folder / CHOICE_FILE).unlink(missing_ok=True)  # no longer valid after more steps
+                model.learn(left, recorder, log_interval=10, reset_num_timesteps=False)
+                recorder.end()
                 if stop.number:
                     raise Stopped(stop.number)
 
 
-def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
+def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
     model = PixelSAC(
         DrivePolicy,
-        worlds,
-        # Falls over the second half, so that the policy settles.
-        learning_rate=lambda left: config.learning_rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * min(1.0, 2.0 * left)),
+        envs,
+        # Decreases over the second half, so that the policy converges.
+        learning_rate=lambda left: config.learning_rate * (_FINAL_RATE + (1.0 - _FINAL_RATE) * min(1.0, 2.0 * left)),
         buffer_size=config.buffer,
         learning_starts=config.starts,
         batch_size=config.batch,
         tau=config.tau,
         gamma=config.gamma,
         train_freq=1,
-        gradient_steps=0,  # see `meanwhile`
+        gradient_steps=0,  # updates run in `meanwhile`
         ent_coef="auto_0.1",
         target_entropy=config.entropy * config.control.actions,
         replay_buffer_class=FrameReplayBuffer,
@@ -170,18 +166,18 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
             "file": pictures,
             "slack": config.save_every + config.worlds,
             "shift": config.shift,
-            "colours": config.colours if config.varies else 0.0,
+            "color_strength": config.colours if config.lighting_varies else 0.0,
             "seed": config.seed,
-            "states": len(config.states),
+            "state_size": len(config.state_scales),
         },
-        states=config.states,
+        state_scales=config.state_scales,
         policy_kwargs={
             "features_extractor_class": Encoder,
             "features_extractor_kwargs": {"architecture": config.architecture},
             "net_arch": list(config.hidden),
             "share_features_extractor": True,
-            "normalize_images": False,  # the encoder does
-            "states": len(config.states),
+            "normalize_images": False,  # the encoder scales them
+            "state_size": len(config.state_scales),
         },
         seed=config.seed,
         device=config.device,
@@ -191,75 +187,74 @@ def _model(worlds: PreparedVecEnv, config: TrainConfig, pictures: Path) -> Pixel
 
 
 def _check_run(folder: Path) -> None:
-    """Raises InputError where a folder has something in it and is no run: a training would delete and replace there."""
+    """Raises InputError if a folder is not empty and not a run, since a training deletes and replaces files."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise InputError(f"{folder} is no folder; move it away, or give another --run")
+        raise InputError(f"{folder} is not a folder; move it away, or give another --run")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "state").is_dir():
-        raise InputError(f"{folder} is no training run (it has no folder state); move it away, or give another --run")
+        raise InputError(
+            f"{folder} is not a training run (it has no folder state); move it away, or give another --run"
+        )
 
 
-def _as_json(said: dict[str, Any]) -> dict[str, Any]:
-    """As it is once it has been written and read."""
-    return json.loads(json.dumps(said))
-
-
-def _check_same(folder: Path, said: dict[str, Any]) -> None:
-    """Refuses another config for a run that is there."""
-    with damaged(folder / "config.json", "train anew under another name"):
-        there = dict(read_json(folder / "config.json"))
-        there["road"]
-    new = [name for name in said if name not in there]
+def _check_same(folder: Path, settings: dict[str, Any]) -> None:
+    """Raises InputError if an existing run has another configuration."""
+    with wrap_read_errors(folder / "config.json", "train anew under another name"):
+        previous = dict(read_json(folder / "config.json"))
+        previous["road"]
+    new = [name for name in settings if name not in previous]
     if new:
         raise InputError(f"{folder} was trained by an earlier version, which had no {new[0]}; give another --run")
-    if there["road"] != said["road"]:
+    if previous["road"] != settings["road"]:
         raise InputError(
-            f"{folder} was trained before the scene was built anew, its task or obstacles changed, or twin draws "
-            "episodes otherwise; give another --run"
+            f"{folder} was trained before the scene was rebuilt, its task or obstacles changed, or twin samples "
+            "episodes differently; give another --run"
         )
-    for name in said:
-        if name != "steps" and there.get(name) != said[name]:
+    for name in settings:
+        if name != "steps" and previous.get(name) != settings[name]:
             raise InputError(
-                f"{folder} was trained with {name} = {there.get(name)!r}, not {said[name]!r}; "
-                "go on with the same, or give another --run"
+                f"{folder} was trained with {name} = {previous.get(name)!r}, not {settings[name]!r}; "
+                "resume with the same, or give another --run"
             )
 
 
-class _Keeper(BaseCallback):
-    """Writes down what happens, and saves."""
+class _RunRecorder(BaseCallback):
+    """Writes the tables, checkpoints and states of a run."""
 
     def __init__(
         self,
         folder: Path,
         config: TrainConfig,
-        said: dict[str, Any],
+        settings: dict[str, Any],
         twin: Twin,
         wall: float,
         resumed: int,
-        watch: Callable[[Progress], None] | None,
+        watch: Callable[[TrainingProgress], None] | None,
         stop: StopNotice,
     ) -> None:
         super().__init__()
         self.model: PixelSAC
         self._folder, self._config, self._scene, self._watch = folder, config, twin.scene.root.resolve().name, watch
-        self._said = said
+        self._settings = settings
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
         self._stop = stop
 
     @property
     def wall(self) -> float:
-        """Of the whole training [s]."""
+        """Wall time of the whole training [s]."""
         return self._wall + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        # Not before: by now the worlds have begun, so that all that was asked for is there.
-        write_json(self._folder / "config.json", self._said)
+        # Only now: the environments have started, so the configuration is valid.
+        write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self.model.num_timesteps
         self._first_updates = self.model._n_updates
-        self._recent: list[bool] = _keep_rows(self._folder / "episodes.csv", EPISODE_COLUMNS, self._saved)[-RECENT:]
+        self._recent: list[bool] = _keep_rows(self._folder / "episodes.csv", TRAINING_EPISODE_COLUMNS, self._saved)[
+            -RECENT_EPISODES:
+        ]
         _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
 
     def _on_rollout_start(self) -> None:
-        # Here, and not in _on_step, all that was collected is in the buffer.
+        # Here, unlike in _on_step, the buffer has all that was collected.
         if self._stop.number or self.model.num_timesteps - self._saved >= self._config.save_every:
             self.save()
         if self._stop.number:
@@ -270,7 +265,7 @@ class _Keeper(BaseCallback):
         rows = []
         for info in (one for one in self.locals["infos"] if "episode" in one):
             if not info["start"]:
-                self._recent = [*self._recent, info["is_success"]][-RECENT:]
+                self._recent = [*self._recent, info["is_success"]][-RECENT_EPISODES:]
             rows.append(
                 (
                     *(self.model.num_timesteps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"]),
@@ -280,16 +275,16 @@ class _Keeper(BaseCallback):
             )
         _append(self._folder / "episodes.csv", rows)
         if self._watch:
-            self._watch(Progress(self.model.num_timesteps, tuple(self._recent)))
+            self._watch(TrainingProgress(self.model.num_timesteps, tuple(self._recent)))
         return True
 
     def end(self) -> None:
-        """When all steps are done."""
+        """Saves the last checkpoint and state when all steps are done."""
         self._checkpoint()
         self.save()
 
     def save(self) -> None:
-        """Everything; nothing where nothing was done since."""
+        """Saves the policy, the state and a row of the log, unless nothing was done since the last save."""
         if self.model.num_timesteps == self._saved:
             return
         model, elapsed = self.model, max(time.monotonic() - self._started, 1e-9)
@@ -298,7 +293,7 @@ class _Keeper(BaseCallback):
             *(model.num_timesteps, f"{self.wall:.1f}", model._n_updates),
             f"{(model.num_timesteps - self._first) / elapsed:.2f}",
             f"{(model._n_updates - self._first_updates) / elapsed:.2f}",
-            round(resident() / 2**20),
+            round(resident_memory() / 2**20),
             *(f"{logged.get(f'train/{name}', float('nan')):.4g}" for name in ("ent_coef", "value")),
         )
         _append(self._folder / "log.csv", [row])
@@ -307,7 +302,7 @@ class _Keeper(BaseCallback):
         self._saved = model.num_timesteps
 
     def _checkpoint(self) -> None:
-        """Keeps a policy, if one is due."""
+        """Saves a checkpoint if one is due."""
         every = self._config.steps / self._config.checkpoints
         number = int(self.model.num_timesteps / every)
         if number and self.model.num_timesteps - number * every < self._config.worlds:
@@ -334,11 +329,11 @@ def _append(path: Path, rows: list[tuple]) -> None:
 
 
 def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
-    """Makes a table, or drops what was written after the save; the successes of whole episodes among what is kept."""
+    """Creates a table, or drops its rows after `steps`; returns the successes of the kept episodes from the start."""
     rows: list[list[str]] = []
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
-            # A line that was being written when the training was killed is not whole.
+            # The last line may be cut if the training was killed.
             rows = [row for row in list(csv.reader(file))[1:] if len(row) == len(columns) and int(row[0]) <= steps]
     write_text(path, csv_text(columns, rows))
     if "success" not in columns:

@@ -1,19 +1,11 @@
-"""The Clearpath Husky A200 as a wheeled MuJoCo model; words and figures: `twin.robot`.
+"""MuJoCo model of the Clearpath Husky A200, and its quasi-static skid steering in closed form.
 
-Names, for whoever scripts it: body and free joint `base_link`; bodies and joints `<front|rear>_<left|right>_wheel`;
-actuators `left` and `right`, commanded in wheel speed [rad/s]; camera `front` (160 × 90) and `front_native`, the same
-at its native size; site `imu`; sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`,
-`<wheel>_wheel_velocity`, `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`;
-`chassis_dry` touches nothing. What the cameras are built into, and do not see: geoms `camera_housing`,
-`camera_bracket`, `camera_lens_left`, `camera_lens_right`.
+Figures and frames: `twin.robot`. `add_husky` lists the names in the model. `python -m twin.mjcf.husky` writes the robot
+alone to `twin/assets/husky/husky.xml`; to attach it to another scene:
 
-`python -m twin.mjcf.husky` writes the robot alone to `twin/assets/husky/husky.xml`, for anyone's own scene:
-
-    husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tyres need these
+    husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tires need these
     robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
     spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
-
-Contact settings: measured, see `_WHEEL_SOLIMP`.
 """
 
 from pathlib import Path
@@ -23,7 +15,7 @@ import mujoco
 import numpy as np
 from scipy.optimize import root
 
-from twin.mjcf.husky_visuals import add_look
+from twin.mjcf.husky_visuals import add_visuals
 from twin.robot import (
     BASE_HEIGHT,
     CAMERA_SIZE,
@@ -44,40 +36,40 @@ from twin.types import Array
 
 TIMESTEP = 0.002  # [s]
 HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
-"""The published robot alone, no floor."""
+"""The published robot alone, without a floor."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
 _WHEEL_INERTIA = (0.02467, 0.04411, 0.02467)  # [kg m²], the axle is y
-_COLLISION_BOXES = (  # full size, centre in the base [m]
+_COLLISION_BOXES = (  # full size, center in the base [m]
     ((0.9874, 0.5709, 0.12375), (0.0, 0.0, 0.061875)),
     ((0.78992, 0.5709, 0.10375), (0.0, 0.0, 0.175625)),
 )
 # With MuJoCo's default solimp (d0 = 0.9) scrubbing wheels hop: 12 to 17 m/s² at the body in a point turn, and the
-# effective track then depends on friction. An impedance that starts from zero has no jump at touchdown. How fast it
-# rises is a compromise: over 3 mm a wheel sinks in by 1.6 mm and touches the facets of a height field ahead of it,
-# which shakes the camera 0.9 m/s² instead of 0.5; over 1 mm scrubbing on a friction of 1.0 flutters.
+# effective track depends on friction. An impedance that starts from zero does not jump at touchdown. The width is a
+# compromise: with 3 mm a wheel sinks in by 1.6 mm and touches the facets of a height field ahead of it, which shakes
+# the camera by 0.9 m/s² instead of 0.5; with 1 mm a scrubbing wheel flutters at a friction of 1.0.
 _WHEEL_SOLIMP = (0.0, 0.95, 0.0025, 0.5, 2.5)
-_WHEEL_SOLREF = (0.02, 2.0)  # damped twice as much as critically: an eighth less shaking on a height field
+_WHEEL_SOLREF = (0.02, 2.0)  # twice critical damping: 1/8 less shaking on a height field
 _IMU_POSITION = (0.19, 0.0, 0.149)  # in the base [m]
 
-ROBOT_GROUP = 4
-"""Geom group of the robot's collision shapes; its looks are in group 1."""
+ROBOT_COLLISION_GROUP = 4
+"""Geom group of the robot's collision geoms; its visual geoms are in `husky_visuals.ROBOT_VISUAL_GROUP`."""
 
 
 def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
-    """Solver settings under which skid steering behaves: see the figures in the module's tests.
+    """Sets the time step and solver options that skid steering needs.
 
-    The ground's softness is in them (`slip_stiffness`, `ground_viscosity`), as MuJoCo knows it for a whole world only.
+    They include the softness of the ground (`slip_stiffness`, `ground_viscosity`), which MuJoCo has per model only.
     """
     params = params or HuskyParams()
     spec.option.timestep = TIMESTEP
-    # Euler and RK4 misbehave with a stiff speed servo; implicitfast takes its damping into the mass matrix.
+    # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds its damping to the mass matrix.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # The pyramidal cone reads the right chi with a torque 21 % too low.
+    # The pyramidal cone gives the right chi, but a torque that is 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = params.slip_stiffness
     spec.option.viscosity = params.ground_viscosity
-    # At the default 1e-8 Newton takes twice the iterations to the same motion.
+    # The default of 1e-8 takes twice the Newton iterations for the same motion.
     spec.option.tolerance = 1e-5
 
 
@@ -88,14 +80,20 @@ def add_husky(
     params: HuskyParams | None = None,
     camera: PixelCamera = ZED2,
 ) -> None:
-    """Adds the robot to a world; its names are in the module's head.
+    """Adds the robot to a model.
+
+    Names: body and free joint `base_link`; bodies and joints `<front|rear>_<left|right>_wheel`; actuators `left` and
+    `right`, commanded in wheel speed [rad/s]; cameras `front` (160 × 90) and `front_native` (native size); site `imu`;
+    sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`, `<wheel>_wheel_velocity`,
+    `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`; `chassis_dry`, without
+    contacts; `camera_*`, the camera's housing, which its own pictures leave out.
 
     Args:
-        spec: The world; its options are not touched (see `set_options`).
-        position: Of the base origin [m], shape (3,).
+        spec: The model; its options stay as they are (see `set_options`).
+        position: Base origin [m], shape (3,).
         quaternion: w, x, y, z, shape (4,).
         params: The robot; the published one by default.
-        camera: The front camera at its native size, where `params` gives no intrinsics.
+        camera: The front camera at its native size, if `params` has no intrinsics.
     """
     params = params or HuskyParams()
     base = spec.worldbody.add_body(name="base_link", pos=position, quat=quaternion)
@@ -108,40 +106,42 @@ def add_husky(
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=np.array(size) / 2,
             pos=center,
-            group=ROBOT_GROUP,
+            group=ROBOT_COLLISION_GROUP,
             rgba=(0.2, 0.2, 0.8, 0.4),
         )
-    add_dry(base, "chassis")
+    disable_fluid_drag(base, "chassis")
     wheels = {name: _add_wheel(base, name, i, params) for i, name in enumerate(WHEELS)}
     for side in SIDES:
-        _add_drive(spec, side, params)
-    base.add_site(name="imu", pos=_IMU_POSITION, size=(0.01, 0.01, 0.01), group=ROBOT_GROUP)
+        _add_side_motor(spec, side, params)
+    base.add_site(name="imu", pos=_IMU_POSITION, size=(0.01, 0.01, 0.01), group=ROBOT_COLLISION_GROUP)
     native = params.camera(camera)
     _add_camera(base, "front", params, native.resized(CAMERA_SIZE))
     _add_camera(base, "front_native", params, native)
     _add_sensors(spec)
-    add_look(spec, base, wheels, params.camera_position, params.wheel_radius, WHEEL_WIDTH)
+    add_visuals(spec, base, wheels, params.camera_position, params.wheel_radius, WHEEL_WIDTH)
 
 
-def held(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Changes a model whose tyres or servos are softer than the published ones, which would creep down the least slope,
-    so that its robot stands still as the published one does; returns it."""
+def stiffen_for_rest(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Raises tire and servo stiffness in place to at least the published values, and returns the model.
+
+    A robot with softer tires or servos creeps down any slope, so it would not come to rest.
+    """
     model.opt.impratio = max(model.opt.impratio, HuskyParams.slip_stiffness)
     for side in SIDES:
-        drive = model.actuator(side)
-        drive.gainprm[0] = max(drive.gainprm[0], HuskyParams.servo_gain)
-        drive.biasprm[2] = -drive.gainprm[0]
+        motor = model.actuator(side)
+        motor.gainprm[0] = max(motor.gainprm[0], HuskyParams.servo_gain)
+        motor.biasprm[2] = -motor.gainprm[0]
     return model
 
 
 def wheel_centers() -> Array:
-    """Wheel hubs in the base [m], shape (4, 3), ordered as WHEELS."""
+    """Positions of the wheel hubs in the base [m], shape (4, 3), ordered as WHEELS."""
     x, y = WHEELBASE / 2, TRACK / 2
     return np.array([[x, y, HUB_HEIGHT], [x, -y, HUB_HEIGHT], [-x, y, HUB_HEIGHT], [-x, -y, HUB_HEIGHT]])
 
 
 def _chassis_inertia(params: HuskyParams) -> tuple[float, Array, Array]:
-    """Mass, centre and full inertia (ixx iyy izz ixy ixz iyz) of chassis and payload (a point mass) together."""
+    """Mass, center and inertia (ixx iyy izz ixy ixz iyz) of the chassis with its payload (a point mass)."""
     masses = np.array([CHASSIS_MASS, params.payload_mass])
     centers = np.array([params.center_of_mass, params.payload_position])
     mass = masses.sum()
@@ -153,11 +153,11 @@ def _chassis_inertia(params: HuskyParams) -> tuple[float, Array, Array]:
     return float(mass), center, tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
-def add_dry(body: mujoco.MjsBody, name: str) -> None:
-    """Keeps what tyres wade through (`ground_viscosity`) from dragging a body.
+def disable_fluid_drag(body: mujoco.MjsBody, name: str) -> None:
+    """Exempts a body from the drag of `ground_viscosity`.
 
-    MuJoCo's fluid acts on every body, unless one of its geoms is said to be an ellipsoid in it: then on that geom only.
-    So the body gets one too small to be felt.
+    MuJoCo's fluid acts on every body, except where a geom has `fluid_ellipsoid` set: then it acts on that geom only. So
+    the body gets a geom too small to matter.
     """
     body.add_geom(
         name=f"{name}_dry",
@@ -166,14 +166,14 @@ def add_dry(body: mujoco.MjsBody, name: str) -> None:
         contype=0,
         conaffinity=0,
         fluid_ellipsoid=True,
-        group=ROBOT_GROUP,
+        group=ROBOT_COLLISION_GROUP,
     )
 
 
 def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams) -> mujoco.MjsBody:
     wheel = base.add_body(name=f"{name}_wheel", pos=wheel_centers()[index])
     wheel.explicitinertial = True
-    # Left unsaid, MuJoCo takes the body's offset in its parent for the centre of mass.
+    # Without ipos, MuJoCo takes the body's offset in its parent as the center of mass.
     wheel.mass, wheel.ipos, wheel.inertia = WHEEL_MASS, (0.0, 0.0, 0.0), _WHEEL_INERTIA
     wheel.add_joint(
         name=f"{name}_wheel", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 1, 0), armature=params.motor_inertia
@@ -189,7 +189,7 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
     }
     wheel.add_geom(
         name=f"{name}_tyre",
-        group=ROBOT_GROUP,
+        group=ROBOT_COLLISION_GROUP,
         rgba=(0.2, 0.2, 0.8, 0.4),
         condim=6,
         priority=1,
@@ -203,8 +203,8 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
     return wheel
 
 
-def _add_drive(spec: mujoco.MjSpec, side: str, params: HuskyParams) -> None:
-    """One motor for the two wheels of a side: a servo on their mean speed, and the belt that keeps them equal."""
+def _add_side_motor(spec: mujoco.MjSpec, side: str, params: HuskyParams) -> None:
+    """Adds the motor of a side: a servo on the mean speed of its two wheels, and the belt that keeps them equal."""
     belt = spec.add_equality(
         name=f"{side}_belt",
         type=mujoco.mjtEq.mjEQ_JOINT,
@@ -256,30 +256,68 @@ def _add_camera(base: mujoco.MjsBody, name: str, params: HuskyParams, camera: Pi
         quat=quaternion,
         resolution=(width, height),
         focal_pixel=(fx, fy),
-        # MuJoCo counts the principal point from the middle of the image, left and up being positive.
+        # MuJoCo measures the principal point from the image center, positive to the left and upwards.
         principal_pixel=(width / 2 - cx, height / 2 - cy),
-        # The metric size of the sensor is arbitrary: focal length and principal point scale with it.
+        # The metric sensor size is arbitrary: focal length and principal point scale with it.
         sensor_size=(width * 1e-5, height * 1e-5),
     )
 
 
 def center_of_mass(params: HuskyParams) -> Array:
-    """Centre of mass of the whole robot in the base [m], shape (3,)."""
+    """Center of mass of the whole robot in the base [m], shape (3,)."""
     mass, center, _ = _chassis_inertia(params)
     return (mass * center + WHEEL_MASS * wheel_centers().sum(0)) / (mass + 4 * WHEEL_MASS)
 
 
+# ---- quasi-static skid steering, to validate the model against
+
+
+def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
+    """Track ratio chi of four point contacts under Coulomb friction at constant speed, for any coefficient.
+
+    With slip velocity s at each wheel the friction force is −μN s/|s|; the forces and their moment about the center of
+    mass sum to zero. A centered mass in a point turn gives exactly 1 + (wheelbase / track)².
+
+    Args:
+        center: Center of mass in the base [m], shape (≥2,); x and y are used.
+        curvature_radius: Mean wheel speed of both sides / yaw rate of the body [m].
+
+    Raises:
+        ArithmeticError: the balance was not found.
+    """
+    arm = wheel_centers()[:, :2] - np.asarray(center)[:2]
+    share_x = 0.5 + np.sign(arm[:, 0]) * center[0] / WHEELBASE
+    share_y = 0.5 + np.sign(arm[:, 1]) * center[1] / TRACK
+    load = share_x * share_y
+
+    def residual(unknown: Array) -> Array:
+        vx, vy, chi = unknown  # body velocity at the center of mass for unit yaw rate
+        rolling = curvature_radius + np.array([-1.0, 1.0, -1.0, 1.0]) * chi * TRACK / 2
+        slip = np.stack([vx - arm[:, 1] - rolling, vy + arm[:, 0]], 1)
+        force = -load[:, None] * slip / np.linalg.norm(slip, axis=1, keepdims=True)
+        moment = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
+        return np.array([force[:, 0].sum(), force[:, 1].sum(), moment.sum()])
+
+    solution = root(residual, np.array([curvature_radius, -center[0] * 0.5, 1.0 + (WHEELBASE / TRACK) ** 2]))
+    if not solution.success:
+        raise ArithmeticError(f"no quasi-static balance for a center of mass at {center}: {solution.message}")
+    return float(solution.x[2])
+
+
+# ---- standalone robot
+
+
 def standalone_xml() -> str:
-    """The published robot alone, no floor, as MJCF."""
+    """MJCF of the published robot alone, without a floor."""
     spec = mujoco.MjSpec()
     spec.modelname = "husky"
     set_options(spec)
     add_husky(spec)
     spec.compile()
-    return _XML_HEAD + spec.to_xml()
+    return _XML_HEADER + spec.to_xml()
 
 
-_XML_HEAD = """<!--
+_XML_HEADER = """<!--
   Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures and licence: NOTICE.md.
 
   body, free joint  base_link
@@ -300,40 +338,6 @@ def main() -> None:
     """Writes `HUSKY_XML`."""
     HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
     print(f"wrote {HUSKY_XML}")
-
-
-# ---- Skid steering in the plane, at constant speed and without MuJoCo: what the model is held against.
-#
-# Words: `twin.robot`. *Quasi-static*: nothing accelerates, so friction forces and their moment balance.
-
-
-def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
-    """Quasi-static chi of four point contacts under Coulomb friction, whatever the coefficient.
-
-    With slip velocity s at each wheel the friction force is −μN s/|s|; forces and moment about the centre of mass must
-    vanish. A centred mass in a point turn gives 1 + (wheelbase / track)² exactly.
-
-    Args:
-        center: Centre of mass in the base, x and y used [m], shape (≥2,).
-        curvature_radius: v / yaw rate of the mean of both sides, in units where the yaw rate of the wheels counts [m].
-    """
-    arm = wheel_centers()[:, :2] - np.asarray(center)[:2]
-    share_x = 0.5 + np.sign(arm[:, 0]) * center[0] / WHEELBASE
-    share_y = 0.5 + np.sign(arm[:, 1]) * center[1] / TRACK
-    load = share_x * share_y
-
-    def residual(unknown: Array) -> Array:
-        vx, vy, chi = unknown  # body velocity at the centre of mass for unit yaw rate
-        rolling = curvature_radius + np.array([-1.0, 1.0, -1.0, 1.0]) * chi * TRACK / 2
-        slip = np.stack([vx - arm[:, 1] - rolling, vy + arm[:, 0]], 1)
-        force = -load[:, None] * slip / np.linalg.norm(slip, axis=1, keepdims=True)
-        moment = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
-        return np.array([force[:, 0].sum(), force[:, 1].sum(), moment.sum()])
-
-    solution = root(residual, np.array([curvature_radius, -center[0] * 0.5, 1.0 + (WHEELBASE / TRACK) ** 2]))
-    if not solution.success:
-        raise ArithmeticError(f"no quasi-static balance for a centre of mass at {center}: {solution.message}")
-    return float(solution.x[2])
 
 
 if __name__ == "__main__":

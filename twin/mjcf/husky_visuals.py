@@ -1,7 +1,7 @@
-"""What the Husky looks like: boxes, tubes and generated meshes without mass or contact, all in geom group 1.
+"""Visual geoms of the Husky: boxes, tubes and generated meshes without mass or contacts, in geom group 1.
 
-Nothing here is taken from Clearpath's meshes; proportions follow the published dimensions. The base frame is that of
-`twin.mjcf.husky`: x forward, y left, z up.
+Nothing is taken from Clearpath's meshes; proportions follow the published dimensions. Base frame: x forward, y left,
+z up, as in `twin.robot`.
 """
 
 from typing import Any
@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-LOOK_GROUP = 1
+ROBOT_VISUAL_GROUP = 1
 
-_CAMERA_PART = "camera_"  # begins the names of what carries the front camera
+_CAMERA_PREFIX = "camera_"  # of the names of the geoms that the front camera is built into
 
 _YELLOW = (0.96, 0.74, 0.05, 1.0)
 _BLACK = (0.06, 0.06, 0.065, 1.0)
@@ -21,10 +21,10 @@ _STEEL = (0.45, 0.46, 0.48, 1.0)
 _LAMP = (0.95, 0.95, 0.88, 1.0)
 _RED = (0.75, 0.06, 0.05, 1.0)
 
-_LUGS = 22  # tread blocks around a tyre
+_LUGS = 22  # tread blocks around a tire
 
 
-def add_look(
+def add_visuals(
     spec: mujoco.MjSpec,
     base: mujoco.MjsBody,
     wheels: dict[str, mujoco.MjsBody],
@@ -32,17 +32,15 @@ def add_look(
     radii: tuple[float, float],
     width: float,
 ) -> None:
-    """Dresses the base and its wheels.
+    """Adds the visual geoms to the base and its wheels (by name, as in `twin.robot.WHEELS`).
 
-    Args:
-        camera: Position of the front camera in the base [m]; a small housing and its mast stand there.
-        radii: Of the left and of the right wheels [m].
-        width: Of a wheel [m].
+    `camera` is the position of the front camera in the base [m], where its housing and mast are added; `radii` are
+    those of the left and right wheels, `width` that of a wheel [m].
     """
     for name, rgba, specular in (("yellow", _YELLOW, 0.4), ("black", _BLACK, 0.2), ("dark", _DARK, 0.2)):
         spec.add_material(name=f"husky_{name}", rgba=rgba, specular=specular, shininess=0.4)
-    tyres = {radius: f"tyre_{i}" for i, radius in enumerate(dict.fromkeys(radii))}
-    meshes = {"hull": _hull()} | {name: _tyre(radius, width) for radius, name in tyres.items()}
+    tires = {radius: f"tyre_{i}" for i, radius in enumerate(dict.fromkeys(radii))}
+    meshes = {"hull": _hull()} | {name: _tire(radius, width) for radius, name in tires.items()}
     for name, (vertices, faces) in meshes.items():
         mesh = spec.add_mesh(name=f"husky_{name}")
         mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
@@ -62,17 +60,17 @@ def add_look(
     _mast(base, camera)
     for name, wheel in wheels.items():
         radius = radii[name.endswith("right")]
-        _mesh(wheel, f"husky_{tyres[radius]}", "husky_black")
+        _mesh(wheel, f"husky_{tires[radius]}", "husky_black")
         for y in (-1.0, 1.0):
             _cylinder(wheel, (0, 0.30 * width * y, 0), (0, 0.44 * width * y, 0), 0.55 * radius, rgba=_STEEL)
             _cylinder(wheel, (0, 0.40 * width * y, 0), (0, 0.47 * width * y, 0), 0.22 * radius, material="husky_yellow")
-            for angle in np.arange(5) * 2 * np.pi / 5:  # wheel bolts: one sees the wheel turn
+            for angle in np.arange(5) * 2 * np.pi / 5:  # wheel bolts, which make the rotation visible
                 x, z = 0.38 * radius * np.cos(angle), 0.38 * radius * np.sin(angle)
                 _cylinder(wheel, (x, 0.42 * width * y, z), (x, 0.465 * width * y, z), 0.012, material="husky_black")
 
 
 def _bumper(base: mujoco.MjsBody, end: float) -> None:
-    """A black bumper bar with two lamps, at the front (end = 1) or the rear (end = −1)."""
+    """Adds a black bumper bar with two lamps at the front (end = 1) or the rear (end = −1)."""
     x = 0.455 * end
     _tube(base, (x, -0.20, 0.075), (x, 0.20, 0.075), 0.024)
     _tube(base, (x, -0.20, 0.165), (x, 0.20, 0.165), 0.018)
@@ -85,7 +83,7 @@ def _bumper(base: mujoco.MjsBody, end: float) -> None:
 
 
 def _mast(base: mujoco.MjsBody, camera: tuple[float, float, float]) -> None:
-    """An arch of two tubes that carries the camera, and the camera's housing just behind its lens."""
+    """Adds an arch of two tubes that carries the camera, and the camera's housing just behind its lens."""
     x, y, z = camera
     foot = min(x, 0.33) - 0.05
     if z > 0.30:
@@ -93,25 +91,25 @@ def _mast(base: mujoco.MjsBody, camera: tuple[float, float, float]) -> None:
             _tube(base, (foot, side, 0.25), (foot, side, z - 0.09), 0.014)
             _tube(base, (foot, side, z - 0.09), (foot, 0.72 * side, z - 0.04), 0.014)
         _tube(base, (foot, -0.144, z - 0.04), (foot, 0.144, z - 0.04), 0.014)
-        _tube(base, (foot, y, z - 0.04), (x - 0.03, y, z - 0.02), 0.012, name=f"{_CAMERA_PART}bracket")
-    _box(base, (0.03, 0.175, 0.03), (x - 0.02, y, z), rgba=_STEEL, name=f"{_CAMERA_PART}housing")
+        _tube(base, (foot, y, z - 0.04), (x - 0.03, y, z - 0.02), 0.012, name=f"{_CAMERA_PREFIX}bracket")
+    _box(base, (0.03, 0.175, 0.03), (x - 0.02, y, z), rgba=_STEEL, name=f"{_CAMERA_PREFIX}housing")
     for name, offset in (("lens_right", -0.06), ("lens_left", 0.06)):
         ends = (x - 0.01, y + offset, z), (x - 0.002, y + offset, z)
-        _cylinder(base, *ends, 0.011, material="husky_black", name=f"{_CAMERA_PART}{name}")
+        _cylinder(base, *ends, 0.011, material="husky_black", name=f"{_CAMERA_PREFIX}{name}")
 
 
-def camera_parts(model: mujoco.MjModel, camera: int) -> NDArray[np.int64]:
-    """Geoms that a camera cannot see, wherever a draw or a latency puts it: what it is built into, shape (k,).
+def camera_mount_geoms(model: mujoco.MjModel, camera: int) -> NDArray[np.int64]:
+    """Geoms to leave out of a camera's pictures: its own housing, lenses and bracket, shape (k,).
 
-    They are those of the camera's own body whose names begin with `camera_`, as `add_look` gives them: housing, lenses
-    and bracket, which in truth go where the camera goes. Another robot's are seen.
+    They are the geoms of the camera's body whose names begin with `camera_`, see `add_visuals`. Randomization and
+    latency move the camera but not these geoms, so they could block its view. Those of other robots stay visible.
     """
     own = np.flatnonzero(model.geom_bodyid == model.cam_bodyid[camera])
-    return own[[model.geom(int(i)).name.startswith(_CAMERA_PART) for i in own]]
+    return own[[model.geom(int(i)).name.startswith(_CAMERA_PREFIX) for i in own]]
 
 
 def _geom(body: mujoco.MjsBody, kind: Any, **settings: Any) -> None:
-    body.add_geom(type=kind, contype=0, conaffinity=0, group=LOOK_GROUP, mass=0.0, **settings)
+    body.add_geom(type=kind, contype=0, conaffinity=0, group=ROBOT_VISUAL_GROUP, mass=0.0, **settings)
 
 
 def _mesh(body: mujoco.MjsBody, name: str, material: str) -> None:
@@ -119,13 +117,13 @@ def _mesh(body: mujoco.MjsBody, name: str, material: str) -> None:
 
 
 def _box(
-    body: mujoco.MjsBody, size: tuple[float, float, float], center: tuple[float, float, float], **look: Any
+    body: mujoco.MjsBody, size: tuple[float, float, float], center: tuple[float, float, float], **settings: Any
 ) -> None:
-    _geom(body, mujoco.mjtGeom.mjGEOM_BOX, size=np.array(size) / 2, pos=center, **look)
+    _geom(body, mujoco.mjtGeom.mjGEOM_BOX, size=np.array(size) / 2, pos=center, **settings)
 
 
-def _cylinder(body: mujoco.MjsBody, start: Any, end: Any, radius: float, **look: Any) -> None:
-    _geom(body, mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=(*start, *end), size=(radius, 0, 0), **look)
+def _cylinder(body: mujoco.MjsBody, start: Any, end: Any, radius: float, **settings: Any) -> None:
+    _geom(body, mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=(*start, *end), size=(radius, 0, 0), **settings)
 
 
 def _tube(body: mujoco.MjsBody, start: Any, end: Any, radius: float, **settings: Any) -> None:
@@ -134,7 +132,7 @@ def _tube(body: mujoco.MjsBody, start: Any, end: Any, radius: float, **settings:
 
 
 def _hull() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The yellow body: an eight-sided outline, wide above the wheels, drawn in towards the top and the bottom."""
+    """Mesh of the yellow hull: eight-sided outlines, widest above the wheels, narrower at the top and the bottom."""
     levels = (  # height, half length, half width, corner cut [m]
         (0.075, 0.36, 0.20, 0.04),
         (0.140, 0.40, 0.22, 0.05),
@@ -149,10 +147,10 @@ def _hull() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     return _lathe(np.array(rings))
 
 
-def _tyre(radius: float, width: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A tyre with chevron lugs about the y axis: rings of vertices whose radius drops between the lugs."""
+def _tire(radius: float, width: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Mesh of a tire with chevron lugs about the y axis: rings of vertices whose radius drops between the lugs."""
     steps = 4 * _LUGS
-    # Across the tyre: position [share of half width], radius at a lug and in a groove [share], chevron's lead [lugs].
+    # Across the tire: position / half width, radius at a lug and in a groove / radius, lead of the chevron [lugs].
     profile = (
         (-0.62, 0.50, 0.50, 0.0),
         (-0.98, 0.70, 0.70, 0.0),
@@ -176,11 +174,7 @@ def _tyre(radius: float, width: float) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def _lathe(rings: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A closed mesh from stacked rings of equal length, counter-clockwise about the stacking direction, with caps.
-
-    Args:
-        rings: Shape (levels, n, 3).
-    """
+    """A closed mesh with caps from stacked rings (levels, n, 3), counter-clockwise about the stacking direction."""
     levels, n, _ = rings.shape
     vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
     i = np.arange(n)

@@ -1,8 +1,8 @@
-"""Stage `mjcf`: cameras, ground, parts and looks → `scene.xml` with `assets/` beside it, and `world.json`.
+"""Stage `mjcf`: writes `scene.xml`, its `assets/` and `world.json` from cameras, ground, convex parts and visual mesh.
 
-Geom groups: 0 ground, 1 the robot's looks, 2 the visual mesh (touches nothing), 3 the convex parts `part_0000`...,
-4 the robot's collision shapes. Route, corridor and goal are sites of group 4. Every path in the XML is relative, so the
-folder may be moved, zipped, or handed to anyone who has plain MuJoCo.
+Geom groups: 0 ground, 1 visual geoms of the robot, 2 visual mesh (no contacts), 3 convex parts `part_0000`...,
+4 collision geoms of the robot. Route, corridor and goal are sites of group 4. All paths in the XML are relative, so
+plain MuJoCo loads the folder from anywhere.
 """
 
 import shutil
@@ -39,30 +39,22 @@ from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
 from twin.scene import SceneDir
 from twin.types import Array
 
-# ---- Whether an exported scene can be moved, and what the robot meets at its start.
-#
-# *Built* is the model as the exporter compiled it; the *copy* is what plain MuJoCo makes of the written folder, moved.
+# ---- portability check
 
 
-_STEPS = 200  # driven through for the comparison
-_APART = 0.002  # [m] base of the built robot and of the copy's may come apart in them
-_DIGITS = 1e-5  # and as a share of where they are, for XML keeps six digits of a number
-_CLEARANCE_RANGE = 5.0  # [m] within which parts are looked for around the spawn
+_COMPARED_STEPS = 200  # steps simulated for the comparison
+_MAX_DEVIATION = 0.002  # [m] between the robot bases of the compiled model and of the copy
+_XML_PRECISION = 1e-5  # plus this fraction of the coordinates: the XML keeps six digits
+_CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 
 
 def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
-    """Loads a moved copy of the scene in plain MuJoCo; its robot must do there what the built one does.
+    """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with the compiled model `built`.
 
-    Args:
-        folder: Holds the written scene.
-        built: With a keyframe `spawn` where there is a robot.
-
-    Returns:
-        Metrics for the report. `spawn_drift_m` is how far the parked robot creeps in 0.4 s, which on a slope is what
-        its tyres imply.
+    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s (soft tires on a slope).
 
     Raises:
-        RuntimeError: the copy is another model, or its robot moves otherwise: a bug of the exporter.
+        RuntimeError: the copy is a different model or its robot moves differently (a bug of the exporter).
     """
     with tempfile.TemporaryDirectory(prefix="twin-moved-") as temporary:
         moved = Path(temporary) / "elsewhere"
@@ -75,34 +67,38 @@ def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
     }
     sizes = [(model.ngeom, model.nq, model.nu, model.nkey) for model in (built, copy)]
     if sizes[0] != sizes[1]:
-        raise RuntimeError(f"the moved copy has {sizes[1]} geoms, coordinates, motors, keyframes; built: {sizes[0]}")
+        raise RuntimeError(
+            f"the moved copy has {sizes[1]} geoms, coordinates, motors and keyframes, expected {sizes[0]}"
+        )
     if not built.nkey:
         return metrics
-    data = _at_spawn(copy)
+    data = _reset_to_spawn(copy)
     metrics["spawn_clearance_m"] = spawn_clearance(copy, data)
-    path, touched = _parked(copy, data)
-    apart = float(np.linalg.norm(path - _parked(built, _at_spawn(built))[0], axis=1).max())
-    if not apart <= _APART + _DIGITS * np.abs(path[0]).max():
-        raise RuntimeError(f"the robot of the moved copy moves otherwise: {apart:.4f} m apart within {_STEPS} steps")
+    path, touched = _simulate_parked(copy, data)
+    deviation = float(np.linalg.norm(path - _simulate_parked(built, _reset_to_spawn(built))[0], axis=1).max())
+    if not deviation <= _MAX_DEVIATION + _XML_PRECISION * np.abs(path[0]).max():
+        raise RuntimeError(
+            f"the robot of the moved copy moves differently: {deviation:.4f} m apart in {_COMPARED_STEPS} steps"
+        )
     drift = float(np.linalg.norm(path[-1] - path[0]))
     return metrics | {"spawn_touched": sorted(touched), "spawn_drift_m": drift}
 
 
 def robot_geoms(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Which geoms belong to the robot, shape (ngeom,)."""
+    """Mask of the geoms that belong to the robot, shape (ngeom,)."""
     return model.body_rootid[model.geom_bodyid] == model.body("base_link").id
 
 
-def touched_names(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
-    """Names of the geoms that the robot touches now, besides the ground."""
+def contact_geom_names(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
+    """Names of the geoms that the robot touches, except the ground."""
     pairs = data.contact.geom
-    mine = robot_geoms(model)[pairs]
-    other = pairs[mine[:, 0] != mine[:, 1]][~mine[mine[:, 0] != mine[:, 1]]]
+    own = robot_geoms(model)[pairs]
+    other = pairs[own[:, 0] != own[:, 1]][~own[own[:, 0] != own[:, 1]]]
     return {model.geom(int(i)).name for i in np.unique(other)} - {"ground"}
 
 
 def spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
-    """Distance from the robot to the nearest convex part [m]; None where none is within 5 m."""
+    """Distance from the robot to the nearest convex part [m]; None if there is none within 5 m."""
     robot = np.flatnonzero(robot_geoms(model) & (model.geom_contype > 0))
     parts = np.flatnonzero(model.geom_group == PART_GROUP)
     center = data.body("base_link").xpos
@@ -110,77 +106,67 @@ def spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
     distances = [
         mujoco.mj_geomDistance(model, data, int(a), int(b), _CLEARANCE_RANGE, None) for a in robot for b in near
     ]
-    best = min(distances, default=_CLEARANCE_RANGE)
-    return float(best) if best < _CLEARANCE_RANGE else None
+    nearest = min(distances, default=_CLEARANCE_RANGE)
+    return float(nearest) if nearest < _CLEARANCE_RANGE else None
 
 
-def _at_spawn(model: mujoco.MjModel) -> mujoco.MjData:
+def _reset_to_spawn(model: mujoco.MjModel) -> mujoco.MjData:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
     mujoco.mj_forward(model, data)
     return data
 
 
-def _parked(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, set[str]]:
-    """Where the base of a robot left alone is after every step [m], shape (steps + 1, 3), and what it touched."""
-    path, touched = [data.qpos[:3].copy()], touched_names(model, data)
-    for _ in range(_STEPS):
+def _simulate_parked(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, set[str]]:
+    """Base positions of a robot without commands [m], shape (steps + 1, 3), and the names of what it touched."""
+    path, touched = [data.qpos[:3].copy()], contact_geom_names(model, data)
+    for _ in range(_COMPARED_STEPS):
         mujoco.mj_step(model, data)
         path.append(data.qpos[:3].copy())
-        touched |= touched_names(model, data)
+        touched |= contact_geom_names(model, data)
     return np.array(path), touched
 
 
-# ---- Asset files as MuJoCo reads them: height fields, OBJ meshes, and textures that stand in for vertex colours.
+# ---- asset files
 
 
-_CHUNK = 50_000  # lines formatted at once
+_LINES_PER_WRITE = 50_000
 
 
 def write_hfield(path: Path, height: NDArray) -> None:
-    """MuJoCo's binary height field: int32 rows, int32 columns, then float32 row by row from the low-y edge."""
+    """Writes MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge."""
     rows, columns = height.shape
     path.write_bytes(np.array([rows, columns], np.int32).tobytes() + height.astype(np.float32).tobytes())
 
 
 def write_obj(path: Path, vertices: NDArray, faces: NDArray, texcoords: NDArray | None = None) -> None:
-    """A Wavefront OBJ.
+    """Writes a Wavefront OBJ of vertices (v, 3) [m] and faces (f, 3), counter-clockwise seen from outside.
 
-    Args:
-        path: File to write.
-        vertices: Shape (v, 3) [m].
-        faces: Shape (f, 3), counter-clockwise seen from outside.
-        texcoords: Per face and corner, u from the left and v from the top of the picture, shape (f, 3, 2).
+    `texcoords` are the texture coordinates of each face's corners, u from the left, v from the top, shape (f, 3, 2).
     """
     with path.open("w", encoding="ascii") as file:
         _write_lines(file, "v %.5f %.5f %.5f\n", vertices)
         if texcoords is None:
             _write_lines(file, "f %d %d %d\n", faces + 1)
             return
-        flipped = texcoords.reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]  # OBJ counts v from the bottom
+        flipped = texcoords.reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]  # OBJ measures v from the bottom
         _write_lines(file, "vt %.6f %.6f\n", flipped)
         corner = np.arange(1, 3 * len(faces) + 1).reshape(-1, 3)
         _write_lines(file, "f %d/%d %d/%d %d/%d\n", np.stack([faces + 1, corner], -1).reshape(-1, 6))
 
 
 def _write_lines(file, line: str, rows: NDArray) -> None:
-    for start in range(0, len(rows), _CHUNK):
-        part = rows[start : start + _CHUNK]
+    for start in range(0, len(rows), _LINES_PER_WRITE):
+        part = rows[start : start + _LINES_PER_WRITE]
         file.write(line * len(part) % tuple(part.ravel().tolist()))
 
 
-def face_tiles(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """A texture that gives every face its own three corner colours, as MuJoCo knows no vertex colours.
+def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Texture with the vertex colors of each face, since MuJoCo has no vertex colors.
 
-    Each face owns 2 × 2 texels: corners 0, 1, 2 at the centres of three of them and c₁ + c₂ − c₀ in the fourth, which
-    makes bilinear filtering exactly the linear interpolation across the triangle (but where the fourth is clamped).
-
-    Args:
-        colors: Per face and corner, shape (f, 3, 3) uint8.
-
-    Returns:
-        The texture, shape (h, w, 3), and texture coordinates per face and corner, shape (f, 3, 2), u from the left and
-        v from the top.
+    Each face has 2 × 2 texels: its corner colors c₀, c₁, c₂ and c₁ + c₂ − c₀, so that bilinear filtering equals linear
+    interpolation across the triangle (except where the fourth texel is clipped). `colors` (f, 3, 3) uint8 are those of
+    each face's corners. Returns the texture (h, w, 3) and texture coordinates as in `write_obj`.
     """
     count = len(colors)
     across = max(1, int(np.ceil(np.sqrt(count))))
@@ -194,46 +180,39 @@ def face_tiles(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64]]
     return texture, corner / [2 * across, 2 * down]
 
 
-_HFIELD_BASE = 1.0  # [m] of solid below the lowest point, so that nothing tunnels through
-_GROUND_SKIN = 0.15  # [m] above the height field: visual mesh below this is left to the field's own texture
+# ---- scene
+
+
+_HFIELD_BASE = 1.0  # [m] of solid below the lowest point, against tunneling
+_GROUND_OVERLAP = 0.15  # [m] above the height field; visual mesh below this is dropped in favor of its texture
 _SETTLE_TIME = 2.0  # [s]
 _MIN_ROUTE = 2.0  # [m]
-_SITE_SPACING = 1.0  # [m] between the route's sites
+_SITE_SPACING = 1.0  # [m] between sites along the route
 
 
 @dataclass(frozen=True)
 class Parts:
-    """P closed convex hulls [m]."""
+    """Closed convex hulls: vertices (v, 3) [m] and faces (f, 3) of each."""
 
     vertices: list[NDArray[np.float32]]
     faces: list[NDArray[np.int32]]
 
     @staticmethod
     def load(path: Path) -> "Parts":
+        """Reads `parts.npz`."""
         with np.load(path, allow_pickle=False) as data:
             v, f = data["vertex_start"], data["face_start"]
-            return (
-                Parts(np.split(data["vertices"], v[1:-1]), np.split(data["faces"], f[1:-1]))
-                if len(v) > 1
-                else Parts([], [])
-            )
+            if len(v) <= 1:
+                return Parts([], [])
+            return Parts(np.split(data["vertices"], v[1:-1]), np.split(data["faces"], f[1:-1]))
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
-    """Writes the portable scene.
-
-    Args:
-        scene: Reads the stages `metric` (Cameras) and `mesh` (ground.npz, parts.npz, visual.npz and, for a drive,
-            route.npz).
-        config: `mjcf` and `robot`.
-        out: Gets `scene.xml`, `assets/` and, for a drive, `world.json`.
-
-    Returns:
-        Metrics for the report.
+    """Runs the stage, see `twin.build`: writes the scene to `out` from the stages `metric` and `mesh`; returns metrics.
 
     Raises:
-        InputError: the route is too short, starts off the ground or where it is too steep to stand, or something solid
-            pushes the robot away there.
+        InputError: the route is too short, or starts near the edge of the ground, on too steep a slope, or where an
+            obstacle pushes the robot away.
     """
     mesh = scene.stage("mesh")
     ground = Ground.load(mesh)
@@ -246,9 +225,9 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
     husky.set_options(spec, config.robot)
-    # Spares MuJoCo the poses of thousands of geoms that never move; what has motors, the robot, never sleeps.
+    # Saves computing the poses of thousands of static geoms; bodies with motors (the robot) never sleep.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    _add_surroundings(spec)
+    _add_sky_and_lights(spec)
     add_ground(spec, ground, assets, config.mjcf.hfield_cell)
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
@@ -260,7 +239,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
     else:
         camera = config.robot.camera(film_camera(Cameras.load(scene.stage("metric"))))
-        spawn, blocked = _add_robot(spec, ground, route, config.robot, camera)
+        spawn, initial_contacts = _add_robot(spec, ground, route, config.robot, camera)
         _add_route(spec, route, config.mjcf.half_width)
         built = _write(spec, out)
         world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot)
@@ -273,12 +252,12 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         }
     metrics |= check_portable(out, built)
     if route is not None:
-        metrics["spawn_touched"] = sorted(blocked | set(metrics["spawn_touched"]))
+        metrics["spawn_touched"] = sorted(initial_contacts | set(metrics["spawn_touched"]))
     return metrics
 
 
 def load_route(path: Path) -> Array | None:
-    """The route [m], shape (m, 3); None where the mesh stage found none."""
+    """The route [m], shape (m, 3); None if the mesh stage wrote none."""
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as data:
@@ -286,7 +265,7 @@ def load_route(path: Path) -> Array | None:
 
 
 def film_camera(cameras: Cameras) -> PixelCamera:
-    """The real camera of the first training frame."""
+    """The physical camera of the first training frame."""
     training = np.flatnonzero(~cameras.held_out)
     first = int(training[0]) if len(training) else 0
     (width, height), (fx, fy, cx, cy) = cameras.sizes[first].tolist(), cameras.intrinsics[first].tolist()
@@ -294,12 +273,9 @@ def film_camera(cameras: Cameras) -> PixelCamera:
 
 
 def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tuple[Array, Array]:
-    """Base position [m] and quaternion (wxyz) of a robot whose wheels stand on the plane that fits the ground below.
+    """Base position [m] and quaternion (wxyz) of a robot on the plane fitted to the ground below its wheels.
 
-    Args:
-        height_at: Height of the ground [m] at points (n, 2), shape (n,).
-        xy: Of the base [m], shape (2,).
-        yaw: [rad]
+    `height_at` maps points (n, 2) to ground heights (n,) [m]; xy (2,) [m] and yaw [rad] are those of the base.
     """
     forward = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-forward[1], forward[0]])
@@ -318,23 +294,23 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
 
 
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
-    """Which points (v, 3) the height field shows already: below it or hardly above, within its bounds.
+    """Mask of the points (v, 3) within the bounds of the height field and below it or less than 0.15 m above.
 
-    Two surfaces within centimetres of each other would flicker, shade each other and swallow the robot's wheels.
+    Two surfaces within centimeters of each other would flicker, shade each other and hide the robot's wheels.
     """
     rows, columns = ground.height.shape
     cell = (vertices[:, :2] - ground.origin) / ground.cell
     inside = ((cell >= 0) & (cell <= [columns - 1, rows - 1])).all(1)
-    return inside & (vertices[:, 2] - ground.at(vertices[:, :2]) < _GROUND_SKIN)
+    return inside & (vertices[:, 2] - ground.at(vertices[:, :2]) < _GROUND_OVERLAP)
 
 
-def compacted(vertices: NDArray, colors: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Drops the vertices that no face uses."""
+def drop_unused_vertices(vertices: NDArray, colors: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Removes the vertices that no face uses; returns vertices, colors and faces."""
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], colors[used], inverse.reshape(faces.shape)
 
 
-def _add_surroundings(spec: mujoco.MjSpec) -> None:
+def _add_sky_and_lights(spec: mujoco.MjSpec) -> None:
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -357,16 +333,16 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient = (0.4, 0.4, 0.42)
     spec.visual.headlight.diffuse = (0.15, 0.15, 0.15)
     spec.visual.headlight.specular = (0, 0, 0)
-    # Clipping planes are multiples of the extent: 0.1 m and 1 km, however large the scene is.
+    # Clipping planes at 0.1 m and 1 km for any scene size: they are given in multiples of the extent.
     spec.stat.extent = 20.0
     spec.visual.map.znear, spec.visual.map.zfar = 0.005, 50.0
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -> None:
-    """Adds the geom `ground`, a height field of `cell` [m] in the ground's colours, its files in `assets`."""
+    """Adds the geom `ground`, a height field of `cell` [m] in the ground's colors; writes its files to `assets`."""
     coarse = ground.coarsened(cell)
     write_hfield(assets / "ground.bin", coarse.height)
-    # A texel per fine cell, the mean of its corners, as the texture spans the field edge to edge. First row: far (+y).
+    # One texel per fine cell, the mean of its corners, since the texture spans the field edge to edge; first row at +y.
     finer = round(coarse.cell / ground.cell)
     rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
     rgb = ground.rgb[:rows, :columns].astype(np.uint16)
@@ -374,9 +350,9 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -
     write_image(assets / "ground.png", cells[::-1].astype(np.uint8))
     low, high = float(coarse.height.min()), float(coarse.height.max())
     half = np.array([columns - 1, rows - 1]) * ground.cell / 2
-    # MuJoCo maps the file's lowest value to 0 and its highest to size[2]; a level field is all 0 at any size.
+    # MuJoCo maps the lowest value of the file to 0 and the highest to size[2]; a level field is 0 for any size.
     spec.add_hfield(name="ground", file="ground.bin", size=(*half, max(high - low, 1e-3), _HFIELD_BASE))
-    _add_textured(spec, "ground", emission=0.25)
+    _add_textured_material(spec, "ground", emission=0.25)
     spec.worldbody.add_geom(
         name="ground",
         type=mujoco.mjtGeom.mjGEOM_HFIELD,
@@ -387,8 +363,8 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -
     )
 
 
-def _add_textured(spec: mujoco.MjSpec, name: str, emission: float) -> None:
-    """A material with `assets/<name>.png` as its colour. Filmed colours carry their own light, hence the emission."""
+def _add_textured_material(spec: mujoco.MjSpec, name: str, emission: float) -> None:
+    """Adds a material textured with `assets/<name>.png`; it emits light, since filmed colors include the lighting."""
     spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
     material = spec.add_material(name=name, emission=emission, specular=0.0, shininess=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
@@ -398,16 +374,16 @@ def _add_visual(spec: mujoco.MjSpec, ground: Ground, path: Path, assets: Path) -
     with np.load(path, allow_pickle=False) as data:
         vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
     faces = faces[~covered_by_ground(vertices, ground)[faces].all(1)]
-    vertices, colors, faces = compacted(vertices, colors, faces)
+    vertices, colors, faces = drop_unused_vertices(vertices, colors, faces)
     if len(faces) == 0:
         return 0
-    texture, texcoords = face_tiles(colors[faces])
+    texture, texcoords = face_texture(colors[faces])
     write_image(assets / "visual.png", texture)
     write_obj(assets / "visual.obj", vertices, faces, texcoords)
     mesh = spec.add_mesh(name="visual", file="visual.obj")
-    # An open surface has no volume.
+    # SHELL: an open surface has no volume.
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    _add_textured(spec, "visual", emission=0.4)
+    _add_textured_material(spec, "visual", emission=0.4)
     spec.worldbody.add_geom(
         name="visual",
         type=mujoco.mjtGeom.mjGEOM_MESH,
@@ -426,7 +402,7 @@ def _add_parts(spec: mujoco.MjSpec, parts: Parts, assets: Path) -> None:
         write_obj(assets / f"{name}.obj", vertices, faces)
         mesh = spec.add_mesh(name=name, file=f"{name}.obj")
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        # Neighbours in different hues, so that one sees where a part ends.
+        # Consecutive parts differ in hue, which shows their borders.
         hue = (i * 0.618034) % 1.0
         rgb = 0.5 + 0.4 * np.cos(2 * np.pi * (hue + np.array([0.0, 1 / 3, 2 / 3])))
         spec.worldbody.add_geom(
@@ -437,11 +413,11 @@ def _add_parts(spec: mujoco.MjSpec, parts: Parts, assets: Path) -> None:
 def _add_robot(
     spec: mujoco.MjSpec, ground: Ground, route: Array, params: HuskyParams, camera: PixelCamera
 ) -> tuple[tuple[float, float, float, float], set[str]]:
-    """Puts the Husky at the route's start, lets it settle, and keeps that as keyframe `spawn`.
+    """Adds the Husky at the start of the route, lets it settle, and stores its state as the keyframe `spawn`.
 
     Returns:
-        x, y, z [m] and yaw [rad] at rest, and the names of what stood in its place besides the ground (and may have
-        pushed it aside).
+        x, y, z [m] and yaw [rad] at rest, and the names of the geoms except the ground that it touched before settling
+        (they may have pushed it aside).
     """
     length = float(arc_lengths(route)[-1])
     if length < _MIN_ROUTE:
@@ -457,28 +433,29 @@ def _add_robot(
         )
     position, quaternion = rest_pose(ground.at, route[0, :2], yaw)
     x, y = quaternion[1:3]
-    fall, steepest = np.degrees(np.arccos(1 - 2 * (x * x + y * y))), np.degrees(np.arctan(params.friction))
-    if fall >= steepest:
+    slope, max_slope = np.degrees(np.arccos(1 - 2 * (x * x + y * y))), np.degrees(np.arctan(params.friction))
+    if slope >= max_slope:
         raise InputError(
-            f"the ground at the route's start falls by {fall:.1f}°, expected at most {steepest:.1f}° for tyres of "
-            f"friction {params.friction:g} to hold; film from a flatter start, or raise the robot's friction"
+            f"the ground at the start of the route falls by {slope:.1f}°, expected at most {max_slope:.1f}° for "
+            f"tires of friction {params.friction:g} to hold; film from a flatter start, or raise the robot's friction"
         )
     husky.add_husky(spec, position, quaternion, params, camera)
-    model = husky.held(spec.compile())
+    model = husky.stiffen_for_rest(spec.compile())
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    blocked = touched_names(model, data)
+    initial_contacts = contact_geom_names(model, data)
     mujoco.mj_step(model, data, int(_SETTLE_TIME / husky.TIMESTEP))
     moved = float(np.linalg.norm(data.qpos[:2] - position[:2]))
     if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
         raise InputError(
-            f"the robot does not rest at the route's start: moved {moved:.2f} m, {data.qpos[2] - position[2]:+.2f} m "
-            f"up in {_SETTLE_TIME:g} s, expected < 0.05; something solid is there: raise mesh.obstacle_height"
+            f"the robot does not rest at the start of the route: moved {moved:.2f} m, "
+            f"{data.qpos[2] - position[2]:+.2f} m up in {_SETTLE_TIME:g} s, expected < 0.05; "
+            "an obstacle is there: raise mesh.obstacle_height"
         )
     spec.add_key(name="spawn", qpos=data.qpos)
     x, y, z = data.qpos[:3]
     forward = data.body("base_link").xmat.reshape(3, 3)[:, 0]
-    return (float(x), float(y), float(z), float(np.arctan2(forward[1], forward[0]))), blocked
+    return (float(x), float(y), float(z), float(np.arctan2(forward[1], forward[0]))), initial_contacts
 
 
 def _add_route(spec: mujoco.MjSpec, route: Array, half_width: float) -> None:

@@ -1,8 +1,8 @@
-"""The finished scene: a portable MJCF folder, and what a driver must know about it.
+"""A drivable scene on disk (`world.json` beside `scene.xml`), and the geometry of its route.
 
-*Route*: the filmed path on the ground, a polyline in driving order. *Arc length* s runs along it in the plane, from 0
-at its start. *Cross-track error*: distance from the route in the plane, positive to its left. *Heading*: angle of the
-route from the x axis, positive towards y. *Corridor*: what lies within `half_width` of the route.
+*Route*: the filmed path on the ground, a polyline in driving order. *Arc length* s: distance along the route in the
+plane, 0 at its start. *Cross-track error*: distance from the route in the plane, positive to its left. *Heading*: angle
+from the x axis, positive towards y. *Corridor*: the area within `half_width` of the route.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -11,14 +11,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from twin.config_file import parse
-from twin.files import check_shapes, checked_text, damaged, read_json, write_json
+from twin.config_file import parse_table
+from twin.files import check_shapes, read_json, require_text, wrap_read_errors, write_json
 from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
 from twin.types import Array
 
 SCENE_XML = "scene.xml"
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
-"""Geom groups, and that of the sites along the route."""
+"""Geom groups; the last one is the site group of route, corridor and goal."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class World:
     """A drivable scene on disk."""
 
     route: Array
-    """On the ground [m], shape (m, 3), m ≥ 2, in driving order."""
+    """Points on the ground in driving order [m], shape (m, 3), m ≥ 2."""
     half_width: float
     """Half width of the drivable corridor [m]."""
     spawn: tuple[float, float, float, float]
@@ -36,11 +36,11 @@ class World:
     camera: PixelCamera = ZED2
     """The front camera at its native size."""
     robot: HuskyParams = field(default_factory=HuskyParams)
-    """What was built into the scene, and what its controller and its camera go by."""
+    """Parameters of the robot in the scene, of its controller and of its camera."""
     names: dict[str, str] = field(
         default_factory=lambda: {"body": "base_link", "camera": "front", "ground": "ground", "keyframe": "spawn"}
     )
-    """What the things in the MJCF are called."""
+    """Names in the MJCF of the `body`, `camera`, `ground` and `keyframe`."""
 
     @property
     def intrinsics(self) -> Array:
@@ -82,10 +82,10 @@ class World:
 
     @staticmethod
     def load(folder: Path) -> "World":
-        """Raises InputError: no such file, or not one that `save` wrote."""
+        """Reads `world.json`. Raises InputError: it is missing or damaged."""
         path = folder / "world.json"
         head = read_json(path)
-        with damaged(path, "build the scene again"):
+        with wrap_read_errors(path, "build the scene again"):
             x, y, z, yaw = map(float, head["spawn"])
             (fx, fy, cx, cy), (width, height) = head["camera"]["native_intrinsics"], head["camera"]["native_size"]
             world = World(
@@ -93,33 +93,36 @@ class World:
                 half_width=float(head["half_width"]),
                 spawn=(x, y, z, yaw),
                 camera=PixelCamera((float(fx), float(fy), float(cx), float(cy)), (int(width), int(height))),
-                robot=parse(HuskyParams, head["robot"], str(path)),
+                robot=parse_table(HuskyParams, head["robot"], str(path)),
                 folder=folder,
-                names={checked_text(key): checked_text(name) for key, name in head["names"].items()},
+                names={require_text(key): require_text(name) for key, name in head["names"].items()},
             )
             m = len(world.route)
             check_shapes({"route": (world.route, (m, 3), "f")})
             if m < 2 or not world.half_width > 0.0 or min(fx, fy, width, height) <= 0:
-                raise ValueError(f"a route of {m} points {world.half_width} m to a side, filmed at {width} × {height}")
+                raise ValueError(
+                    f"{m} route points, half width {world.half_width} m, a camera of {width} × {height} px with focal "
+                    f"lengths {fx:g}, {fy:g} px; expected at least 2 points, and positive sizes"
+                )
             missing = {"body", "camera", "ground", "keyframe"} - world.names.keys()
             if missing:
-                raise ValueError(f"no name of {', '.join(sorted(missing))}")
+                raise ValueError(f"names of {', '.join(sorted(missing))} missing")
         return world
 
 
 def arc_lengths(route: Array) -> Array:
-    """Arc length at each vertex [m], shape (m, ≥2) → (m,)."""
+    """Arc length at each vertex of a route (m, ≥2), shape (m,) [m]."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route[:, :2], axis=0), axis=1))])
 
 
 def point_at(route: Array, s: Array | float) -> Array:
-    """Points at arc lengths s [m]; beyond an end, that end. Shapes (m, d) and (...) → (..., d)."""
+    """Points (..., d) of a route (m, d) at arc lengths s (...) [m]; s is clamped to the ends."""
     knots = arc_lengths(route)
     return np.stack([np.interp(s, knots, route[:, k]) for k in range(route.shape[1])], -1)
 
 
 def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
-    """Heading [rad] at arc lengths s: of the chord over `window` [m] around each, shape as s."""
+    """Heading [rad] at arc lengths s, of the chord over `window` [m] around each; shape as s."""
     length = arc_lengths(route)[-1]
     window = min(window, length)
     middle = np.clip(s, window / 2, length - window / 2)
@@ -127,21 +130,23 @@ def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
     return np.arctan2(chord[..., 1], chord[..., 0])
 
 
-def nearest(route: Array, xy: Array, around: tuple[Array | float, Array | float] | None = None) -> tuple[Array, Array]:
-    """Foot of the perpendicular on the route.
+def nearest_on_route(
+    route: Array, xy: Array, around: tuple[Array | float, Array | float] | None = None
+) -> tuple[Array, Array]:
+    """Nearest points of the route.
 
     Args:
         route: Shape (m, ≥2).
-        xy: Points, shape (..., 2).
-        around: Arc lengths between which to look [m], for a route that meets itself, for all points or of shape (...);
-            everywhere by default.
+        xy: Query points, shape (..., 2).
+        around: Lowest and highest arc length to search [m], each a number or of shape (...), for a route that meets
+            itself; the whole route by default.
 
     Returns:
-        Arc length of the foot [m] and cross-track error [m], both of shape (...).
+        Arc length of the nearest point [m] and cross-track error [m], both of shape (...).
     """
     knots, xy = arc_lengths(route), np.asarray(xy)
     low, high = (knots[0], knots[-1]) if around is None else around
-    # Of every point, the segments that reach into its range: a run of them, as long as the longest of all points.
+    # The consecutive segments that overlap each range, padded to the longest such run.
     first = np.broadcast_to(np.searchsorted(knots[1:], low), xy.shape[:-1])
     last = np.broadcast_to(np.searchsorted(knots[:-1], high, "right"), xy.shape[:-1])
     run = first[..., None] + np.arange(np.max(last - first, initial=1))
@@ -149,30 +154,30 @@ def nearest(route: Array, xy: Array, around: tuple[Array | float, Array | float]
     start, step = route[run, :2], np.diff(route[:, :2], axis=0)[run]
     offset = xy[..., None, :] - start
     length_2 = np.maximum((step**2).sum(-1), 1e-18)
-    share = np.clip((offset * step).sum(-1) / length_2, 0.0, 1.0)
-    miss = offset - share[..., None] * step
-    best = np.argmin(np.where(inside, (miss**2).sum(-1), np.inf), -1)[..., None]
+    fraction = np.clip((offset * step).sum(-1) / length_2, 0.0, 1.0)
+    residual = offset - fraction[..., None] * step
+    best = np.argmin(np.where(inside, (residual**2).sum(-1), np.inf), -1)[..., None]
     cross = step[..., 0] * offset[..., 1] - step[..., 1] * offset[..., 0]
-    distance = np.take_along_axis(np.linalg.norm(miss, axis=-1), best, -1)[..., 0]
+    distance = np.take_along_axis(np.linalg.norm(residual, axis=-1), best, -1)[..., 0]
     side = np.sign(np.take_along_axis(cross, best, -1)[..., 0])
-    s = np.take_along_axis(knots[run] + share * np.sqrt(length_2), best, -1)[..., 0]
+    s = np.take_along_axis(knots[run] + fraction * np.sqrt(length_2), best, -1)[..., 0]
     return s, np.where(side < 0, -distance, distance)
 
 
 def total_turn(route: Array) -> float:
-    """How far the heading turns from the route's start to its end [rad], left positive, full turns counted."""
+    """Total change of heading along the route [rad], left positive, full turns counted."""
     s = np.append(np.arange(0.0, arc_lengths(route)[-1], 0.25), np.inf)
     heading = np.unwrap(heading_at(route, s))
     return float(heading[-1] - heading[0])
 
 
 def corridor_edges(route: Array, half_width: float) -> tuple[Array, Array]:
-    """Left and right edge of the corridor at the route's vertices, shapes (m, 3); heights are the route's."""
+    """Left and right edges of the corridor at the vertices and heights of the route, shapes (m, 3)."""
     heading = heading_at(route, arc_lengths(route))
     normal = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1) * half_width
     return route + normal, route - normal
 
 
-def heading_error(wanted: Array | float, actual: Array | float) -> Array:
-    """wanted − actual, wrapped to ±π [rad]."""
-    return (np.asarray(wanted) - actual + np.pi) % (2 * np.pi) - np.pi
+def heading_error(target: Array | float, actual: Array | float) -> Array:
+    """target − actual, wrapped to ±π [rad]."""
+    return (np.asarray(target) - actual + np.pi) % (2 * np.pi) - np.pi

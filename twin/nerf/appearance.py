@@ -1,7 +1,6 @@
-"""What makes one place look different: the appearance embedding.
+"""Appearance embeddings in training: a vector per lighting plus a small residual per frame.
 
-The embedding of a frame is its *lighting*'s vector plus a *residual* of its own, which is kept small and takes up what
-drifts within a film (exposure). `lightings.py` says how one is asked for by name.
+The residual models drift within a film, such as exposure. `lightings.py` looks embeddings up by name.
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ from twin.nerf.lightings import Lightings
 
 
 class Appearance:
-    """The embeddings of a field's lightings and frames."""
+    """Embeddings of a field's lightings and frames."""
 
     def __init__(
         self,
@@ -25,11 +24,9 @@ class Appearance:
     ):
         """
         Args:
-            lightings: Names, in the order of `vectors`.
-            frames: Names of the training frames, in the order of `residuals`.
+            lightings: Names of the `vectors` (lightings, dim).
+            frames: Names of the training frames, of the `residuals` (n, dim).
             frame_lighting: Index of each frame's lighting, shape (n,).
-            vectors: Shape (lightings, dim).
-            residuals: Shape (n, dim).
             stale: See `Lightings.stale`.
         """
         self.lightings, self.frames, self.frame_lighting = lightings, frames, frame_lighting
@@ -37,11 +34,11 @@ class Appearance:
         self.lighting_of_frame = torch.as_tensor(frame_lighting, device=vectors.device)
 
     def of_frames(self, frame: torch.Tensor) -> torch.Tensor:
-        """Embeddings of frame indices, shape (k,) → (k, dim)."""
+        """Embeddings (k, dim) of frame indices (k,)."""
         return self.vectors[self.lighting_of_frame[frame]] + self.residuals[frame]
 
     def named(self) -> Lightings:
-        """All embeddings by name, as plain arrays."""
+        """All embeddings by name, as NumPy arrays."""
         every = torch.arange(len(self.frames), device=self.vectors.device)
         with torch.no_grad():
             vectors, frame_vectors = self.vectors.detach().cpu().numpy(), self.of_frames(every).cpu().numpy()
@@ -63,7 +60,7 @@ class Appearance:
 def initial_appearance(
     lightings: tuple[str, ...], frames: tuple[str, ...], frame_lighting: NDArray[np.int64], dim: int, seed: int
 ) -> Appearance:
-    """Lightings apart at random, residuals zero."""
+    """Random lighting vectors and zero residuals."""
     rng = np.random.default_rng([seed, 1])
     vectors = torch.as_tensor(rng.normal(0.0, 0.3, (len(lightings), dim)).astype(np.float32))
     return Appearance(lightings, frames, frame_lighting, vectors, torch.zeros(len(frames), dim))

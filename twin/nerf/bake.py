@@ -1,6 +1,6 @@
-"""From a radiance field to bricks: sampled where a camera saw matter, fine-tuned on the training frames, put in bytes.
+"""Bakes a radiance field: samples it into bricks around surfaces, fine-tunes these on the training frames, quantizes.
 
-Vocabulary as in `kernels/bricks.py`. The networks and embeddings stay as they were trained; only the samples are tuned.
+Terms as in `kernels/bricks.py`. Fine-tuning changes the samples only; networks and embeddings stay as trained.
 """
 
 import time
@@ -8,70 +8,70 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.nerf import network
 from twin.nerf.baked import BakedField
-from twin.nerf.brick_layout import BrickLayout, brick_indices, leaps
-from twin.nerf.buffers import CameraArrays, Workspace, parallel, single_threaded_torch, view
+from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
+from twin.nerf.buffers import CameraArrays, Workspace, parallel, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
-from twin.nerf.field import RadianceField
+from twin.nerf.field import QUERY_POINTS, RadianceField
 from twin.nerf.kernels import bricks as kernels
 from twin.nerf.kernels import composite as volume
 from twin.runtime import bar
+from twin.warp_runtime import wp
 
 _SHARDS = 4
 _RAYS = 4096  # per step of fine-tuning
-_VIEWS = 64  # that tell where matter is, at most, spread evenly
-_LOOK = 112  # [px] width of the looks that tell where matter is
-_SAMPLES = 24
-_SEEN = 0.004  # weight from which a place counts as matter
-_FINEST = 0.03  # [m] side of the near cells at best
-_COARSENING = 1.15
-_COARSE, _MORE = 0.15, 1.39  # [m] side of near cells from which there may be so many times the bricks: 7 % of speed
-_FAR_COARSER = 4.0  # cells of the far grid over those of the near one
-_NOTHING = -8.0  # raw density where no brick is
-_RAW_RANGE = (-6.0, 12.0)  # of raw density, that bytes cover
-_TAIL = 2e-4  # share of the features' values beyond what bytes cover
-_RATES = (0.05, 0.02)  # of raw density and features
-_BATCH = 65536
-_PROBES = 1024  # rays that random lightings are judged on, see `appearance_prior.py`
+_VIEWS = 64  # training views that find the surfaces, at most, evenly spaced
+_VIEW_WIDTH = 112  # [px] of these views
+_SAMPLES = 24  # per ray
+_MIN_WEIGHT = 0.004  # compositing weight from which a sample lies on a surface
+_MIN_CELL = 0.03  # [m] least side of near cells
+_COARSENING = 1.15  # least growth of cells per attempt
+_LARGE_CELL = 0.15  # [m] near cells above this side allow _EXTRA_BRICKS times the bricks, for 7 % of the speed
+_EXTRA_BRICKS = 1.39
+_FAR_CELL_RATIO = 4.0  # side of far cells over that of near cells
+_EMPTY_RAW_DENSITY = -8.0  # raw density outside all bricks
+_RAW_RANGE = (-6.0, 12.0)  # raw densities that a byte covers
+_CLIPPED_SHARE = 2e-4  # share of feature values clipped at each end of a byte's range
+_RATES = (0.05, 0.02)  # learning rates of raw density and features
+_PROBES = 1024  # rays for the prior of random lightings, see `appearance_prior.py`
 
 
 def bake(
-    field: RadianceField, pixels: TrainingPixels, seed: int = 0, steps: int = 300, most_bricks: int = 9000
+    field: RadianceField, pixels: TrainingPixels, seed: int = 0, steps: int = 300, max_bricks: int = 9000
 ) -> tuple[BakedField, dict[str, Any]]:
-    """A baked field and what there is to say of it.
+    """Bakes a trained field; returns the baked field and a summary.
 
     Args:
         field: A trained field.
         pixels: The frames it was trained on.
-        seed: Of the fine-tuning's batches.
-        steps: Of fine-tuning, at least 1.
-        most_bricks: Cells grow until there are no more bricks than this, 9,000 being 105 MB; no more than 1.39 times
-            as many where cells would come out larger than 15 cm, as those of a long road do.
+        seed: Seed of the fine-tuning batches.
+        steps: Fine-tuning steps, at least 1.
+        max_bricks: Cells grow until there are at most this many bricks (9,000 are 105 MB), or 1.39 times as many where
+            cells would exceed 15 cm, as on a long road.
 
     Raises:
-        InputError: no camera sees anything in the field.
+        InputError: no training camera sees a surface in the field.
     """
     began = time.perf_counter()
-    near, far = _matter(field, pixels)
+    near, far = _surface_positions(field, pixels)
     if not len(near) and not len(far):
         raise InputError(
             "no training camera sees anything in the trained field, so there is nothing to bake; raise nerf.steps, or "
             "lower nerf.near_plane or set nerf.near_half_extent = 0 where these were changed"
         )
-    layout, slots = _layout(field, near, far, most_bricks)
-    if layout.near_side.max() / kernels.CELLS > _COARSE:
-        layout, slots = _layout(field, near, far, round(_MORE * most_bricks))
-    values = _sample(field, layout, slots)
-    tuner = _Tuner(field, pixels, layout, slots, values, steps, seed)
+    layout, slots = _layout(field, near, far, max_bricks)
+    if layout.near_side.max() / kernels.CELLS > _LARGE_CELL:
+        layout, slots = _layout(field, near, far, round(_EXTRA_BRICKS * max_bricks))
+    values = _sample_bricks(field, layout, slots)
+    tuner = _FineTuner(field, pixels, layout, slots, values, steps, seed)
     error = tuner.run()
     del tuner
-    arrays = _in_bytes(values, slots, field, layout) | _probes(field, pixels, seed)
-    baked = BakedField(layout, field.appearance.named(), arrays, field.where, field.about)
+    arrays = _quantized(values, slots, field, layout) | _probes(field, pixels, seed)
+    baked = BakedField(layout, field.appearance.named(), arrays, field.device, field.about)
     return baked, {
         "bricks_near": len(slots[0]),
         "bricks_far": len(slots[1]),
@@ -82,56 +82,55 @@ def bake(
     }
 
 
-def _matter(field: RadianceField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Grid positions of samples in and outside the near box that the training cameras see matter at."""
-    cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, field.where)
+def _surface_positions(field: RadianceField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Grid positions of surface samples seen by the training cameras, (a, 3) in the near box and (b, 3) outside."""
+    cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, field.device)
     frames = np.unique(np.linspace(0, len(pixels.cameras) - 1, _VIEWS).round().astype(int))
     spots: list[tuple[NDArray, NDArray]] = [(np.zeros((0, 3), "f4"),) * 2] * len(frames)
 
-    with bar("looking for matter", len(spots), "view") as progress:
+    with bar("finding surfaces", len(spots), "view") as progress:
 
         @torch.no_grad()
-        def look(k: int) -> None:
+        def find(k: int) -> None:
             i = int(frames[k])
-            width = min(_LOOK, int(pixels.width[i]))
+            width = min(_VIEW_WIDTH, int(pixels.width[i]))
             height = max(1, round(width * pixels.height[i] / pixels.width[i]))
             v, u = (np.mgrid[:height, :width] + 0.5) * (pixels.width[i] / width)
             n = width * height
-            ws = field._borrow(n, _SAMPLES, 0)
-            ws.camera.fill_(i)
-            ws.pixel.copy_(torch.as_tensor(np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)))
-            field.cast(ws, cameras, 0, n)
-            field.sample(ws, 0, n, 0.02)
-            field.query(ws, 0, n * _SAMPLES)
-            field.composite(ws, 0, n)
-            seen = ws.positions[: n * _SAMPLES][ws.weights.reshape(-1) > _SEEN].cpu().numpy()
+            with field.workspace(n, _SAMPLES) as ws:
+                ws.camera.fill_(i)
+                ws.pixel.copy_(torch.as_tensor(np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)))
+                field.cast(ws, cameras, 0, n)
+                field.sample(ws, 0, n, 0.02)
+                field.query(ws, 0, n * _SAMPLES)
+                field.composite(ws, 0, n)
+                seen = ws.positions[: n * _SAMPLES][ws.weights.reshape(-1) > _MIN_WEIGHT].cpu().numpy()
             inside = ((seen >= 0.25) & (seen < 0.75)).all(1)
             spots[k] = seen[inside].copy(), seen[~inside].copy()
-            field._spare.append(ws)
             progress.update()
 
         with single_threaded_torch():
-            parallel(look, range(len(spots)), field.where)
+            parallel(find, range(len(spots)), field.device)
     return np.concatenate([a for a, _ in spots]), np.concatenate([b for _, b in spots])
 
 
 def _layout(
-    field: RadianceField, near: NDArray, far: NDArray, most: int
+    field: RadianceField, near: NDArray, far: NDArray, max_bricks: int
 ) -> tuple[BrickLayout, tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """The finest layout whose bricks around matter are few enough, and where these are."""
+    """The finest layout with at most `max_bricks` bricks around surfaces, and the near and far bricks, each (s, 3)."""
     half = np.array(field.layout.half)
-    cell = _FINEST
+    cell = _MIN_CELL
     while True:
         near_shape = np.maximum(np.ceil(2 * half / (cell * kernels.CELLS)), 1).astype(int)
-        far_shape = np.maximum(np.ceil(4 * half / (cell * _FAR_COARSER * kernels.CELLS)), 4).astype(int)
+        far_shape = np.maximum(np.ceil(4 * half / (cell * _FAR_CELL_RATIO * kernels.CELLS)), 4).astype(int)
         slots = _bricks_around(near * 2.0 - 0.5, near_shape), _bricks_around(far, far_shape)
-        # The far grid leaves to the near one what lies wholly inside the near box.
+        # The near grid covers bricks that lie wholly inside the near box.
         low, high = slots[1] / far_shape, (slots[1] + 1) / far_shape
         slots = slots[0], slots[1][~((low >= 0.25) & (high <= 0.75)).all(1)]
         count = sum(map(len, slots))
-        if count <= most:
+        if count <= max_bricks:
             break
-        cell *= max(_COARSENING, (count / most) ** 0.4)
+        cell *= max(_COARSENING, (count / max_bricks) ** 0.4)
     shapes = [tuple(int(x) for x in shape) for shape in (near_shape, far_shape)]
     layout = BrickLayout(
         *(field.layout.centre, field.layout.half, field.layout.near_plane, field.layout.density_unit),
@@ -141,7 +140,7 @@ def _layout(
 
 
 def _bricks_around(spots: NDArray, shape: NDArray) -> NDArray[np.int64]:
-    """Bricks (s, 3) that spots in [0, 1)³ fall into, or miss by less than a cell; sorted."""
+    """Sorted bricks (s, 3) that contain positions in [0, 1)³ or lie less than a cell away from them."""
     marked = np.zeros(shape, bool)
     at = spots * shape
     margin = 1.0 / kernels.CELLS
@@ -152,31 +151,30 @@ def _bricks_around(spots: NDArray, shape: NDArray) -> NDArray[np.int64]:
     return np.argwhere(marked)
 
 
-def _sample(field: RadianceField, layout: BrickLayout, slots: tuple[NDArray, NDArray]) -> torch.Tensor:
-    """The field's raw densities and features at the samples of all slots, shape (s, 729, CHANNELS)."""
+def _sample_bricks(field: RadianceField, layout: BrickLayout, slots: tuple[NDArray, NDArray]) -> torch.Tensor:
+    """Raw densities and features of the field at all brick samples, shape (s, 729, CHANNELS)."""
     grid = np.stack(np.meshgrid(*[np.arange(kernels.CORNERS)] * 3, indexing="ij"), -1).reshape(-1, 3) / kernels.CELLS
     near = (slots[0][:, None] + grid) / np.array(layout.near_shape) * 0.5 + 0.25
     far = (slots[1][:, None] + grid) / np.array(layout.far_shape)
-    places = np.concatenate([near.reshape(-1, 3), far.reshape(-1, 3)]).astype(np.float32).clip(0.0, 1.0 - 1e-6)
-    values = torch.empty(len(places), volume.CHANNELS, device=field.where)
+    positions = np.concatenate([near.reshape(-1, 3), far.reshape(-1, 3)]).astype(np.float32).clip(0.0, 1.0 - 1e-6)
+    values = torch.empty(len(positions), volume.CHANNELS, device=field.device)
 
     @torch.no_grad()
     def one(start: int) -> None:
-        ws = field._borrow(0, 1, _BATCH)
-        n = min(_BATCH, len(places) - start)
-        ws.positions[:n] = torch.as_tensor(places[start : start + n], device=field.where)
-        field.query(ws, 0, n)
-        values[start : start + n] = ws.outputs[:n]
-        field._spare.append(ws)
+        n = min(QUERY_POINTS, len(positions) - start)
+        with field.workspace(0, 1, QUERY_POINTS) as ws:
+            ws.positions[:n] = torch.as_tensor(positions[start : start + n], device=field.device)
+            field.query(ws, 0, n)
+            values[start : start + n] = ws.outputs[:n]
 
     with single_threaded_torch():
-        parallel(one, range(0, len(places), _BATCH), field.where)
+        parallel(one, range(0, len(positions), QUERY_POINTS), field.device)
     values[:, 0].clamp_(*_RAW_RANGE)
     return values.view(-1, kernels.SAMPLES, volume.CHANNELS)
 
 
-class _Tuner:
-    """Fine-tuning: rays through the training frames, back into the samples."""
+class _FineTuner:
+    """Fits brick samples to the training frames by gradient descent through the renderer."""
 
     def __init__(
         self,
@@ -189,46 +187,45 @@ class _Tuner:
         seed: int,
     ):
         self.field, self.pixels, self.steps, self.values, self.seed = field, pixels, steps, values, seed
-        where = field.where
+        device = field.device
         near, far = brick_indices(layout, *slots)
         self.index: list[Any] = [
-            wp.array(near, dtype=wp.int32, device=where),
-            wp.array(far, dtype=wp.int32, device=where),
+            wp.array(near, dtype=wp.int32, device=device),
+            wp.array(far, dtype=wp.int32, device=device),
         ]
-        self.gradient, self.second = torch.zeros_like(values), torch.zeros(*values.shape[:2], 2, device=where)
-        self.w_values, self.w_gradient = view(values, volume.Channels), view(self.gradient, volume.Channels)
-        self.w_second = view(self.second, wp.vec2f)
+        self.gradient, self.second = torch.zeros_like(values), torch.zeros(*values.shape[:2], 2, device=device)
+        self.w_values, self.w_gradient = warp_view(values, volume.Channels), warp_view(self.gradient, volume.Channels)
+        self.w_second = warp_view(self.second, wp.vec2f)
         self.rays = -(-_RAYS // _SHARDS) * _SHARDS
-        self.ws = Workspace(field.layout, self.rays, _SAMPLES, where, training=True)
-        self.cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, where)
+        self.ws = Workspace(field.layout, self.rays, _SAMPLES, device, training=True)
+        self.cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, device)
 
     def run(self) -> float:
-        """Tunes the values in place; the PSNR [dB] on the last tenth of the batches."""
+        """Tunes the values in place; returns the PSNR [dB] over the last tenth of the batches."""
         rng = np.random.default_rng([self.seed, 5])
         errors = []
         steps = self.steps
-        parts = _SHARDS
         with bar("fine-tuning", steps, "step") as progress, single_threaded_torch():
             for step in range(steps):
                 batch = self.pixels.batch(rng, _SHARDS, 0, self.rays // _SHARDS, 0)
                 self.ws.camera.copy_(torch.from_numpy(batch.frame))
                 self.ws.pixel.copy_(torch.from_numpy(batch.pixel))
                 self.ws.targets.zero_()
-                colour = torch.from_numpy(batch.colour).to(self.field.where)
+                color = torch.from_numpy(batch.color).to(self.field.device)
                 decay = 0.05 ** (step / steps)
 
-                def go(shard: int, colour: torch.Tensor = colour, step: int = step) -> float:
-                    return self._shard(shard, colour, step)
+                def backward(shard: int, color: torch.Tensor = color, step: int = step) -> float:
+                    return self._backward(shard, color, step)
 
                 def update(part: int, decay: float = decay, step: int = step) -> None:
-                    self._update(part, parts, decay, step)
+                    self._update(part, _SHARDS, decay, step)
 
-                errors.append(sum(parallel(go, range(_SHARDS), self.field.where)) / _SHARDS)
-                parallel(update, range(parts), self.field.where)
+                errors.append(sum(parallel(backward, range(_SHARDS), self.field.device)) / _SHARDS)
+                parallel(update, range(_SHARDS), self.field.device)
                 progress.update()
         return float(-10 * np.log10(np.mean(errors[-max(1, steps // 10) :])))
 
-    def _shard(self, shard: int, colour: torch.Tensor, step: int) -> float:
+    def _backward(self, shard: int, color: torch.Tensor, step: int) -> float:
         f, ws = self.field, self.ws
         count = self.rays // _SHARDS
         start = shard * count
@@ -238,16 +235,16 @@ class _Tuner:
         wp.launch(
             kernels.interpolate,
             count * _SAMPLES,
-            [ws.w_positions, *self.index, self.w_values, _NOTHING, samples.start],
+            [ws.w_positions, *self.index, self.w_values, _EMPTY_RAW_DENSITY, samples.start],
             [ws.w_outputs],
-            device=f.where,
+            device=f.device,
         )
         f.composite(ws, start, count)
         composited = ws.composited[rays].detach().requires_grad_(True)
         harmonics = network.spherical_harmonics(ws.directions[rays])
         features = network.ray_features(f.parameters, composited, harmonics)
         embedding = f.appearance.of_frames(ws.camera[rays].long())
-        error = network.head(f.parameters, features, harmonics, embedding) - colour[rays]
+        error = network.head(f.parameters, features, harmonics, embedding) - color[rays]
         loss = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.1) / _SHARDS
         (gradient,) = torch.autograd.grad(loss, [composited])
         with torch.no_grad():
@@ -261,17 +258,17 @@ class _Tuner:
                     *(ws.w_composited_grad, ws.w_inverse_grad, f.layout.density_unit, 0.0, 0.0, 1.0, 1.0, start),
                 ],
                 [ws.w_ray_outputs_grad],
-                device=f.where,
+                device=f.device,
             )
         return float((error.detach() ** 2).mean())
 
     def _update(self, part: int, parts: int, rate: float, step: int) -> None:
-        w_outputs_grad = view(self.ws.outputs_grad, volume.Channels)
+        w_outputs_grad = warp_view(self.ws.outputs_grad, volume.Channels)
         wp.launch(
             kernels.interpolate_backward,
             self.rays * _SAMPLES,
             [self.ws.w_positions, *self.index, w_outputs_grad, part, parts, self.w_gradient],
-            device=self.field.where,
+            device=self.field.device,
         )
         t = step + 1
         wp.launch(
@@ -282,28 +279,28 @@ class _Tuner:
                 volume.Channels(_RATES[0] * rate, *[_RATES[1] * rate] * (volume.CHANNELS - 1)),
                 *(1.0 / (1.0 - 0.99**t), self.w_values, self.w_gradient, self.w_second),
             ],
-            device=self.field.where,
+            device=self.field.device,
         )
 
 
 def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str, NDArray]:
-    """Rays spread over the training frames, as `plausible.Probes` takes them."""
+    """Random rays through the training frames, as arrays of `appearance_prior.Probes`."""
     rng = np.random.default_rng([seed, 6])
     frame = np.linspace(0, len(pixels.cameras) - 1, _PROBES).round().astype(int)
     pixel = rng.random((_PROBES, 2)) * np.stack([pixels.width, pixels.height], 1)[frame]
-    cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, field.where)
+    cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, field.device)
     features, harmonics, _, _ = field.trace(cameras, frame, pixel)
     return {"probes.features": features.cpu().numpy(), "probes.harmonics": harmonics.cpu().numpy()}
 
 
-def _in_bytes(
+def _quantized(
     values: torch.Tensor, slots: tuple[NDArray, NDArray], field: RadianceField, layout: BrickLayout
 ) -> dict[str, NDArray]:
-    """Arrays as `BakedField` takes them. The values are used up."""
+    """Arrays of a `BakedField`. Overwrites the values."""
     flat = values.view(-1, volume.CHANNELS)
-    matter = torch.nonzero(flat[:, 0] > 0.0)[:, 0]
-    some = flat[matter[:: max(1, len(matter) // 200_000)] if len(matter) else slice(None, None, 100)].cpu().numpy()
-    low, high = np.quantile(some, [_TAIL, 1.0 - _TAIL], axis=0).astype(np.float32)
+    dense = torch.nonzero(flat[:, 0] > 0.0)[:, 0]
+    some = flat[dense[:: max(1, len(dense) // 200_000)] if len(dense) else slice(None, None, 100)].cpu().numpy()
+    low, high = np.quantile(some, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0).astype(np.float32)
     low[0], high[0] = _RAW_RANGE
     step = (np.maximum(high - low, 1e-6) / 255.0).astype(np.float32)
     flat.sub_(torch.as_tensor(low, device=flat.device)).div_(torch.as_tensor(step, device=flat.device))
@@ -317,4 +314,4 @@ def _in_bytes(
     }
     parameters = {k: v for k, v in field.parameters.items() if not k.startswith("trunk")}
     arrays |= {f"network.{k}": v.detach().cpu().numpy() for k, v in parameters.items()}
-    return arrays | leaps(layout, arrays)
+    return arrays | skip_distances(layout, arrays)

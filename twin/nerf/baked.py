@@ -1,10 +1,10 @@
-"""The baked field: what the renderer marches. Loads and renders without torch.
+"""Baked field: density and features of a trained radiance field in sparse 8-bit bricks. Renders without torch.
 
-Density and features of a trained radiance field, sampled into sparse bricks of bytes where some camera saw matter (see
-`kernels/bricks.py`), and the two small networks that work per ray (see `network.py`). A lighting is one vector, so one
-baked field shows its place under every lighting.
+`kernels/bricks.py` defines the bricks. The two per-ray networks, head and background (`network.py`), are stored beside
+them. A lighting is one vector, so one baked field renders the place under every lighting.
 """
 
+import copy
 import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -15,112 +15,110 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 from safetensors.numpy import save as to_bytes
 
-from twin.errors import InputError, shown
-from twin.files import check_shapes, checked_text, damaged, load_tensors, read_json, write_json
-from twin.geometry.cameras import Posed, resized
+from twin.errors import InputError, short_repr
+from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
+from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
-from twin.nerf.brick_layout import BrickLayout, brick_indices, brick_leaps, density_codes
+from twin.nerf.brick_layout import BrickLayout, brick_indices, density_codes, stored_skips
 from twin.nerf.fog import Fog
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bytes
-from twin.nerf.kernels.color_head import HARMONICS, Eight, shade
-from twin.nerf.kernels.color_head import LANES as SHADE_LANES
+from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
+from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.lookup import Bricks
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import Rendering
-from twin.runtime import bar, cores
+from twin.runtime import available_cores, bar
 from twin.types import Array32
-
-wp.config.log_level = wp.LOG_ERROR
-
+from twin.warp_runtime import wp
 
 _FORMAT = 2
-_PIECES = 3  # of a picture, per core
-_SIZES_KEPT = 4  # of pictures: a vector of worlds needs all of them, and those that begin anew
+_BANDS_PER_CORE = 3  # more bands than cores, as bands with sky in them finish sooner
+_MAX_TARGETS = 4  # image sizes kept: a vector env renders all its envs, and those that are being reset
 
 
 class BakedField:
-    """Density and colour of a place under every lighting it was filmed in, ready to render."""
+    """Density and color of a place under every lighting it was filmed in, ready to render."""
 
     def __init__(
         self,
         layout: BrickLayout,
         lightings: Lightings,
         arrays: dict[str, NDArray],
-        where: str = "cpu",
+        device: str = "cpu",
         about: dict[str, Any] | None = None,
     ):
         """
         Args:
             layout: Sizes and bounds.
-            lightings: The appearance embeddings by name.
-            arrays: `near` and `far` (bricks' grid positions of the slots, (s, 3), near ones first), `features`
-                (s, 729, CHANNELS) bytes, `low` and `step` (CHANNELS,), `near_leap` and `far_leap` (see `leaps`),
-                `network.*`, and `probes.*`, see `plausible.Probes`, where random lightings are to be had.
-            where: Device.
-            about: Whatever else is to be kept beside the numbers, JSON-able.
+            lightings: Appearance embeddings by name.
+            arrays: `near` and `far` (grid positions of the stored bricks, (s, 3)), `features` (s, 729, CHANNELS) bytes,
+                near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
+                `brick_layout.skip_distances`), `network.*`, and for random lightings `probes.*` (see
+                `appearance_prior.Probes`).
+            device: `cpu` or `cuda`.
+            about: JSON-able metadata stored with the field.
         """
-        self.layout, self.lightings_by_name, self.about, self.where = layout, lightings, about or {}, where
+        self.layout, self.lightings_by_name, self.about, self.device = layout, lightings, about or {}, device
         self._arrays = arrays
-        p = {k.removeprefix("network."): v for k, v in arrays.items() if k.startswith("network.")}
+        p = self.network
         if "probes.features" in arrays:
             probes = Probes(arrays["probes.features"], arrays["probes.harmonics"], p)
             self.lightings_by_name = replace(lightings, probes=probes)
         near, far = brick_indices(layout, arrays["near"], arrays["far"])
 
         def on_device(array: NDArray, dtype: Any) -> Any:
-            if where == "cpu":  # NumPy puts large arrays of its own on huge pages, where random reads cost less
+            if device == "cpu":  # NumPy allocates large arrays on huge pages, where random reads cost less
                 own = np.empty(array.shape, array.dtype)
                 own[...] = array
-                return wp.array(own, dtype=dtype, device=where, copy=False)
-            return wp.array(np.ascontiguousarray(array), dtype=dtype, device=where)
+                return wp.array(own, dtype=dtype, device=device, copy=False)
+            return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
 
         b: Any = Bricks()
-        near, near_leaps = brick_leaps(near, arrays["near_leap"])
-        far, far_leaps = brick_leaps(far, arrays["far_leap"])
+        near, near_skips = stored_skips(near, arrays["near_leap"])
+        far, far_skips = stored_skips(far, arrays["far_leap"])
         b.near_index, b.far_index = on_device(near.ravel(), wp.int32), on_device(far.ravel(), wp.int32)
-        b.leaps = on_device(np.concatenate([near_leaps, far_leaps]).ravel(), wp.uint8)
+        b.skips = on_device(np.concatenate([near_skips, far_skips]).ravel(), wp.uint8)
         b.near_blocks = wp.vec3i(*(BLOCKS * n for n in layout.near_shape))
         b.far_blocks = wp.vec3i(*(BLOCKS * n for n in layout.far_shape))
         b.densities = on_device(density_codes(arrays["features"][..., 0]), wp.uint8)
         b.features = on_device(arrays["features"].reshape(-1, CHANNELS), Bytes)
         b.low, b.step = Channels(*arrays["low"].tolist()), Channels(*arrays["step"].tolist())
-        b.centre = wp.vec3f(*layout.centre)
+        b.center = wp.vec3f(*layout.centre)
         b.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
         b.near_cell, b.far_cell = float(layout.near_side.min()) / CELLS, layout.far_cell
         b.unit, b.near_plane = layout.density_unit, layout.near_plane
         self._bricks = b
         self._lock = threading.Lock()
-        self._pictures: dict[tuple[int, int, int, bool], _Picture] = {}
+        self._targets: dict[tuple[int, int, int, bool], _RenderTarget] = {}
 
-        hidden, behind = p["head.1"].shape[0], p["backdrop.0"].shape[1]
-        self._march = kernels.march(kernels.LANES[where])
-        self._shade, weights = shade(SHADE_LANES[where], hidden, behind)
+        hidden, background_hidden = p["head.1"].shape[0], p["backdrop.0"].shape[1]
+        self._march = kernels.march_kernel(kernels.LANES[device])
+        self._shade, weights = color_head_kernel(HEAD_LANES[device], hidden, background_hidden)
         rows = CHANNELS - 1 + HARMONICS
         w: Any = weights()
 
-        def eights(matrix: NDArray) -> Any:
-            """By eight hidden units (the first axis), then by what else they connect."""
-            return on_device(matrix.reshape(len(matrix) // 8, 8, -1).transpose(0, 2, 1).reshape(-1, 8), Eight)
+        def as_vec8(matrix: NDArray) -> Any:
+            """Groups of eight hidden units (first axis of the matrix), then the other axis."""
+            return on_device(matrix.reshape(len(matrix) // 8, 8, -1).transpose(0, 2, 1).reshape(-1, 8), Vec8)
 
-        w.head_0, w.head_1, w.head_2 = eights(p["head.0"][:rows].T), eights(p["head.1"].T), eights(p["head.2"])
-        w.head_1_bias, w.head_2_bias = eights(p["head.1.bias"]), wp.vec3f(*p["head.2.bias"].tolist())
+        w.head_0, w.head_1, w.head_2 = as_vec8(p["head.0"][:rows].T), as_vec8(p["head.1"].T), as_vec8(p["head.2"])
+        w.head_1_bias, w.head_2_bias = as_vec8(p["head.1.bias"]), wp.vec3f(*p["head.2.bias"].tolist())
         for name in ("backdrop.0", "backdrop.0.bias", "backdrop.1"):
             setattr(w, name.replace(".", "_"), on_device(p[name].ravel(), wp.float32))
         self._weights = w
-        self._bias_of = p["head.0.bias"], p["head.0"][rows:]
-        load_kernels([kernels.approach, self._march, self._shade], where)
-        self._threads = cores()
-        self._pool = ThreadPoolExecutor(self._threads) if where == "cpu" and self._threads > 1 else None
+        self._first_bias = p["head.0.bias"], p["head.0"][rows:]
+        load_kernels([kernels.cone_march, self._march, self._shade], device)
+        self._threads = available_cores()
+        self._pool = ThreadPoolExecutor(self._threads) if device == "cpu" and self._threads > 1 else None
 
     @property
     def lightings(self) -> tuple[str, ...]:
-        """Names of the lightings it was filmed under, and of those added to it."""
+        """Names of the filmed lightings, then of the added ones."""
         return self.lightings_by_name.names
 
     @property
@@ -131,106 +129,128 @@ class BakedField:
         )
 
     @property
+    def network(self) -> dict[str, NDArray]:
+        """Arrays of the color head and the background network, by name."""
+        return {k.removeprefix("network."): v for k, v in self._arrays.items() if k.startswith("network.")}
+
+    @property
     def bytes(self) -> int:
-        """Size of the arrays."""
+        """Size of the stored arrays [bytes]."""
         return sum(array.nbytes for array in self._arrays.values())
 
     def embedding(self, lighting: str) -> Array32:
         """See `Lightings.embedding`."""
         return self.lightings_by_name.embedding(lighting)
 
-    def air(self, lighting: str) -> Fog | None:
-        """See `Lightings.air`. `render` shows the place without it; environments lay it over their pictures."""
-        return self.lightings_by_name.air(lighting)
+    def fog(self, lighting: str) -> Fog | None:
+        """See `Lightings.fog`. `render` leaves the fog out; environments apply it to their images."""
+        return self.lightings_by_name.fog(lighting)
 
     def sample_lighting(self, rng: np.random.Generator) -> Array32:
-        """The embedding of a random lighting that could have been filmed, shape (dim,). See `Lightings.sample`."""
+        """Embedding (dim,) of a random plausible lighting, see `Lightings.sample`."""
         return self.lightings_by_name.sample(rng)
 
     def add_lightings(
-        self, more: Mapping[str, Array32], stale: tuple[str, ...] = (), airs: Mapping[str, Fog] | None = None
+        self, more: Mapping[str, Array32], stale: tuple[str, ...] = (), fogs: Mapping[str, Fog] | None = None
     ) -> None:
         """See `Lightings.added`."""
-        self.lightings_by_name = self.lightings_by_name.added(more, stale, airs)
+        self.lightings_by_name = self.lightings_by_name.added(more, stale, fogs)
 
     def render(
         self,
-        cameras: Posed,
+        cameras: PosedCameras,
         lighting: str | NDArray | Sequence[str | NDArray],
         size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
     ) -> Rendering:
-        """What n cameras see, in air as clear as the film's.
+        """Renders n cameras, in air as clear as the film's.
 
         Args:
             cameras: `Cameras` of a scene, or `Viewpoints`.
             lighting: A name, see `Lightings.embedding`, or an embedding (dim,); or one of either per camera.
-            size: Width, height [px] of the pictures; that of the cameras unless given.
-            stop: z-depth of what else stands there [m], shape (n, height, width): the march ends at it. `opacity` is
-                then what the field holds back of it, and `rgb` the colour of the field's own share alone.
+            size: Image width and height [px]; by default the size of the cameras.
+            stop: z-depth of other objects [m], shape (n, height, width), where the march ends. `opacity` is then the
+                share of the object's light that the field blocks, and `rgb` the color of the field's share alone.
 
         Raises:
-            InputError: unknown lighting, or cameras of several sizes and none given.
+            InputError: unknown lighting, or cameras of several sizes and no size given.
         """
-        with self._lock:  # the arrays are shared by all who call
-            return self._developed(cameras, lighting, size, stop).rendering()
+        with self._lock:  # all callers share the render targets
+            return self._render(cameras, lighting, size, stop).result()
 
-    def show(
+    def render_on_device(
         self,
-        cameras: Posed,
+        cameras: PosedCameras,
         lighting: str | NDArray | Sequence[str | NDArray],
-        take: Callable[[Any, Any], None],
+        consume: Callable[[Any, Any], None],
     ) -> None:
-        """Shows `take` what n cameras see without bringing it to the host.
+        """Renders as `render` does and passes the result to `consume` without copying it to the host.
 
-        Args:
-            cameras: As for `render`.
-            lighting: As for `render`.
-            take: Is given colours, Warp (n, height · width) of vec3, and opacities, (n, height · width), on the
-                field's device; they are rendered into again once it returns.
+        `consume` gets Warp arrays on the field's device, colors (n, height · width) of vec3 and opacities
+        (n, height · width), which are reused after it returns.
         """
         with self._lock:
-            picture = self._developed(cameras, lighting, None, None)
-            take(picture.rgb, picture.opacity)
+            target = self._render(cameras, lighting, None, None)
+            consume(target.rgb, target.opacity)
 
-    def _developed(
+    def render_features(self, cameras: PosedCameras, lighting: str | NDArray) -> tuple[Rendering, Array32]:
+        """Renders as `render` does and also returns the composited features before the color head.
+
+        Returns:
+            The rendering, and a copy of opacity (channel 0) and features, shape (n, CHANNELS, height, width).
+        """
+        with self._lock:
+            target = self._render(cameras, lighting, None, None)
+            n, height, width = target.shape
+            return target.result(), target.features.numpy().reshape(n, -1, height, width).copy()
+
+    def single_threaded(self) -> "BakedField":
+        """A field on the same arrays with its own render targets and lock, which renders on the calling thread.
+
+        Several such fields render at the same time, each in a thread of the caller.
+        """
+        out = copy.copy(self)
+        out._targets, out._lock, out._pool = {}, threading.Lock(), None
+        return out
+
+    def _render(
         self,
-        cameras: Posed,
+        cameras: PosedCameras,
         lighting: str | NDArray | Sequence[str | NDArray],
         size: tuple[int, int] | None,
         stop: NDArray | None,
-    ) -> "_Picture":
-        intrinsics, (width, height) = resized(cameras, size)
+    ) -> "_RenderTarget":
+        intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         pose = np.asarray(cameras.camera_to_world, np.float64)
-        picture = self._picture(len(pose), width, height, stop is not None)
-        picture.aim(pose, intrinsics, self._biases(lighting, len(pose)), stop)
+        target = self._target(len(pose), width, height, stop is not None)
+        target.set_cameras(pose, intrinsics, self._head_biases(lighting, len(pose)), stop)
         if self._pool is None:
-            for piece in picture.pieces:
-                picture.develop(piece)
+            for band in target.bands:
+                target.render_band(band)
         else:
-            list(self._pool.map(picture.develop, picture.pieces))
-        return picture
+            list(self._pool.map(target.render_band, target.bands))
+        return target
 
-    def _biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Array32:
-        """The head's first bias with the appearance in it, shape (n, hidden)."""
+    def _head_biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Array32:
+        """Bias of the head's first layer including the appearance, shape (n, hidden)."""
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
         vectors = np.stack(
             [self.embedding(v) if isinstance(v, str) else np.asarray(v) for v in ([lighting] if one else lighting)]
         ).astype(np.float32)
         if len(vectors) not in (1, n):
             raise InputError(f"{len(vectors)} lightings for {n} cameras; expected one, or one per camera")
-        bias, matrix = self._bias_of
-        # One by one: of a matrix BLAS adds up in another order, and a picture must not depend on those beside it.
+        bias, matrix = self._first_bias
+        # One product per vector: for a matrix BLAS sums in another order, and an image must not depend on the others.
         return np.broadcast_to(bias + np.stack([vector @ matrix for vector in vectors]), (n, len(bias)))
 
-    def _picture(self, n: int, width: int, height: int, stopped: bool) -> "_Picture":
-        """Arrays for pictures of this size; the last few are kept, as the next is likely of a size there was before."""
+    def _target(self, n: int, width: int, height: int, stopped: bool) -> "_RenderTarget":
+        """The render target of this image size; the last `_MAX_TARGETS` are kept."""
         key = n, width, height, stopped
-        picture = self._pictures.pop(key, None) or _Picture(self, *key)
-        self._pictures[key] = picture
-        while len(self._pictures) > _SIZES_KEPT:
-            del self._pictures[next(iter(self._pictures))]
-        return picture
+        target = self._targets.pop(key, None) or _RenderTarget(self, *key)
+        self._targets[key] = target
+        while len(self._targets) > _MAX_TARGETS:
+            del self._targets[next(iter(self._targets))]
+        return target
 
     # ---- files
 
@@ -251,25 +271,21 @@ class BakedField:
         )
 
     @staticmethod
-    def load(folder: Path, where: str = "cpu") -> "BakedField":
-        """Reads a baked field.
-
-        Raises:
-            InputError: none there, or one of another format.
-        """
+    def load(folder: Path, device: str = "cpu") -> "BakedField":
+        """Loads a baked field; raises InputError if the folder has none, or one of another format."""
         path = folder / "baked.json"
         if not path.exists():
-            raise InputError(f"{folder}: holds no baked.json; build the scene (again)")
+            raise InputError(f"{folder}: contains no baked.json; build the scene (again)")
         head = read_json(path)
-        with damaged(path, "build the scene again"):
+        with wrap_read_errors(path, "build the scene again"):
             if head.get("format") != _FORMAT:
-                raise InputError(f"{path}: format {shown(head.get('format'))}, expected {_FORMAT}; build it anew")
+                raise InputError(f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build it anew")
             layout: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in head["layout"].items()}
             bricks = BrickLayout(**layout)
-            names, frames = tuple(map(checked_text, head["lightings"])), tuple(map(checked_text, head["frames"]))
+            names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
             about = dict(head["about"])
         arrays = load_tensors(folder / "baked.safetensors")
-        with damaged(folder / "baked.safetensors", "build the scene again"):
+        with wrap_read_errors(folder / "baked.safetensors", "build the scene again"):
             vectors, frame_vectors = arrays.pop("lightings.vectors"), arrays.pop("lightings.frames")
             dim = vectors.shape[1]
             check_shapes(
@@ -278,68 +294,68 @@ class BakedField:
                     "lightings.frames": (frame_vectors, (len(frames), dim), "f"),
                 }
             )
-            return BakedField(bricks, Lightings(names, vectors, frames, frame_vectors), arrays, where, about)
+            return BakedField(bricks, Lightings(names, vectors, frames, frame_vectors), arrays, device, about)
 
 
-class _Picture:
-    """What pictures of one size are rendered into, and the launches that do it, cut into pieces for the cores."""
+class _RenderTarget:
+    """Buffers for images of one size, and recorded launches that render them in horizontal bands, for the cores."""
 
     def __init__(self, field: BakedField, n: int, width: int, height: int, stopped: bool):
-        self.shape, where = (n, height, width), field.where
+        self.shape, device = (n, height, width), field.device
         across, down, pixels = -(-width // kernels.TILE), -(-height // kernels.TILE), width * height
 
         def new(shape: tuple[int, ...], dtype: Any = wp.float32) -> Any:
-            return wp.zeros(shape, dtype=dtype, device=where)
+            return wp.zeros(shape, dtype=dtype, device=device)
 
-        film: Any = kernels.ImageBuffers()
-        film.rotation, film.position = new((n,), wp.mat33f), new((n,), wp.vec3f)
-        film.intrinsics = new((n,), wp.vec4f)
-        film.stop = new((n, pixels) if stopped else (0, 0))
-        film.width, film.height, film.across = width, height, across
-        self.film, self.bias = film, new((n, len(field._bias_of[0]) // 8), Eight)
+        image: Any = kernels.ImageBuffers()
+        image.rotation, image.position = new((n,), wp.mat33f), new((n,), wp.vec3f)
+        image.intrinsics = new((n,), wp.vec4f)
+        image.stop = new((n, pixels) if stopped else (0, 0))
+        image.width, image.height, image.across = width, height, across
+        self.image, self.bias = image, new((n, len(field._first_bias[0]) // 8), Vec8)
         self.depth, self.opacity, self.rgb = new((n, pixels)), new((n, pixels)), new((n, pixels), wp.vec3f)
         self.features = new((n, CHANNELS, pixels))
         start = new((n, across * down))
-        # More pieces than cores, as those with sky in them are done sooner.
-        pieces = _PIECES * field._threads if field._pool else 1
-        edges = np.unique(np.linspace(0, down, pieces + 1).round().astype(int)).tolist()
-        self.pieces = range(len(edges) - 1)
+        bands = _BANDS_PER_CORE * field._threads if field._pool else 1
+        edges = np.unique(np.linspace(0, down, bands + 1).round().astype(int)).tolist()
+        self.bands = range(len(edges) - 1)
         self.launches = []
         for first, last in itertools.pairwise(edges):
-            record = partial(wp.launch, device=where, record_cmd=True)
+            recorded = partial(wp.launch, device=device, record_cmd=True)
             tiles = (last - first) * across
             top, bottom = first * kernels.TILE * width, min(last * kernels.TILE, height) * width
-            packets = tiles * kernels.TILE**2 // kernels.LANES[where]
-            runs = -(-(bottom - top) // SHADE_LANES[where])
+            packets = tiles * kernels.TILE**2 // kernels.LANES[device]
+            runs = -(-(bottom - top) // HEAD_LANES[device])
             self.launches.append(
                 [
-                    record(kernels.approach, (n, tiles), [field._bricks, film, first * across], [start]),
-                    record(
-                        *(field._march, (n, packets), [field._bricks, film, first * across, start]),
+                    recorded(kernels.cone_march, (n, tiles), [field._bricks, image, first * across], [start]),
+                    recorded(
+                        *(field._march, (n, packets), [field._bricks, image, first * across, start]),
                         [self.features, self.depth],
                     ),
-                    record(
-                        *(field._shade, (n, runs), [field._weights, self.bias, film, top, bottom, self.features]),
+                    recorded(
+                        *(field._shade, (n, runs), [field._weights, self.bias, image, top, bottom, self.features]),
                         [self.depth, self.rgb, self.opacity],
                     ),
                 ]
             )
 
-    def aim(self, pose: NDArray, intrinsics: NDArray, bias: NDArray, stop: NDArray | None) -> None:
-        film = self.film
-        film.rotation.assign(pose[:, :3, :3].astype(np.float32))
-        film.position.assign(pose[:, :3, 3].astype(np.float32))
-        film.intrinsics.assign(intrinsics.astype(np.float32))
+    def set_cameras(self, pose: NDArray, intrinsics: NDArray, bias: NDArray, stop: NDArray | None) -> None:
+        image = self.image
+        image.rotation.assign(pose[:, :3, :3].astype(np.float32))
+        image.position.assign(pose[:, :3, 3].astype(np.float32))
+        image.intrinsics.assign(intrinsics.astype(np.float32))
         self.bias.assign(np.ascontiguousarray(bias, np.float32).reshape(len(bias), -1, 8))
         if stop is not None:
-            film.stop.assign(np.asarray(stop, np.float32).reshape(film.stop.shape))
+            image.stop.assign(np.asarray(stop, np.float32).reshape(image.stop.shape))
 
-    def develop(self, piece: int) -> None:
-        for launch in self.launches[piece]:
+    def render_band(self, band: int) -> None:
+        """Marches one band and colors it."""
+        for launch in self.launches[band]:
             launch.launch()
 
-    def rendering(self) -> Rendering:
-        """A copy, as the arrays are rendered into again."""
+    def result(self) -> Rendering:
+        """A copy of the images, as the buffers are reused."""
         return Rendering(
             self.rgb.numpy().reshape(*self.shape, 3).copy(),
             self.depth.numpy().reshape(self.shape).copy(),
@@ -347,9 +363,9 @@ class _Picture:
         )
 
 
-def load_kernels(needed: list[Any], where: str) -> None:
-    """Compiles or loads kernels now, so that no two threads compile them."""
+def load_kernels(needed: list[Any], device: str) -> None:
+    """Compiles or loads kernels, so that no two threads do it at once."""
     with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
         for kernel in needed:
-            kernel.module.load(wp.get_device(where))
+            kernel.module.load(wp.get_device(device))
             progress.update()

@@ -1,8 +1,8 @@
-"""Honest figures on frames the field never saw.
+"""Evaluation of a field on held-out frames, and its control across lightings.
 
-A held-out frame starts from the embedding of its lighting. Its own residual (exposure, say) is fitted on one half of
-the picture, left or right, and scored on the other; both ways, and the mean counts. Nothing else is fitted.
-*Unfitted* scores use the lighting's embedding as it is; *wrong* scores use that of the other lightings, unfitted.
+The embedding of a held-out frame is fitted on one half of the image, left or right, starting from its lighting's, and
+scored on the other half; the score is the mean of both ways. Nothing else is fitted. *Unfitted* scores use the
+lighting's embedding as it is; *wrong* scores use those of the other lightings, unfitted.
 """
 
 from functools import cache
@@ -23,27 +23,27 @@ from twin.nerf.rendering import RenderableField
 from twin.runtime import track
 from twin.types import Array
 
-_FIT_RAYS = 4000  # of a half picture, spread evenly
-_MAX_FRAMES = 6  # held-out frames scored per lighting, spread evenly
+_FIT_RAYS = 4000  # of half an image, evenly spaced
+_MAX_FRAMES = 6  # held-out frames scored per lighting, evenly spaced
 
 
 def score_frame(
     field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
 ) -> dict[str, float]:
-    """PSNR [dB] and SSIM of one held-out frame: `psnr`, `ssim`, `unfitted`, `wrong` (nan with one lighting), and
-    `baked`, which is as `unfitted` (nan without a baked field)."""
+    """Scores one held-out frame: `ssim`, and in dB the PSNRs `psnr`, `unfitted`, `wrong` (nan with one lighting) and
+    `baked` (of the baked field, unfitted; nan without one)."""
     bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
     image = bytes_.astype(np.float32) / 255.0
     height, width = mask.shape
     v, u = np.mgrid[:height, :width] + 0.5
-    arrays = CameraArrays(cameras.camera_to_world[i : i + 1], intrinsics[None], field.where)
+    arrays = CameraArrays(cameras.camera_to_world[i : i + 1], intrinsics[None], field.device)
     pixel = np.stack([u.ravel(), v.ravel()], -1)
     features, harmonics, _, _ = field.trace(arrays, np.zeros(len(pixel), int), pixel)
-    colours = torch.as_tensor(image.reshape(-1, 3), device=field.where)
+    colors = torch.as_tensor(image.reshape(-1, 3), device=field.device)
     start = field.embedding(cameras.lightings[i])
 
     def picture(embedding: NDArray[np.float32]) -> NDArray[np.float32]:
-        return field.colour(features, harmonics, embedding).reshape(height, width, 3)
+        return field.color(features, harmonics, embedding).reshape(height, width, 3)
 
     left = np.zeros((height, width), bool)
     left[:, : width // 2] = True
@@ -52,10 +52,10 @@ def score_frame(
         fit_on, score_on = np.flatnonzero(half & mask), ~half & mask
         if not len(fit_on) or not score_on.any():
             continue
-        some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // _FIT_RAYS)], device=field.where)
-        shown = picture(fit_appearance(field, features[some], harmonics[some], colours[some], start)[0])
+        some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // _FIT_RAYS)], device=field.device)
+        shown = picture(fit_appearance(field, features[some], harmonics[some], colors[some], start)[0])
         psnrs.append(psnr(shown, image, score_on))
-        # Masked pixels are made equal: they neither help nor harm beyond their windows.
+        # Masked pixels are made equal, which affects SSIM only in windows that contain them.
         shown[~mask] = image[~mask]
         side = slice(width // 2, None) if half is left else slice(None, width // 2)
         ssims.append(ssim(shown[:, side], image[:, side]))
@@ -80,9 +80,9 @@ def evaluate(
     max_frames: int = _MAX_FRAMES,
     baked: BakedField | None = None,
 ) -> dict[str, Any]:
-    """Held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted`, `psnr_baked` (unfitted, too; of the baked
-    field where there is one) and `psnr_wrong_lighting` (None where there is no other lighting). Lightings without
-    held-out frames have n = 0 and are left out of the rest."""
+    """Mean held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted`, `psnr_baked` (unfitted; only with a
+    baked field) and `psnr_wrong_lighting` (None without another lighting). Lightings without held-out frames have n = 0
+    and no other entry."""
     columns = {"psnr": "psnr", "ssim": "ssim", "psnr_unfitted": "unfitted"}
     if baked is not None:
         columns["psnr_baked"] = "baked"
@@ -109,36 +109,33 @@ def evaluate(
     return result
 
 
-# ---- Cross-lighting control: filmed places shown under the lightings they were *not* filmed in.
-#
-# A *pose* is that of a training frame, with the lighting it was filmed in. It is *shown* under every lighting, and what
-# counts is the picture's mean colour (RGB in [0, 1], over the pixels that are not masked). No film shows the same place
-# at the same time under two lightings, so the reference is the film's frame of the shown lighting that was taken nearest.
+# ---- cross-lighting control
 
-
-_POSES = 60  # in all, spread evenly over each lighting's frames
-_WIDTH = 96  # [px] longer side of the pictures
-_DIGITS = 4
+_MAX_POSES = 60  # in all, evenly spaced over each lighting's frames
+_WIDTH = 96  # [px] longer side of the images
+_DIGITS = 4  # decimals of the results
 
 
 def cross_lighting(
-    field: RenderableField, cameras: Cameras, most: int = _POSES, width: int = _WIDTH
+    field: RenderableField, cameras: Cameras, max_poses: int = _MAX_POSES, width: int = _WIDTH
 ) -> dict[str, Any] | None:
-    """How the training poses look under every lighting, and whether the depth stays; None with less than two lightings.
+    """Renders training poses under every lighting, not only their own; None with fewer than two lightings.
 
-    Keys, colours (r, g, b), distances between colours Euclidean in RGB:
+    Only an image's mean color counts (RGB in [0, 1], over unmasked pixels). No film shows the same place at the same
+    time under two lightings, so the reference for lighting j is the nearest frame filmed under j.
 
-    * `poses`: how many were rendered, under every lighting each.
-    * `filmed_colour[i]`: mean colour of the film at the poses of lighting i.
-    * `mean_colour[i][j]`: mean colour of the poses of lighting i, shown under j.
-    * `to_shown_rms[j]`: of poses filmed under others and shown under j, the rms distance to `filmed_colour[j]`.
-    * `to_filmed_rms[j]`: of the same pictures, to `filmed_colour` of the lighting their pose was filmed in.
-    * `colour_follows[j]`: share of the same pictures that are nearer to the film's nearest frame of j than to the film
-      at their own pose. 1 where the light asked for decides the colour, 0 where the pose does. A tie counts one half,
-      so lightings that do not differ come to about one half.
-    * `follows_by_pair[i][j]`: the same, of the poses of lighting i alone.
-    * `depth_moves_m`: the greatest change of any pixel's depth between any two lightings [m]. Depth has no lighting in
-      it, so this is 0 by construction; it is measured all the same.
+    Keys, with Euclidean color distances in RGB:
+
+    * `poses`: number of poses, each rendered under every lighting.
+    * `filmed_colour[i]`: mean color of the film at the poses of lighting i.
+    * `mean_colour[i][j]`: mean color of the poses of lighting i, rendered under j.
+    * `to_shown_rms[j]`: rms distance to `filmed_colour[j]` of poses filmed under other lightings, rendered under j.
+    * `to_filmed_rms[j]`: rms distance of the same images to `filmed_colour` of the lighting of their pose.
+    * `colour_follows[j]`: share of the same images that are nearer to the nearest frame of j than to the film at their
+      own pose: 1 if the lighting decides the color, 0 if the pose does. A tie counts one half, so equal lightings give
+      about one half.
+    * `follows_by_pair[i][j]`: the same for the poses of lighting i alone.
+    * `depth_moves_m`: greatest change of any pixel's depth between two lightings [m], 0 by construction.
     """
     trained = cameras.select(~cameras.held_out)
     lightings = [name for name in field.lightings if name in trained.lightings]
@@ -148,12 +145,12 @@ def cross_lighting(
     @cache
     def filmed(i: int) -> Array:
         image, mask, _ = load_frame(trained, i, width)
-        return mean_colour(image / 255.0, mask)
+        return mean_color(image / 255.0, mask)
 
     poses = []
     for name in lightings:
         mine = [i for i, light in enumerate(trained.lightings) if light == name]
-        some = np.unique(np.linspace(0, len(mine) - 1, max(1, most // len(lightings))).round().astype(int))
+        some = np.unique(np.linspace(0, len(mine) - 1, max(1, max_poses // len(lightings))).round().astype(int))
         poses += [mine[k] for k in some]
     light = np.array([lightings.index(trained.lightings[i]) for i in poses])
     shown = np.empty((len(poses), len(lightings), 3))
@@ -161,7 +158,7 @@ def cross_lighting(
     for row, i in enumerate(track(poses, "poses under every lighting", unit="pose")):
         mask = load_frame(trained, i, width)[1]
         views = [field.render(trained.select(np.array([i])), name, mask.shape[::-1]) for name in lightings]
-        shown[row] = [mean_colour(view.rgb[0], mask) for view in views]
+        shown[row] = [mean_color(view.rgb[0], mask) for view in views]
         moves = max(moves, float(np.ptp([view.depth[0] for view in views], axis=0).max()))
     own = np.array([filmed(i) for i in poses])
     film = np.array([own[light == j].mean(0) for j in range(len(lightings))])
@@ -178,10 +175,10 @@ def cross_lighting(
     for j, name in enumerate(lightings):
         rows = np.flatnonzero(light != j)
         there = np.array([filmed(nearest(trained, poses[row], name)) for row in rows])
-        # Differences below a thousandth of a byte are a tie: only rounding would decide it.
-        nearer = np.round(off(shown[rows, j], own[rows]) - off(shown[rows, j], there), 6)
-        columns["to_shown_rms"][name] = rms(off(shown[rows, j], film[j]))
-        columns["to_filmed_rms"][name] = rms(off(shown[rows, j], film[light[rows]]))
+        # Differences below a thousandth of a byte are rounding, and count as a tie.
+        nearer = np.round(color_distance(shown[rows, j], own[rows]) - color_distance(shown[rows, j], there), 6)
+        columns["to_shown_rms"][name] = rms(color_distance(shown[rows, j], film[j]))
+        columns["to_filmed_rms"][name] = rms(color_distance(shown[rows, j], film[light[rows]]))
         follows = 0.5 + 0.5 * np.sign(nearer)
         columns["colour_follows"][name] = round(float(follows.mean()), _DIGITS)
         for i in np.unique(light[rows]):
@@ -189,20 +186,20 @@ def cross_lighting(
     return out | columns | {"follows_by_pair": pairs, "depth_moves_m": moves}
 
 
-def mean_colour(image: NDArray, mask: NDArray[np.bool_]) -> Array:
-    """Mean of an image (h, w, 3) where the mask (h, w) is true, shape (3,); of all of it where it is true nowhere."""
+def mean_color(image: NDArray, mask: NDArray[np.bool_]) -> Array:
+    """Mean color (3,) of an image (h, w, 3) where the mask (h, w) is true, or of all of it if it is true nowhere."""
     return np.asarray(image[mask] if mask.any() else image.reshape(-1, 3), np.float64).mean(0)
 
 
 def nearest(cameras: Cameras, i: int, lighting: str) -> int:
-    """The frame of a lighting, which there is, that was taken nearest to frame i."""
+    """Index of the frame of a lighting (at least one exists) nearest to frame i."""
     found = nearest_frame(cameras, i, lighting)
     assert found is not None
     return found
 
 
-def off(a: Array, b: Array) -> Array:
-    """Distances between colours, shapes (n, 3) and (n, 3) or (3,) → (n,)."""
+def color_distance(a: Array, b: Array) -> Array:
+    """Euclidean distances of colors, (n, 3) and (n, 3) or (3,) → (n,)."""
     return np.linalg.norm(a - b, axis=-1)
 
 
@@ -210,5 +207,5 @@ def rms(values: Array) -> float:
     return round(float(np.sqrt((values**2).mean())), _DIGITS)
 
 
-def rounded(colour: Array) -> list[float]:
-    return [round(float(value), _DIGITS) for value in colour]
+def rounded(color: Array) -> list[float]:
+    return [round(float(value), _DIGITS) for value in color]

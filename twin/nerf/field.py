@@ -1,51 +1,54 @@
-"""The radiance field: density and colour of a place, under every lighting it was filmed in.
+"""Radiance field: density and color of a place under every lighting it was filmed in.
 
-Hash grid → trunk → density and features per sample; features are composited along the ray; the head turns them into
-colour (see `network.py`). Points and distances are in metres, in the world of the cameras; for other vocabulary see
-`kernels/space.py`.
+Hash grid → trunk → density and features per sample; the features are composited along the ray and the head turns them
+into a color (`network.py`). Points and distances are in meters, in the world frame of the cameras; `kernels/space.py`
+defines the other terms.
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
-from twin.errors import InputError, shown
-from twin.files import checked_text, damaged, read_json, regular, write_json
-from twin.geometry.cameras import Posed, resized
+from twin.errors import InputError, short_repr
+from twin.files import read_json, regular_file, require_text, wrap_read_errors, write_json
+from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
 from twin.nerf.buffers import (
     CameraArrays,
     Layout,
     Workspace,
-    device,
     level_cells,
     level_shapes,
     load_training_kernels,
     opacity_grids,
     parallel,
+    resolve_device,
     single_threaded_torch,
-    view,
+    warp_view,
 )
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler, space
 from twin.nerf.rendering import FAR, Rendering
+from twin.warp_runtime import wp
 
 _FORMAT = 1
+QUERY_POINTS = 65536
+"""Points per batch of `RadianceField.query`."""
 _RENDER_RAYS = 4096  # per batch
-_RENDER_SAMPLES = 24
+_RENDER_SAMPLES = 24  # per ray
 _HEAD_RAYS = 8192  # per batch of the head
-_RENDER_FLOOR = 0.02  # weight of unlikely places when rendering
-_QUERY_POINTS = 65536  # per batch of density queries
-_MOST_SEED = 2**31 - 1  # of a kernel, which counts in 32 bits with a sign
+_RENDER_UNIFORM_WEIGHT = 0.02  # uniform share of the sampling distribution when rendering
+_MAX_SEED = 2**31 - 1  # kernels take 32-bit signed seeds
 
 
 class RadianceField:
@@ -63,25 +66,25 @@ class RadianceField:
         """
         Args:
             layout: Sizes and bounds.
-            appearance: The embeddings, on the same device as the rest.
+            appearance: Embeddings, on the same device as the tensors below.
             table: Hash tables, shape (levels, 2**log2_table, FEATURES).
             parameters: Weights, see `network.initial_parameters`.
-            grids: Stop grids, near and far, see `kernels/sampler.py`.
-            about: Whatever else is to be kept beside the numbers, JSON-able.
+            grids: Near and far opacity grid, see `kernels/sampler.py`.
+            about: JSON-able metadata stored with the field.
         """
         self.layout, self.appearance, self.about = layout, appearance, about or {}
         self.table, self.parameters, self.grids = table, parameters, grids
-        self.where = "cpu" if table.device.type == "cpu" else "cuda"
-        load_training_kernels(self.where)
-        self.w_table = view(table, hashgrid.Feature)
-        self.w_near_grid, self.w_far_grid = (view(grid, wp.float32) for grid in grids)
-        cells = level_cells(layout.space, layout.levels, layout.growth)
-        self.w_cells: Any = wp.array(cells, dtype=wp.vec3f, device=self.where)
-        self.w_shapes: Any = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.where)
+        self.device = "cpu" if table.device.type == "cpu" else "cuda"
+        load_training_kernels(self.device)
+        self.w_table = warp_view(table, hashgrid.Feature)
+        self.w_near_grid, self.w_far_grid = (warp_view(grid, wp.float32) for grid in grids)
+        cells = level_cells(layout.near_box, layout.levels, layout.growth)
+        self.w_cells: Any = wp.array(cells, dtype=wp.vec3f, device=self.device)
+        self.w_shapes: Any = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.device)
         self.mask = wp.uint32(2**layout.log2_table - 1)
-        self.centre = wp.vec3f(*layout.centre)
+        self.center = wp.vec3f(*layout.centre)
         self.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        self.stop = opacity_grids(layout.space)
+        self.grid_sizes = opacity_grids(layout.near_box)
         self._spare: list[Workspace] = []
 
     @property
@@ -91,7 +94,7 @@ class RadianceField:
     @property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the near box [m], shape (2, 3)."""
-        return self.layout.space.bounds
+        return self.layout.near_box.bounds
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """See `Appearance.embedding`."""
@@ -101,7 +104,7 @@ class RadianceField:
         """See `Lightings.added`."""
         self.appearance = self.appearance.added(more, stale)
 
-    # ---- the passes of a batch; each works on rays [start, start + count) of a workspace
+    # ---- passes of a batch, each on rays [start, start + count) of a workspace
 
     def cast(self, ws: Workspace, cameras: CameraArrays, start: int, count: int) -> None:
         """Pixels → rays."""
@@ -110,34 +113,34 @@ class RadianceField:
             count,
             [ws.w_camera, ws.w_pixel, cameras.rotation, cameras.position, cameras.intrinsics, start],
             [ws.w_origins, ws.w_directions, ws.w_cosines],
-            device=self.where,
+            device=self.device,
         )
 
     def sample(
         self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int | None = None
     ) -> None:
-        """Rays → samples. See `kernels/sampler.py`; any seed jitters them, None takes the middles."""
-        jitter = -1 if seed is None else seed & _MOST_SEED
+        """Rays → samples, see `kernels/sampler.py`. A seed jitters them; None takes the middles of the strata."""
+        jitter = -1 if seed is None else seed & _MAX_SEED
         wp.launch(
             sampler.sample_rays,
             count,
             [
-                *(ws.w_origins, ws.w_directions, ws.w_targets, self.centre, self.inverse_half),
-                *(self.w_near_grid, self.w_far_grid, self.stop.near_cell, self.stop.far_cell),
+                *(ws.w_origins, ws.w_directions, ws.w_targets, self.center, self.inverse_half),
+                *(self.w_near_grid, self.w_far_grid, self.grid_sizes.near_cell, self.grid_sizes.far_cell),
                 *(self.layout.near_plane, floor, target_mass, jitter, start),
             ],
             [ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_ray_positions],
-            device=self.where,
+            device=self.device,
         )
 
     def query(self, ws: Workspace, start: int, count: int) -> None:
-        """Grid positions → network outputs, for rows (not rays) [start, start + count)."""
+        """Grid positions → network outputs, for rows (samples, not rays) [start, start + count)."""
         wp.launch(
             hashgrid.encode,
             count,
             [ws.w_positions, self.w_table, self.w_cells, self.w_shapes, self.mask, start],
             [ws.w_features],
-            device=self.where,
+            device=self.device,
         )
         rows = slice(start, start + count)
         network.trunk(self.parameters, ws.features[rows], ws.hidden[rows], ws.outputs[rows])
@@ -149,81 +152,77 @@ class RadianceField:
             count,
             [ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, self.layout.density_unit, start],
             [ws.w_weights, ws.w_composited, ws.w_inverse, ws.w_median],
-            device=self.where,
+            device=self.device,
         )
 
-    # ---- what others ask of it
+    # ---- queries and rendering
 
     def density(self, points: NDArray) -> NDArray[np.float32]:
         """Density [1/m] at points [m], shape (k, 3) → (k,)."""
         points = np.ascontiguousarray(points, np.float32)
         result = np.empty(len(points), np.float32)
-        batch = _QUERY_POINTS
 
         @torch.no_grad()
         def one(start: int) -> None:
-            ws = self._borrow(0, 1, batch)
-            n = min(batch, len(points) - start)
-            metres = torch.as_tensor(points[start : start + n], device=self.where)
-            wp.launch(
-                space.contract_points,
-                n,
-                [view(metres, wp.vec3f), self.centre, self.inverse_half, 0],
-                [ws.w_positions],
-                device=self.where,
-            )
-            self.query(ws, 0, n)
-            raw = ws.outputs[:n, 0].clamp(max=volume.RAW_LIMIT)
-            result[start : start + n] = (torch.exp(raw) * self.layout.density_unit).cpu().numpy()
+            n = min(QUERY_POINTS, len(points) - start)
+            meters = torch.as_tensor(points[start : start + n], device=self.device)
+            with self.workspace(0, 1, QUERY_POINTS) as ws:
+                wp.launch(
+                    space.contract_points,
+                    n,
+                    [warp_view(meters, wp.vec3f), self.center, self.inverse_half, 0],
+                    [ws.w_positions],
+                    device=self.device,
+                )
+                self.query(ws, 0, n)
+                raw = ws.outputs[:n, 0].clamp(max=volume.RAW_LIMIT)
+                result[start : start + n] = (torch.exp(raw) * self.layout.density_unit).cpu().numpy()
             u = np.abs((points[start : start + n] - self.layout.centre) / self.layout.half).max(1)
             result[start : start + n] /= np.maximum(u, 1.0) ** 2
-            self._spare.append(ws)
 
         with single_threaded_torch():
-            parallel(one, range(0, len(points), batch), self.where)
+            parallel(one, range(0, len(points), QUERY_POINTS), self.device)
         return result
 
     def trace(
         self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int = _RENDER_SAMPLES
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What does not depend on the lighting, of n rays given by camera index (n,) and pixel (n, 2) [px].
+        """Traces n rays, given by camera index (n,) and pixel (n, 2) [px], up to what does not depend on the lighting.
 
         Returns:
             Features (n, CHANNELS − 1), spherical harmonics of the directions (n, 16), z-depth [m] (n,), opacity (n,).
         """
         n, batch = len(camera), _RENDER_RAYS
-        features = torch.empty(n, volume.CHANNELS - 1, device=self.where)
-        harmonics = torch.empty(n, 16, device=self.where)
-        depth, opacity = torch.empty(n, device=self.where), torch.empty(n, device=self.where)
+        features = torch.empty(n, volume.CHANNELS - 1, device=self.device)
+        harmonics = torch.empty(n, 16, device=self.device)
+        depth, opacity = torch.empty(n, device=self.device), torch.empty(n, device=self.device)
 
         @torch.no_grad()
         def one(start: int) -> None:
-            ws = self._borrow(batch, samples, 0)
             stop = min(start + batch, n)
-            k = stop - start
-            ws.camera[:k] = torch.as_tensor(camera[start:stop].astype(np.int32), device=self.where)
-            ws.pixel[:k] = torch.as_tensor(pixel[start:stop].astype(np.float32), device=self.where)
-            self.cast(ws, cameras, 0, k)
-            self.sample(ws, 0, k, _RENDER_FLOOR)
-            self.query(ws, 0, k * samples)
-            self.composite(ws, 0, k)
-            rows = slice(start, stop)
-            harmonics[rows] = network.spherical_harmonics(ws.directions[:k])
-            features[rows] = network.ray_features(self.parameters, ws.composited[:k], harmonics[rows])
-            median = ws.median_distance[:k]
-            depth[rows] = torch.where(median > 0.0, median * ws.cosines[:k], FAR).clamp(max=FAR)
-            opacity[rows] = ws.composited[:k, 0]
-            self._spare.append(ws)
+            k, rows = stop - start, slice(start, stop)
+            with self.workspace(batch, samples) as ws:
+                ws.camera[:k] = torch.as_tensor(camera[rows].astype(np.int32), device=self.device)
+                ws.pixel[:k] = torch.as_tensor(pixel[rows].astype(np.float32), device=self.device)
+                self.cast(ws, cameras, 0, k)
+                self.sample(ws, 0, k, _RENDER_UNIFORM_WEIGHT)
+                self.query(ws, 0, k * samples)
+                self.composite(ws, 0, k)
+                harmonics[rows] = network.spherical_harmonics(ws.directions[:k])
+                features[rows] = network.ray_features(self.parameters, ws.composited[:k], harmonics[rows])
+                median = ws.median_distance[:k]
+                depth[rows] = torch.where(median > 0.0, median * ws.cosines[:k], FAR).clamp(max=FAR)
+                opacity[rows] = ws.composited[:k, 0]
 
         with single_threaded_torch():
-            parallel(one, range(0, n, batch), self.where)
+            parallel(one, range(0, n, batch), self.device)
         return features, harmonics, depth, opacity
 
-    def colour(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: NDArray) -> NDArray[np.float32]:
-        """Colour of traced rays under one embedding (dim,), shape (n, 3)."""
+    def color(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: NDArray) -> NDArray[np.float32]:
+        """Colors in [0, 1], shape (n, 3), of traced rays under one embedding (dim,)."""
         n, batch = len(features), _HEAD_RAYS
-        rgb = torch.empty(n, 3, device=self.where)
-        vector = torch.as_tensor(np.asarray(embedding, np.float32), device=self.where)
+        rgb = torch.empty(n, 3, device=self.device)
+        vector = torch.as_tensor(np.asarray(embedding, np.float32), device=self.device)
 
         @torch.no_grad()
         def one(start: int) -> None:
@@ -231,38 +230,40 @@ class RadianceField:
             rgb[rows] = network.head(self.parameters, features[rows], harmonics[rows], vector)
 
         with single_threaded_torch():
-            parallel(one, range(0, n, batch), self.where)
+            parallel(one, range(0, n, batch), self.device)
         return rgb.cpu().numpy()
 
-    def render(self, cameras: Posed, lighting: str | NDArray, size: tuple[int, int] | None = None) -> Rendering:
-        """What n cameras see under one lighting; as `BakedField.render`, which is many times faster.
-
-        Raises:
-            InputError: unknown lighting, or cameras of several sizes and none given.
-        """
+    def render(self, cameras: PosedCameras, lighting: str | NDArray, size: tuple[int, int] | None = None) -> Rendering:
+        """Renders n cameras under one lighting, with arguments and errors of the much faster `BakedField.render`."""
         vector = self.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
-        intrinsics, (width, height) = resized(cameras, size)
+        intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         n = len(intrinsics)
-        arrays = CameraArrays(cameras.camera_to_world, intrinsics, self.where)
+        arrays = CameraArrays(cameras.camera_to_world, intrinsics, self.device)
         v, u = np.mgrid[:height, :width] + 0.5
         pixel = np.tile(np.stack([u.ravel(), v.ravel()], -1), (n, 1))
         features, harmonics, depth, opacity = self.trace(arrays, np.repeat(np.arange(n), width * height), pixel)
         return Rendering(
-            self.colour(features, harmonics, vector).reshape(n, height, width, 3),
+            self.color(features, harmonics, vector).reshape(n, height, width, 3),
             depth.cpu().numpy().reshape(n, height, width),
             opacity.cpu().numpy().reshape(n, height, width),
         )
 
-    def _borrow(self, rays: int, samples: int, extra: int) -> Workspace:
-        """A workspace of this size from those at hand, or a new one; list operations are atomic between threads."""
-        for ws in self._spare:
-            if (ws.rays, ws.samples) == (rays, samples):
+    @contextmanager
+    def workspace(self, rays: int, samples: int, extra: int = 0) -> Iterator[Workspace]:
+        """Lends a spare workspace of this size, or a new one. Thread-safe, as list operations are atomic."""
+        shape = rays, samples, extra
+        ws = None
+        for spare in self._spare:
+            if (spare.rays, spare.samples, spare.extra) == shape:
                 try:
-                    self._spare.remove(ws)
-                    return ws
+                    self._spare.remove(spare)
                 except ValueError:  # another thread took it
                     continue
-        return Workspace(self.layout, rays, samples, self.where, extra)
+                ws = spare
+                break
+        ws = ws or Workspace(self.layout, rays, samples, self.device, extra)
+        yield ws
+        self._spare.append(ws)
 
     # ---- files
 
@@ -286,26 +287,25 @@ class RadianceField:
         )
 
     @staticmethod
-    def load(folder: Path, where: str | None = None) -> "RadianceField":
-        """Reads a field on to a device (by default `compute.device()`).
+    def load(folder: Path, device: str | None = None) -> "RadianceField":
+        """Loads a field on to a device, see `buffers.resolve_device`.
 
-        Raises:
-            InputError: no field there, or one of another format.
+        Raises InputError if the folder has no field, or one of another format.
         """
-        where = where or device()
+        device = resolve_device(device)
         if not (folder / "field.json").exists():
-            raise InputError(f"{folder}: holds no field.json; build the scene's field first")
+            raise InputError(f"{folder}: contains no field.json; build the scene's field first")
         path = folder / "field.json"
         head = read_json(path)
-        with damaged(path, "build the scene again"):
+        with wrap_read_errors(path, "build the scene again"):
             if head.get("format") != _FORMAT:
-                raise InputError(f"{path}: format {shown(head.get('format'))}, expected {_FORMAT}; build it anew")
+                raise InputError(f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build it anew")
             layout = Layout(**(head["layout"] | {key: tuple(head["layout"][key]) for key in ("centre", "half")}))
-            names, frames = tuple(map(checked_text, head["lightings"])), tuple(map(checked_text, head["frames"]))
+            names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
             frame_lighting, about = np.array(head["frame_lighting"], np.int64), dict(head["about"])
-        path = regular(folder / "field.safetensors")
-        with damaged(path, "build the scene again"):
-            tensors = load_file(str(path), device=where)
+        path = regular_file(folder / "field.safetensors")
+        with wrap_read_errors(path, "build the scene again"):
+            tensors = load_file(str(path), device=device)
             appearance = Appearance(
                 names, frames, frame_lighting, tensors["appearance.vectors"], tensors["appearance.residuals"]
             )
@@ -314,22 +314,22 @@ class RadianceField:
             return RadianceField(layout, appearance, tensors["table"], parameters, grids, about)
 
 
-def untrained(layout: Layout, appearance: Appearance, seed: int, where: str) -> RadianceField:
-    """A field before its first step: nearly transparent everywhere."""
+def untrained_field(layout: Layout, appearance: Appearance, seed: int, device: str) -> RadianceField:
+    """The field before its first training step: nearly transparent everywhere."""
     generator = torch.Generator().manual_seed(seed)
     table = (torch.rand(layout.levels, 2**layout.log2_table, hashgrid.FEATURES, generator=generator) - 0.5) * 2e-2
     parameters = network.initial_parameters(
         layout.levels * hashgrid.FEATURES, layout.hidden, layout.appearance_dim, seed
     )
-    stop = opacity_grids(layout.space)
-    near = torch.full(stop.near_shape, -math.expm1(-layout.density_unit * stop.near_cell), device=where)
-    far = torch.full(stop.far_shape, -math.expm1(-layout.density_unit * stop.far_cell), device=where)
+    stop = opacity_grids(layout.near_box)
+    near = torch.full(stop.near_shape, -math.expm1(-layout.density_unit * stop.near_cell), device=device)
+    far = torch.full(stop.far_shape, -math.expm1(-layout.density_unit * stop.far_cell), device=device)
     moved = Appearance(
         appearance.lightings,
         appearance.frames,
         appearance.frame_lighting,
-        appearance.vectors.to(where),
-        appearance.residuals.to(where),
+        appearance.vectors.to(device),
+        appearance.residuals.to(device),
     )
-    on_device = {name: value.to(where) for name, value in parameters.items()}
-    return RadianceField(layout, moved, table.to(where), on_device, (near, far))
+    on_device = {name: value.to(device) for name, value in parameters.items()}
+    return RadianceField(layout, moved, table.to(device), on_device, (near, far))

@@ -1,9 +1,7 @@
-"""The air between a camera and a place, laid into a picture by its depth.
+"""Homogeneous fog, applied to an image by its depth (Koschmieder 1924).
 
-*Extinction* is the share of light that a metre of air takes away [1/m]: what is seen over a distance d keeps
-exp(−extinction · d) of its light and gains the rest from the *airlight*, which the air itself scatters towards the
-camera (Koschmieder 1924). *Visibility*, as meteorologists say it, is the distance over which 5 % are kept: 3 over the
-extinction.
+Light over a distance d keeps the share exp(−extinction · d) and gains the rest from the *airlight*, which the air
+scatters towards the camera. The meteorological visibility, where 5 % are kept, is 3 / extinction.
 """
 
 from dataclasses import dataclass
@@ -13,20 +11,20 @@ import numpy as np
 from twin.types import Array32
 
 REACH = 100.0
-"""[m] that air reaches at most: haze lies low, so the sky shines through."""
+"""Greatest distance [m] over which fog accumulates: it lies low, so the sky shines through."""
 
 
 @dataclass(frozen=True)
 class Fog:
-    """Over that of the film; clear by default."""
+    """Fog in addition to the film's; clear by default."""
 
     extinction: float = 0.0
     """[1/m]"""
     airlight: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1]."""
 
-    def over(self, rgb: Array32, distance: Array32) -> Array32:
-        """A picture (..., 3) as seen through this air; distance along the rays [m], shape (...)."""
+    def apply(self, rgb: Array32, distance: Array32) -> Array32:
+        """Applies the fog to an image (..., 3) with distances along the rays [m], shape (...)."""
         if not self.extinction:
             return rgb
         kept = np.exp(np.float32(-self.extinction) * np.minimum(distance, np.float32(REACH)))[..., None]
@@ -34,10 +32,7 @@ class Fog:
 
 
 def mixed(one: Fog | None, other: Fog | None, share: float) -> Fog | None:
-    """The air `share` of the way from one to another; None is the film's, and both of them None give None.
-
-    Each airlight counts by how much there is of its air.
-    """
+    """Fog `share` of the way from one to another, airlights weighted by extinction; None is the air of the film."""
     if one is None and other is None:
         return None
     a, b = one or Fog(), other or Fog()

@@ -1,8 +1,8 @@
-"""Lightings by name: plain arrays, for whoever renders without training.
+"""Lightings by name, as NumPy arrays, for rendering without torch.
 
-A *lighting* can be asked for by name, as a frame (`day/000012`), or as a mixture `day:night:0.3`, which is 30 % of the
-way from day to night. One that nobody filmed can be drawn at random, see `appearance_prior.py`. To the lightings that a field
-was trained on those may be *added* that photos were fitted for, see `added_lightings.py`.
+A lighting is requested by its name, by a frame (`day/000012`), or as a mixture `day:night:0.3`, 30 % of the way from
+day to night. Random lightings come from `appearance_prior.py`; lightings fitted to photos (`added_lightings.py`) can be
+added to those that the field was trained on.
 """
 
 from collections.abc import Mapping
@@ -28,13 +28,13 @@ class Lightings:
     frame_vectors: NDArray[np.float32]
     """Shape (frames, dim)."""
     probes: appearance_prior.Probes | None = None
-    """What a random lighting is judged on; a baked field has them."""
+    """Rays on which random lightings are checked; a baked field has them."""
     stale: tuple[str, ...] = ()
-    """Lightings that were added to another build of the field, or by an older twin, and mean nothing to this one."""
+    """Added lightings that are refused, as they were fitted to another build of the field or by an older twin."""
     count_added: int = 0
-    """How many of the last ones were added."""
-    airs: Mapping[str, Fog] = field(default_factory=dict)
-    """Of those added, by name: what was in the air when their photos were taken."""
+    """Number of added lightings, the last ones of `names`."""
+    fogs: Mapping[str, Fog] = field(default_factory=dict)
+    """Fog in the photos of the added lightings, by name."""
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """The embedding of a lighting, a frame or a mixture, shape (dim,).
@@ -56,33 +56,23 @@ class Lightings:
             )
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
 
-    def air(self, lighting: str) -> Fog | None:
-        """The air that a photo told of a lighting, or of a mixture with one; None where it is the film's.
-
-        Raises:
-            InputError: as `embedding`, where a mixture is none.
-        """
-        if lighting in self.airs:
-            return self.airs[lighting]
+    def fog(self, lighting: str) -> Fog | None:
+        """Fog of an added lighting or of a mixture with one; None means the air of the film. Errors as `embedding`."""
+        if lighting in self.fogs:
+            return self.fogs[lighting]
         mixture = None if lighting in self.names else _mixture(lighting)
-        return mixed(self.air(mixture[0]), self.air(mixture[1]), mixture[2]) if mixture else None
+        return mixed(self.fog(mixture[0]), self.fog(mixture[1]), mixture[2]) if mixture else None
 
     def sample(self, rng: np.random.Generator) -> NDArray[np.float32]:
-        """The embedding of a random lighting that could have been filmed, shape (dim,); `appearance_prior.py` has the rule.
-
-        The same generator state gives the same lighting.
-
-        Raises:
-            InputError: there are no probes, or none of the lightings drawn was plausible.
-        """
-        return appearance_prior.sample(rng, self.judge)
+        """Samples the embedding (dim,) of a plausible lighting; raises InputError without probes or success."""
+        return appearance_prior.sample_plausible(rng, self.prior)
 
     @cached_property
-    def judge(self) -> appearance_prior.AppearancePrior:
-        """Tells whether an embedding could have been filmed. Raises InputError where there are no probes."""
+    def prior(self) -> appearance_prior.AppearancePrior:
+        """The prior of plausible embeddings. Raises InputError without probes."""
         if self.probes is None:
             raise InputError(
-                "no probes to judge a random lighting on; take the baked field, twin.load_scene(SCENE).field()"
+                "no probes to check a random lighting on; use the baked field, twin.load_scene(SCENE).field()"
             )
         return appearance_prior.AppearancePrior(self.probes, self.vectors, self.frame_vectors)
 
@@ -90,9 +80,9 @@ class Lightings:
         self,
         more: Mapping[str, NDArray[np.float32]],
         stale: tuple[str, ...] = (),
-        airs: Mapping[str, Fog] | None = None,
+        fogs: Mapping[str, Fog] | None = None,
     ) -> "Lightings":
-        """With more lightings, embeddings (dim,) by name, the names of those that are not to be used, and airs."""
+        """A copy with more lightings: embeddings (dim,) by name, stale names (see `stale`), and fog by name."""
         vectors = np.concatenate([self.vectors, *(vector[None] for vector in more.values())])
         return replace(
             self,
@@ -100,24 +90,24 @@ class Lightings:
             vectors=vectors,
             stale=(*self.stale, *stale),
             count_added=self.count_added + len(more),
-            airs={**self.airs, **(airs or {})},
+            fogs={**self.fogs, **(fogs or {})},
         )
 
     def filmed(self) -> "Lightings":
-        """Without those that were added."""
+        """A copy without the added lightings."""
         count = len(self.names) - self.count_added
-        return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0, airs={})
+        return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0, fogs={})
 
 
 def _mixture(lighting: str) -> tuple[str, str, float] | None:
-    """The two lightings and the share of `a:b:share`; None where it is not of that form."""
+    """Parts of `a:b:share`; None if the name has another form."""
     if lighting.count(":") != 2:
         return None
     a, b, share = lighting.split(":")
     try:
         s = float(share)
     except ValueError:
-        raise InputError(f"lighting {lighting!r}: {share!r} is no number; expected a:b:share") from None
+        raise InputError(f"lighting {lighting!r}: {share!r} is not a number; expected a:b:share") from None
     if not 0.0 <= s <= 1.0:
         raise InputError(
             f"lighting {lighting!r}: the share {share} is not from 0 to 1; give {a}:{b}:0.3 for 30 % of the "

@@ -1,10 +1,9 @@
-"""Camera refinement: while the field is trained, frames move a little until what each saw lines up with the others.
+"""Camera pose refinement during field training.
 
-A frame's *correction* is a translation [m] and a rotation vector about its centre [rad], both in the world's axes.
-Along a ray the samples keep their distances from the camera, so with the gradient gᵢ of the loss at sample i, at
-distance tᵢ along the unit direction d, the gradient of the translation is Σ gᵢ and that of the rotation d × Σ tᵢ·gᵢ.
-How colours change with the direction they are seen from pulls at no camera. Corrections have no mean: where all frames
-move alike, the place does.
+A frame's *correction* is a translation [m] and a rotation vector about its center [rad], both in world axes. Samples of
+a ray keep their distances from the camera, so with the gradient gᵢ of the loss at sample i, at distance tᵢ along the
+unit direction d, the gradient of the translation is Σ gᵢ and that of the rotation d × Σ tᵢ·gᵢ. The dependence of color
+on the viewing direction is left out. Corrections are kept at zero mean, as a common motion would move the whole place.
 """
 
 from dataclasses import replace
@@ -12,53 +11,50 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 
 from twin.geometry.cameras import Cameras
-from twin.nerf.buffers import CameraArrays, Workspace, view
+from twin.nerf.buffers import CameraArrays, Workspace, warp_view
 from twin.nerf.field import RadianceField
 from twin.nerf.kernels import rays
 from twin.types import Array
+from twin.warp_runtime import wp
 
-_STEP = 0.05  # [px] of a training frame, by which a step moves a picture at first
-_NEIGHBOURS = 2  # training frames whose corrections a frame that was not trained on gets the mean of
+_STEP_PIXELS = 0.05  # [px of a training frame] initial image motion per step
+_NEIGHBORS = 2  # training frames whose mean correction a held-out frame gets
 
 
-class Refinement:
-    """The corrections of n frames under training, and the cameras with them."""
+class PoseRefinement:
+    """Corrections of n training frames, their optimizer, and the corrected cameras (`arrays`)."""
 
     def __init__(self, camera_to_world: Array, intrinsics: Array, near: float, ws: Workspace) -> None:
+        """Starts at poses (n, 4, 4) with intrinsics (n, 4) [px of a training frame].
+
+        The distance `near` of near surfaces [m] converts pixels to translations; `ws` is the training's workspace.
         """
-        Args:
-            camera_to_world: Of the frames as given, shape (n, 4, 4).
-            intrinsics: fx, fy, cx, cy [px of a training frame], shape (n, 4).
-            near: How far what is near is from the cameras [m]; what a translation is worth in pixels.
-            ws: Of the training.
-        """
-        wp.load_module(rays.__name__, device=ws.where)  # two threads that first need it would each compile it
-        n, where = len(camera_to_world), ws.where
-        self.turn = torch.zeros(n, 3, device=where, requires_grad=True)
+        wp.load_module(rays.__name__, device=ws.device)  # or two threads would each compile it
+        n, device = len(camera_to_world), ws.device
+        self.rotation = torch.zeros(n, 3, device=device, requires_grad=True)
         """Rotation vectors [rad], shape (n, 3)."""
-        self.shift = torch.zeros(n, 3, device=where, requires_grad=True)
+        self.translation = torch.zeros(n, 3, device=device, requires_grad=True)
         """Translations [m], shape (n, 3)."""
-        self._given = torch.as_tensor(camera_to_world, device=where, dtype=torch.float64)
-        self.arrays = CameraArrays(camera_to_world, intrinsics, where)
-        angle = _STEP / float(np.median(intrinsics[:, 0]))
+        self._initial = torch.as_tensor(camera_to_world, device=device, dtype=torch.float64)
+        self.arrays = CameraArrays(camera_to_world, intrinsics, device)
+        angle = _STEP_PIXELS / float(np.median(intrinsics[:, 0]))
         self._rates = angle, angle * near
-        groups = [{"params": [self.turn]}, {"params": [self.shift]}]
-        self._optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+        groups = [{"params": [self.rotation]}, {"params": [self.translation]}]
+        self._optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
         self._ws = ws
-        self._positions_grad = torch.zeros(ws.rays * ws.samples, 3, device=where)
-        self._ray_grad = torch.zeros(2, ws.rays, 3, device=where)
+        self._positions_grad = torch.zeros(ws.rays * ws.samples, 3, device=device)
+        self._ray_grad = torch.zeros(2, ws.rays, 3, device=device)
         on_rays = self._positions_grad.view(ws.rays, ws.samples, 3)
         self._w_positions_grad, self._w_ray_positions_grad = (
-            view(self._positions_grad, wp.vec3f),
-            view(on_rays, wp.vec3f),
+            warp_view(self._positions_grad, wp.vec3f),
+            warp_view(on_rays, wp.vec3f),
         )
-        self._w_ray_grad: list[Any] = [view(part, wp.vec3f) for part in self._ray_grad]
+        self._w_ray_grad: list[Any] = [warp_view(part, wp.vec3f) for part in self._ray_grad]
 
     def backward(self, field: RadianceField, start: int, count: int) -> None:
-        """Gradients of rays [start, start + count), after those of their samples' features."""
+        """Computes ray gradients of rays [start, start + count) from the gradients of their samples' features."""
         ws = self._ws
         wp.launch(
             rays.encode_positions_backward,
@@ -68,63 +64,63 @@ class Refinement:
                 ws.w_features_grad,
             ],
             [self._w_positions_grad],
-            device=field.where,
+            device=field.device,
         )
         wp.launch(
             rays.rays_backward,
             count,
             [
-                *(ws.w_origins, ws.w_directions, ws.w_distances, field.centre, field.inverse_half, start),
+                *(ws.w_origins, ws.w_directions, ws.w_distances, field.center, field.inverse_half, start),
                 self._w_ray_positions_grad,
             ],
             self._w_ray_grad,
-            device=field.where,
+            device=field.device,
         )
 
     def step(self, rate: float) -> None:
-        """Moves the cameras; `rate` is a share of the learning rate."""
+        """Takes an optimizer step; `rate` scales the learning rates."""
         frame = self._ws.camera.long()
         origin, direction = self._ray_grad
-        turning = torch.linalg.cross(self._ws.directions, direction)
-        self.shift.grad = torch.zeros_like(self.shift).index_add_(0, frame, origin)
-        self.turn.grad = torch.zeros_like(self.turn).index_add_(0, frame, turning)
-        for group, most in zip(self._optimiser.param_groups, self._rates, strict=True):
-            group["lr"] = most * rate
-        self._optimiser.step()
+        torque = torch.linalg.cross(self._ws.directions, direction)
+        self.translation.grad = torch.zeros_like(self.translation).index_add_(0, frame, origin)
+        self.rotation.grad = torch.zeros_like(self.rotation).index_add_(0, frame, torque)
+        for group, base in zip(self._optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = base * rate
+        self._optimizer.step()
         with torch.no_grad():
-            for part in (self.turn, self.shift):
+            for part in (self.rotation, self.translation):
                 part -= part.mean(0)
-            pose = corrected(self._given, self.turn.double(), self.shift.double()).cpu().numpy()
+            pose = apply_corrections(self._initial, self.rotation.double(), self.translation.double()).cpu().numpy()
         self.arrays.set_poses(pose)
 
-    def refined(self, cameras: Cameras) -> tuple[Cameras, dict[str, float]]:
-        """All frames of a training with the corrections of those trained on, and how far these moved [m], [°].
+    def refined_cameras(self, cameras: Cameras) -> tuple[Cameras, dict[str, float]]:
+        """Corrected poses of all frames, and a summary of how far the training frames moved [m], [°].
 
-        A frame that was not trained on gets the mean correction of the `_NEIGHBOURS` of its source next to it in time.
+        A held-out frame gets the mean correction of the `_NEIGHBORS` training frames of its source nearest in time.
         """
-        turn, shift = (part.detach().cpu().double().numpy() for part in (self.turn, self.shift))
+        rotation, translation = (part.detach().cpu().double().numpy() for part in (self.rotation, self.translation))
         every = np.zeros((len(cameras), 6))
         trained, sources = np.flatnonzero(~cameras.held_out), np.array(cameras.sources)
-        every[trained] = np.concatenate([turn, shift], 1)
+        every[trained] = np.concatenate([rotation, translation], 1)
         for i in np.flatnonzero(cameras.held_out):
             mine = trained[sources[trained] == sources[i]]
             if len(mine):
-                near = mine[np.argsort(np.abs(cameras.times[mine] - cameras.times[i]), kind="stable")[:_NEIGHBOURS]]
+                near = mine[np.argsort(np.abs(cameras.times[mine] - cameras.times[i]), kind="stable")[:_NEIGHBORS]]
                 every[i] = every[near].mean(0)
         moved = torch.as_tensor(every)
-        pose = corrected(torch.as_tensor(cameras.camera_to_world), moved[:, :3], moved[:, 3:]).numpy()
-        metres, degrees = np.linalg.norm(shift, axis=1), np.rad2deg(np.linalg.norm(turn, axis=1))
-        said = {"median_m": float(np.median(metres)), "most_m": float(metres.max())}
-        said |= {"median_deg": float(np.median(degrees)), "most_deg": float(degrees.max())}
-        return replace(cameras, camera_to_world=pose), said
+        pose = apply_corrections(torch.as_tensor(cameras.camera_to_world), moved[:, :3], moved[:, 3:]).numpy()
+        meters, degrees = np.linalg.norm(translation, axis=1), np.rad2deg(np.linalg.norm(rotation, axis=1))
+        summary = {"median_m": float(np.median(meters)), "most_m": float(meters.max())}
+        summary |= {"median_deg": float(np.median(degrees)), "most_deg": float(degrees.max())}
+        return replace(cameras, camera_to_world=pose), summary
 
 
-def corrected(camera_to_world: torch.Tensor, turn: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """Poses (n, 4, 4) turned by rotation vectors (n, 3) [rad] about their centres and shifted by (n, 3) [m]."""
-    x, y, z = turn.unbind(-1)
-    none = torch.zeros_like(x)
-    skew = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).reshape(-1, 3, 3)
+def apply_corrections(camera_to_world: torch.Tensor, rotation: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
+    """Poses (n, 4, 4), rotated about their centers by rotation vectors (n, 3) [rad] and translated by (n, 3) [m]."""
+    x, y, z = rotation.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     out = camera_to_world.clone()
     out[:, :3, :3] = torch.linalg.matrix_exp(skew) @ camera_to_world[:, :3, :3]
-    out[:, :3, 3] += shift
+    out[:, :3, 3] += translation
     return out

@@ -1,140 +1,138 @@
-"""Distances by stereo: where a film's own frames, with their poses known, agree on how far a pixel is.
+"""Multi-view stereo: depth supervision from frames of one film with known poses.
 
-A *source* of a frame is another frame of the same film that sees much of the same from a few degrees aside. Every few
-pixels a plane is found that makes the sources look like the frame (PatchMatch stereo: Bleyer et al. 2011; on several
-frames: Galliani et al. 2015); it counts as found where enough sources come to the same place. What is found becomes
-sightings to train on. Plain surfaces stay open: nothing is guessed here.
+A *source* of a frame is another frame of the same film with a similar view from a few degrees aside. PatchMatch stereo
+(Bleyer et al. 2011; for several views Galliani et al. 2015) fits a plane to every cell of a few pixels such that the
+sources look like the frame. A cell counts if enough sources find the same point; textureless surfaces get no depth.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.poses import inverse_pose
 from twin.nerf.buffers import parallel
-from twin.nerf.dataset import DepthSupervision, TrainingPixels, joined
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
 from twin.nerf.kernels import patch_match as kernels
 from twin.runtime import bar
 from twin.types import Array
+from twin.warp_runtime import wp
 
-_GRID = 160  # cells along a frame's longer side
-_SOURCES = 4
-_ROUNDS = 4
-_ANGLE = 5.0  # [°] between two frames at what both see: less is vague, more looks too different
-_SPACING = 240  # a window's pixels are this share of the longer side apart
-_MOST_COST = 0.5  # 1 − NCC
-_TOLERANCE = 0.04  # of inverse depth, within which two frames agree
-_PARALLAX = 0.3  # [px] that a change by the tolerance must move a pixel for a source to have a say
-_VOTES = 2
-_FEWEST_POINTS = 20  # sparse points a frame must see to say what depths to expect
+_GRID_CELLS = 160  # cells along a frame's longer side
+_MAX_SOURCES = 4  # per frame
+_ROUNDS = 4  # PatchMatch rounds after the first
+_BEST_ANGLE = 5.0  # [°] between two views of a point: less is imprecise, more changes the appearance too much
+_WINDOW_SPACING = 240  # longer side of a frame over the spacing of a window's pixels
+_MAX_COST = 0.5  # 1 − NCC
+_TOLERANCE = 0.04  # relative difference of inverse depth within which two frames agree
+_MIN_PARALLAX = 0.3  # [px] that a change by the tolerance must move a pixel in a source that votes
+_MIN_VOTES = 2  # sources that must agree
+_MIN_POINTS = 20  # sparse points from which a frame's depth range is estimated
 
 
 @dataclass(frozen=True)
-class Geometry:
-    """A frame's sources and how its pixels appear in them."""
+class StereoGeometry:
+    """A frame's s sources and the mapping of its pixels into them: homography · (u, v, 1) + epipole / depth."""
 
     source: NDArray[np.int32]
-    turn: Array
+    """Frame indices, shape (s,)."""
+    homography: Array
     """K_source · R · K⁻¹, shape (s, 3, 3)."""
-    shift: Array
+    epipole: Array
     """K_source · t, shape (s, 3)."""
-    back_turn: Array
-    back_shift: Array
+    back_homography: Array
+    """The same from source to frame."""
+    back_epipole: Array
 
 
-def stereo_depths(pixels: TrainingPixels, seed: int, where: str) -> tuple[DepthSupervision, dict[str, Any]]:
-    """Sightings of every frame that has sources, and what there is to say of them.
+def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[DepthSupervision, dict[str, Any]]:
+    """Depth supervision for every frame that has sources, and a summary; the same seed gives the same depths.
 
-    Args:
-        pixels: The training frames; their sparse points say what depths to expect, without them there is no stereo.
-        seed: Of the guesses; the same seed gives the same sightings.
-        where: Device.
+    The sparse points of the frames give the depth range; without them there is no stereo.
     """
     n = len(pixels.cameras)
-    none = joined([])
+    none = join_depths([])
     points = pixels.points
-    if len(points.frame) < _FEWEST_POINTS or n < 3:
+    if len(points.frame) < _MIN_POINTS or n < 3:
         return none, {"frames": 0, "sightings": 0, "share": 0.0}
-    depths = [_depths(pixels, i) for i in range(n)]
+    depths = [_depth_quantiles(pixels, i) for i in range(n)]
     sources = choose_sources(pixels.cameras, pixels.intrinsics, np.array([np.median(d) for d in depths]))
-    step = max(1, round(float(max(pixels.width.max(), pixels.height.max())) / _GRID))
+    step = max(1, round(float(max(pixels.width.max(), pixels.height.max())) / _GRID_CELLS))
     shapes = np.stack([pixels.height // step, pixels.width // step], 1).astype(np.int32)
     rows, columns = int(shapes[:, 0].max()), int(shapes[:, 1].max())
-    frames = kernels.Frames()
-    grey = pixels.colours.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / 255.0
-    frames.grey = wp.array(grey, dtype=wp.float32, device=where)
-    frames.start = wp.array(pixels.start[:-1].astype(np.int64), dtype=wp.int64, device=where)
-    frames.width = wp.array(pixels.width.astype(np.int32), dtype=wp.int32, device=where)
-    frames.height = wp.array(pixels.height.astype(np.int32), dtype=wp.int32, device=where)
-    planes: wp.array = wp.zeros((n, rows, columns), dtype=wp.vec3, device=where)
-    costs: wp.array = wp.full((n, rows, columns), 2.0, dtype=wp.float32, device=where)
-    cells: wp.array = wp.array(shapes, dtype=wp.vec2i, device=where)
+    frames = kernels.GrayImages()
+    gray = pixels.colors.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / 255.0
+    frames.gray = wp.array(gray, dtype=wp.float32, device=device)
+    frames.start = wp.array(pixels.start[:-1].astype(np.int64), dtype=wp.int64, device=device)
+    frames.width = wp.array(pixels.width.astype(np.int32), dtype=wp.int32, device=device)
+    frames.height = wp.array(pixels.height.astype(np.int32), dtype=wp.int32, device=device)
+    planes: wp.array = wp.zeros((n, rows, columns), dtype=wp.vec3, device=device)
+    costs: wp.array = wp.full((n, rows, columns), 2.0, dtype=wp.float32, device=device)
+    cells: wp.array = wp.array(shapes, dtype=wp.vec2i, device=device)
     geometry = [_geometry(pixels, i, sources[i]) for i in range(n)]
-    pairs = [_pairs(g, where) for g in geometry]
-    wp.load_module("twin.nerf.kernels.patch_match", device=where)
+    views = [_source_views(g, device) for g in geometry]
+    wp.load_module("twin.nerf.kernels.patch_match", device=device)
 
     with bar("stereo", n, "frame") as progress:
 
         def find(i: int) -> None:
             shape = tuple(int(x) for x in shapes[i])
             if len(sources[i]):
-                spacing = max(1.0, float(round(max(pixels.width[i], pixels.height[i]) / _SPACING)))
+                spacing = max(1.0, float(round(max(pixels.width[i], pixels.height[i]) / _WINDOW_SPACING)))
                 low, high = 0.5 / float(depths[i].max()), 2.0 / float(depths[i].min())
                 guesses: list[wp.array] = [
-                    wp.array(guess.astype(np.float32), dtype=wp.vec3, device=where)
-                    for guess in (_nearest_points(pixels, i, step, shape), _floor(pixels, i, step, shape))
+                    wp.array(guess.astype(np.float32), dtype=wp.vec3, device=device)
+                    for guess in (_planes_at_points(pixels, i, step, shape), _ground_planes(pixels, i, step, shape))
                 ]
-                mine, cost = _window(planes, i, shape), _window(costs, i, shape)
+                own_planes, own_costs = _frame_part(planes, i, shape), _frame_part(costs, i, shape)
                 for number in range(_ROUNDS + 1):
                     for parity in (0, 1):
                         wp.launch(
                             kernels.sweep,
                             (shape[0], (shape[1] + 1) // 2),
                             [
-                                *(frames, pairs[i], i, step, spacing, low, high, number, parity),
+                                *(frames, views[i], i, step, spacing, low, high, number, parity),
                                 *(seed * 100_003 + i, *guesses),
                             ],
-                            [mine, cost],
-                            device=where,
+                            [own_planes, own_costs],
+                            device=device,
                         )
             progress.update()
 
-        parallel(find, range(n), where)
+        parallel(find, range(n), device)
 
     def check(i: int) -> tuple[DepthSupervision, int]:
         shape = tuple(int(x) for x in shapes[i])
         if not len(sources[i]):
             return none, 0
-        votes: wp.array = wp.zeros(shape, dtype=wp.int32, device=where)
+        votes: wp.array = wp.zeros(shape, dtype=wp.int32, device=device)
         back: list[wp.array] = [
-            wp.array(geometry[i].back_turn.astype(np.float32), dtype=wp.mat33, device=where),
-            wp.array(geometry[i].back_shift.astype(np.float32), dtype=wp.vec3, device=where),
+            wp.array(geometry[i].back_homography.astype(np.float32), dtype=wp.mat33, device=device),
+            wp.array(geometry[i].back_epipole.astype(np.float32), dtype=wp.vec3, device=device),
         ]
         wp.launch(
-            kernels.agree,
+            kernels.count_votes,
             shape,
             [
-                *(pairs[i], *back, planes, cells, _window(costs, i, shape), i, step),
-                *(_MOST_COST, _TOLERANCE, _PARALLAX, votes),
+                *(views[i], *back, planes, cells, _frame_part(costs, i, shape), i, step),
+                *(_MAX_COST, _TOLERANCE, _MIN_PARALLAX, votes),
             ],
-            device=where,
+            device=device,
         )
-        q = _window(planes, i, shape).numpy()[..., 0]
-        row, column = np.nonzero(votes.numpy() >= min(_VOTES, len(sources[i])))
+        q = _frame_part(planes, i, shape).numpy()[..., 0]
+        row, column = np.nonzero(votes.numpy() >= min(_MIN_VOTES, len(sources[i])))
         pixel = np.stack([column, row], 1) * step + step // 2 + 0.5
-        open_ = pixels.open[pixels.start[i] + pixel[:, 1].astype(int) * pixels.width[i] + pixel[:, 0].astype(int)]
-        pixel, depth = pixel[open_], 1.0 / q[row[open_], column[open_]]
+        u, v = pixel.astype(int).T
+        unmasked = pixels.unmasked[pixels.start[i] + v * pixels.width[i] + u]
+        pixel, depth = pixel[unmasked], 1.0 / q[row[unmasked], column[unmasked]]
         distance = depth * np.linalg.norm(unproject(pixel, pixels.intrinsics[i]), axis=1)
-        return DepthSupervision(np.full(len(pixel), i, np.int32), pixel, distance.astype(np.float32)), shape[0] * shape[
-            1
-        ]
+        depths = DepthSupervision(np.full(len(pixel), i, np.int32), pixel, distance.astype(np.float32))
+        return depths, shape[0] * shape[1]
 
-    checked = parallel(check, range(n), where)
-    found = joined([s for s, _ in checked])
+    checked = parallel(check, range(n), device)
+    found = join_depths([s for s, _ in checked])
     return found, {
         "frames": sum(len(s.frame) > 0 for s, _ in checked),
         "sightings": len(found.frame),
@@ -143,12 +141,9 @@ def stereo_depths(pixels: TrainingPixels, seed: int, where: str) -> tuple[DepthS
 
 
 def choose_sources(cameras: Cameras, intrinsics: Array, depth: Array) -> list[NDArray[np.int32]]:
-    """Up to four sources of every frame, best first, from what each would see at the depth it expects.
+    """Up to four sources of every frame, best first, rated on points around its median depth [m], shape (n,).
 
-    Args:
-        cameras: Training frames.
-        intrinsics: Of the pictures used, shape (n, 4) [px].
-        depth: Median depth a frame sees [m], shape (n,).
+    `intrinsics` are fx, fy, cx, cy [px] of the scaled images, shape (n, 4).
     """
     n = len(cameras)
     positions, world_to_camera = cameras.positions, inverse_pose(cameras.camera_to_world)
@@ -160,30 +155,30 @@ def choose_sources(cameras: Cameras, intrinsics: Array, depth: Array) -> list[ND
         others = np.flatnonzero((names == names[i]) & (np.arange(n) != i))
         z = spots[:, 2:] * depth[i]
         local = np.concatenate([spots[:, :2] * half[i] * z, z], 1)
-        place = local @ cameras.camera_to_world[i, :3, :3].T + positions[i]
-        there = np.einsum("jab,sb->jsa", world_to_camera[others, :3, :3], place) + world_to_camera[others, None, :3, 3]
+        point = local @ cameras.camera_to_world[i, :3, :3].T + positions[i]
+        there = np.einsum("jab,sb->jsa", world_to_camera[others, :3, :3], point) + world_to_camera[others, None, :3, 3]
         ahead = there[..., 2] > 0.1 * depth[i]
         inside = (np.abs(there[..., :2]) < half[others, None] * there[..., 2:]).all(-1) & ahead
-        a, b = place - positions[i], place - positions[others, None]
+        a, b = point - positions[i], point - positions[others, None]
         cosine = (a * b).sum(-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1) + 1e-12)
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        # Seen twice as large or half as large, a window no longer looks the same.
+        # A window does not match at twice or half its scale.
         ratio = np.linalg.norm(b, axis=-1) / np.linalg.norm(a, axis=-1)
-        spread = np.where(angle < _ANGLE, 2.0, 8.0)
-        worth = (inside * np.exp(-(((angle - _ANGLE) / spread) ** 2) - (np.log(ratio) / 0.7) ** 2)).sum(-1)
-        best = np.argsort(-worth, kind="stable")[:_SOURCES]
-        out.append(others[best[worth[best] > 0.01 * len(spots)]].astype(np.int32))
+        spread = np.where(angle < _BEST_ANGLE, 2.0, 8.0)
+        rating = (inside * np.exp(-(((angle - _BEST_ANGLE) / spread) ** 2) - (np.log(ratio) / 0.7) ** 2)).sum(-1)
+        best = np.argsort(-rating, kind="stable")[:_MAX_SOURCES]
+        out.append(others[best[rating[best] > 0.01 * len(spots)]].astype(np.int32))
     return out
 
 
-def _depths(pixels: TrainingPixels, i: int) -> Array:
-    """What z-depths frame i may expect [m]: 1st to 99th percentile of its sparse points, or of all frames'."""
+def _depth_quantiles(pixels: TrainingPixels, i: int) -> Array:
+    """Quantiles (1, 25, 50, 75, 99 %) of z-depth [m] of frame i's sparse points, or of all if it has few."""
     points = pixels.points
-    mine = points.frame == i
-    if mine.sum() < _FEWEST_POINTS:
-        mine = np.ones(len(points.frame), bool)
-    rays = np.stack([np.ones(int(mine.sum())), *_ray_slopes(pixels, points.frame[mine], points.pixel[mine])], 1)
-    depth = points.distance[mine] / np.linalg.norm(rays, axis=1)
+    own = points.frame == i
+    if own.sum() < _MIN_POINTS:
+        own = np.ones(len(points.frame), bool)
+    rays = np.stack([np.ones(int(own.sum())), *_ray_slopes(pixels, points.frame[own], points.pixel[own])], 1)
+    depth = points.distance[own] / np.linalg.norm(rays, axis=1)
     return np.quantile(depth, [0.01, 0.25, 0.5, 0.75, 0.99])
 
 
@@ -192,65 +187,65 @@ def _ray_slopes(pixels: TrainingPixels, frame: NDArray, pixel: Array) -> tuple[A
     return (pixel[:, 0] - cx) / fx, (pixel[:, 1] - cy) / fy
 
 
-def _geometry(pixels: TrainingPixels, i: int, sources: NDArray[np.int32]) -> Geometry:
+def _geometry(pixels: TrainingPixels, i: int, sources: NDArray[np.int32]) -> StereoGeometry:
     def matrix(k: Array) -> Array:
         return np.array([[k[0], 0.0, k[2]], [0.0, k[1], k[3]], [0.0, 0.0, 1.0]])
 
     own = matrix(pixels.intrinsics[i])
     pose = pixels.cameras.camera_to_world[i]
-    turns, shifts, back_turns, back_shifts = [], [], [], []
+    homographies, epipoles, back_homographies, back_epipoles = [], [], [], []
     for j in sources:
         other = matrix(pixels.intrinsics[j])
         there = inverse_pose(pixels.cameras.camera_to_world[j]) @ pose
-        turns.append(other @ there[:3, :3] @ np.linalg.inv(own))
-        shifts.append(other @ there[:3, 3])
+        homographies.append(other @ there[:3, :3] @ np.linalg.inv(own))
+        epipoles.append(other @ there[:3, 3])
         here = inverse_pose(there)
-        back_turns.append(own @ here[:3, :3] @ np.linalg.inv(other))
-        back_shifts.append(own @ here[:3, 3])
-    stack = [np.array(m).reshape(-1, *shape) for m, shape in ((turns, (3, 3)), (shifts, (3,)))]
-    back = [np.array(m).reshape(-1, *shape) for m, shape in ((back_turns, (3, 3)), (back_shifts, (3,)))]
-    return Geometry(sources, *stack, *back)
+        back_homographies.append(own @ here[:3, :3] @ np.linalg.inv(other))
+        back_epipoles.append(own @ here[:3, 3])
+    stack = [np.array(m).reshape(-1, *shape) for m, shape in ((homographies, (3, 3)), (epipoles, (3,)))]
+    back = [np.array(m).reshape(-1, *shape) for m, shape in ((back_homographies, (3, 3)), (back_epipoles, (3,)))]
+    return StereoGeometry(sources, *stack, *back)
 
 
-def _pairs(geometry: Geometry, where: str) -> Any:
-    pairs = kernels.Pairs()
-    pairs.source = wp.array(geometry.source, dtype=wp.int32, device=where)
-    pairs.turn = wp.array(geometry.turn.astype(np.float32), dtype=wp.mat33, device=where)
-    pairs.shift = wp.array(geometry.shift.astype(np.float32), dtype=wp.vec3, device=where)
-    return pairs
+def _source_views(geometry: StereoGeometry, device: str) -> Any:
+    views = kernels.SourceViews()
+    views.source = wp.array(geometry.source, dtype=wp.int32, device=device)
+    views.homography = wp.array(geometry.homography.astype(np.float32), dtype=wp.mat33, device=device)
+    views.epipole = wp.array(geometry.epipole.astype(np.float32), dtype=wp.vec3, device=device)
+    return views
 
 
-def _window(array: wp.array, i: int, shape: tuple[int, ...]) -> wp.array:
-    """Frame i's share of an array over all frames, cut to the frame's shape."""
+def _frame_part(array: wp.array, i: int, shape: tuple[int, ...]) -> wp.array:
+    """Frame i's part of an array over all frames, cropped to the frame's shape."""
     return array[i][: shape[0], : shape[1]]
 
 
-def _grid(step: int, shape: tuple[int, ...]) -> Array:
-    """Pixel (u, v) of every cell, shape (rows, columns, 2)."""
+def _cell_pixels(step: int, shape: tuple[int, ...]) -> Array:
+    """Center pixel (u, v) of every cell, shape (rows, columns, 2)."""
     return (pixel_grid(shape[1], shape[0]) - 0.5) * step + step // 2 + 0.5
 
 
-def _nearest_points(pixels: TrainingPixels, i: int, step: int, shape: tuple[int, ...]) -> Array:
-    """The depth of the sparse point nearest in the picture, facing the lens; q = 0 where the frame saw none."""
+def _planes_at_points(pixels: TrainingPixels, i: int, step: int, shape: tuple[int, ...]) -> Array:
+    """Fronto-parallel planes (rows, columns, 3) at the depth of the nearest sparse point; q = 0 without points."""
     from scipy.spatial import cKDTree
 
-    mine = pixels.points.frame == i
+    own = pixels.points.frame == i
     out = np.zeros((*shape, 3))
-    if mine.any():
-        pixel = pixels.points.pixel[mine]
-        x, y = _ray_slopes(pixels, pixels.points.frame[mine], pixel)
-        q = np.sqrt(1.0 + x**2 + y**2) / pixels.points.distance[mine]
-        out[..., 0] = q[cKDTree(pixel).query(_grid(step, shape).reshape(-1, 2))[1]].reshape(shape)
+    if own.any():
+        pixel = pixels.points.pixel[own]
+        x, y = _ray_slopes(pixels, pixels.points.frame[own], pixel)
+        q = np.sqrt(1.0 + x**2 + y**2) / pixels.points.distance[own]
+        out[..., 0] = q[cKDTree(pixel).query(_cell_pixels(step, shape).reshape(-1, 2))[1]].reshape(shape)
     return out
 
 
-def _floor(pixels: TrainingPixels, i: int, step: int, shape: tuple[int, ...]) -> Array:
-    """The level floor at z = 0; q ≤ 0 above the horizon."""
+def _ground_planes(pixels: TrainingPixels, i: int, step: int, shape: tuple[int, ...]) -> Array:
+    """The ground plane z = 0 in every cell, shape (rows, columns, 3); q ≤ 0 above the horizon."""
     pose, (fx, fy, cx, cy) = pixels.cameras.camera_to_world[i], pixels.intrinsics[i]
     height = pose[2, 3]
-    # z of the place a ray with unit z-depth reaches at depth d is height + d · (row 3 of R) · ray, and 0 on the floor.
+    # A ray at depth d reaches z = height + d · (row 3 of R) · ray, which is 0 on the ground.
     down = -pose[2, :3] / (height if height > 1e-3 else -1.0)
-    grid = _grid(step, shape)
+    grid = _cell_pixels(step, shape)
     out = np.empty((*shape, 3))
     out[..., 1], out[..., 2] = down[0] / fx, down[1] / fy
     out[..., 0] = down[2] + (grid[..., 0] - cx) * out[..., 1] + (grid[..., 1] - cy) * out[..., 2]

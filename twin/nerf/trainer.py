@@ -1,4 +1,9 @@
-"""Stage `field`: metric cameras → a trained radiance field, the same baked for rendering, and how good both are."""
+"""Stage `field`: trains a radiance field on metric cameras, bakes it for rendering, and evaluates both.
+
+A *step* takes one batch of rays forward and back. The number of steps is fixed (`nerf.steps`) and no clock decides
+anything, so on a CPU the same input gives the same field bit for bit. Every batch also holds *free points*: random
+points around the camera path, where nothing can be.
+"""
 
 import math
 import time
@@ -9,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 
 from twin.config import NerfConfig, SceneConfig
@@ -20,39 +24,37 @@ from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.bake import bake
 from twin.nerf.buffers import (
-    COARSEST,
+    COARSEST_CELLS,
     CameraArrays,
     Layout,
-    Space,
+    NearBox,
     Workspace,
-    device,
+    near_box_of_cameras,
     parallel,
+    resolve_device,
     single_threaded_torch,
-    space_of_cameras,
 )
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.evaluate import cross_lighting, evaluate
-from twin.nerf.field import RadianceField, untrained
+from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
-from twin.nerf.pose_refinement import Refinement
+from twin.nerf.pose_refinement import PoseRefinement
 from twin.nerf.stereo import stereo_depths
 from twin.runtime import bar
 from twin.scene import SceneDir
+from twin.warp_runtime import wp
 
-# ---- What a field is trained to besides the colours of the pictures: how much each part counts, and what needs no kernel.
-#
-# Distortion and depth are in `kernels/composite.py`, with the gradient of volume rendering.
+# ---- losses; distortion and depth are in `kernels/composite.py`
 
-
-_EDGE = 10.0  # a contrast of 1/10 makes bending count e times less
-_MOST_BEND = 0.5  # beyond this it is an edge of depth, whatever the colours say
-_HORIZON = 0.03  # rays this near to level are neither above nor below the horizon [sine]
+_EDGE_SHARPNESS = 10.0  # a color contrast of 1/10 divides the plane loss by e
+_MAX_BEND = 0.5  # relative bending beyond this is a depth edge, whatever the colors are
+_HORIZON_SINE = 0.03  # rays this close to level are neither above nor below the horizon
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each part of the loss counts."""
+    """Weights of the loss terms beside the color error."""
 
     distortion: float = 0.005
     depth: float = 1.0
@@ -64,59 +66,44 @@ class LossWeights:
     residual: float = 1e-3
 
 
-def bending(inverse_depth: torch.Tensor, colour: torch.Tensor) -> torch.Tensor:
-    """How far triples of rays are from seeing a plane, where their colours give no reason for an edge.
+def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor:
+    """Edge-aware planarity loss of triples of rays, from inverse z-depths (3k,) [1/m] and colors (3k, 3).
 
-    The inverse z-depth of a plane is affine in the pixel, so its second difference vanishes on any plane; relative to
-    the inverse depth itself it has no unit. The road has little texture, so this is what spreads the few known depths.
-
-    Args:
-        inverse_depth: Expected inverse z-depth [1/m], shape (3k,), triple after triple.
-        colour: Shape (3k, 3).
+    The inverse z-depth of a plane is affine in the pixel, so its second difference, taken relative to it, is zero. The
+    road has little texture, and this loss spreads its few known depths.
     """
     d = inverse_depth.view(-1, 3)
-    c = colour.view(-1, 3, 3)
+    c = color.view(-1, 3, 3)
     contrast = (c[:, 0] - c[:, 1]).abs().sum(-1) + (c[:, 2] - c[:, 1]).abs().sum(-1)
     bend = (d[:, 0] + d[:, 2] - 2.0 * d[:, 1]).abs() / (d.detach().mean(1) + 1e-3)
-    return (torch.exp(-_EDGE * contrast) * bend.clamp(max=_MOST_BEND)).mean()
+    return (torch.exp(-_EDGE_SHARPNESS * contrast) * bend.clamp(max=_MAX_BEND)).mean()
 
 
 def horizon_loss(opacity: torch.Tensor, up: torch.Tensor, sky: float, ground: float) -> torch.Tensor:
-    """Above the horizon what may be open is open (a plain sky fits at any distance); below it something is solid.
-
-    Args:
-        opacity: Of rays, shape (n,).
-        up: Vertical component of their unit directions, shape (n,).
-        sky: Cost of an opaque ray above the horizon.
-        ground: Cost of an open ray below it.
-    """
-    above, below = (up > _HORIZON).float(), (up < -_HORIZON).float()
+    """Mean cost of opaque rays above the horizon (`sky`; a plain sky fits at any distance) and transparent rays below
+    (`ground`), from opacity (n,) and the vertical component `up` (n,) of the ray directions."""
+    above, below = (up > _HORIZON_SINE).float(), (up < -_HORIZON_SINE).float()
     return (sky * above * opacity + ground * below * (1.0 - opacity)).mean()
 
 
-# ---- Training: from posed frames to a radiance field.
-#
-# A *step* takes a batch of rays through the field and back. Its length is fixed (`nerf.steps`) and no clock decides
-# anything, so that on a CPU the same input gives the same field bit by bit. Every batch also holds *free points*: random
-# points around the filmed path, where a camera was and so nothing can be.
+# ---- training
 
-
-_SHARDS = 4
-_CELL_PIXELS = 2.0  # side of the finest cell [px of a training frame, at the near end of what was seen]
-_GROWTH_RANGE = (1.3, 2.2)
-_HIDDEN = 64
-_TRIPLES = 0.3  # share of the rays that come in threes, to see whether surfaces are plane
+_SHARDS = 4  # per batch
+_CELL_PIXELS = 2.0  # side of the finest cell [px of a training frame, at the near end of the visible range]
+_GROWTH_RANGE = (1.3, 2.2)  # of the cells from one hash level to the next
+_HIDDEN = 64  # units per hidden layer
+_TRIPLE_SHARE = 0.3  # share of the rays that come in triples, for the plane loss
 _FREE_POINTS = 256  # per shard and step
-_NETWORK_RATE = 1e-2  # learning rate of the networks and embeddings at the start
-_FINAL_RATE = 0.03  # learning rates end at this share
-_RISE, _FALL = 0.3, 0.1  # how fast a cell of the stop grids follows what is found in it
+_NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
+_FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
+_RISE, _FALL = 0.3, 0.1  # how fast opacity grid cells follow higher and lower samples
 _LOG_OFFSET = 0.05  # of the distortion's logarithmic distance [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
-_EXPLORE = 0.15  # share of the steps over which sampling narrows down
+_EXPLORATION_SHARE = 0.15  # share of the steps over which sampling narrows down; cameras move only after it
 
 
 class Trainer:
-    """A field under training. `step()` until `done`, then `finish()`."""
+    """Trains a field: call `step()` until `done`, then `finish()`."""
 
     def __init__(
         self,
@@ -124,52 +111,53 @@ class Trainer:
         points: SparsePoints,
         config: NerfConfig,
         seed: int,
-        where: str,
+        device: str,
         weights: LossWeights | None = None,
         camera_height: float = 0.0,
     ):
-        self.config, self.seed, self.where = config, seed, where
+        self.config, self.seed, self.device = config, seed, device
         self.weights = weights or LossWeights()
         self.pixels = TrainingPixels(cameras, points, config.max_width, camera_height)
         self.stereo: dict[str, Any] | None = None
-        """What there is to say of the sightings by stereo; None where they are switched off."""
+        """Summary of the stereo depths; None without `nerf.stereo`."""
         if config.stereo:
-            self.pixels.stereo, self.stereo = stereo_depths(self.pixels, seed, where)
+            self.pixels.stereo, self.stereo = stereo_depths(self.pixels, seed, device)
         train = self.pixels.cameras
         self.lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([self.lightings.index(name) for name in train.lightings])
-        space = space_of_cameras(cameras.camera_to_world, config.near_half_extent)
+        near_box = near_box_of_cameras(cameras.camera_to_world, config.near_half_extent)
         layout = Layout(
-            space.centre,
-            space.half,
+            near_box.center,
+            near_box.half,
             near_plane=config.near_plane,
             levels=config.levels,
-            growth=self._growth(space),
+            growth=self._growth(near_box),
             log2_table=config.log2_table,
             hidden=_HIDDEN,
             appearance_dim=config.appearance_dim,
         )
         appearance = initial_appearance(self.lightings, train.names, frame_lighting, config.appearance_dim, seed)
-        self.field = untrained(layout, appearance, seed, where)
+        self.field = untrained_field(layout, appearance, seed, device)
         self.rng = np.random.default_rng([seed, 2])
         self.rays = -(-config.rays // _SHARDS) * _SHARDS
-        self.ws = Workspace(layout, self.rays, config.samples, where, _SHARDS * _FREE_POINTS, training=True)
+        self.ws = Workspace(layout, self.rays, config.samples, device, _SHARDS * _FREE_POINTS, training=True)
         self.free = free_segments(train, config.near_plane)
-        self.refinement: Refinement | None = None
-        """How the frames move; None where they do not."""
+        self.refinement: PoseRefinement | None = None
+        """Camera corrections; None without `nerf.refine_cameras`."""
         if config.refine_cameras:
-            near = self._near(space)
-            self.refinement = Refinement(train.camera_to_world, self.pixels.intrinsics, near, self.ws)
+            near = self._near_distance(near_box)
+            self.refinement = PoseRefinement(train.camera_to_world, self.pixels.intrinsics, near, self.ws)
             self.arrays = self.refinement.arrays
         else:
-            self.arrays = CameraArrays(train.camera_to_world, self.pixels.intrinsics, where)
+            self.arrays = CameraArrays(train.camera_to_world, self.pixels.intrinsics, device)
 
         f = self.field
-        self.small = {**f.parameters, "vectors": f.appearance.vectors, "residuals": f.appearance.residuals}
-        for name, tensor in self.small.items():
+        self.torch_parameters = {**f.parameters, "vectors": f.appearance.vectors, "residuals": f.appearance.residuals}
+        for name, tensor in self.torch_parameters.items():
             if not name.startswith("trunk"):
                 tensor.requires_grad_(True)
-        self.optimiser = torch.optim.Adam(list(self.small.values()), lr=_NETWORK_RATE, betas=(0.9, 0.99), eps=1e-12)
+        learned = list(self.torch_parameters.values())
+        self.optimizer = torch.optim.Adam(learned, lr=_NETWORK_RATE, betas=(0.9, 0.99), eps=1e-12)
         self.table_grad = torch.zeros_like(f.table)
         self.first, self.second = torch.zeros_like(f.table), torch.zeros_like(f.table)
         feature = hashgrid.Feature
@@ -180,63 +168,63 @@ class Trainer:
         )
         self.steps_done = 0
 
-    def _growth(self, space: Space) -> float:
-        """Ratio of one level's cells to the next finer one's, such that the finest suits the frames."""
-        cell = _CELL_PIXELS * self._near(space) / float(np.median(self.pixels.intrinsics[:, 0]))
-        ratio = 4.0 * space.scale / cell / COARSEST
+    def _growth(self, near_box: NearBox) -> float:
+        """Growth of the cells per hash level, such that the finest cell is `_CELL_PIXELS` wide."""
+        cell = _CELL_PIXELS * self._near_distance(near_box) / float(np.median(self.pixels.intrinsics[:, 0]))
+        ratio = 4.0 * near_box.scale / cell / COARSEST_CELLS
         return float(np.clip(ratio ** (1.0 / max(1, self.config.levels - 1)), *_GROWTH_RANGE))
 
-    def _near(self, space: Space) -> float:
-        """How far what is near is from the cameras [m]."""
+    def _near_distance(self, near_box: NearBox) -> float:
+        """Distance of near surfaces from the cameras [m]."""
         seen = self.pixels.points.distance
-        return float(np.quantile(seen, 0.05)) if len(seen) else 0.25 * space.scale
+        return float(np.quantile(seen, 0.05)) if len(seen) else 0.25 * near_box.scale
 
     @property
     def done(self) -> bool:
         return self.steps_done >= self.config.steps
 
     def rate(self) -> float:
-        """Learning rate now, as a share of that at the start."""
+        """Current learning rate, as a share of the initial one."""
         warm = min(1.0, (self.steps_done + 1) / _WARM_UP)
         return warm * math.exp(math.log(_FINAL_RATE) * self.steps_done / self.config.steps)
 
     def step(self) -> float:
-        """One step; returns the mean squared error of its colours."""
-        ws, where = self.ws, self.where
+        """Runs one training step and returns the mean squared error of its colors."""
+        ws, device = self.ws, self.device
         per_shard = self.rays // _SHARDS
-        sightings = int(per_shard * self.config.sightings)
-        triples = int(per_shard * _TRIPLES) // 3
-        batch = self.pixels.batch(self.rng, _SHARDS, triples, per_shard - sightings - 3 * triples, sightings)
+        supervised = int(per_shard * self.config.sightings)
+        triples = int(per_shard * _TRIPLE_SHARE) // 3
+        batch = self.pixels.batch(self.rng, _SHARDS, triples, per_shard - supervised - 3 * triples, supervised)
         ws.camera.copy_(torch.from_numpy(batch.frame))
         ws.pixel.copy_(torch.from_numpy(batch.pixel))
         ws.targets.copy_(torch.from_numpy(batch.distance))
-        colour = torch.from_numpy(batch.colour).to(where)
+        color = torch.from_numpy(batch.color).to(device)
         free = self._free_points(_SHARDS * _FREE_POINTS)
         if free is not None:
             ws.positions[self.rays * ws.samples :].copy_(free)
 
-        results = parallel(lambda shard: self._shard(shard, colour, triples, free is not None), range(_SHARDS), where)
+        results = parallel(lambda shard: self._shard(shard, color, triples, free is not None), range(_SHARDS), device)
         rate = self.rate()
-        parallel(lambda task: self._update(task, rate), range(self.config.levels + 2), where)
-        for tensor, *gradients in zip(self.small.values(), *(r[1] for r in results), strict=True):
+        parallel(lambda task: self._update(task, rate), range(self.config.levels + 2), device)
+        for tensor, *gradients in zip(self.torch_parameters.values(), *(r[1] for r in results), strict=True):
             tensor.grad = torch.stack(gradients).sum(0) if len(gradients) > 1 else gradients[0]
-        for group in self.optimiser.param_groups:
+        for group in self.optimizer.param_groups:
             group["lr"] = _NETWORK_RATE * rate
-        self.optimiser.step()
+        self.optimizer.step()
         if self._refines:
             self.refinement.step(rate)  # type: ignore[union-attr]
         self.steps_done += 1
         return sum(r[0] for r in results) / _SHARDS
 
-    def _shard(self, shard: int, colour: torch.Tensor, triples: int, free: bool) -> tuple[float, list[torch.Tensor]]:
-        """Forward and back through one shard: its error, and the gradients of the small tensors in their order."""
+    def _shard(self, shard: int, color: torch.Tensor, triples: int, free: bool) -> tuple[float, list[torch.Tensor]]:
+        """Forward and backward pass of one shard: its error, and the gradients in the order of `torch_parameters`."""
         f, ws, w = self.field, self.ws, self.weights
         count = self.rays // _SHARDS
         start = shard * count
         rays = slice(start, start + count)
         samples = slice(start * ws.samples, (start + count) * ws.samples)
         first_free = self.rays * ws.samples + shard * _FREE_POINTS
-        explore = max(0.0, 1.0 - self.steps_done / (_EXPLORE * self.config.steps + 1))
+        explore = max(0.0, 1.0 - self.steps_done / (_EXPLORATION_SHARE * self.config.steps + 1))
 
         f.cast(ws, self.arrays, start, count)
         f.sample(ws, start, count, 0.1 + explore, target_mass=0.3, seed=self.seed * 1_000_003 + self.steps_done)
@@ -249,15 +237,15 @@ class Trainer:
         harmonics = network.spherical_harmonics(ws.directions[rays])
         features = network.ray_features(f.parameters, composited, harmonics)
         rgb = network.head(f.parameters, features, harmonics, f.appearance.of_frames(frame))
-        error = rgb - colour[rays]
-        # The shards' losses add up to a mean over the batch.
-        loss = torch.nn.functional.smooth_l1_loss(rgb, colour[rays], beta=0.1) / _SHARDS
+        error = rgb - color[rays]
+        # The losses of the shards sum to a mean over the batch.
+        loss = torch.nn.functional.smooth_l1_loss(rgb, color[rays], beta=0.1) / _SHARDS
         loss = loss + w.residual * (residuals[frame] ** 2).mean() / _SHARDS
         loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2], w.sky, w.ground) / _SHARDS
         inverse_depth = (ws.inverse_distance[rays] / ws.cosines[rays]).requires_grad_(True)
         if triples and w.plane > 0.0:
-            loss = loss + w.plane / _SHARDS * bending(inverse_depth[: 3 * triples], colour[rays][: 3 * triples])
-        learned = [t for n, t in self.small.items() if not n.startswith("trunk")]
+            loss = loss + w.plane / _SHARDS * plane_loss(inverse_depth[: 3 * triples], color[rays][: 3 * triples])
+        learned = [t for n, t in self.torch_parameters.items() if not n.startswith("trunk")]
         gradients = torch.autograd.grad(loss, [composited, inverse_depth, *learned], allow_unused=True)
         with torch.no_grad():
             ws.composited_grad[rays] = gradients[0]
@@ -270,10 +258,10 @@ class Trainer:
                     *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_weights, ws.w_targets),
                     *(ws.w_composited_grad, ws.w_inverse_grad, f.layout.density_unit),
                     *(w.distortion / self.rays, w.depth / self.rays, w.depth_reach),
-                    *(_LOG_OFFSET * f.layout.space.scale, start),
+                    *(_LOG_OFFSET * f.layout.near_box.scale, start),
                 ],
                 [ws.w_ray_outputs_grad],
-                device=self.where,
+                device=self.device,
             )
             first, second = self._trunk_backward(samples)
             if self._refines:
@@ -282,18 +270,18 @@ class Trainer:
                 more = self._free_backward(first_free)
                 first, second = first + more[0], second + more[1]
             wp.launch(
-                volume.densities_of,
+                volume.sample_densities,
                 samples.stop - samples.start,
                 [ws.w_outputs, f.layout.density_unit, samples.start],
                 [ws.w_densities],
-                device=self.where,
+                device=self.device,
             )
             return float((error**2).mean()), [first, second, *gradients[2:]]
 
     @property
     def _refines(self) -> bool:
-        """Whether cameras move yet: at first the field knows less than they do."""
-        return self.refinement is not None and self.steps_done >= _EXPLORE * self.config.steps
+        """True while cameras move: not at first, when the field is less accurate than they are."""
+        return self.refinement is not None and self.steps_done >= _EXPLORATION_SHARE * self.config.steps
 
     def _trunk_backward(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         ws = self.ws
@@ -307,18 +295,18 @@ class Trainer:
         )
 
     def _free_backward(self, start: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Gradient of free · mean(log(1 + σ·scale)) over the free points: gentle where much is wrong."""
+        """Gradient of free · mean(log(1 + σ·scale)) over the free points; it saturates at high density."""
         f, ws = self.field, self.ws
         f.query(ws, start, _FREE_POINTS)
         rows = slice(start, start + _FREE_POINTS)
         depth = (
-            torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit * f.layout.space.scale
+            torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit * f.layout.near_box.scale
         )
         ws.outputs_grad[rows, 0] = self.weights.free / (_SHARDS * _FREE_POINTS) * depth / (1.0 + depth)
         return self._trunk_backward(rows)
 
     def _update(self, task: int, rate: float) -> None:
-        """Task by task: each level's scatter and Adam step; and the two halves of the density grid."""
+        """Task < levels: gradient scatter and Adam step of a hash level. The last two: halves of the opacity grids."""
         f, ws = self.field, self.ws
         levels = self.config.levels
         if task >= levels:
@@ -326,10 +314,10 @@ class Trainer:
                 sampler.update_grids,
                 self.rays * ws.samples,
                 [
-                    *(ws.w_positions, ws.w_densities, f.stop.near_cell, f.stop.far_cell),
+                    *(ws.w_positions, ws.w_densities, f.grid_sizes.near_cell, f.grid_sizes.far_cell),
                     *(_RISE, _FALL, task - levels, 2, f.w_near_grid, f.w_far_grid),
                 ],
-                device=self.where,
+                device=self.device,
             )
             return
         t = self.steps_done + 1
@@ -337,7 +325,7 @@ class Trainer:
             hashgrid.encode_backward,
             (1, ws.features.shape[0]),
             [ws.w_positions, f.w_cells, f.w_shapes, f.mask, task, ws.w_features_grad, self.w_table_grad],
-            device=self.where,
+            device=self.device,
         )
         wp.launch(
             hashgrid.adam_step,
@@ -346,11 +334,11 @@ class Trainer:
                 *(task, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)),
                 *(f.w_table, self.w_table_grad, self.w_first, self.w_second),
             ],
-            device=self.where,
+            device=self.device,
         )
 
     def _free_points(self, n: int) -> torch.Tensor | None:
-        """Grid positions of random points no camera can have been inside of, shape (n, 3)."""
+        """Grid positions of random points that must be empty, shape (n, 3); None without free segments."""
         if not len(self.free):
             return None
         pick = self.free[self.rng.integers(len(self.free), size=n)]
@@ -361,19 +349,19 @@ class Trainer:
         x = pick[:, 0] + (pick[:, 1] - pick[:, 0]) * self.rng.random((n, 1)) + offset
         layout = self.field.layout
         u = (x - np.array(layout.centre)) / np.array(layout.half)  # camera positions lie in the near box
-        return torch.as_tensor((u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32), device=self.where)
+        return torch.as_tensor((u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32), device=self.device)
 
     def finish(self) -> RadianceField:
-        """The trained field, no longer part of any graph."""
-        for tensor in self.small.values():
+        """The trained field, detached from autograd."""
+        for tensor in self.torch_parameters.values():
             tensor.requires_grad_(False)
         return self.field
 
 
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
-    """Straight pieces of the filmed path, shape (k, 2, 3) [m]: around them (within the near plane) nothing is.
+    """Straight segments of the camera path, shape (k, 2, 3) [m]; space within the near plane around them is empty.
 
-    A step much longer than its source's usual one is a jump between photos and no path; its ends still count.
+    A step much longer than the median of its source is a jump between photos, not a path; its ends still count.
     """
     pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
     for source in dict.fromkeys(cameras.sources):
@@ -386,14 +374,19 @@ def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
 
 
 def train_field(
-    cameras: Cameras, points: SparsePoints, config: NerfConfig, seed: int = 0, camera_height: float = 0.0
+    cameras: Cameras,
+    points: SparsePoints,
+    config: NerfConfig,
+    seed: int = 0,
+    camera_height: float = 0.0,
+    device: str | None = None,
 ) -> tuple[RadianceField, dict[str, Any], Cameras]:
-    """Trains a field; it, what there is to say of the training, and the cameras that it fits.
+    """Trains a field; returns it, the training metrics, and the cameras, refined if so configured.
 
-    `camera_height` [m] is that of a camera carried at constant height over the ground, 0 where it was not.
+    `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
+    `buffers.resolve_device`.
     """
-    where = device()
-    trainer = Trainer(cameras, points, config, seed, where, camera_height=camera_height)
+    trainer = Trainer(cameras, points, config, seed, resolve_device(device), camera_height=camera_height)
     curve: list[list[float]] = []
     began = time.perf_counter()
     mean = 0.0
@@ -410,8 +403,8 @@ def train_field(
     seconds = time.perf_counter() - began
     field, moved = trainer.finish(), None
     if trainer.refinement:
-        cameras, moved = trainer.refinement.refined(cameras)
-    small = sum(t.numel() for t in trainer.small.values())
+        cameras, moved = trainer.refinement.refined_cameras(cameras)
+    in_torch = sum(t.numel() for t in trainer.torch_parameters.values())
     return (
         field,
         {
@@ -419,7 +412,7 @@ def train_field(
             "seconds_train": round(seconds, 2),
             "rays_per_second": round(config.steps * trainer.rays / seconds, 1),
             "train_psnr": curve[-1][1],
-            "parameters": int(field.table.numel() + small),
+            "parameters": int(field.table.numel() + in_torch),
             "sightings_points": len(trainer.pixels.points.frame),
             "sightings_path": len(trainer.pixels.path.frame),
             "stereo": trainer.stereo,
@@ -430,37 +423,38 @@ def train_field(
     )
 
 
-_TIMES = ("seconds", "seconds_train", "rays_per_second")
+# ---- stage
+
+_TIMING_KEYS = ("seconds", "seconds_train", "rays_per_second")
 _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
 
 
 def constant_height(metric: dict[str, Any]) -> float:
-    """The camera's height above the ground [m], if the metric stage found it to be known and constant; else 0."""
+    """Camera height above the ground [m] if the metric stage found it known and constant, else 0."""
     height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
     if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
         return 0.0
     return 0.0 if spread is not None and spread > _HEIGHT_SPREAD * height else float(height)
 
 
-def untimed(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Metrics without how long it took: the same field is the same file, and what was fitted to it stays valid."""
+def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Metrics without timings, so that equal fields are equal files and lightings fitted to them stay valid."""
     return {
-        name: untimed(value) if isinstance(value, dict) else value
+        name: without_timings(value) if isinstance(value, dict) else value
         for name, value in metrics.items()
-        if name not in _TIMES
+        if name not in _TIMING_KEYS
     }
 
 
-def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
-    """Stage `field`: trains on the metric cameras, scores the held-out frames, saves the field.
+def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
+    """Runs stage `field`: trains, bakes, evaluates on held-out frames, and saves both fields; returns the metrics.
 
-    Raises:
-        InputError: nothing to train on, an unreadable frame, or a device that is not there.
+    Raises InputError without a training frame, on an unreadable frame, or on an unavailable device.
     """
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    field, metrics, cameras = train_field(cameras, points, config.nerf, config.seed, height)
+    field, metrics, cameras = train_field(cameras, points, config.nerf, config.seed, height, device)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
@@ -470,7 +464,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         "seed": config.seed,
         "nerf": asdict(config.nerf),
         "versions": {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")},
-        "metrics": untimed(metrics),
+        "metrics": without_timings(metrics),
     }
     field.save(out)
     baked.about = field.about

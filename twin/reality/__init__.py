@@ -1,4 +1,4 @@
-"""The known-truth world: a campus road, generated, filmed like a real place, and driven in as the real test.
+"""The known-truth world: a generated campus road that is filmed like a real place and serves as the real test.
 
-Nothing outside this folder, `twin/reality/comparison.py` and the tests may read its truth.
+The product imports nothing from this package; the truth beside a scene is read by `comparison.py` and tests only.
 """

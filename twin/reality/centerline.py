@@ -1,8 +1,8 @@
-"""The road's centre line and the ground it lies on.
+"""The center line of the road and the height of the ground.
 
-*Station* s [m] is the length along the centre line from the start of the road, *lateral* [m] the signed offset from it,
-positive to the left of the driving direction. The road runs straight along +x, turns right on a circular arc, and runs
-straight on. Heights are metres above the datum z = 0.
+*Station* s [m] is the arc length along the center line, *lateral* [m] the signed offset from it, positive to the left
+of the driving direction. The road runs straight along +x, turns right on a circular arc, and runs straight on. Heights
+[m] are above z = 0.
 """
 
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike
 
 from twin.types import Array
 
-ROAD_HALF_WIDTH = 3.0  # [m] asphalt, centre line to kerb face
-KERB_HEIGHT = 0.11  # [m] above the asphalt beside it
+ROAD_HALF_WIDTH = 3.0  # [m] of asphalt, from the center line to the face of the kerb
+KERB_HEIGHT = 0.11  # [m] above the adjacent asphalt
 KERB_WIDTH = 0.16  # [m]
-VERGE_WIDTH = 5.6  # [m] grass beyond the kerb that the road's own mesh covers
-PAVEMENT_WIDTH = 1.7  # [m] slabs along the left kerb
+VERGE_WIDTH = 5.6  # [m] of grass beyond the kerb, part of the road mesh
+PAVEMENT_WIDTH = 1.7  # [m] of slabs along the left kerb
 START, END = -6.0, 88.0  # [m] stations between which the road is paved
-VERGE_SLOPE = 0.025  # rise of the verges away from the road
-_CROWN = 0.018  # fall of the road from its crown to either side
-_CROWN_ROUNDING = 0.35  # [m] half width over which the crown is rounded off
-# Undulation: amplitude [m], wave vector [rad/m] (x, y), phase [rad]. Gentle: the steepest slope is about 3 %.
+VERGE_SLOPE = 0.025  # of the verges, rising away from the road
+_CROWN = 0.018  # slope of the road from its crown to either side
+_CROWN_ROUNDING = 0.35  # [m] half width of the rounding of the crown
+# Undulation: amplitude [m], wave vector (x, y) [rad/m], phase [rad]. The steepest slope is about 3 %.
 _WAVES = (
     (0.055, (0.170, 0.030), 0.4),
     (0.035, (-0.060, 0.210), 1.9),
@@ -32,7 +32,7 @@ _WAVES = (
 
 @dataclass(frozen=True)
 class RoadLine:
-    """A straight, a right-hand arc, and a straight; the centre line of the road."""
+    """The center line of the road: a straight, a right-hand arc and a straight."""
 
     straight: float = 30.0
     """Length before the turn [m]."""
@@ -41,7 +41,7 @@ class RoadLine:
     turn: float = np.pi / 2.0
     """Angle of the turn, to the right [rad]."""
     length: float = 60.0
-    """Length of the whole drive [m]."""
+    """Length of the drive [m]."""
 
     @property
     def arc(self) -> float:
@@ -53,7 +53,7 @@ class RoadLine:
         return -np.clip((np.asarray(station) - self.straight) / self.radius, 0.0, self.turn)
 
     def at(self, station: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
-        """Points (x, y) [m], shape (..., 2). Before 0 and beyond the end the line goes straight on."""
+        """Points (x, y) [m], shape (..., 2). The line continues straight before station 0 and beyond its end."""
         s, lateral = np.broadcast_arrays(np.asarray(station, float), np.asarray(lateral, float))
         heading = self.heading(s)
         before, after = np.minimum(s, self.straight), np.maximum(s - self.straight - self.arc, 0.0)
@@ -62,7 +62,7 @@ class RoadLine:
         return np.stack([x - lateral * np.sin(heading), y + lateral * np.cos(heading)], -1)
 
     def project(self, xy: ArrayLike) -> tuple[Array, Array]:
-        """Station and lateral of the nearest point of the centre line; shapes (..., 2) → (...), (...)."""
+        """Station and lateral [m] of points relative to the center line, shapes (..., 2) → (...), (...)."""
         xy = np.asarray(xy, float)
         x, y = xy[..., 0], xy[..., 1]
         out = np.array([np.cos(self.turn), -np.sin(self.turn)])  # direction after the turn
@@ -79,13 +79,13 @@ class RoadLine:
 
 
 def undulation(xy: ArrayLike) -> Array:
-    """The rolling of the land [m], shape (..., 2) → (...)."""
+    """Height of the undulating land without the road [m], shape (..., 2) → (...)."""
     xy = np.asarray(xy, float)
     return sum((a * np.sin(xy @ np.array(k) + phase) for a, k, phase in _WAVES), np.zeros(xy.shape[:-1]))
 
 
 def cross_profile(lateral: ArrayLike) -> Array:
-    """Height across the road above the undulation [m]: crowned asphalt, a kerb, a verge that rises outwards."""
+    """Height above the undulation [m]: crowned asphalt, a kerb, and a verge that rises outwards."""
     away = np.abs(np.asarray(lateral, float))
     crown = -_CROWN * (np.sqrt(away**2 + _CROWN_ROUNDING**2) - _CROWN_ROUNDING)
     edge = -_CROWN * (np.hypot(ROAD_HALF_WIDTH, _CROWN_ROUNDING) - _CROWN_ROUNDING)

@@ -1,8 +1,8 @@
-"""How far a build is from the known truth, where a scene has one.
+"""Errors of a build against the known truth of a generated scene.
 
-The *twin frame* is the metric frame of the build, the *true frame* that of the generated world. Everything but
-`ate_m` and `scale_error` is measured after a rigid alignment (no scale) of the twin's cameras with the true ones, since
-metres of the twin are what a robot drives in. Surfaces are compared where some camera could see them.
+The *twin frame* is the metric frame of the build, the *true frame* that of the generated world. All figures except
+`ate_m` and `scale_error` are measured after a rigid alignment (no scale) of the twin's cameras with the true ones,
+since a robot drives in the twin's metres. Surfaces are compared only where some camera could see them.
 """
 
 from pathlib import Path
@@ -20,40 +20,40 @@ from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, rotation_angle, umeyama
 from twin.nerf.baked import BakedField
 from twin.reality.truth import Truth
-from twin.scene import SceneDir, result_of
+from twin.scene import SceneDir, stage_result
 from twin.types import Array
 
 if TYPE_CHECKING:
     from twin.nerf.field import RadianceField
 
 
-_NEAR_ROUTE = 10.0  # [m] obstacles further from the route are not compared
-_MAX_HEIGHT = 3.0  # [m] nor what is higher above the ground
-_STANDING = 0.15  # [m] what stands less than this above the ground is ground or kerb
+_NEAR_ROUTE = 10.0  # [m] from the route within which surfaces are compared
+_MAX_HEIGHT = 3.0  # [m] above the ground up to which obstacles are compared
+_MIN_HEIGHT = 0.15  # [m] above the ground; lower points belong to the ground or a kerb
 _INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] above the ground where the corridor must be free
-_RAYS = (96, 54)  # per camera, to find what it sees
-_EYES = 48  # cameras that surfaces are looked at from, at most
-_DEPTH_REACH = 20.0  # [m] depth beyond is not compared
+_RAYS = (96, 54)  # per camera, to find the visible surface
+_MAX_CAMERAS = 48  # that surfaces are observed from
+_MAX_DEPTH = 20.0  # [m] up to which depth is compared
 _MESH_KEYS = (
     *("mesh_accuracy_median_m", "mesh_accuracy_mean_m", "mesh_completeness_mean_m"),
     *("mesh_completeness_5cm", "mesh_completeness_10cm", "mesh_chamfer_m"),
 )
-_MOST_OFF = 1.0  # [m] what is missing counts as this far off in means
-_SEEN_CELL = 0.1  # [m] seen surface is thinned to one point per cell
+_MAX_DISTANCE = 1.0  # [m] to which distances are clipped in means
+_VISIBLE_CELL = 0.1  # [m] the visible surface is thinned to one point per cell
 
 
 def compare(scene: SceneDir) -> dict[str, Any]:
-    """Measures a build against its truth and writes the result into `build/truth.json`, where its report looks for it.
+    """Measures a build against its truth and writes `build/truth.json`, which the report reads.
 
     Returns:
-        What was written: `measure`'s, and `of`, the results of the stages that were compared.
+        The written table: that of `measure`, and `of`, the results (digests) of the compared stages.
 
     Raises:
-        InputError: the scene has no truth, or is not built as far as the mesh.
+        InputError: the scene has no truth, or its mesh stage has not been built.
     """
     if not (scene.truth / "truth.npz").exists():
         raise InputError(f"{scene.root} has no truth; only scenes of `python -m twin.reality film` have one")
-    of = {stage: result_of(scene, stage) for stage in ("metric", "field", "mesh")}
+    of = {stage: stage_result(scene, stage) for stage in ("metric", "field", "mesh")}
     compared = {"of": of, **measure(scene)}
     write_json(scene.truth_json, compared)
     return compared
@@ -63,20 +63,21 @@ def measure(scene: SceneDir) -> dict[str, Any]:
     """Measures a build against its truth.
 
     Returns:
-        `figures`, and `camera_errors_m`, lists by source [m], after a similarity.
+        `figures`, and `camera_errors_m`: position errors after a similarity, as a list per source [m].
 
         `figures`, lengths [m], angles [°]: `ate_m`, `ate_max_m` (camera positions after a similarity), `scale_error`
         (the twin's metre over the true one, minus 1), `ate_rigid_m`, `tilt_deg` (of the twin's vertical),
         `rotation_median_deg`, `ground_median_m`, `ground_p95_m`, `ground_bias_m` (inside the corridor),
-        `obstacle_accuracy_m` (seen surface of the convex parts to the true surface), `obstacle_completeness_m` (and
-        back), `obstacle_median_m` (the larger of the two), `corridor_intrusions`, `route_median_m` (twin's route to the
-        true centre line), `depth_median_m`, `depth_relative` (of the field, up to 20 m).
+        `obstacle_accuracy_m` (visible surface of the convex parts to the true surface), `obstacle_completeness_m`
+        (true surface to parts), `obstacle_median_m` (the larger of the two), `corridor_intrusions`, `route_median_m`
+        (twin's route to the true center line), `depth_median_m`, `depth_relative` (of the field, up to 20 m).
 
-        Of the visual mesh, all of it and of the true surface that cameras could see within 10 m of the route, at any
-        height: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to the true surface), `mesh_completeness_mean_m`
-        (and back), `mesh_completeness_5cm`, `mesh_completeness_10cm` (share of the true surface that has the mesh so
-        near; the latter by kind of thing, too: `_ground`, `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of
-        the two means). In the means no distance counts more than 1 m. None where a stage has made nothing to measure.
+        For the visual mesh against the true surface, both as far as cameras could see them within 10 m of the route,
+        at any height: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to true surface),
+        `mesh_completeness_mean_m` (true surface to mesh), `mesh_completeness_5cm`, `mesh_completeness_10cm` (fraction
+        of the true surface within that distance of the mesh; the latter also per kind: `_ground`, `_obstacle`,
+        `_foliage`), `mesh_chamfer_m` (half the sum of the two means). Means clip distances at 1 m. A figure is None
+        where its stage produced nothing to measure.
     """
     truth = Truth.load(scene.truth)
     cameras = Cameras.load(scene.stage("metric"))
@@ -94,7 +95,7 @@ def measure(scene: SceneDir) -> dict[str, Any]:
 
 
 def matched_poses(truth: Truth, cameras: Cameras) -> Array:
-    """The true pose of every frame of a build, shape (n, 4, 4)."""
+    """True poses of all frames of a build, shape (n, 4, 4)."""
     out = np.empty((len(cameras), 4, 4))
     for source in sorted(set(cameras.sources)):
         rows = np.array([s == source for s in cameras.sources])
@@ -104,10 +105,10 @@ def matched_poses(truth: Truth, cameras: Cameras) -> Array:
 
 
 def align_rigid(poses: Array, true_poses: Array) -> Similarity:
-    """The rigid transform that best maps cameras on to the true ones, shapes (n, 4, 4).
+    """The rigid transform that best maps camera poses onto the true ones, shapes (n, 4, 4).
 
-    Each camera counts as its centre and the tips of its axes one metre long, so that a straight drive, whose centres
-    alone leave the roll about it open, is aligned as well.
+    Each camera contributes its center and the tips of its axes, 1 m long: the centers of a straight drive alone do not
+    determine the roll about it.
     """
 
     def tripods(p: Array) -> Array:
@@ -118,11 +119,11 @@ def align_rigid(poses: Array, true_poses: Array) -> Similarity:
 
 def camera_errors(poses: Array, true_poses: Array) -> dict[str, float]:
     """Errors of camera poses against the true ones, shapes (n, 4, 4)."""
-    centres, true_centres = poses[:, :3, 3], true_poses[:, :3, 3]
-    similarity = umeyama(centres, true_centres)
-    off = np.linalg.norm(similarity.points(centres) - true_centres, axis=1)
+    centers, true_centers = poses[:, :3, 3], true_poses[:, :3, 3]
+    similarity = umeyama(centers, true_centers)
+    off = np.linalg.norm(similarity.points(centers) - true_centers, axis=1)
     rigid = align_rigid(poses, true_poses)
-    rigid_off = np.linalg.norm(rigid.points(centres) - true_centres, axis=1)
+    rigid_off = np.linalg.norm(rigid.points(centers) - true_centers, axis=1)
     turned = np.swapaxes(true_poses[:, :3, :3], 1, 2) @ rigid.poses(poses)[:, :3, :3]
     return {
         "frames": len(poses),
@@ -137,7 +138,7 @@ def camera_errors(poses: Array, true_poses: Array) -> dict[str, float]:
 
 
 def corridor(truth: Truth, half_width: float, step: float = 0.25) -> Array:
-    """Points of the ground within the true corridor [m], shape (m, 3)."""
+    """Grid of ground points within the true corridor [m], shape (m, 3)."""
     stations = np.arange(truth.start, truth.start + truth.length + step / 2, step)
     laterals = np.linspace(-half_width, half_width, 2 * round(half_width / step) + 1)
     xy = truth.route.at(stations[:, None], laterals[None]).reshape(-1, 2)
@@ -171,17 +172,19 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
         return out
     parts = [(to_truth.points(v), f) for v, f in load_parts(mesh)]
     out["corridor_intrusions"] = sum(intrudes(v, f, truth) for v, f in parts)
-    eyes = true_poses[np.unique(np.linspace(0, len(true_poses) - 1, _EYES).round().astype(int))]
-    kinds = {kind: [t.part for t in truth.place.things if t.kind == kind] for kind in ("ground", "obstacle", "foliage")}
+    viewpoints = true_poses[np.unique(np.linspace(0, len(true_poses) - 1, _MAX_CAMERAS).round().astype(int))]
+    kinds = {
+        kind: [t.part for t in truth.place.objects if t.kind == kind] for kind in ("ground", "obstacle", "foliage")
+    }
     solid = _surface([(p.vertices, p.faces) for p in kinds["obstacle"]])
     leafy = _surface([(p.vertices, p.faces) for p in kinds["obstacle"] + kinds["foliage"]])
     whole = _surface([(p.vertices, p.faces) for kind in kinds.values() for p in kind])
-    sight = visible_points(whole, eyes, truth)
-    seen = _standing(sight, truth)
-    seen = seen[solid.distance(seen) < 1e-3]  # neither leaves nor ground
+    visible = visible_points(whole, viewpoints, truth)
+    seen = _obstacle_points(visible, truth)
+    seen = seen[solid.distance(seen) < 1e-3]  # without leaves and ground
     if parts and len(seen):
         twin = _surface(parts)
-        standing = _standing(visible_points(twin, eyes, truth), truth)
+        standing = _obstacle_points(visible_points(twin, viewpoints, truth), truth)
         if len(standing):
             accuracy, completeness = np.median(leafy.distance(standing)), np.median(twin.distance(seen))
             out["obstacle_accuracy_m"], out["obstacle_completeness_m"] = float(accuracy), float(completeness)
@@ -189,33 +192,33 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     if (mesh / "visual.npz").exists():
         with np.load(mesh / "visual.npz", allow_pickle=False) as data:
             visual = _surface([(to_truth.points(data["vertices"].astype(np.float64)), data["faces"])])
-        near, seen = _near(visible_points(visual, eyes, truth), truth), _near(sight, truth)
+        near, seen = _near_route(visible_points(visual, viewpoints, truth), truth), _near_route(visible, truth)
         if len(near) and len(seen):
             to_mesh = visual.distance(seen)
             out |= mesh_quality(whole.distance(near), to_mesh)
-            for kind, things in kinds.items():
-                mine = _surface([(p.vertices, p.faces) for p in things]).distance(seen) < 1e-3
+            for kind, objects in kinds.items():
+                mine = _surface([(p.vertices, p.faces) for p in objects]).distance(seen) < 1e-3
                 if mine.any():
                     out[f"mesh_completeness_10cm_{kind}"] = float((to_mesh[mine] <= 0.1).mean())
     return out
 
 
 def mesh_quality(to_true: Array, to_mesh: Array) -> dict[str, float]:
-    """What distances between a mesh and the true surface come to, by the keys of `compare`.
+    """The `mesh_*` figures of `measure`.
 
     Args:
-        to_true: Of points of the mesh from the true surface [m], shape (n,).
-        to_mesh: Of points of the true surface from the mesh [m], shape (m,).
+        to_true: Distances of mesh points from the true surface [m], shape (n,).
+        to_mesh: Distances of true surface points from the mesh [m], shape (m,).
     """
-    # Further off the nearest surface is another one, and how far only tells how empty the place is.
-    accuracy, completeness = (float(np.minimum(d, _MOST_OFF).mean()) for d in (to_true, to_mesh))
+    # Beyond `_MAX_DISTANCE` the nearest surface is another one, and its distance only measures how empty the place is.
+    accuracy, completeness = (float(np.minimum(d, _MAX_DISTANCE).mean()) for d in (to_true, to_mesh))
     near = [float((to_mesh <= reach).mean()) for reach in (0.05, 0.1)]
     values = (float(np.median(to_true)), accuracy, completeness, *near, 0.5 * (accuracy + completeness))
     return dict(zip(_MESH_KEYS, values, strict=True))
 
 
 def load_parts(mesh: Path) -> list[tuple[Array, NDArray[np.int32]]]:
-    """The convex parts of a mesh stage: vertices (v, 3) [m] and faces (f, 3) of each."""
+    """The convex parts of a mesh stage, each as vertices (v, 3) [m] and faces (f, 3)."""
     with np.load(mesh / "parts.npz", allow_pickle=False) as data:
         v, f = data["vertices"].astype(np.float64), data["faces"].astype(np.int32)
         vs, fs = data["vertex_start"], data["face_start"]
@@ -223,7 +226,7 @@ def load_parts(mesh: Path) -> list[tuple[Array, NDArray[np.int32]]]:
 
 
 def intrudes(vertices: Array, faces: NDArray[np.int32], truth: Truth) -> bool:
-    """Whether a convex part (true frame) reaches into the true corridor, 5 cm to 1.5 m above the ground."""
+    """True if a convex part (true frame) reaches into the true corridor, 5 cm to 1.5 m above the ground."""
     floor = corridor(truth, truth.half_width, 0.125)
     low, high = vertices.min(0), vertices.max(0)
     floor = floor[((floor[:, :2] >= low[:2]) & (floor[:, :2] <= high[:2])).all(1)]
@@ -237,15 +240,15 @@ def intrudes(vertices: Array, faces: NDArray[np.int32], truth: Truth) -> bool:
     return bool(inside.any())
 
 
-def _standing(points: Array, truth: Truth) -> Array:
-    """Those points that stand on the ground near the filmed route, below the height that counts."""
-    points = _near(points, truth)
+def _obstacle_points(points: Array, truth: Truth) -> Array:
+    """The points of obstacles: near the filmed route, `_MIN_HEIGHT` to `_MAX_HEIGHT` above the ground."""
+    points = _near_route(points, truth)
     height = points[:, 2] - truth.ground_height(points[:, :2])
-    return points[(height > _STANDING) & (height < _MAX_HEIGHT)]
+    return points[(height > _MIN_HEIGHT) & (height < _MAX_HEIGHT)]
 
 
-def _near(points: Array, truth: Truth) -> Array:
-    """Those points that are near the filmed route, at any height."""
+def _near_route(points: Array, truth: Truth) -> Array:
+    """The points near the filmed route, at any height."""
     station, lateral = truth.route.project(points[:, :2])
     along = (station > truth.start) & (station < truth.start + truth.length + _NEAR_ROUTE)
     return points[along & (np.abs(lateral) < _NEAR_ROUTE)]
@@ -257,14 +260,14 @@ def _surface(meshes: list[tuple[Array, NDArray]]) -> Surface:
     return Surface(np.concatenate([v for v, _ in meshes]), np.concatenate(faces))
 
 
-def visible_points(surface: Surface, eyes: Array, truth: Truth) -> Array:
-    """Points of a surface that cameras (k, 4, 4) see, thinned to one per cell, shape (m, 3)."""
+def visible_points(surface: Surface, viewpoints: Array, truth: Truth) -> Array:
+    """Points of a surface visible from camera poses (k, 4, 4), thinned to one per cell, shape (m, 3)."""
     local = unproject(pixel_grid(*_RAYS), scaled_intrinsics(truth.intrinsics, truth.size, _RAYS)).reshape(-1, 3)
-    rays = np.concatenate([local @ pose[:3, :3].T for pose in eyes])
-    origins = np.repeat(eyes[:, :3, 3], len(local), 0)
+    rays = np.concatenate([local @ pose[:3, :3].T for pose in viewpoints])
+    origins = np.repeat(viewpoints[:, :3, 3], len(local), 0)
     t = surface.cast(origins, rays)
     points = (origins + rays * t[:, None])[t > 0.0]
-    _, first = np.unique(np.floor(points / _SEEN_CELL).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(np.floor(points / _VISIBLE_CELL).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(first)]
 
 
@@ -275,9 +278,9 @@ def _depth_errors(folder: Path, truth: Truth, to_truth: Similarity) -> dict[str,
 
 
 def depth_errors(
-    field: "BakedField | RadianceField", truth: Truth, to_truth: Similarity, reach: float = _DEPTH_REACH
+    field: "BakedField | RadianceField", truth: Truth, to_truth: Similarity, reach: float = _MAX_DEPTH
 ) -> dict[str, float | None]:
-    """A field's depth at true viewpoints against the true depth up to `reach` [m]; three frames of each film."""
+    """Median depth errors of a field against the true depth up to `reach` [m], in three frames of each film."""
     errors, relative = [], []
     for name, film in truth.films.items():
         if name not in field.lightings:

@@ -1,7 +1,7 @@
-"""Filming the known-truth world: a camera on a cart, its exposure and noise, and a video file.
+"""Films of the known-truth world: camera trajectory on a cart, exposure, sensor noise and video encoding.
 
-A *film* is a list of frames at a fixed rate under one lighting; its poses are the truth. Every film has its own speed,
-lateral wander and shake, so that no two films share a viewpoint.
+A *film* is a sequence of frames at a fixed rate under one lighting; its poses are the truth. Every film has its own
+speed, lateral wander and shake, so that no two films share a viewpoint.
 """
 
 from collections.abc import Iterable
@@ -12,25 +12,25 @@ import av
 import mujoco
 import mujoco_warp
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.reality import true_world
 from twin.reality.centerline import RoadLine, ground_height
-from twin.reality.lighting import LIGHTINGS, Lighting, hazed
-from twin.reality.things import SEED, KnownPlace
+from twin.reality.lighting import LIGHTINGS, Lighting, apply_haze
+from twin.reality.place_objects import SEED, KnownPlace
 from twin.runtime import track
 from twin.types import Array
+from twin.warp_runtime import wp
 
-CAMERA_HEIGHT = 1.2  # [m] lens above the ground, on average and within a centimetre
+CAMERA_HEIGHT = 1.2  # [m] mean height of the lens above the ground; it varies by less than 1 cm
 _PITCH = np.deg2rad(8.0)  # downwards
 _HFOV = np.deg2rad(85.0)
 
 
 @dataclass(frozen=True)
 class FilmingPlan:
-    """What is filmed and how."""
+    """Segment of the road to film, and the camera's settings."""
 
     lightings: tuple[str, ...] = ("sun", "overcast", "night")
     start: float = 0.0
@@ -55,7 +55,7 @@ class FilmingPlan:
 
 
 def smooth_noise(rng: np.random.Generator, times: Array, period: float) -> Array:
-    """A sum of three sines about a period [s], unit deviation; shape as `times`."""
+    """Sum of three sines with periods around `period` [s] and unit standard deviation; shape as `times`."""
     rates = 2 * np.pi / (period * rng.uniform(0.6, 1.7, 3))
     return np.sin(times[:, None] * rates + rng.uniform(0, 2 * np.pi, 3)).sum(1) / np.sqrt(1.5)
 
@@ -72,7 +72,7 @@ def trajectory(plan: FilmingPlan, route: RoadLine, lighting: str) -> tuple[Array
     xy = route.at(station, lateral)
     lift = 0.004 * smooth_noise(rng, times, 1.1)
     position = np.concatenate([xy, (ground_height(route, xy) + CAMERA_HEIGHT + lift)[:, None]], 1)
-    # The cart points where it is heading: the centre line's direction turned by the wander's slope.
+    # Heading of the cart: direction of the center line plus the slope of the lateral wander.
     drift = np.gradient(lateral, station)
     yaw = route.heading(station + 0.6) + np.arctan(drift) + np.deg2rad(0.9) * smooth_noise(rng, times, 2.3)
     pitch = _PITCH + np.deg2rad(0.5) * smooth_noise(rng, times, 1.3)
@@ -81,7 +81,7 @@ def trajectory(plan: FilmingPlan, route: RoadLine, lighting: str) -> tuple[Array
 
 
 def _pose(position: Array, yaw: float, pitch: float, roll: float) -> Array:
-    """camera_to_world of a camera that looks along `yaw`, `pitch` downwards, rolled clockwise [rad]."""
+    """camera_to_world for heading `yaw`, downward `pitch` and clockwise `roll` [rad]."""
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)
@@ -93,10 +93,10 @@ def _pose(position: Array, yaw: float, pitch: float, roll: float) -> Array:
 
 
 class Renderer:
-    """Renders the place under one lighting; the camera goes anywhere."""
+    """Renders the place under one lighting from any pose with `mujoco_warp`'s ray tracer."""
 
     def __init__(self, lighting: str, place: KnownPlace, plan: FilmingPlan) -> None:
-        spec = true_world.spec(lighting, place)
+        spec = true_world.world_spec(lighting, place)
         camera = spec.camera("film")
         camera.fovy = float(np.rad2deg(2 * np.arctan(plan.height / 2 / plan.intrinsics[1])))
         model = spec.compile()
@@ -135,15 +135,15 @@ class Renderer:
         return rgb.numpy()[0].astype(np.float32), depth
 
 
-def develop(
+def sensor_image(
     rng: np.random.Generator, light: NDArray[np.float32], lighting: Lighting, exposure: float
 ) -> NDArray[np.uint8]:
-    """What the sensor makes of the light: vignetting, exposure, a shoulder for highlights, noise, eight bits."""
+    """The 8-bit image of a linear RGB image: vignetting, exposure, highlight roll-off and sensor noise."""
     height, width = light.shape[:2]
     y, x = np.mgrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
     signal = light * (lighting.exposure * exposure * (1.0 - 0.16 * radius2))[..., None] * np.asarray(lighting.gain)
-    knee = 0.75  # above it, highlights are rolled off towards 1
+    knee = 0.75  # highlights above it roll off towards 1
     over = np.maximum(signal - knee, 0.0)
     signal = np.minimum(signal, knee) + (1.0 - knee) * (1.0 - np.exp(-over / (1.0 - knee)))
     sigma = lighting.noise * np.sqrt(0.35 + 1.3 * signal)
@@ -152,26 +152,28 @@ def develop(
 
 
 def exposures(lighting: str, times: Array) -> Array:
-    """Relative exposure of each frame: it drifts slowly, as automatic exposure does."""
+    """Relative exposure of each frame, with a slow drift like that of automatic exposure."""
     rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting))])
     return np.exp(LIGHTINGS[lighting].drift * smooth_noise(rng, times, 11.0))
 
 
-def shoot(lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path) -> tuple[Array, Array]:
-    """Films one lighting into a video file; returns its times and poses."""
+def film_lighting(lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path) -> tuple[Array, Array]:
+    """Writes the film of one lighting; returns its times (n,) [s] and poses (n, 4, 4)."""
     times, poses = trajectory(plan, place.route, lighting)
     gains = exposures(lighting, times)
     rng = np.random.default_rng([SEED, 13, sum(map(ord, lighting))])
     render = Renderer(lighting, place, plan)
     steps = track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame")
     light = LIGHTINGS[lighting]
-    encode((develop(rng, hazed(*render(pose), light), light, float(gain)) for pose, gain in steps), plan, path)
+    write_video(
+        (sensor_image(rng, apply_haze(*render(pose), light), light, float(gain)) for pose, gain in steps), plan, path
+    )
     return times, poses
 
 
-def encode(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Path) -> None:
+def write_video(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Path) -> None:
     """Writes RGB frames (h, w, 3) as H.264; the same frames give the same file."""
-    # x264's fast paths depend on the processor and even on memory alignment; these settings make its file repeat.
+    # x264's fast paths depend on the processor and on memory alignment; these settings make its output reproducible.
     options = {"crf": str(plan.crf), "preset": "slower", "threads": "1", "x264-params": "cpu-independent=1"}
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=plan.fps, options=options)
@@ -181,10 +183,10 @@ def encode(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Path) -
         container.mux(stream.encode())
 
 
-def depths(
+def depth_maps(
     lighting: str, place: KnownPlace, plan: FilmingPlan, poses: Array
 ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
-    """Depth at a quarter of the film's size [m] of about ten frames: their indices (k,) and maps (k, h / 4, w / 4)."""
+    """Indices (k,) of about ten frames and their depth maps [m] at a quarter of the film's size, (k, h / 4, w / 4)."""
     small = replace(plan, width=plan.width // 4, height=plan.height // 4, samples=1)
     frames = np.unique(np.linspace(0, len(poses) - 1, 10).round().astype(np.int64))
     render = Renderer(lighting, place, small)

@@ -1,7 +1,8 @@
-"""The lightings of the known-truth world: lights, sky, and how the camera takes them.
+"""Lightings of the known-truth world: lights, sky, haze and the camera's exposure under them.
 
-Colours are those of the film, not of physics: the renderer adds lights linearly and clips at 1, and the film module
-applies exposure and a tone curve to what it gets.
+`LIGHTINGS` are those of the films; `WEATHER` are those of the real test, which are never filmed. Colors are display
+values, not radiometric ones: the renderer adds lights linearly and clips at 1, and `filming.py` applies exposure and a
+tone curve.
 """
 
 from dataclasses import dataclass
@@ -11,47 +12,47 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.reality.place_objects import SEED
 from twin.reality.textures import fbm
-from twin.reality.things import SEED
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Lighting:
-    """One lighting and its film's traits."""
+    """One lighting, and the camera settings of films under it. Colors are RGB."""
 
     name: str
-    ambient: Colour
-    """Light from everywhere."""
-    suns: tuple[tuple[Colour, Colour, bool], ...]
-    """Directional lights: direction they shine in, colour, whether they cast shadows."""
-    zenith: Colour
-    horizon: Colour
+    ambient: Color
+    """Ambient light."""
+    suns: tuple[tuple[Color, Color, bool], ...]
+    """Directional lights: direction of the rays, color, and a flag for cast shadows."""
+    zenith: Color
+    horizon: Color
     clouds: float
-    """Cover, 0 to 1."""
-    cloud: Colour
-    skyline: Colour
-    """Of the far trees and roofs along the horizon."""
+    """Cloud cover, 0 to 1."""
+    cloud: Color
+    skyline: Color
+    """Color of the distant trees and roofs along the horizon."""
     occlusion: float
-    """How much of the baked ambient occlusion is applied, 0 to 1."""
-    lamps: Colour = (0.0, 0.0, 0.0)
+    """Strength of the baked ambient occlusion, 0 to 1."""
+    lamps: Color = (0.0, 0.0, 0.0)
     """Light of the street lamps."""
     glow: float = 0.0
     """Emission of lamp heads and lit windows."""
     exposure: float = 1.0
     drift: float = 0.10
-    """Standard deviation of the exposure's logarithm within the film."""
+    """Standard deviation of the log exposure within a film."""
     noise: float = 0.004
-    """Sensor noise at mid grey [share of full scale]."""
-    gain: Colour = (1.0, 1.0, 1.0)
+    """Sensor noise at mid grey [fraction of full scale]."""
+    gain: Color = (1.0, 1.0, 1.0)
     """White balance."""
-    glow_sun: Colour = (0.0, 0.0, 0.0)
+    glow_sun: Color = (0.0, 0.0, 0.0)
     """Brightening of the sky around the first sun."""
     wet: float = 0.0
-    """How much darker the ground is for being wet, 0 to 1."""
+    """Darkening of the wet ground, 0 to 1."""
     visibility: float = float("inf")
-    """Distance over which haze takes all but 1/e of the light [m]; haze has the colour of the horizon."""
+    """Distance at which haze transmits 1/e of the light [m]; haze has the color of the horizon."""
 
 
 LIGHTINGS: dict[str, Lighting] = {
@@ -122,15 +123,15 @@ LIGHTINGS: dict[str, Lighting] = {
 }
 
 
-def sky(lighting: Lighting, seed: int, width: int = 512) -> NDArray[np.uint8]:
-    """A cube map for MuJoCo's skybox: six faces stacked, shape (6 · width, width, 3) uint8.
+def sky_cube_map(lighting: Lighting, seed: int, width: int = 512) -> NDArray[np.uint8]:
+    """A cube map for MuJoCo's skybox: six stacked faces, shape (6 · width, width, 3) uint8.
 
-    The geometry of sky and clouds differs per lighting; the skyline is the same in all.
+    The clouds differ per lighting; the skyline is the same in all.
     """
     t, s = np.meshgrid(np.arange(width), np.arange(width), indexing="ij")
     a, b = (2 * (s + 0.5) / width - 1), (2 * (t + 0.5) / width - 1)
     one = np.ones_like(a)
-    # OpenGL cube-face order +X −X +Y −Y +Z −Z; MuJoCo reads it with its y axis up the world's z.
+    # OpenGL cube-face order +X −X +Y −Y +Z −Z; MuJoCo reads it with its y axis along the world's z.
     cube = [(one, -b, -a), (-one, -b, a), (a, one, b), (a, -one, -b), (a, -b, one), (-a, -b, -one)]
     rays = np.stack([np.stack(face, -1) for face in cube])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -165,8 +166,8 @@ def sky(lighting: Lighting, seed: int, width: int = 512) -> NDArray[np.uint8]:
     return (np.clip(out, 0.0, 1.0) * 255 + 0.5).astype(np.uint8).reshape(6 * width, width, 3)
 
 
-def hazed(light: NDArray[np.float32], depth: NDArray[np.float32], lighting: Lighting) -> NDArray[np.float32]:
-    """A picture (h, w, 3) seen through the lighting's haze, by its z-depth (h, w) [m]; the sky, 0, has its own."""
+def apply_haze(light: NDArray[np.float32], depth: NDArray[np.float32], lighting: Lighting) -> NDArray[np.float32]:
+    """An image (h, w, 3) with haze applied by z-depth (h, w) [m]; sky pixels (depth 0) stay as they are."""
     if np.isinf(lighting.visibility):
         return light
     share = np.where(depth > 0.0, np.exp(-depth / lighting.visibility), 1.0).astype(np.float32)[..., None]
@@ -174,17 +175,17 @@ def hazed(light: NDArray[np.float32], depth: NDArray[np.float32], lighting: Ligh
 
 
 def add_lights(spec: mujoco.MjSpec, lighting: Lighting, lamp_heads: NDArray[np.float64]) -> None:
-    """Adds a lighting's lights to a model; `lamp_heads` are the lamps' positions [m], shape (k, 3)."""
+    """Adds the lights of a lighting to a model; `lamp_heads` are lamp positions [m], shape (k, 3)."""
     spec.visual.headlight.active = 0
     world = spec.worldbody
-    for k, (direction, colour, shadow) in enumerate(lighting.suns):
+    for k, (direction, color, shadow) in enumerate(lighting.suns):
         world.add_light(
             name=f"sun_{k}",
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
             pos=[0, 0, 60],
             dir=np.asarray(direction) / np.linalg.norm(direction),
             ambient=list(lighting.ambient) if k == 0 else [0, 0, 0],
-            diffuse=list(colour),
+            diffuse=list(color),
             specular=[0, 0, 0],
             castshadow=shadow,
         )
@@ -206,24 +207,20 @@ def add_lights(spec: mujoco.MjSpec, lighting: Lighting, lamp_heads: NDArray[np.f
         )
 
 
-# ---- The lightings of the real test. None of them is ever filmed; a build of the twin gets a photo of them at most.
-#
-# The five stated ones were driven while training was developed, and a constant of the twin was measured on pictures of
-# these and of days 1 to 5 (`twin.env.domain_randomization.UNTOLD`): only days 6 to 15 were no part of any choice.
-#
-# The sun stands elsewhere than in any film, its light has other colours, the air is hazy or the ground wet. Five are
-# stated here, fifteen more are *days*, drawn once with a fixed seed as a calendar would: sun, clouds and air are whatever
-# they are. What a trial adds of its own is only the camera's drift of exposure.
+# ---- lightings of the real test
 
 
 _DAYS = 15
-_WHITE, _RED = np.array([1.0, 0.94, 0.83]), np.array([1.0, 0.60, 0.34])  # of a high sun, and of one at the horizon
-_REDDENED = 14.0  # [°] over which a rising sun loses all but 1/e of its red
-_GREY = 0.3  # of this the mean of pictures is to be, as automatic exposure would have it
+_HIGH_SUN, _LOW_SUN = (
+    np.array([1.0, 0.94, 0.83]),
+    np.array([1.0, 0.60, 0.34]),
+)  # colors of a high sun and of one at the horizon
+_REDDENING_ANGLE = 14.0  # [°] of elevation over which the red of a low sun falls to 1/e
+_MEAN_BRIGHTNESS = 0.3  # mean of an image that automatic exposure aims at
 
 
 def _day(number: int) -> Lighting:
-    """A day: its sun, its clouds and its air are drawn from the ranges below, its colours follow from these."""
+    """A random day: sun, clouds and haze are sampled with a fixed seed, and its colors follow from these."""
     rng = np.random.default_rng([SEED, 51, number])
     elevation, azimuth = rng.uniform(6.0, 60.0), rng.uniform(0.0, 2.0 * np.pi)
     clouds, veil = rng.uniform(0.1, 1.0), rng.uniform(0.0, 1.0)
@@ -231,12 +228,12 @@ def _day(number: int) -> Lighting:
     visibility, wetness = float(np.exp(rng.uniform(np.log(60.0), np.log(400.0)))), float(rng.uniform(0.15, 0.4))
     tint, brightness = rng.uniform(-0.03, 0.03), float(np.exp(rng.uniform(-0.15, 0.15)))
 
-    up, low = np.sin(np.deg2rad(elevation)), float(np.exp(-elevation / _REDDENED))
+    up, low = np.sin(np.deg2rad(elevation)), float(np.exp(-elevation / _REDDENING_ANGLE))
     overcast = clouds > 0.8
-    through = 0.0 if overcast else (1.0 - clouds) ** 0.3 * (1.0 - 0.4 * veil)  # of the sun's own light
-    sun = through * (0.55 + 0.45 * up) * 1.2 * (low * _RED + (1.0 - low) * _WHITE)
-    grey = 0.30 + 0.32 * np.sqrt(up) * (0.7 + 0.3 * clouds)  # what comes from everywhere
-    ambient = grey * np.array([0.96 - 0.04 * through, 1.0, 1.08 + 0.04 * through])
+    through = 0.0 if overcast else (1.0 - clouds) ** 0.3 * (1.0 - 0.4 * veil)  # fraction of direct sunlight
+    sun = through * (0.55 + 0.45 * up) * 1.2 * (low * _LOW_SUN + (1.0 - low) * _HIGH_SUN)
+    gray = 0.30 + 0.32 * np.sqrt(up) * (0.7 + 0.3 * clouds)  # ambient
+    ambient = gray * np.array([0.96 - 0.04 * through, 1.0, 1.08 + 0.04 * through])
     level = np.cos(np.deg2rad(elevation))
     ray = (float(-level * np.cos(azimuth)), float(-level * np.sin(azimuth)), float(-up))
     clear, dull = np.array([0.24, 0.45, 0.80]), np.array([0.62, 0.65, 0.70])
@@ -247,27 +244,27 @@ def _day(number: int) -> Lighting:
     cloud *= 0.78 if overcast else 1.0
     return Lighting(
         f"day_{number}",
-        ambient=_colour(ambient),
+        ambient=_color(ambient),
         suns=(
-            ((0.1, 0.2, -1.0), _colour(np.full(3, 0.3 * grey)), False) if overcast else (ray, _colour(sun), True),
-            ((-ray[0], -ray[1], -0.7), _colour(0.18 * ambient), False),
+            ((0.1, 0.2, -1.0), _color(np.full(3, 0.3 * gray)), False) if overcast else (ray, _color(sun), True),
+            ((-ray[0], -ray[1], -0.7), _color(0.18 * ambient), False),
         ),
-        zenith=_colour(zenith),
-        horizon=_colour(horizon),
+        zenith=_color(zenith),
+        horizon=_color(horizon),
         clouds=float(clouds),
-        cloud=_colour(cloud),
-        skyline=_colour(horizon * np.array([0.42, 0.47, 0.44])),
+        cloud=_color(cloud),
+        skyline=_color(horizon * np.array([0.42, 0.47, 0.44])),
         occlusion=float(0.4 + 0.6 * (1.0 - through)),
-        exposure=float(brightness * _GREY / (0.36 * (ambient.mean() + 0.5 * up * sun.mean()))),
+        exposure=float(brightness * _MEAN_BRIGHTNESS / (0.36 * (ambient.mean() + 0.5 * up * sun.mean()))),
         noise=0.003 + 0.004 * low,
         gain=(1.0 + tint, 1.0, 1.0 - tint),
-        glow_sun=_colour(0.45 * through * np.array([1.0, 0.8, 0.55])),
+        glow_sun=_color(0.45 * through * np.array([1.0, 0.8, 0.55])),
         wet=wetness if wet else 0.0,
         visibility=visibility if hazy else float("inf"),
     )
 
 
-def _colour(rgb: np.ndarray) -> Colour:
+def _color(rgb: np.ndarray) -> Color:
     red, green, blue = np.clip(rgb, 0.0, 1.05).tolist()
     return red, green, blue
 
@@ -355,4 +352,11 @@ WEATHER: dict[str, Lighting] = {
         *(_day(number) for number in range(1, 1 + _DAYS)),
     )
 }
-"""By name."""
+"""Lightings of the real test by name: five stated ones and 15 random days.
+
+None is filmed; a build sees at most a photo of one. The sun stands elsewhere than in any film, its light has other
+colors, and the air may be hazy or the ground wet. A trial adds only a drift of the camera's exposure.
+
+The five stated ones were used during development, and `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was
+measured on images of these and of days 1 to 5, so only days 6 to 15 took no part in any choice.
+"""

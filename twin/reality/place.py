@@ -1,18 +1,20 @@
-"""The ground along the road, and the place put together: everything solid stays outside ±1.6 m of the centre line."""
+"""The place: ground, buildings, street furniture and vegetation. Solid objects stay outside ±1.6 m of the center line.
+
+Tables state where objects stand, by station and lateral [m], and what differs between objects of a kind.
+"""
 
 import numpy as np
 
 from twin.reality import centerline as roads
 from twin.reality import primitives
 from twin.reality.centerline import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, RoadLine, ground_height
+from twin.reality.place_objects import SEED, KnownPlace, PlaceObject, Solid, cell, up
 from twin.reality.primitives import MeshPart
-from twin.reality.things import SEED, KnownPlace, Solid, Thing, cell, up
 from twin.types import Array
 
-# ---- Buildings: blocks with a roof slab, windows, sills and doors.
+# ---- buildings
 
-
-# Name: centre (x, y) [m]; width, depth, height [m]; windows per 10 m of wall, floors.
+# Name: center (x, y) [m]; width, depth, height [m]; windows per 10 m of wall, floors.
 BUILDINGS: dict[str, tuple[tuple[float, float], tuple[float, float, float], tuple[int, int]]] = {
     "hall": ((10.0, -14.0), (17.0, 9.0, 8.0), (4, 2)),
     "library": ((19.5, 13.8), (18.0, 8.0, 10.5), (4, 3)),
@@ -27,22 +29,22 @@ BUILDINGS: dict[str, tuple[tuple[float, float], tuple[float, float, float], tupl
 }
 
 
-def _building(
+def _add_building(
     place: KnownPlace,
     name: str,
-    centre: tuple[float, float],
+    center: tuple[float, float],
     size: tuple[float, float, float],
     windows: tuple[int, int],
 ) -> None:
     """A block with a roof slab, windows in `windows` = (per 10 m of wall, floors), sills and doors."""
-    rng = np.random.default_rng([SEED, 1, len(place.things)])
+    rng = np.random.default_rng([SEED, 1, len(place.objects)])
     width, depth, height = size
-    corners = np.array(centre) + 0.5 * np.array([[a * width, b * depth] for a in (-1, 1) for b in (-1, 1)])
+    corners = np.array(center) + 0.5 * np.array([[a * width, b * depth] for a in (-1, 1) for b in (-1, 1)])
     base = float(ground_height(place.route, corners).min()) - 0.2
-    origin = np.array([*centre, 0.0])
+    origin = np.array([*center, 0.0])
     shell = primitives.walls(width, depth, base, base + height).moved(origin)
-    solid = Solid("box", np.array([*centre, base + height / 2]), (width / 2, depth / 2, height / 2))
-    place.things.append(Thing(name, "obstacle", shell, name, (solid,)))
+    solid = Solid("box", np.array([*center, base + height / 2]), (width / 2, depth / 2, height / 2))
+    place.objects.append(PlaceObject(name, "obstacle", shell, name, (solid,)))
     roof = cell("tank", primitives.box((width + 0.7, depth + 0.7, 0.35), base + height).moved(origin))
     trim: list[MeshPart] = [roof]
     panes: list[tuple[int, MeshPart]] = []
@@ -52,7 +54,7 @@ def _building(
         length = (width, depth)[wall % 2]
         across = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]][wall], float)
         out = np.array([across[1], -across[0]])
-        face = np.array(centre) + out * (depth, width)[wall % 2] / 2
+        face = np.array(center) + out * (depth, width)[wall % 2] / 2
         count = max(2, round(length / 10.0 * windows[0]))
         door = int(rng.integers(0, count))
         for level in range(windows[1]):
@@ -63,7 +65,7 @@ def _building(
                 tall, wide = (2.25, 1.25) if is_door else (min(1.75, floor * 0.58), 1.2)
                 z0 = base + 0.2 if is_door else base + 0.6 + level * floor + 0.35 * (floor - tall)
                 left, right = middle - across * wide / 2, middle + across * wide / 2
-                pane = upright(left + 0.02 * out, right + 0.02 * out, z0, z0 + tall)
+                pane = vertical_quad(left + 0.02 * out, right + 0.02 * out, z0, z0 + tall)
                 if is_door:
                     trim.append(cell(f"door{int(rng.integers(0, 2))}", pane))
                     canopy = primitives.box((wide + 0.8, 0.9, 0.12), z0 + tall + 0.15)
@@ -76,33 +78,32 @@ def _building(
                 sill = primitives.box((wide + 0.2, 0.14, 0.07), z0 - 0.09)
                 at = np.append(middle + 0.07 * out, 0.0)
                 trim.append(cell("white", sill.moved(at, float(np.arctan2(across[1], across[0])))))
-    place.things.append(Thing(f"{name}_trim", "obstacle", primitives.join(trim)))
-    place.things.append(Thing(f"{name}_glass", "obstacle", primitives.join([cell(f"window{k}", p) for k, p in panes])))
-    # Windows that are lit after dark: which texture they show depends on the lighting.
+    place.objects.append(PlaceObject(f"{name}_trim", "obstacle", primitives.join(trim)))
+    place.objects.append(
+        PlaceObject(f"{name}_glass", "obstacle", primitives.join([cell(f"window{k}", p) for k, p in panes]))
+    )
+    # Windows lit after dark exist twice; the lighting decides which of the two is in the model.
     day = primitives.join([cell(f"window{k}", p) for k, p in lit])
     dark = primitives.join([cell(f"lit{k % 8}", p) for k, p in lit])
-    place.things.append(Thing(f"{name}_day", "obstacle", day, "windows_by_day"))
-    place.things.append(Thing(f"{name}_lit", "obstacle", dark, "windows_by_night"))
+    place.objects.append(PlaceObject(f"{name}_day", "obstacle", day, "windows_by_day"))
+    place.objects.append(PlaceObject(f"{name}_lit", "obstacle", dark, "windows_by_night"))
 
 
-def upright(left: Array, right: Array, low: float, high: float) -> MeshPart:
-    """A vertical rectangle between two points of the plan."""
+def vertical_quad(left: Array, right: Array, low: float, high: float) -> MeshPart:
+    """A vertical rectangle between two points (x, y) [m] and two heights [m]."""
     return primitives.quad(np.array([[*left, high], [*left, low], [*right, low], [*right, high]]))
 
 
-def add(place: KnownPlace) -> None:
-    """Adds every building to a place."""
-    for name, (centre, size, windows) in BUILDINGS.items():
-        _building(place, name, centre, size, windows)
+def add_buildings(place: KnownPlace) -> None:
+    """Adds all buildings to a place."""
+    for name, (center, size, windows) in BUILDINGS.items():
+        _add_building(place, name, center, size, windows)
 
 
-# ---- What stands beside the road: lamp posts, signs, cones, benches, bins, crates, cars, and the barrier at its end.
-#
-# Where each thing stands is in the tables at the top: station and lateral [m], then what differs from one to the next.
-
+# ---- street furniture
 
 _LAMPS = ((2.0, 3.75), (15.0, -3.75), (28.0, 3.75), (40.0, 3.9), (51.0, -3.75), (63.0, 3.75), (76.0, -3.75))
-_SIGNS = (  # turned from facing the traffic [rad]
+_SIGNS = (  # last: rotation from facing the traffic [rad]
     *((6.0, -3.7, 0.1), (11.0, 3.6, -0.2), (20.0, -3.8, 0.0), (27.5, -4.0, 0.5), (33.0, 4.6, -0.4)),
     *((37.5, 4.4, -0.9), (46.0, 3.7, 0.0), (55.0, -3.7, 0.2), (67.0, -3.7, 0.0), (72.0, 3.8, 0.1)),
 )
@@ -115,61 +116,61 @@ _BINS = (
     *((10.9, 4.6, "green"), (17.5, -3.9, "dark"), (38.7, 5.2, "blue")),
     *((58.6, 4.6, "green"), (48.5, 4.4, "red")),
 )
-_CRATES = (  # side [m]
+_CRATES = (  # last: side [m]
     *((18.5, -5.0, 1.1), (18.6, -6.3, 0.9), (29.5, -5.6, 1.2)),
     *((45.5, 6.5, 1.0), (54.0, -5.3, 1.15), (65.0, -4.9, 1.0)),
 )
-_KEPT_FREE = 2.15  # [m] from the centre line that nothing's middle is moved into
+_MIN_LATERAL = 2.15  # [m] closest that a displaced object comes to the center line
 _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
-def street_add(place: KnownPlace, later: np.random.Generator | None = None) -> None:
-    """Adds everything beside the road to a place; with a generator as on another day, when small things have moved."""
+def add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = None) -> None:
+    """Adds all objects beside the road; with a generator, small ones are displaced, as on another day."""
     for k, lamp in enumerate(_LAMPS):
-        _lamp_post(place, k, *lamp)
+        _add_lamp_post(place, k, *lamp)
     for k, sign in enumerate(_SIGNS):
-        _sign(place, k, *sign)
+        _add_sign(place, k, *sign)
     for k, (station, lateral) in enumerate(_CONES):
-        _cone(place, k, *_moved(later, station, lateral, 1.5, 0.2))
+        _add_cone(place, k, *_displaced(rng, station, lateral, 1.5, 0.2))
     for k, bench in enumerate(_BENCHES):
-        _bench(place, k, *bench)
+        _add_bench(place, k, *bench)
     for k, (station, lateral, skin) in enumerate(_BINS):
-        station, lateral = _moved(later, station, lateral, 1.0, 0.2)
+        station, lateral = _displaced(rng, station, lateral, 1.0, 0.2)
         foot = place.spot(station, lateral)
         part = cell(skin, primitives.tube(foot - up(0.05), foot + up(0.95), 0.24, 0.28, 14))
         solid = Solid("cylinder", foot + up(0.45), (0.27, 0.5, 0.0))
-        place.things.append(Thing(f"bin_{k}", "obstacle", part, "atlas", (solid,)))
+        place.objects.append(PlaceObject(f"bin_{k}", "obstacle", part, "atlas", (solid,)))
     for k, (station, lateral, side) in enumerate(_CRATES):
-        _crate(place, k, *_moved(later, station, lateral, 0.5, 0.2), side)
+        _add_crate(place, k, *_displaced(rng, station, lateral, 0.5, 0.2), side)
     for k, (station, lateral, skin) in enumerate(_CARS):
-        _car(place, k, *_moved(later, station, lateral, 1.5, 0.1), skin)
+        _add_car(place, k, *_displaced(rng, station, lateral, 1.5, 0.1), skin)
     for k, lateral in enumerate((-2.0, 0.0, 2.0)):  # the road ends here
         foot, yaw = place.spot(END - 3.0, lateral), place.heading(END) + np.pi / 2
         part = cell("barrier", primitives.box((1.8, 0.12, 1.0)).moved(foot, yaw))
         solid = Solid("box", foot + up(0.5), (0.9, 0.06, 0.5), yaw)
-        place.things.append(Thing(f"barrier_{k}", "obstacle", part, "atlas", (solid,)))
+        place.objects.append(PlaceObject(f"barrier_{k}", "obstacle", part, "atlas", (solid,)))
 
 
-def _moved(
-    later: np.random.Generator | None, station: float, lateral: float, along: float, across: float
+def _displaced(
+    rng: np.random.Generator | None, station: float, lateral: float, along: float, across: float
 ) -> tuple[float, float]:
-    """Station and lateral of a thing that has been moved by up to so much [m], never nearer than `_KEPT_FREE`."""
-    if later is None:
+    """Station and lateral displaced by at most `along` and `across` [m]; the lateral stays beyond `_MIN_LATERAL`."""
+    if rng is None:
         return station, lateral
-    station += later.uniform(-along, along)
-    away = max(abs(lateral) + later.uniform(-across, across), min(abs(lateral), _KEPT_FREE))
+    station += rng.uniform(-along, along)
+    away = max(abs(lateral) + rng.uniform(-across, across), min(abs(lateral), _MIN_LATERAL))
     return float(station), float(np.copysign(away, lateral))
 
 
-def _cone(place: KnownPlace, k: int, station: float, lateral: float) -> None:
+def _add_cone(place: KnownPlace, k: int, station: float, lateral: float) -> None:
     foot = place.spot(station, lateral)
     parts = [cell("cone", primitives.tube(foot + up(0.03), foot + up(0.62), 0.16, 0.03, 12))]
     parts.append(cell("rubber", primitives.box((0.42, 0.42, 0.04)).moved(foot, 0.3 * k)))
     solid = Solid("cylinder", foot + up(0.31), (0.16, 0.31, 0.0))
-    place.things.append(Thing(f"cone_{k}", "obstacle", primitives.join(parts), "atlas", (solid,)))
+    place.objects.append(PlaceObject(f"cone_{k}", "obstacle", primitives.join(parts), "atlas", (solid,)))
 
 
-def _crate(place: KnownPlace, k: int, station: float, lateral: float, side: float) -> None:
+def _add_crate(place: KnownPlace, k: int, station: float, lateral: float, side: float) -> None:
     foot = place.spot(station, lateral) - up(0.05)
     yaw = place.heading(station) + 0.37 * k
     stack = [cell("crate", primitives.box((side, side, side)).moved(foot, yaw))]
@@ -178,10 +179,10 @@ def _crate(place: KnownPlace, k: int, station: float, lateral: float, side: floa
         top = foot + np.array([0.1, 0.05, side])
         stack.append(cell("planks", primitives.box((0.7, 0.7, 0.6)).moved(top, yaw + 0.4)))
         solids.append(Solid("box", top + up(0.3), (0.35, 0.35, 0.3), yaw + 0.4))
-    place.things.append(Thing(f"crate_{k}", "obstacle", primitives.join(stack), "atlas", tuple(solids)))
+    place.objects.append(PlaceObject(f"crate_{k}", "obstacle", primitives.join(stack), "atlas", tuple(solids)))
 
 
-def _lamp_post(place: KnownPlace, k: int, station: float, lateral: float) -> None:
+def _add_lamp_post(place: KnownPlace, k: int, station: float, lateral: float) -> None:
     foot = place.spot(station, lateral)
     inward = place.spot(station, lateral - np.sign(lateral) * 1.5)[:2] - foot[:2]
     top = foot + up(5.1)
@@ -194,21 +195,21 @@ def _lamp_post(place: KnownPlace, k: int, station: float, lateral: float) -> Non
     yaw = float(np.arctan2(inward[1], inward[0]))
     parts.append(cell("dark", primitives.box((0.62, 0.26, 0.10), 0.02).moved(head, yaw)))
     solid = Solid("cylinder", foot + up(2.5), (0.1, 2.6, 0.0))
-    place.things.append(Thing(f"lamp_{k}", "obstacle", primitives.join(parts), "atlas", (solid,)))
+    place.objects.append(PlaceObject(f"lamp_{k}", "obstacle", primitives.join(parts), "atlas", (solid,)))
     glass = cell("lamp", primitives.box((0.5, 0.2, 0.06), -0.04).moved(head, yaw))
-    place.things.append(Thing(f"lamp_{k}_glass", "obstacle", glass, "lamp_glass"))
+    place.objects.append(PlaceObject(f"lamp_{k}_glass", "obstacle", glass, "lamp_glass"))
     place.lamp_heads.append(head)
 
 
-def _sign(place: KnownPlace, k: int, station: float, lateral: float, turn: float) -> None:
+def _add_sign(place: KnownPlace, k: int, station: float, lateral: float, turn: float) -> None:
     foot = place.spot(station, lateral)
     yaw = place.heading(station) + turn
     c, s = np.cos(yaw), np.sin(yaw)
-    across = np.array([s, -c])  # the reader's left to right, seen while driving
+    across = np.array([s, -c])  # left to right as the reader sees it
     high, low, wide = (2.4, 1.5, 0.9) if k % 3 else (1.9, 0.7, 1.3)
     face = foot[:2] - 0.05 * np.array([c, s])
     left, right = face - across * wide / 2, face + across * wide / 2
-    board = cell(f"sign{k % 8}", upright(left, right, foot[2] + low, foot[2] + high))
+    board = cell(f"sign{k % 8}", vertical_quad(left, right, foot[2] + low, foot[2] + high))
     back = primitives.box((0.03, wide, high - low), foot[2] + low).moved(
         np.append(foot[:2] - 0.03 * np.array([c, s]), 0), yaw
     )
@@ -217,12 +218,12 @@ def _sign(place: KnownPlace, k: int, station: float, lateral: float, turn: float
         Solid("cylinder", foot + up(high / 2), (0.04, high / 2, 0.0)),
         Solid("box", np.append(foot[:2], foot[2] + (low + high) / 2), (0.05, wide / 2, (high - low) / 2), yaw),
     )
-    place.things.append(
-        Thing(f"sign_{k}", "obstacle", primitives.join([board, cell("zinc", back), pole]), "atlas", solids)
+    place.objects.append(
+        PlaceObject(f"sign_{k}", "obstacle", primitives.join([board, cell("zinc", back), pole]), "atlas", solids)
     )
 
 
-def _bench(place: KnownPlace, k: int, station: float, lateral: float) -> None:
+def _add_bench(place: KnownPlace, k: int, station: float, lateral: float) -> None:
     foot, yaw = place.spot(station, lateral), place.heading(station)
     parts = [cell("planks", primitives.box((1.7, 0.45, 0.06), 0.42).moved(foot, yaw))]
     out = np.array([-np.sin(yaw), np.cos(yaw), 0.0]) * np.sign(lateral)
@@ -232,10 +233,10 @@ def _bench(place: KnownPlace, k: int, station: float, lateral: float) -> None:
         parts.append(cell("dark", primitives.box((0.07, 0.42, 0.50), -0.08).moved(foot + end * ahead, yaw)))
     solid = Solid("box", foot + up(0.22), (0.85, 0.24, 0.27), yaw)
     back = Solid("box", foot + 0.22 * out + up(0.7), (0.85, 0.04, 0.2), yaw)
-    place.things.append(Thing(f"bench_{k}", "obstacle", primitives.join(parts), "atlas", (solid, back)))
+    place.objects.append(PlaceObject(f"bench_{k}", "obstacle", primitives.join(parts), "atlas", (solid, back)))
 
 
-def _car(place: KnownPlace, k: int, station: float, lateral: float, skin: str) -> None:
+def _add_car(place: KnownPlace, k: int, station: float, lateral: float, skin: str) -> None:
     foot, yaw = place.spot(station, lateral), place.heading(station)
     c, s = np.cos(yaw), np.sin(yaw)
     parts = [cell(skin, primitives.box((4.0, 1.7, 0.62), 0.28).moved(foot, yaw))]
@@ -253,11 +254,10 @@ def _car(place: KnownPlace, k: int, station: float, lateral: float, skin: str) -
         Solid("box", foot + up(0.45), (2.0, 0.87, 0.45), yaw),
         Solid("box", foot - 0.2 * np.array([c, s, 0]) + up(1.18), (1.05, 0.78, 0.28), yaw),
     )
-    place.things.append(Thing(f"car_{k}", "obstacle", primitives.join(parts), "atlas", solids))
+    place.objects.append(PlaceObject(f"car_{k}", "obstacle", primitives.join(parts), "atlas", solids))
 
 
-# ---- Trees, hedges and tufts of grass: foliage of many single leaves, with gaps that light passes through.
-
+# ---- vegetation
 
 _TREES = (  # station, lateral, height, crown radius [m]
     (4.5, -5.6, 6.2, 1.9),
@@ -285,16 +285,16 @@ _HEDGES = ((0.0, 11.0, -7.6), (18.0, 30.0, 7.9), (46.0, 60.0, 7.6), (46.5, 58.0,
 _TUFTS = 5200
 
 
-def trees_add(place: KnownPlace) -> None:
-    """Adds all that grows to a place."""
+def add_vegetation(place: KnownPlace) -> None:
+    """Adds trees, hedges and tufts of grass to a place."""
     for k, tree in enumerate(_TREES):
-        _tree(place, k, *tree)
+        _add_tree(place, k, *tree)
     for k, hedge in enumerate(_HEDGES):
-        _hedge(place, k, *hedge)
-    _tufts(place)
+        _add_hedge(place, k, *hedge)
+    _add_tufts(place)
 
 
-def _tree(place: KnownPlace, k: int, station: float, lateral: float, height: float, crown: float) -> None:
+def _add_tree(place: KnownPlace, k: int, station: float, lateral: float, height: float, crown: float) -> None:
     rng = np.random.default_rng([SEED, 2, k])
     foot = place.spot(station, lateral)
     lean = np.append(rng.normal(0, 0.15, 2), 0.0)
@@ -308,27 +308,27 @@ def _tree(place: KnownPlace, k: int, station: float, lateral: float, height: flo
         wood.append(primitives.tube(fork - up(0.1), tip, thick * 0.4, thick * 0.12, 6, False))
         clusters.append(tip)
     clusters.append(fork + up(0.5 * height))
-    centres = []
+    centers = []
     for tip in clusters:
         ball = rng.normal(size=(330, 3))
         ball /= np.linalg.norm(ball, axis=1, keepdims=True)
         radius = crown * 0.55 * rng.uniform(0.25, 1.0, (330, 1)) ** 0.5
-        centres.append(tip + ball * radius * [1.0, 1.0, 0.75])
-    crown_leaves = np.concatenate(centres)
+        centers.append(tip + ball * radius * [1.0, 1.0, 0.75])
+    crown_leaves = np.concatenate(centers)
     crown_leaves = crown_leaves[crown_leaves[:, 2] > foot[2] + 0.3 * height]
     trunk = Solid("cylinder", foot + up(0.2 * height), (thick * 1.1, 0.25 * height, 0.0))
     wood_part = cell(f"bark{k % 3}", primitives.join(wood))
-    place.things.append(Thing(f"tree_{k}", "obstacle", wood_part, "atlas", (trunk,)))
+    place.objects.append(PlaceObject(f"tree_{k}", "obstacle", wood_part, "atlas", (trunk,)))
     middle = crown_leaves.mean(0)
     outward = np.linalg.norm((crown_leaves - middle) / [crown, crown, 0.8 * crown], axis=1)
     light = 0.15 + 0.6 * np.clip(outward, 0, 1) ** 1.5 + 0.18 * (crown_leaves[:, 2] - middle[2]) / crown
     foliage = cell(f"leaf{k % 4}", primitives.leaves(rng, crown_leaves, (0.09, 0.21), light))
-    place.things.append(Thing(f"tree_{k}_leaves", "foliage", foliage))
+    place.objects.append(PlaceObject(f"tree_{k}_leaves", "foliage", foliage))
 
 
-def _hedge(place: KnownPlace, k: int, start: float, end: float, lateral: float) -> None:
+def _add_hedge(place: KnownPlace, k: int, start: float, end: float, lateral: float) -> None:
     rng = np.random.default_rng([SEED, 3, k])
-    core, solids, centres = [], [], []
+    core, solids, centers = [], [], []
     for station in np.arange(start, end, 1.0):
         foot, yaw = place.spot(station + 0.5, lateral) - up(0.1), place.heading(station + 0.5)
         core.append(cell("hedge", primitives.box((1.15, 0.55, 0.95)).moved(foot, yaw)))
@@ -339,15 +339,15 @@ def _hedge(place: KnownPlace, k: int, start: float, end: float, lateral: float) 
         surface[push == 1, 1] = rng.normal(0.31, 0.04, (push == 1).sum())
         surface[push == 2, 1] = rng.normal(-0.31, 0.04, (push == 2).sum())
         c, s = np.cos(yaw), np.sin(yaw)
-        centres.append(surface @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + foot)
-    tips = np.concatenate(centres)
+        centers.append(surface @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + foot)
+    tips = np.concatenate(centers)
     light = 0.25 + 0.5 * np.clip((tips[:, 2] - tips[:, 2].min()) / 1.1, 0.0, 1.0)
     twigs = cell("leaf1", primitives.leaves(rng, tips, (0.08, 0.17), light))
-    place.things.append(Thing(f"hedge_{k}", "obstacle", primitives.join([*core, twigs]), "atlas", tuple(solids)))
+    place.objects.append(PlaceObject(f"hedge_{k}", "obstacle", primitives.join([*core, twigs]), "atlas", tuple(solids)))
 
 
-def _tufts(place: KnownPlace) -> None:
-    """Grass and weeds that stand up a little along the kerbs and on the verges."""
+def _add_tufts(place: KnownPlace) -> None:
+    """Adds grass and weeds along the kerbs and on the verges."""
     rng = np.random.default_rng([SEED, 4])
     n = _TUFTS
     station = rng.uniform(START, 75.0, n)
@@ -363,28 +363,32 @@ def _tufts(place: KnownPlace) -> None:
     window = rng.uniform(0.5, 0.9, (n, 1, 2)) + 0.08 * np.array([[0, 1], [1, 1], [0.5, 0]])
     points = np.stack([foot - across - up(0.02), foot + across - up(0.02), tip], 1)
     blades = MeshPart(points.reshape(-1, 3), np.arange(3 * n, dtype=np.int32).reshape(-1, 3), window.reshape(-1, 2))
-    place.things.append(Thing("tufts", "detail", cell("leaf2", blades)))
+    place.objects.append(PlaceObject("tufts", "detail", cell("leaf2", blades)))
 
 
-LAND = (-60.0, 120.0, -130.0, 60.0)  # [m] x and y range of the land beyond the verges
+# ---- ground
+
+LAND_RANGE = (-60.0, 120.0, -130.0, 60.0)  # [m] x and y range of the land beyond the verges
 _LAND_STEP = 1.5
 
 
-def build(route: RoadLine | None = None, later: bool = False) -> KnownPlace:
-    """The campus road; `later`: on another day than it was filmed, cones, bins, crates and cars having been moved.
+def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
+    """The campus road; the result is always the same.
 
-    Deterministic: the same place each time.
+    Args:
+        route: Center line; the default road where None.
+        displaced: The place on another day than the film's: cones, bins, crates and cars stand elsewhere.
     """
     place = KnownPlace(route or RoadLine())
-    _ground(place)
-    add(place)
-    trees_add(place)
-    street_add(place, np.random.default_rng([SEED, 8]) if later else None)
+    _add_ground(place)
+    add_buildings(place)
+    add_vegetation(place)
+    add_street_furniture(place, np.random.default_rng([SEED, 8]) if displaced else None)
     return place
 
 
-def _ribbon(route: RoadLine, laterals: list[float], heights: list[float] | None, step: float) -> MeshPart:
-    """A strip along the road through laterals (left first); heights [m] over the undulation, None = the ground's."""
+def _road_strip(route: RoadLine, laterals: list[float], heights: list[float] | None, step: float) -> MeshPart:
+    """A strip along the road through laterals [m], left first, at heights above the undulation [m] or on the ground."""
     stations = np.arange(roads.START, roads.END + step / 2, step)
     across = np.asarray(laterals, float)
     xy = route.at(stations[None], across[:, None])
@@ -397,10 +401,10 @@ def _ribbon(route: RoadLine, laterals: list[float], heights: list[float] | None,
     )
 
 
-def _ground(place: KnownPlace) -> None:
+def _add_ground(place: KnownPlace) -> None:
     route, edge = place.route, ROAD_HALF_WIDTH
     crossing = np.linspace(edge, -edge, 13)
-    place.things.append(Thing("road", "ground", _ribbon(route, list(crossing), None, 0.5), "road"))
+    place.objects.append(PlaceObject("road", "ground", _road_strip(route, list(crossing), None, 0.5), "road"))
     low = float(roads.cross_profile(edge))
     outer = edge + roads.KERB_WIDTH
     high = float(roads.cross_profile(outer))
@@ -409,11 +413,11 @@ def _ground(place: KnownPlace) -> None:
         verge = np.linspace(outer, outer + roads.VERGE_WIDTH, 8)
         if side > 0:
             profile, verge = profile[::-1], verge[::-1]
-        kerb = _ribbon(route, [side * p[0] for p in profile], [p[1] for p in profile], 0.5)
-        place.things.append(Thing(f"kerb_{name}", "ground", kerb, "kerb"))
-        strip = _ribbon(route, [side * v for v in verge], None, 0.5)
-        place.things.append(Thing(f"verge_{name}", "ground", strip, f"verge_{name}"))
-    x0, x1, y0, y1 = LAND
+        kerb = _road_strip(route, [side * p[0] for p in profile], [p[1] for p in profile], 0.5)
+        place.objects.append(PlaceObject(f"kerb_{name}", "ground", kerb, "kerb"))
+        strip = _road_strip(route, [side * v for v in verge], None, 0.5)
+        place.objects.append(PlaceObject(f"verge_{name}", "ground", strip, f"verge_{name}"))
+    x0, x1, y0, y1 = LAND_RANGE
     x, y = np.meshgrid(np.arange(x0, x1 + 0.1, _LAND_STEP), np.arange(y1, y0 - 0.1, -_LAND_STEP))
     xy = np.stack([x, y], -1)
     _, lateral = route.project(xy)
@@ -422,4 +426,4 @@ def _ground(place: KnownPlace) -> None:
     )
     points = np.concatenate([xy, (roads.ground_height(route, xy) - sunk)[..., None]], -1)
     uv = np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1)
-    place.things.append(Thing("land", "ground", primitives.grid(points, uv), "land"))
+    place.objects.append(PlaceObject("land", "ground", primitives.grid(points, uv), "land"))

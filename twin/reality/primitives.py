@@ -1,6 +1,6 @@
-"""Textured triangle meshes of simple things, in world coordinates [m].
+"""Textured triangle meshes of simple shapes, in world coordinates [m].
 
-A *part* is one piece of surface with one texture; `uv` is (column, row) in [0, 1] of its texture, row 0 at the top.
+A *part* is a surface with one texture; `uv` is (column, row) in [0, 1] of that texture, row 0 at the top.
 """
 
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from twin.types import Array
 
 @dataclass(frozen=True)
 class MeshPart:
-    """A mesh of n vertices and m triangles."""
+    """A textured mesh of n vertices and m triangles."""
 
     vertices: Array
     """Shape (n, 3) [m]."""
@@ -23,18 +23,18 @@ class MeshPart:
     """Shape (n, 2)."""
 
     def in_window(self, low: Array, high: Array) -> "MeshPart":
-        """The same surface with its [0, 1]² texture squeezed into a window of an atlas."""
+        """The same surface with its texture coordinates mapped from [0, 1]² into a window of an atlas."""
         return replace(self, uv=low + np.clip(self.uv, 0.0, 1.0) * (np.asarray(high) - low))
 
     def moved(self, origin: Array, yaw: float = 0.0) -> "MeshPart":
-        """Turned about z by `yaw` [rad], then shifted to `origin`."""
+        """The mesh rotated about z by `yaw` [rad], then translated by `origin` [m]."""
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return replace(self, vertices=self.vertices @ turn.T + origin)
 
 
 def join(parts: list[MeshPart]) -> MeshPart:
-    """One mesh of several."""
+    """Several meshes as one."""
     starts = np.cumsum([0] + [len(p.vertices) for p in parts])
     return MeshPart(
         np.concatenate([p.vertices for p in parts]),
@@ -46,7 +46,7 @@ def join(parts: list[MeshPart]) -> MeshPart:
 def grid(points: Array, uv: Array) -> MeshPart:
     """A surface through a lattice of points, shapes (rows, columns, 3) and (rows, columns, 2).
 
-    Faces up where rows run to the right of columns (as rows across a road from its left edge, columns along it).
+    It faces up if rows run across a road from its left edge and columns along it.
     """
     rows, columns = points.shape[:2]
     i = np.arange(rows * columns).reshape(rows, columns)
@@ -56,13 +56,13 @@ def grid(points: Array, uv: Array) -> MeshPart:
 
 
 def quad(corners: Array) -> MeshPart:
-    """A rectangle from its corners: top left, bottom left, bottom right, top right; shape (4, 3)."""
+    """A rectangle from its corners top left, bottom left, bottom right, top right; shape (4, 3)."""
     uv = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
     return MeshPart(np.asarray(corners, float), np.array([[0, 1, 2], [0, 2, 3]], np.int32), uv)
 
 
 def box(size: tuple[float, float, float], base: float = 0.0) -> MeshPart:
-    """A box of full sizes (x, y, z) standing on z = `base`, each face the whole texture."""
+    """A box of full sizes (x, y, z) on z = `base`; each face shows the whole texture."""
     x, y, z0, z1 = size[0] / 2, size[1] / 2, base, base + size[2]
     ring = [(-x, -y), (x, -y), (x, y), (-x, y)]
     sides = []
@@ -74,7 +74,7 @@ def box(size: tuple[float, float, float], base: float = 0.0) -> MeshPart:
 
 
 def walls(width: float, depth: float, low: float, high: float) -> MeshPart:
-    """Four walls around a rectangle of x `width` and y `depth`; the texture runs once around, from corner (−x, −y)."""
+    """Four walls around a rectangle of x `width` and y `depth`; the texture wraps once, from corner (−x, −y)."""
     x, y = width / 2, depth / 2
     ring = np.array([(-x, -y), (x, -y), (x, y), (-x, y), (-x, -y)])
     along = np.cumsum([0.0, width, depth, width, depth]) / (2 * (width + depth))
@@ -107,23 +107,22 @@ def tube(
     if not capped:
         return side
     lids = []
-    for centre, radius in ((np.asarray(top, float), radius_top), (np.asarray(bottom, float), radius_bottom)):
-        rim = centre + radius * ring[:-1]
+    for center, radius in ((np.asarray(top, float), radius_top), (np.asarray(bottom, float), radius_bottom)):
+        rim = center + radius * ring[:-1]
         fan = np.array([[0, 1 + k, 1 + (k + 1) % sides] for k in range(sides)], np.int32)
         rim_uv = 0.5 + 0.5 * np.stack([np.cos(angle[:-1]), np.sin(angle[:-1])], 1)
-        lids.append(MeshPart(np.vstack([centre, rim]), fan, np.vstack([[0.5, 0.5], rim_uv])))
+        lids.append(MeshPart(np.vstack([center, rim]), fan, np.vstack([[0.5, 0.5], rim_uv])))
     return join([side, *lids])
 
 
 def leaves(
-    rng: np.random.Generator, centres: Array, size: tuple[float, float], light: Array, uv_size: float = 0.08
+    rng: np.random.Generator, centers: Array, size: tuple[float, float], light: Array, uv_size: float = 0.08
 ) -> MeshPart:
-    """Small bent rhombi around given centres, shape (n, 3): foliage with gaps that light passes through.
+    """Foliage: small bent rhombi around centers, shape (n, 3), with gaps between them.
 
-    Each leaf shows its own window of the texture, `uv_size` wide: from its left where `light` is 0, to its right where
-    it is 1, shape (n,).
+    Each leaf shows a window of the texture, `uv_size` wide, placed from left to right by `light` in [0, 1], shape (n,).
     """
-    n = len(centres)
+    n = len(centers)
     long, short = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
     long[:, 2] *= 0.6  # leaves hang rather flat
     long /= np.linalg.norm(long, axis=1, keepdims=True)
@@ -131,8 +130,8 @@ def leaves(
     short /= np.linalg.norm(short, axis=1, keepdims=True)
     half = 0.5 * rng.uniform(*size, (n, 1))
     droop = np.cross(long, short) * half * 0.25
-    tips = [centres - half * long, centres + 0.55 * half * short + droop, centres + half * long]
-    tips.append(centres - 0.55 * half * short + droop)
+    tips = [centers - half * long, centers + 0.55 * half * short + droop, centers + half * long]
+    tips.append(centers - 0.55 * half * short + droop)
     corner = rng.uniform(0.0, 1.0 - uv_size, (n, 1, 2))
     corner[:, 0, 0] = np.clip(light + rng.normal(0.0, 0.1, n), 0.0, 1.0) * (1.0 - uv_size)
     window = corner + uv_size * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])

@@ -1,78 +1,73 @@
-"""A rasteriser of its own for what the robot sees of the known-truth world: a small picture in a few milliseconds.
+"""A CPU rasterizer for the images of the robot's camera in the known-truth world: small images in a few milliseconds.
 
-The world stands still under one lighting, so all of it is flattened once into triangles, textures in halving sizes
-(*levels*), lights and a shadow map. A picture is made in two passes over 2 × 2 samples per pixel: which triangle is
-nearest (*visibility*), then its colour (*shading*). Shading is what `film.Renderer` does, so that a picture looks like
-a frame of the film; textures are averaged over a sample's footprint, as a film's many pixels would be.
+The static world is flattened once into triangles, mip-mapped textures, lights and a shadow map. An image takes two
+passes over 2 × 2 samples per pixel: the nearest triangle, then its color, shaded like `filming.Renderer` with textures
+averaged over the footprint of a sample.
 
-A ray through a sample has direction d with z = 1 in the camera. With corners a, b, c seen from the camera, it meets the
-triangle where d · (b × c), d · (c × a), d · (a × b) have the sign of det = a · (b × c); they are proportional to the
-barycentric coordinates there (Olano and Greer, Triangle scan conversion using 2D homogeneous coordinates, 1997). Their
-sum is d · ((b − a) × (c − a)), and z = det / the sum. No clipping is needed.
+A ray through a sample has direction d with z = 1 in the camera frame. With corners a, b, c in that frame, it hits the
+triangle if d · (b × c), d · (c × a), d · (a × b) have the sign of det = a · (b × c); they are proportional to the
+barycentric coordinates of the hit (Olano and Greer, Triangle scan conversion using 2D homogeneous coordinates, 1997).
+Their sum is d · ((b − a) × (c − a)), and z = det / sum. No clipping is needed.
 """
 
-from dataclasses import dataclass
+# mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, type-var, operator"
+# mypy: disable-error-code="call-overload, var-annotated"
+# (kernels use Warp's own types, which mypy does not know)
 
-# mypy: disable-error-code="index, attr-defined, valid-type, misc, call-overload, arg-type, type-var, operator"
-# (inside kernels, Warp's own types hold, which mypy does not know)
-# mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
-# (inside kernels, Warp's own types hold, which mypy does not know)
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import mujoco
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from twin.types import Array, Array32
+from twin.warp_runtime import wp
 
-# ---- A MuJoCo model of textured meshes that stands still, as plain arrays for `rasterizer.py`.
-#
-# *Levels* of a texture are the texture itself and its halvings, until `_SMALLEST` pixels; all are in one array of bytes.
+# ---- model to arrays
 
-
-_LEVELS = 6
-_SMALLEST = 8  # [px] side of a level
-_SMOOTH = 0.8  # cosine to its face above which a vertex normal is used, as MuJoCo does
+_MAX_LEVELS = 6
+_MIN_SIDE = 8  # [px] of a mip level
+_SMOOTH_COSINE = 0.8  # between vertex and face normal, above which the vertex normal is used, as in MuJoCo
 
 
 @dataclass(frozen=True)
-class FlatMesh:
-    """m triangles of geom groups 0 and 1, and the lights."""
+class FlatScene:
+    """m textured triangles and the lights of a static model."""
 
     corners: Array32
     """World [m], shape (m, 3, 3)."""
     normals: Array32
-    """At the corners, unit, shape (m, 3, 3)."""
+    """Unit normals at the corners, shape (m, 3, 3)."""
     uvs: Array32
-    """Column, row in [0, 1] of the texture, shape (m, 3, 2)."""
+    """Texture coordinates column, row in [0, 1], shape (m, 3, 2)."""
     textures: NDArray[np.int32]
-    """Shape (m,)."""
+    """Texture indices, shape (m,)."""
     emissions: Array32
     """Shape (m,)."""
     texels: NDArray[np.uint8]
-    """Every level of every texture, row by row, RGB; shape (bytes,)."""
-    levels: NDArray[np.int32]
-    """Offset in `texels`, width, height [px]; shape (textures, levels, 3). The last ones may repeat."""
+    """RGB of all mip levels of all textures, row by row, shape (bytes,)."""
+    mip_levels: NDArray[np.int32]
+    """Offset in `texels`, width and height [px], shape (textures, levels, 3); the last levels may repeat."""
     sky: int
-    """The texture that is the cube map of the sky."""
+    """Texture index of the sky's cube map."""
     ambient: Array32
     """Shape (3,)."""
-    sun_rays: Array32
-    """Directions in which the directional lights shine, unit, shape (k, 3)."""
-    sun_colours: Array32
+    sun_directions: Array32
+    """Unit ray directions of the directional lights, shape (k, 3)."""
+    sun_colors: Array32
     """Shape (k, 3)."""
     sun_shadows: NDArray[np.bool_]
-    """Which cast shadows, shape (k,)."""
+    """True for those that cast shadows, shape (k,)."""
     lamps: Array32
-    """Position [m] and colour of the spot lights, which shine straight down, shape (l, 2, 3)."""
-    lamp_shape: Array32
-    """Attenuation: constant, per square metre; cosine of the cutoff. Shape (3,)."""
+    """Position [m] and color of the spot lights, which shine straight down, shape (l, 2, 3)."""
+    lamp_falloff: Array32
+    """Constant and quadratic [1/m²] attenuation, cosine of the cutoff angle; shape (3,)."""
 
 
-def flatten(model: mujoco.MjModel) -> FlatMesh:
-    """The model's meshes in geom groups 0 and 1, its textures and its lights."""
+def flatten(model: mujoco.MjModel) -> FlatScene:
+    """The meshes of a model in geom groups 0 and 1, its textures and its lights."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
@@ -81,7 +76,7 @@ def flatten(model: mujoco.MjModel) -> FlatMesh:
     materials = model.geom_matid[shown]
     counts = [len(piece[0]) for piece in pieces]
     textures = model.mat_texid[materials, mujoco.mjtTextureRole.mjTEXROLE_RGB]
-    texels, levels = _levels(model)
+    texels, mip_levels = _mip_levels(model)
     suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     lamps = np.flatnonzero(~suns)
     shape = np.array([1.0, 0.0, 0.0])
@@ -89,26 +84,26 @@ def flatten(model: mujoco.MjModel) -> FlatMesh:
         one = lamps[0]
         shape = np.array([*model.light_attenuation[one][[0, 2]], np.cos(np.deg2rad(model.light_cutoff[one]))])
     lit = np.stack([data.light_xpos[lamps], model.light_diffuse[lamps]], 1)
-    return FlatMesh(
+    return FlatScene(
         corners=np.concatenate([piece[0] for piece in pieces]),
         normals=np.concatenate([piece[1] for piece in pieces]),
         uvs=np.concatenate([piece[2] for piece in pieces]),
         textures=np.repeat(textures, counts).astype(np.int32),
         emissions=np.repeat(model.mat_emission[materials], counts).astype(np.float32),
         texels=texels,
-        levels=levels,
+        mip_levels=mip_levels,
         sky=int(np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)[0]),
         ambient=model.light_ambient.sum(0).astype(np.float32),
-        sun_rays=data.light_xdir[suns].astype(np.float32),
-        sun_colours=model.light_diffuse[suns].astype(np.float32),
+        sun_directions=data.light_xdir[suns].astype(np.float32),
+        sun_colors=model.light_diffuse[suns].astype(np.float32),
         sun_shadows=np.asarray(model.light_castshadow[suns], bool),
         lamps=lit.astype(np.float32),
-        lamp_shape=shape.astype(np.float32),
+        lamp_falloff=shape.astype(np.float32),
     )
 
 
 def _triangles(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[Array32, Array32, Array32]:
-    """Corners in the world, normals and uvs of a geom's mesh, shapes (m, 3, 3), (m, 3, 3), (m, 3, 2)."""
+    """World corners, normals and uvs of a geom's mesh, shapes (m, 3, 3), (m, 3, 3), (m, 3, 2)."""
     mesh = model.geom_dataid[geom]
     first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
     part = slice(first, first + count)
@@ -117,22 +112,22 @@ def _triangles(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[A
     smooth = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[part]] @ turn.T
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = (flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12))[:, None]
-    normals = np.where((smooth * flat).sum(-1, keepdims=True) < _SMOOTH, flat, smooth)
+    normals = np.where((smooth * flat).sum(-1, keepdims=True) < _SMOOTH_COSINE, flat, smooth)
     uvs = model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[part]]
     return corners.astype(np.float32), normals.astype(np.float32), uvs.astype(np.float32)
 
 
-def _levels(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """Every texture in halving sizes: `Flat.texels` and `Flat.levels`."""
+def _mip_levels(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    """`FlatScene.texels` and `FlatScene.mip_levels` of a model's textures."""
     images: list[NDArray[np.uint8]] = []
-    table = np.zeros((model.ntex, _LEVELS, 3), np.int32)
+    table = np.zeros((model.ntex, _MAX_LEVELS, 3), np.int32)
     offset = 0
     for texture in range(model.ntex):
         width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
         begin = model.tex_adr[texture]
         image = model.tex_data[begin : begin + 3 * width * height].reshape(height, width, 3)
-        for level in range(_LEVELS):
-            if level and min(image.shape[:2]) >= 2 * _SMALLEST:
+        for level in range(_MAX_LEVELS):
+            if level and min(image.shape[:2]) >= 2 * _MIN_SIDE:
                 image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
             elif level:
                 table[texture, level] = table[texture, level - 1]
@@ -143,21 +138,17 @@ def _levels(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], NDArray[np.int32]
     return np.concatenate(images), table
 
 
-# ---- A shadow map: how far the sun's light comes along its direction, over a plane across it, drawn once per lighting.
-#
-# The map covers the road that is driven, `_RANGE`; what lies beyond it is in the light. A point is in shadow where
-# something lies between it and the sun; each look asks the four nearest texels and blends their answers.
+# ---- shadow map
 
-
-_RANGE = ((-14.0, -66.0, -1.0), (66.0, 24.0, 6.0))  # [m] what is shaded
-_TEXEL = 0.03  # [m]
+_SHADOW_RANGE = ((-14.0, -66.0, -1.0), (66.0, 24.0, 6.0))  # [m] box that the map covers; points outside are lit
+_SHADOW_TEXEL = 0.03  # [m]
 _FAR = 1.0e6  # [m]
-_GRAZING = 12.0  # the most texels by which a surface is lifted from its own shadow
+_MAX_BIAS = 12.0  # [texels] bound of the bias against self-shadowing
 
 
 @wp.struct
 class ShadowMap:
-    """Axes of the plane and of the light, and the depths along it."""
+    """Orthographic depth map along a directional light: axes, origin [m] and depths along `ray` [m]."""
 
     sun: int
     right: wp.vec3
@@ -168,12 +159,21 @@ class ShadowMap:
 
 
 @wp.kernel
-def _draw(corners: wp.array2d[wp.vec3], shadows: ShadowMap):
+def _rasterize_shadow(corners: wp.array2d[wp.vec3], shadows: ShadowMap):
     i = wp.tid()
     o = shadows.left_bottom
-    a = wp.vec3(wp.dot(corners[i, 0], shadows.right) - o[0], wp.dot(corners[i, 0], shadows.up) - o[1], 0.0) / _TEXEL
-    b = wp.vec3(wp.dot(corners[i, 1], shadows.right) - o[0], wp.dot(corners[i, 1], shadows.up) - o[1], 0.0) / _TEXEL
-    c = wp.vec3(wp.dot(corners[i, 2], shadows.right) - o[0], wp.dot(corners[i, 2], shadows.up) - o[1], 0.0) / _TEXEL
+    a = (
+        wp.vec3(wp.dot(corners[i, 0], shadows.right) - o[0], wp.dot(corners[i, 0], shadows.up) - o[1], 0.0)
+        / _SHADOW_TEXEL
+    )
+    b = (
+        wp.vec3(wp.dot(corners[i, 1], shadows.right) - o[0], wp.dot(corners[i, 1], shadows.up) - o[1], 0.0)
+        / _SHADOW_TEXEL
+    )
+    c = (
+        wp.vec3(wp.dot(corners[i, 2], shadows.right) - o[0], wp.dot(corners[i, 2], shadows.up) - o[1], 0.0)
+        / _SHADOW_TEXEL
+    )
     da, db, dc = (
         wp.dot(corners[i, 0], shadows.ray),
         wp.dot(corners[i, 1], shadows.ray),
@@ -197,102 +197,102 @@ def _draw(corners: wp.array2d[wp.vec3], shadows: ShadowMap):
 
 
 @wp.func
-def _free(shadows: ShadowMap, x: int, y: int, along: float):
+def _is_lit(shadows: ShadowMap, x: int, y: int, along: float):
     if x < 0 or y < 0 or x >= shadows.depth.shape[1] or y >= shadows.depth.shape[0]:
         return 1.0
     return wp.where(shadows.depth[y, x] < along, 0.0, 1.0)
 
 
 @wp.func
-def in_light(shadows: ShadowMap, point: wp.vec3, normal: wp.vec3):
-    """Share of the sun that reaches a point [m] of a surface, 0 to 1."""
+def sun_visibility(shadows: ShadowMap, point: wp.vec3, normal: wp.vec3):
+    """Fraction of sunlight at a surface point [m]: depth tests at the four nearest texels, interpolated."""
     facing = wp.max(-wp.dot(normal, shadows.ray), 1.0e-3)
-    # Over half a texel's width a slanted surface rises this far towards the light; so much it must not shade itself.
-    slack = _TEXEL * wp.min(wp.sqrt(1.0 - facing * facing) / facing, _GRAZING) + 0.5 * _TEXEL
-    x = (wp.dot(point, shadows.right) - shadows.left_bottom[0]) / _TEXEL
-    y = (wp.dot(point, shadows.up) - shadows.left_bottom[1]) / _TEXEL
+    # Bias: a slanted surface rises this far towards the light within half a texel and must not shade itself.
+    slack = _SHADOW_TEXEL * wp.min(wp.sqrt(1.0 - facing * facing) / facing, _MAX_BIAS) + 0.5 * _SHADOW_TEXEL
+    x = (wp.dot(point, shadows.right) - shadows.left_bottom[0]) / _SHADOW_TEXEL
+    y = (wp.dot(point, shadows.up) - shadows.left_bottom[1]) / _SHADOW_TEXEL
     along = wp.dot(point, shadows.ray) - slack
     x0, y0 = int(wp.floor(x)), int(wp.floor(y))
     fx, fy = x - float(x0), y - float(y0)
-    low = _free(shadows, x0, y0, along) * (1.0 - fx) + _free(shadows, x0 + 1, y0, along) * fx
-    high = _free(shadows, x0, y0 + 1, along) * (1.0 - fx) + _free(shadows, x0 + 1, y0 + 1, along) * fx
+    low = _is_lit(shadows, x0, y0, along) * (1.0 - fx) + _is_lit(shadows, x0 + 1, y0, along) * fx
+    high = _is_lit(shadows, x0, y0 + 1, along) * (1.0 - fx) + _is_lit(shadows, x0 + 1, y0 + 1, along) * fx
     return low * (1.0 - fy) + high * fy
 
 
-def draw(corners: wp.array, flat: FlatMesh) -> ShadowMap:
-    """The map of the first sun that casts shadows; without any, an empty one whose `sun` is −1."""
+def render_shadow_map(corners: wp.array, flat: FlatScene) -> ShadowMap:
+    """The map of the first directional light that casts shadows; without one, an empty map with `sun` = −1."""
     out = ShadowMap()
     casting = np.flatnonzero(flat.sun_shadows)
     out.sun = int(casting[0]) if len(casting) else -1
-    ray = flat.sun_rays[out.sun].astype(np.float64) if len(casting) else np.array([0.0, 0.0, -1.0])
+    ray = flat.sun_directions[out.sun].astype(np.float64) if len(casting) else np.array([0.0, 0.0, -1.0])
     helper = np.eye(3)[np.argmin(np.abs(ray))]
     right = np.cross(ray, helper)
     right /= np.linalg.norm(right)
     up = np.cross(right, ray)
-    box = np.array([[x, y, z] for x, y, z in np.array(np.meshgrid(*np.array(_RANGE).T)).reshape(3, -1).T])
+    box = np.array([[x, y, z] for x, y, z in np.array(np.meshgrid(*np.array(_SHADOW_RANGE).T)).reshape(3, -1).T])
     low, high = (box @ np.stack([right, up], 1)).min(0), (box @ np.stack([right, up], 1)).max(0)
-    columns, rows = np.ceil((high - low) / _TEXEL).astype(int).tolist() if len(casting) else (1, 1)
+    columns, rows = np.ceil((high - low) / _SHADOW_TEXEL).astype(int).tolist() if len(casting) else (1, 1)
     out.right, out.up, out.ray, out.left_bottom = wp.vec3(*right), wp.vec3(*up), wp.vec3(*ray), wp.vec2(*low)
     depth: Any = wp.full((rows, columns), _FAR, dtype=float, device="cpu")
     out.depth = depth
     if len(casting):
-        wp.launch(_draw, len(corners), [corners, out], device="cpu")
+        wp.launch(_rasterize_shadow, len(corners), [corners, out], device="cpu")
     return out
 
 
-wp.config.log_level = wp.LOG_ERROR  # compiling is announced by our own bars
+# ---- rasterizer
 
 
 SAMPLES = 2
-"""Per pixel and axis."""
+"""Samples per pixel and axis."""
 
 _NEAR = 0.02  # [m]
-_ALL = 1.0e30  # [samples]
-_EMPTY = 1 << 62
-_DEPTHS = 1.0e5  # steps of depth per metre
+_UNBOUNDED = 1.0e30  # [samples]
+_NO_TRIANGLE = 1 << 62
+_DEPTH_STEPS = 1.0e5  # [1/m] resolution of a key's depth
 _INDEX_BITS = 20
-_MOST_TAPS = 6  # texels looked up along a footprint's longer axis
+_MAX_TAPS = 6  # lookups along a footprint's longer axis
 
 
 @wp.kernel
-def _clear(nearest: wp.array[wp.int64]):
-    nearest[wp.tid()] = wp.int64(_EMPTY)
+def _reset(nearest_keys: wp.array[wp.int64]):
+    nearest_keys[wp.tid()] = wp.int64(_NO_TRIANGLE)
 
 
 @wp.func
-def _around(box: wp.vec4, a: wp.vec3, b: wp.vec3, lens: wp.vec4):
-    """The box (x0, y0, x1, y1) [samples] grown to hold a, and where the edge from a to b meets the near plane."""
+def _extend_box_by_edge(box: wp.vec4, a: wp.vec3, b: wp.vec3, lens: wp.vec4):
+    """Extends a box (x0, y0, x1, y1) [samples] by a, and by the intersection of edge a–b with the near plane."""
     if a[2] >= _NEAR:
-        box = _holding(box, a, lens)
+        box = _extend_box_by_point(box, a, lens)
     if (a[2] < _NEAR) != (b[2] < _NEAR):
-        box = _holding(box, a + (b - a) * ((_NEAR - a[2]) / (b[2] - a[2])), lens)
+        box = _extend_box_by_point(box, a + (b - a) * ((_NEAR - a[2]) / (b[2] - a[2])), lens)
     return box
 
 
 @wp.func
-def _holding(box: wp.vec4, p: wp.vec3, lens: wp.vec4):
+def _extend_box_by_point(box: wp.vec4, p: wp.vec3, lens: wp.vec4):
     x, y = lens[0] * p[0] / p[2] + lens[2], lens[1] * p[1] / p[2] + lens[3]
     return wp.vec4(wp.min(box[0], x), wp.min(box[1], y), wp.max(box[2], x), wp.max(box[3], y))
 
 
 @wp.kernel
-def _see(
+def _rasterize(
     corners: wp.array2d[wp.vec3],
     to_camera: wp.mat33,
     eye: wp.vec3,
     lens: wp.vec4,
     width: int,
     height: int,
-    nearest: wp.array[wp.int64],
+    nearest_keys: wp.array[wp.int64],
 ):
-    """Notes the nearest triangle of every sample: depth and index in one number."""
+    """Stores the nearest triangle of every sample as one key: depth, then index."""
     i = wp.tid()
     a, b, c = to_camera * (corners[i, 0] - eye), to_camera * (corners[i, 1] - eye), to_camera * (corners[i, 2] - eye)
     if a[2] < _NEAR and b[2] < _NEAR and c[2] < _NEAR:
         return
-    # Box around what of the triangle lies beyond the near plane; sample k lies at k + 0.5.
-    box = wp.vec4(_ALL, _ALL, -_ALL, -_ALL)
-    box = _around(_around(_around(box, a, b, lens), b, c, lens), c, a, lens)
+    # Box around the part of the triangle beyond the near plane; sample k lies at k + 0.5.
+    box = wp.vec4(_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, -_UNBOUNDED)
+    box = _extend_box_by_edge(_extend_box_by_edge(_extend_box_by_edge(box, a, b, lens), b, c, lens), c, a, lens)
     if box[2] < 0.5 or box[3] < 0.5 or box[0] > float(width) - 0.5 or box[1] > float(height) - 0.5:
         return
     x0, x1 = int(wp.ceil(wp.max(box[0] - 0.5, 0.0))), int(wp.floor(wp.min(box[2] - 0.5, float(width - 1))))
@@ -314,8 +314,8 @@ def _see(
             if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
                 z = det / (u * plane[0] + v * plane[1] + plane[2])
                 if z > _NEAR and z < _FAR:
-                    key = wp.int64(z * _DEPTHS) * wp.int64(1 << _INDEX_BITS) + wp.int64(i)
-                    wp.atomic_min(nearest, y * width + x, key)
+                    key = wp.int64(z * _DEPTH_STEPS) * wp.int64(1 << _INDEX_BITS) + wp.int64(i)
+                    wp.atomic_min(nearest_keys, y * width + x, key)
 
 
 @wp.func
@@ -325,7 +325,7 @@ def _texel(texels: wp.array[wp.uint8], at: int):
 
 @wp.func
 def _bilinear(texels: wp.array[wp.uint8], level: wp.vec3i, uv: wp.vec2):
-    """Colour, 0 to 255, of a level (offset, width, height) at uv in [0, 1]², clamped to its edge."""
+    """Color, 0 to 255, of a mip level (offset, width, height) at uv in [0, 1]², clamped to its edge."""
     x = wp.clamp(uv[0] * float(level[1]) - 0.5, 0.0, float(level[1] - 1))
     y = wp.clamp(uv[1] * float(level[2]) - 0.5, 0.0, float(level[2] - 1))
     x0, y0 = int(x), int(y)
@@ -338,34 +338,34 @@ def _bilinear(texels: wp.array[wp.uint8], level: wp.vec3i, uv: wp.vec2):
 
 
 @wp.func
-def _painted(
+def _sample_texture(
     texels: wp.array[wp.uint8],
-    levels: wp.array2d[wp.vec3i],
+    mip_levels: wp.array2d[wp.vec3i],
     texture: int,
     uv: wp.vec2,
-    along_x: wp.vec2,
-    along_y: wp.vec2,
+    uv_step_x: wp.vec2,
+    uv_step_y: wp.vec2,
 ):
-    """Mean colour over a footprint, which two steps of uv span: taps along its longer axis, a level by its shorter."""
-    base = levels[texture, 0]
+    """Mean color over the footprint spanned by two uv steps: taps along its longer axis, mip level by its shorter."""
+    base = mip_levels[texture, 0]
     size = wp.vec2(float(base[1]), float(base[2]))
-    dx, dy = wp.length(wp.cw_mul(along_x, size)), wp.length(wp.cw_mul(along_y, size))
-    step, longer, shorter = along_y, dy, dx
+    dx, dy = wp.length(wp.cw_mul(uv_step_x, size)), wp.length(wp.cw_mul(uv_step_y, size))
+    step, longer, shorter = uv_step_y, dy, dx
     if dx > dy:
-        step, longer, shorter = along_x, dx, dy
-    taps = int(wp.clamp(wp.ceil(longer / wp.max(shorter, 1.0)), 1.0, float(_MOST_TAPS)))
+        step, longer, shorter = uv_step_x, dx, dy
+    taps = int(wp.clamp(wp.ceil(longer / wp.max(shorter, 1.0)), 1.0, float(_MAX_TAPS)))
     wide = wp.max(wp.max(shorter, longer / float(taps)), 1.0)
-    level = levels[texture, wp.min(int(wp.log2(wide) + 0.5), levels.shape[1] - 1)]
-    colour = wp.vec3(0.0, 0.0, 0.0)
+    level = mip_levels[texture, wp.min(int(wp.log2(wide) + 0.5), mip_levels.shape[1] - 1)]
+    color = wp.vec3(0.0, 0.0, 0.0)
     for k in range(taps):
         share = (float(k) + 0.5) / float(taps) - 0.5
-        colour += _bilinear(texels, level, uv + step * share)
-    return colour / (255.0 * float(taps))
+        color += _bilinear(texels, level, uv + step * share)
+    return color / (255.0 * float(taps))
 
 
 @wp.func
 def _sky(texels: wp.array[wp.uint8], level: wp.vec3i, ray: wp.vec3):
-    """Colour of a cube map, six faces stacked in OpenGL's order, with its y axis up the world's z."""
+    """Color of a cube map with six faces stacked in OpenGL's order and its y axis along the world's z."""
     x, y, z = ray[0], ray[2], -ray[1]
     ax, ay, az = wp.abs(x), wp.abs(y), wp.abs(z)
     face = int(0)  # noqa: RUF046 - a variable to Warp
@@ -395,15 +395,15 @@ def _shade(
     textures: wp.array[int],
     emissions: wp.array[float],
     texels: wp.array[wp.uint8],
-    levels: wp.array2d[wp.vec3i],
+    mip_levels: wp.array2d[wp.vec3i],
     sky: int,
     ambient: wp.vec3,
-    sun_rays: wp.array[wp.vec3],
-    sun_colours: wp.array[wp.vec3],
+    sun_directions: wp.array[wp.vec3],
+    sun_colors: wp.array[wp.vec3],
     lamps: wp.array2d[wp.vec3],
-    lamp_shape: wp.vec3,
+    lamp_falloff: wp.vec3,
     shadows: ShadowMap,
-    nearest: wp.array[wp.int64],
+    nearest_keys: wp.array[wp.int64],
     to_camera: wp.mat33,
     eye: wp.vec3,
     lens: wp.vec4,
@@ -411,18 +411,18 @@ def _shade(
     rgb: wp.array2d[wp.vec3],
     depth: wp.array2d[float],
 ):
-    """Colour of a pixel, the mean of its samples, and z-depth of its first (0 = sky)."""
+    """Writes the mean color of a pixel's samples and the z-depth of its first (0 = sky)."""
     py, px = wp.tid()
     to_world = wp.transpose(to_camera)
     total = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES * SAMPLES):
         x, y = px * SAMPLES + sample % SAMPLES, py * SAMPLES + sample // SAMPLES
         d = wp.vec3((float(x) + 0.5 - lens[2]) / lens[0], (float(y) + 0.5 - lens[3]) / lens[1], 1.0)
-        key = nearest[y * width + x]
-        if key == wp.int64(_EMPTY):
+        key = nearest_keys[y * width + x]
+        if key == wp.int64(_NO_TRIANGLE):
             if sample == 0:
                 depth[py, px] = 0.0
-            total += _sky(texels, levels[sky, 0], to_world * d)
+            total += _sky(texels, mip_levels[sky, 0], to_world * d)
             continue
         i = int(key % wp.int64(1 << _INDEX_BITS))
         a = to_camera * (corners[i, 0] - eye)
@@ -434,54 +434,54 @@ def _shade(
         z = wp.dot(a, plane) / wp.dot(d, plane)
         if sample == 0:
             depth[py, px] = z
-        # Barycentric coordinates here and a sample further right and down: what the footprint of this one spans.
+        # Barycentric coordinates here and one sample further right and down, which span the footprint.
         wx = w + wp.vec3(na[0], nb[0], nc[0]) / lens[0]
         wy = w + wp.vec3(na[1], nb[1], nc[1]) / lens[1]
         here = w / (w[0] + w[1] + w[2])
         uv = uvs[i, 0] * here[0] + uvs[i, 1] * here[1] + uvs[i, 2] * here[2]
         wx = wx / (wx[0] + wx[1] + wx[2])
         wy = wy / (wy[0] + wy[1] + wy[2])
-        along_x = uvs[i, 0] * wx[0] + uvs[i, 1] * wx[1] + uvs[i, 2] * wx[2] - uv
-        along_y = uvs[i, 0] * wy[0] + uvs[i, 1] * wy[1] + uvs[i, 2] * wy[2] - uv
-        base = _painted(texels, levels, textures[i], uv, along_x, along_y)
+        uv_step_x = uvs[i, 0] * wx[0] + uvs[i, 1] * wx[1] + uvs[i, 2] * wx[2] - uv
+        uv_step_y = uvs[i, 0] * wy[0] + uvs[i, 1] * wy[1] + uvs[i, 2] * wy[2] - uv
+        base = _sample_texture(texels, mip_levels, textures[i], uv, uv_step_x, uv_step_y)
 
         point = eye + to_world * (d * z)
         normal = wp.normalize(normals[i, 0] * here[0] + normals[i, 1] * here[1] + normals[i, 2] * here[2])
         if wp.dot(normal, to_world * d) > 0.0:
             normal = -normal
         light = ambient + wp.vec3(emissions[i], emissions[i], emissions[i])
-        for k in range(sun_rays.shape[0]):
-            facing = -wp.dot(normal, sun_rays[k])
+        for k in range(sun_directions.shape[0]):
+            facing = -wp.dot(normal, sun_directions[k])
             if facing > 0.0:
                 if k == shadows.sun:
-                    facing *= in_light(shadows, point, normal)
-                light += sun_colours[k] * facing
+                    facing *= sun_visibility(shadows, point, normal)
+                light += sun_colors[k] * facing
         for k in range(lamps.shape[0]):
-            to_lamp = lamps[k, 0] - point
-            distance = wp.length(to_lamp)
-            to_lamp = to_lamp / distance
-            below = to_lamp[2]  # lamps shine straight down
-            facing = wp.dot(normal, to_lamp)
-            if below >= lamp_shape[2] and facing > 0.0:
-                light += lamps[k, 1] * (facing * below / (lamp_shape[0] + lamp_shape[1] * distance * distance))
-        colour = wp.cw_mul(base, light)
-        total += wp.vec3(wp.min(colour[0], 1.0), wp.min(colour[1], 1.0), wp.min(colour[2], 1.0))
+            lamp_direction = lamps[k, 0] - point
+            distance = wp.length(lamp_direction)
+            lamp_direction = lamp_direction / distance
+            below = lamp_direction[2]  # lamps shine straight down
+            facing = wp.dot(normal, lamp_direction)
+            if below >= lamp_falloff[2] and facing > 0.0:
+                light += lamps[k, 1] * (facing * below / (lamp_falloff[0] + lamp_falloff[1] * distance * distance))
+        color = wp.cw_mul(base, light)
+        total += wp.vec3(wp.min(color[0], 1.0), wp.min(color[1], 1.0), wp.min(color[2], 1.0))
     rgb[py, px] = total / float(SAMPLES * SAMPLES)
 
 
-class Raster:
-    """Renders one place under one lighting."""
+class Rasterizer:
+    """Renders one place under one lighting from any pose."""
 
     def __init__(self, model: mujoco.MjModel, intrinsics: Array, size: tuple[int, int]) -> None:
         """
         Args:
-            model: Of `world.spec`.
+            model: Compiled `true_world.world_spec`.
             intrinsics: fx, fy, cx, cy [px], shape (4,).
-            size: Width, height of the picture [px].
+            size: Width, height of the image [px].
         """
-        flat: FlatMesh = flatten(model)
+        flat: FlatScene = flatten(model)
         if len(flat.corners) >= 1 << _INDEX_BITS:
-            raise ValueError(f"{len(flat.corners)} triangles; the rasteriser takes fewer than {1 << _INDEX_BITS}")
+            raise ValueError(f"{len(flat.corners)} triangles; the rasterizer takes fewer than {1 << _INDEX_BITS}")
         self._size = (SAMPLES * size[0], SAMPLES * size[1])
         self._lens = wp.vec4(*(float(value) * SAMPLES for value in intrinsics))
         with wp.ScopedDevice("cpu"):
@@ -496,14 +496,14 @@ class Raster:
                 wp.array(flat.textures, dtype=int),
                 wp.array(flat.emissions, dtype=float),
                 wp.array(flat.texels, dtype=wp.uint8),
-                wp.array(flat.levels, dtype=wp.vec3i),
+                wp.array(flat.mip_levels, dtype=wp.vec3i),
                 flat.sky,
                 wp.vec3(*flat.ambient.tolist()),
-                wp.array(flat.sun_rays, dtype=wp.vec3),
-                wp.array(flat.sun_colours, dtype=wp.vec3),
+                wp.array(flat.sun_directions, dtype=wp.vec3),
+                wp.array(flat.sun_colors, dtype=wp.vec3),
                 wp.array(flat.lamps, dtype=wp.vec3),
-                wp.vec3(*flat.lamp_shape.tolist()),
-                draw(self._corners, flat),
+                wp.vec3(*flat.lamp_falloff.tolist()),
+                render_shadow_map(self._corners, flat),
             ]
 
     def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -512,8 +512,8 @@ class Raster:
         eye = wp.vec3(*camera_to_world[:3, 3].tolist())
         width, height = self._size
         with wp.ScopedDevice("cpu"):
-            wp.launch(_clear, width * height, [self._nearest])
+            wp.launch(_reset, width * height, [self._nearest])
             view = [to_camera, eye, self._lens, width]
-            wp.launch(_see, len(self._corners), [self._corners, *view, height, self._nearest])
+            wp.launch(_rasterize, len(self._corners), [self._corners, *view, height, self._nearest])
             wp.launch(_shade, self._rgb.shape, [*self._inputs, self._nearest, *view, self._rgb, self._depth])
         return self._rgb.numpy().copy(), self._depth.numpy().copy()

@@ -1,7 +1,7 @@
-"""Reality's own Husky: what the training side is not told, drawn once.
+"""The robot of the real test: a Husky with hidden parameters, the true road it drives on, and its camera.
 
-Every value is uniform in the range stated here, from a fixed seed, and stays the same through all trials and the drive
-log, as one robot's would. What is printed on the robot (its controller's limits, its track) is as published.
+Each hidden value is uniform in the range stated here, sampled with a fixed seed, and stays the same in all trials and
+the drive log. Published values (the controller's limits, the track) are unchanged.
 """
 
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 
 from twin.config import MjcfConfig
 from twin.env.camera_noise import CameraNoise, CameraOptions
+from twin.env.dm import DrivePhysics
 from twin.env.obstacles import EpisodeObstacles
 from twin.env.options import Options
-from twin.env.physics import DrivePhysics
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.task import DriveTask
 from twin.geometry.cameras import pixel_grid, unproject
@@ -26,31 +26,31 @@ from twin.mjcf import husky
 from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World, heading_at, point_at
 from twin.reality import place as places
-from twin.reality import true_world as worlds
+from twin.reality import true_world
 from twin.reality.centerline import RoadLine, ground_height
-from twin.reality.filming import FilmingPlan, develop, smooth_noise, trajectory
-from twin.reality.lighting import Lighting, hazed
-from twin.reality.rasterizer import Raster
-from twin.reality.things import SEED, KnownPlace, Thing
+from twin.reality.filming import FilmingPlan, sensor_image, smooth_noise, trajectory
+from twin.reality.lighting import Lighting, apply_haze
+from twin.reality.place_objects import SEED, KnownPlace, PlaceObject
+from twin.reality.rasterizer import Rasterizer
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.types import Array
 
 
 @dataclass(frozen=True)
 class HiddenRobot:
-    """One Husky with its front camera."""
+    """A Husky with hidden parameters and its front camera."""
 
     params: HuskyParams
-    camera_turn: tuple[float, float, float]
-    """By which the camera is mounted askew, about its axes right, up, back [°]."""
+    camera_misalignment: tuple[float, float, float]
+    """Rotation of the mounted camera about its axes right, up, back [°]."""
     camera: CameraOptions
-    """Vibration and shutter; exposure is `exposure_drift`, for it acts on light and not on a finished picture."""
+    """Vibration and shutter. Exposure is separate, since here it acts on light and not on a finished image."""
     exposure_drift: float
-    """Standard deviation of the logarithm of the exposure."""
+    """Standard deviation of the log exposure."""
 
 
-def robot() -> HiddenRobot:
-    """The one there is."""
+def hidden_robot() -> HiddenRobot:
+    """The robot of the real test."""
     rng = np.random.default_rng([SEED, 41])
 
     def between(low: float, high: float) -> float:
@@ -82,82 +82,77 @@ def robot() -> HiddenRobot:
     return HiddenRobot(params, turn, camera, between(0.06, 0.12))
 
 
-# ---- The road as the robot drives it: the true ground and all that is solid, on a day after the film was made.
-#
-# Tasks are the twin's own, by name, and mean the same places: the *route* is the path that the camera was filmed along,
-# which is what a twin of the film takes for its route, here as it truly was. So are the rules of a trial, which are those
-# of `twin.env.task`.
+# ---- road
+
+_COLLISION_REACH = 1.5  # [m] beyond the corridor; as in the twin, the robot touches nothing further away
+_LENGTH_TOLERANCE = 0.98  # fraction of the longest path; the first film above it gives the route
 
 
-_REACH = 1.5  # [m] beyond the corridor's edge: as in the twin, what lies further is never touched
-_SAME_LENGTH = 0.98  # share of the longest film's path from which on the first film counts
+def true_route(plan: FilmingPlan | None = None, line: RoadLine | None = None) -> Array:
+    """The route: the filmed path on the true ground [m], shape (m, 3).
 
-
-def route(plan: FilmingPlan | None = None, line: RoadLine | None = None) -> Array:
-    """The filmed path on the true ground [m], shape (m, 3).
-
-    Of several films the first of those within 2 % of the longest, as a build chooses.
+    As in a build, the first film within 2 % of the longest gives the path.
     """
     plan, line = plan or FilmingPlan(), line or RoadLine()
     paths = [smooth_route(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
     lengths = np.array([route_length(path) for path in paths])
-    xy = paths[int(np.argmax(lengths >= _SAME_LENGTH * lengths.max()))]
+    xy = paths[int(np.argmax(lengths >= _LENGTH_TOLERANCE * lengths.max()))]
     return np.column_stack([xy, ground_height(line, xy)])
 
 
 @cache
-def place_robot() -> KnownPlace:
-    """The place on the day of the trials."""
-    return places.build(later=True)
+def place_on_test_day() -> KnownPlace:
+    """The place on the day of the trials, after small objects have moved."""
+    return places.build(displaced=True)
 
 
 class TrueRoad:
-    """One task of the real test."""
+    """One task of the real test on the true ground, with the twin's task names and episode rules."""
 
     def __init__(self, task: str, robot: HiddenRobot, options: Options) -> None:
         """
         Args:
-            task: As in the twin: straight, right_turn or route.
-            robot: Drives.
-            options: What a policy's numbers mean; its pictures are none of the road's business.
+            task: straight, right_turn or route.
+            robot: The robot that drives.
+            options: Environment options of the policy, without images.
 
         Raises:
-            InputError: no such task.
+            InputError: unknown task.
         """
-        line = route()
+        line = true_route()
         half_width = MjcfConfig().half_width
         yaw = float(heading_at(line, 0.0))
-        start, quaternion = rest_pose(lambda xy: ground_height(place_robot().route, xy), line[0, :2], yaw)
+        start, quaternion = rest_pose(lambda xy: ground_height(place_on_test_day().route, xy), line[0, :2], yaw)
         self.world = World(line, half_width, (*start.tolist(), yaw), Path(), robot=robot.params)
-        self.stretch: RouteSegment = find_task(task, self.world)
-        spec = worlds.solids(self._near(half_width + _REACH))
+        self.segment: RouteSegment = find_task(task, self.world)
+        spec = true_world.collision_spec(self._near(half_width + _COLLISION_REACH))
         husky.set_options(spec, robot.params)
         husky.add_husky(spec, start, quaternion, robot.params)
         self.model = spec.compile()
-        _mount(self.model, robot.camera_turn)
+        _rotate_camera(self.model, robot.camera_misalignment)
         self.physics = DrivePhysics.of(self.model, robot.params)
-        none = EpisodeObstacles((), self.world, self.stretch)
-        self.drive = DriveTask(self.world, self.stretch, options, none, self.model)
+        none = EpisodeObstacles((), self.world, self.segment)
+        self.drive = DriveTask(self.world, self.segment, options, none, self.model)
 
     def intrinsics(self, size: tuple[int, int]) -> Array:
-        """fx, fy, cx, cy [px] of the robot's camera with pictures of a size (width, height), shape (4,)."""
+        """fx, fy, cx, cy [px] of the robot's camera for images of a size (width, height), shape (4,)."""
         return np.array(self.world.robot.camera().resized(size).intrinsics)
 
     def _near(self, reach: float) -> KnownPlace:
-        """The place with nothing solid further than `reach` [m] from the stretch."""
-        s = self.stretch
+        """The place without solid objects further than `reach` [m] from the segment."""
+        s = self.segment
         along = cKDTree(point_at(self.world.route[:, :2], np.arange(s.start, s.end + 0.1, 0.1)))
 
-        def near(thing: Thing) -> bool:
+        def near(obj: PlaceObject) -> bool:
             return any(
-                along.query(one.centre[:2])[0] - np.hypot(one.half[0], one.half[1]) <= reach for one in thing.solids
+                along.query(one.center[:2])[0] - np.hypot(one.half[0], one.half[1]) <= reach for one in obj.solids
             )
 
-        return KnownPlace(place_robot().route, [thing for thing in place_robot().things if near(thing)], [])
+        return KnownPlace(place_on_test_day().route, [obj for obj in place_on_test_day().objects if near(obj)], [])
 
 
-def _mount(model: mujoco.MjModel, turn: tuple[float, float, float]) -> None:
-    """Turns the front camera about its axes by angles [°]."""
+def _rotate_camera(model: mujoco.MjModel, turn: tuple[float, float, float]) -> None:
+    """Rotates the front camera about its axes right, up, back by angles [°]."""
     camera = model.camera("front").id
     rotation, quaternion = np.zeros(4), np.zeros(4)
     mujoco.mju_euler2Quat(rotation, np.deg2rad(turn), "xyz")
@@ -165,22 +160,23 @@ def _mount(model: mujoco.MjModel, turn: tuple[float, float, float]) -> None:
     model.cam_quat[camera] = quaternion
 
 
-# ---- What the robot's camera makes of the world: it shakes, its shutter smears, haze dims, the sensor develops and adds
-# noise. Numbers: `real_robot.py` and the lighting.
+# ---- camera
 
-
-_SKY = 1.0e4  # [m] away, where smearing is concerned
-_DRIFT_TIME = 9.0  # [s] of the exposure
-_TICK = 0.1  # [s] between two values of it
-_NOISE = 0.5  # of a film frame's, whose pixels are a quarter as wide; a resized picture has less
+_SKY_DISTANCE = 1.0e4  # [m] depth of the sky for motion blur
+_DRIFT_TIME = 9.0  # [s] period of the exposure drift
+_DRIFT_STEP = 0.1  # [s] between values of the exposure drift
+_NOISE_SCALE = 0.5  # of a film frame's noise: its pixels are a quarter as wide, and a resized image has less
 
 
 class RealCamera:
-    """One camera in one trial; the same generator and the same poses give the same pictures."""
+    """The robot's camera in one trial: vibration, motion blur, haze, exposure drift and sensor noise.
+
+    The same generator and poses give the same images.
+    """
 
     def __init__(
         self,
-        raster: Raster,
+        rasterizer: Rasterizer,
         lighting: Lighting,
         robot: HiddenRobot,
         intrinsics: Array,
@@ -189,25 +185,25 @@ class RealCamera:
     ) -> None:
         """
         Args:
-            raster: Of the place under the lighting, with these intrinsics and this size.
-            lighting: Exposure, noise, haze.
-            robot: Whose camera it is.
+            rasterizer: Renders the place under the lighting with these intrinsics and this size.
+            lighting: Exposure, noise and haze.
+            robot: Camera effects.
             intrinsics: fx, fy, cx, cy [px], shape (4,).
             size: Width, height [px].
-            rng: Of the trial.
+            rng: Random generator of the trial.
         """
-        self._raster, self._robot, self._intrinsics, self._rng = raster, robot, intrinsics, rng
-        self._lighting = replace(lighting, noise=_NOISE * lighting.noise)
+        self._rasterizer, self._intrinsics, self._rng = rasterizer, intrinsics, rng
+        self._lighting = replace(lighting, noise=_NOISE_SCALE * lighting.noise)
         self._rays = unproject(pixel_grid(*size), intrinsics)
         self._effects = CameraNoise(robot.camera, rng)
-        self._times = np.arange(0.0, 600.0, _TICK)
+        self._times = np.arange(0.0, 600.0, _DRIFT_STEP)
         self._gains = np.exp(robot.exposure_drift * smooth_noise(rng, self._times, _DRIFT_TIME))
 
-    def look(self, camera_to_world: Array, time: float) -> NDArray[np.uint8]:
-        """The picture (h, w, 3) of a camera that would be at a pose (4, 4) if it did not shake, at a time [s]."""
-        pose = self._effects.shaken(camera_to_world, time)
-        light, depth = self._raster(pose)
-        light = hazed(light, depth, self._lighting)
-        far = np.where(depth > 0.0, depth, np.float32(_SKY))
-        light = self._effects.exposed(light, far, pose, time, self._rays, self._intrinsics)
-        return develop(self._rng, light, self._lighting, float(np.interp(time, self._times, self._gains)))
+    def capture(self, camera_to_world: Array, time: float) -> NDArray[np.uint8]:
+        """The image (h, w, 3) at a time [s] from a pose (4, 4), to which vibration is added."""
+        pose = self._effects.perturb_pose(camera_to_world, time)
+        light, depth = self._rasterizer(pose)
+        light = apply_haze(light, depth, self._lighting)
+        far = np.where(depth > 0.0, depth, np.float32(_SKY_DISTANCE))
+        light = self._effects.apply(light, far, pose, time, self._rays, self._intrinsics)
+        return sensor_image(self._rng, light, self._lighting, float(np.interp(time, self._times, self._gains)))

@@ -1,7 +1,7 @@
-"""Procedural textures: arrays of RGB in [0, 1], rows × columns × 3, that look like something at every scale.
+"""Procedural textures: RGB in [0, 1], shape (rows, columns, 3), with detail at every scale.
 
-Nothing repeats along the road, because a repeating texture would give structure from motion false matches.
-Randomness comes from a generator per texture, so that one texture's change leaves the others as they are.
+Nothing repeats along the road: a repeating texture would cause false matches in structure from motion. Each texture has
+its own random generator, so a change of one leaves the others as they are.
 """
 
 import cv2
@@ -12,7 +12,7 @@ from twin.types import Array32
 
 
 def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, finest: float = 1.0, gain: float = 0.7):
-    """Fractal noise, zero mean, unit deviation: octaves of random values from `coarsest` to `finest` pixels."""
+    """Fractal noise with zero mean and unit standard deviation: octaves from `coarsest` to `finest` pixels."""
     out = np.zeros(shape, np.float32)
     size, weight = coarsest, 1.0
     while size >= finest:
@@ -25,57 +25,55 @@ def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, fines
     return (out - out.mean()) / out.std()
 
 
-def blend(image: NDArray, colour: tuple[float, float, float], weight: NDArray) -> None:
-    """Paints over an image in place; `weight` in [0, 1], shape (rows, columns)."""
+def blend(image: NDArray, color: tuple[float, float, float], weight: NDArray) -> None:
+    """Blends a color into an image in place; `weight` in [0, 1], shape (rows, columns)."""
     w = weight[..., None].astype(np.float32)
-    image += w * (np.asarray(colour, np.float32) - image)
+    image += w * (np.asarray(color, np.float32) - image)
 
 
-def _colour(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
+def _tinted(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
     image = np.asarray(base, np.float32) * (1.0 + contrast * noise[..., None].astype(np.float32))
     if tint is not None:
         image = image * (1.0 + tint[..., None] * np.array([0.10, 0.02, -0.10], np.float32))
     return image.astype(np.float32)
 
 
-def _speckle(
-    rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[float, float], colours: NDArray
-) -> None:
-    """Scatters small ellipses (chips, fallen leaves, stones) on an image, in place."""
+def _speckle(rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[float, float], colors: NDArray) -> None:
+    """Draws small random ellipses (chips, fallen leaves, stones) into an image, in place."""
     rows, columns = image.shape[:2]
-    centres = np.stack([rng.uniform(0, columns, count), rng.uniform(0, rows, count)], -1)
+    centers = np.stack([rng.uniform(0, columns, count), rng.uniform(0, rows, count)], -1)
     axes = rng.uniform(*sizes, (count, 2))
     angles = rng.uniform(0, 180, count)
-    picks = rng.integers(0, len(colours), count)
+    picks = rng.integers(0, len(colors), count)
     shade = rng.uniform(0.7, 1.3, count)
-    for centre, axis, angle, pick, light in zip(centres, axes, angles, picks, shade, strict=True):
-        colour = tuple(float(c * light) for c in colours[pick])
+    for center, axis, angle, pick, light in zip(centers, axes, angles, picks, shade, strict=True):
+        color = tuple(float(c * light) for c in colors[pick])
         shift = 4  # fractional bits of the coordinates
         cv2.ellipse(
             image,
-            [int(c * 2**shift) for c in centre],
+            [int(c * 2**shift) for c in center],
             [max(1, int(a * 2**shift)) for a in axis],
             float(angle),
             0.0,
             360.0,
-            colour,
+            color,
             -1,
             cv2.LINE_AA if image.dtype == np.uint8 else cv2.LINE_8,
             shift,
         )
 
 
-def _grains(rng: np.random.Generator, image: Array32, share: float, colours: NDArray) -> None:
-    """Colours single texels, `share` of them: the stones of an asphalt, in place."""
+def _grains(rng: np.random.Generator, image: Array32, share: float, colors: NDArray) -> None:
+    """Colors a fraction `share` of single texels in place, as the stones of asphalt."""
     hit = rng.random(image.shape[:2]) < share
     shade = rng.uniform(0.75, 1.15, (int(hit.sum()), 1))
-    image[hit] = 0.35 * image[hit] + 0.65 * colours[rng.integers(0, len(colours), int(hit.sum()))] * shade
+    image[hit] = 0.35 * image[hit] + 0.65 * colors[rng.integers(0, len(colors), int(hit.sum()))] * shade
 
 
 def _crack(
     rng: np.random.Generator, mask: NDArray, start: NDArray, heading: float, length: float, width: float
 ) -> None:
-    """A wandering, branching crack drawn into `mask`."""
+    """Draws a wandering, branching crack into `mask`."""
     point = start.astype(float)
     step = 6.0
     for _ in range(int(length / step)):
@@ -88,14 +86,14 @@ def _crack(
 
 
 def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Array32:
-    """Asphalt: rows across (row 0 at the left edge), columns along. Lengths [m], `pixel` [m].
+    """Asphalt with rows across the road (row 0 at the left edge) and columns along it. Lengths and `pixel` [m].
 
-    Chips, stains, wheel tracks, patches with tarred seams, cracks, manholes, a worn centre line and edge lines.
+    It has chips, stains, wheel tracks, patches with tarred seams, cracks, manholes and worn markings.
     """
     rows, columns = round(2 * half_width / pixel), round(length / pixel)
     shape = (rows, columns)
     lateral = (half_width - (np.arange(rows) + 0.5) * pixel)[:, None]
-    image = _colour(
+    image = _tinted(
         (0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, 0.5 * fbm(rng, shape, 6.0 / pixel, 40.0)
     )
     chips = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
@@ -114,7 +112,7 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         if c1 - c0 < 8 or r1 - r0 < 8:
             continue
         level = rng.uniform(0.19, 0.48)
-        part = _colour((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
+        part = _tinted((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
         _grains(rng, part, rng.uniform(0.05, 0.2), chips)
         image[r0:r1, c0:c1] = 0.25 * image[r0:r1, c0:c1] + 0.75 * part
         seam = np.zeros((r1 - r0, c1 - c0), np.float32)
@@ -129,14 +127,14 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         _crack(rng, cracks, start, heading, rng.uniform(40, 330), rng.uniform(1.0, 3.0))
     blend(image, (0.08, 0.08, 0.085), 0.85 * cv2.GaussianBlur(cracks, (3, 3), 0.6))
     for _ in range(int(length / 1.8)):  # drips of oil, spilt water, chewing gum
-        centre = [int(rng.uniform(0, columns)), int(rng.uniform(0, rows))]
+        center = [int(rng.uniform(0, columns)), int(rng.uniform(0, rows))]
         size = int(rng.uniform(3, 26))
-        r = slice(max(0, centre[1] - size), centre[1] + size)
-        c = slice(max(0, centre[0] - size), centre[0] + size)
+        r = slice(max(0, center[1] - size), center[1] + size)
+        c = slice(max(0, center[0] - size), center[0] + size)
         rr, cc = np.mgrid[r.start : min(rows, r.stop), c.start : min(columns, c.stop)]
         if rr.size == 0:
             continue
-        blob = np.clip(1.6 - np.hypot(rr - centre[1], cc - centre[0]) / (0.6 * size), 0, 1)
+        blob = np.clip(1.6 - np.hypot(rr - center[1], cc - center[0]) / (0.6 * size), 0, 1)
         blend(image[rr[0, 0] : rr[-1, 0] + 1, cc[0, 0] : cc[0, -1] + 1], (0.12, 0.12, 0.13), 0.6 * blob)
     _markings(rng, image, lateral, pixel)
     for station in np.arange(4.0, length, 11.0):  # manholes and gullies
@@ -166,13 +164,13 @@ def _markings(rng: np.random.Generator, image: Array32, lateral: NDArray, pixel:
         blend(image, (0.80, 0.80, 0.76), worn * mask)
 
 
-def _manhole(image: Array32, centre: tuple[int, int], radius: int) -> None:
-    cv2.circle(image, centre, radius + 3, (0.14, 0.14, 0.14), -1)
-    cv2.circle(image, centre, radius, (0.36, 0.33, 0.30), -1)
+def _manhole(image: Array32, center: tuple[int, int], radius: int) -> None:
+    cv2.circle(image, center, radius + 3, (0.14, 0.14, 0.14), -1)
+    cv2.circle(image, center, radius, (0.36, 0.33, 0.30), -1)
     for k in range(-radius + 4, radius - 2, 6):
         half = int(np.sqrt(max(0, (radius - 3) ** 2 - k * k)))
-        cv2.line(image, (centre[0] - half, centre[1] + k), (centre[0] + half, centre[1] + k), (0.17, 0.16, 0.15), 2)
-    cv2.circle(image, centre, radius - 2, (0.22, 0.2, 0.19), 2)
+        cv2.line(image, (center[0] - half, center[1] + k), (center[0] + half, center[1] + k), (0.17, 0.16, 0.15), 2)
+    cv2.circle(image, center, radius - 2, (0.22, 0.2, 0.19), 2)
 
 
 def _gully(image: Array32, column: int, left: bool, pixel: float) -> None:
@@ -185,8 +183,8 @@ def _gully(image: Array32, column: int, left: bool, pixel: float) -> None:
 
 
 def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
-    """Turf from above: patches, worn earth, blades, stones, fallen leaves. `pixel` [m]."""
-    image = _colour((0.29, 0.38, 0.15), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8), 0.17, fbm(rng, shape, 4.0 / pixel, 10))
+    """Turf from above: patches, bare earth, blades, stones, fallen leaves; `pixel` [m]."""
+    image = _tinted((0.29, 0.38, 0.15), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8), 0.17, fbm(rng, shape, 4.0 / pixel, 10))
     blend(image, (0.44, 0.36, 0.22), np.clip(fbm(rng, shape, 1.8 / pixel, 3.0) - 1.1, 0, 0.8))
     count = int(shape[0] * shape[1] * 0.02)
     starts = np.stack([rng.uniform(0, shape[1], count), rng.uniform(0, shape[0], count)], -1)
@@ -194,19 +192,19 @@ def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Arr
     tones = rng.uniform(0.55, 1.65, count)
     for a, b, tone in zip(starts.astype(int).tolist(), ends.astype(int).tolist(), tones, strict=True):
         cv2.line(image, a, b, (0.29 * tone, 0.37 * tone, 0.14 * tone), 1)
-    colours = np.array([[0.6, 0.45, 0.18], [0.45, 0.27, 0.1], [0.8, 0.8, 0.7], [0.5, 0.5, 0.47], [0.72, 0.66, 0.2]])
-    _speckle(rng, image, int(shape[0] * shape[1] * 0.0015), (1.0, 3.2), colours.astype(np.float32))
+    colors = np.array([[0.6, 0.45, 0.18], [0.45, 0.27, 0.1], [0.8, 0.8, 0.7], [0.5, 0.5, 0.47], [0.72, 0.66, 0.2]])
+    _speckle(rng, image, int(shape[0] * shape[1] * 0.0015), (1.0, 3.2), colors.astype(np.float32))
     return np.clip(image, 0.02, 1.0)
 
 
 def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: tuple[float, float]) -> Array32:
-    """Concrete paving: each slab of its own tone, joints with moss, gum, stains. `slab` is (across, along) [m]."""
+    """Concrete slabs of random tones, joints with moss, gum and stains; `slab` is (across, along) [m]."""
     rows, columns = shape
     r, c = np.arange(rows) * pixel / slab[0], np.arange(columns) * pixel / slab[1]
     tone = rng.uniform(0.8, 1.15, (int(r[-1]) + 1, int(c[-1]) + 2))
     offset = 0.5 * (r.astype(int) % 2)[:, None]
     cells = (c[None] + offset).astype(int)
-    image = _colour((0.53, 0.51, 0.47), fbm(rng, shape, 60, 1.5), 0.10) * tone[r.astype(int)[:, None], cells, None]
+    image = _tinted((0.53, 0.51, 0.47), fbm(rng, shape, 60, 1.5), 0.10) * tone[r.astype(int)[:, None], cells, None]
     joint = ((r % 1.0) < 1.5 * pixel / slab[0])[:, None] | (((c[None] + offset) % 1.0) < 1.5 * pixel / slab[1])
     blend(image, (0.19, 0.2, 0.14), 0.85 * joint)
     spots = np.array([[0.2, 0.2, 0.2], [0.7, 0.68, 0.64], [0.4, 0.33, 0.22]], np.float32)
@@ -215,15 +213,15 @@ def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: 
 
 
 def kerb(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
-    """Kerb stones a metre long; rows across the profile, columns along."""
+    """Kerb stones 0.9 m long, rows across the profile and columns along it."""
     return slabs(rng, shape, pixel, (10.0, 0.9)) * np.float32(0.95)
 
 
 def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]) -> Array32:
-    """Brickwork with single bricks off colour, weathering from top to bottom."""
+    """Brickwork with bricks of random tones and stains from top to bottom."""
     image = slabs(rng, shape, pixel, (0.12, 0.36))
-    grey = image.mean(-1, keepdims=True) / 0.5
-    tint = np.asarray(base, np.float32) * grey
+    gray = image.mean(-1, keepdims=True) / 0.5
+    tint = np.asarray(base, np.float32) * gray
     stains = fbm(rng, shape, 2.0 / pixel, 4.0)
     streaks = fbm(rng, (1, shape[1]), 30, 2.0) * np.linspace(1.0, 0.2, shape[0])[:, None]
     return np.clip(tint * (1.0 + 0.10 * stains[..., None] - 0.06 * streaks[..., None]), 0.02, 1.0).astype(np.float32)
@@ -232,8 +230,8 @@ def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base:
 def plaster(
     rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]
 ) -> Array32:
-    """Rendered wall: blotches, drip streaks, cracks, a darker plinth."""
-    image = _colour(base, fbm(rng, shape, 3.0 / pixel, 1.5), 0.06, 0.5 * fbm(rng, shape, 2.0 / pixel, 8))
+    """Plastered wall: blotches, drip streaks, cracks, a darker plinth."""
+    image = _tinted(base, fbm(rng, shape, 3.0 / pixel, 1.5), 0.06, 0.5 * fbm(rng, shape, 2.0 / pixel, 8))
     streaks = np.clip(fbm(rng, (1, shape[1]), 24, 2.0), 0, 3) * np.linspace(1.0, 0.1, shape[0])[:, None]
     image *= 1.0 - 0.07 * streaks[..., None]
     cracks = np.zeros(shape, np.float32)
@@ -247,14 +245,14 @@ def plaster(
 
 
 def weathered(image: Array32, pixel: float) -> Array32:
-    """A wall that is darker towards its foot and under its eaves, where less of the sky reaches it."""
+    """The wall texture darkened towards foot and eaves, where less sky is visible."""
     up = (image.shape[0] - np.arange(image.shape[0]))[:, None, None] * pixel
     down = image.shape[0] * pixel - up
     return (image * (1.0 - 0.35 * np.exp(-up / 0.6) - 0.30 * np.exp(-down / 0.5))).astype(np.float32)
 
 
 def window(rng: np.random.Generator, lit: bool) -> Array32:
-    """One window, 96 × 72: frame, glazing bars, and sky, curtains or a lit room behind the glass."""
+    """A window of 96 × 72 px: frame, glazing bars, and sky, curtains or a lit room behind the glass."""
     image = np.zeros((96, 72, 3), np.float32)
     down = np.linspace(0, 1, 96)[:, None]
     if lit:
@@ -285,30 +283,30 @@ def bark(rng: np.random.Generator, shape: tuple[int, int]) -> Array32:
     """Bark: long vertical furrows, lichen."""
     grain = fbm(rng, (shape[0] // 4, shape[1]), 24, 1.0, 0.85)
     grain = cv2.resize(grain, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
-    image = _colour((0.34, 0.27, 0.20), grain, 0.30)
+    image = _tinted((0.34, 0.27, 0.20), grain, 0.30)
     blend(image, (0.52, 0.54, 0.42), np.clip(fbm(rng, shape, 40, 2.0) - 1.0, 0, 0.7))
     return np.clip(image, 0.03, 1.0)
 
 
 def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
-    """A field of leaf tones, from shade (left) to light (right), from which each leaf takes a window."""
-    image = _colour(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
+    """Leaf tones from dark (left) to light (right); `primitives.leaves` gives each leaf a window of it."""
+    image = _tinted(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
     image *= np.linspace(0.35, 1.35, shape[1], dtype=np.float32)[None, :, None]
     return np.clip(image, 0.03, 1.0)
 
 
 def wood(rng: np.random.Generator, shape: tuple[int, int]) -> Array32:
-    """Weathered planks, grain along the columns."""
+    """Weathered planks with the grain along the columns."""
     grain = cv2.resize(fbm(rng, (shape[0], shape[1] // 8), 12, 1.0), shape[::-1], interpolation=cv2.INTER_LINEAR)
-    image = _colour((0.50, 0.37, 0.24), grain, 0.17)
+    image = _tinted((0.50, 0.37, 0.24), grain, 0.17)
     image[:: max(2, shape[0] // 5)] *= 0.4
     _speckle(rng, image, 30, (1.0, 3.0), np.array([[0.2, 0.13, 0.08]], np.float32))
     return np.clip(image, 0.03, 1.0)
 
 
 def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
-    """Painted or galvanised metal: scratches, rust, stickers."""
-    image = _colour(base, fbm(rng, shape, 40, 1.5), 0.11)
+    """Painted or galvanized metal: scratches, rust, stickers."""
+    image = _tinted(base, fbm(rng, shape, 40, 1.5), 0.11)
     blend(image, (0.36, 0.2, 0.1), np.clip(fbm(rng, shape, 30, 1.5) - 1.5, 0, 0.8))
     for _ in range(9):
         a, b = rng.uniform(0, shape[1], 2).astype(int), rng.uniform(0, shape[0], 2).astype(int)
@@ -321,7 +319,7 @@ def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, f
 
 
 def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float, float, float], word: str) -> Array32:
-    """A sign or poster: border, a word, lines of small print, a picture."""
+    """A sign or poster: border, a word, lines of small print, dots."""
     rows, columns = shape
     image = np.empty((rows, columns, 3), np.uint8)
     image[:] = [round(255 * c) for c in ground]
@@ -335,15 +333,15 @@ def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float
             if rng.random() < 0.75:
                 cv2.line(image, (x, y), (x + int(rng.integers(4, 12)), y), ink, 3)
     for _ in range(4):
-        centre = (int(rng.uniform(columns * 0.72, columns - 20)), int(rng.uniform(rows * 0.5, rows - 24)))
-        cv2.circle(image, centre, int(rng.integers(5, 18)), rng.uniform(12, 242, 3).tolist(), -1)
+        center = (int(rng.uniform(columns * 0.72, columns - 20)), int(rng.uniform(rows * 0.5, rows - 24)))
+        cv2.circle(image, center, int(rng.integers(5, 18)), rng.uniform(12, 242, 3).tolist(), -1)
     return np.clip(image / np.float32(255.0) * (1.0 + 0.05 * fbm(rng, shape, 50, 2.0)[..., None]), 0.03, 1.0)
 
 
 def stripes(
     rng: np.random.Generator, shape: tuple[int, int], a: tuple[float, ...], b: tuple[float, ...], n: int
 ) -> Array32:
-    """Horizontal bands, dirty: cones and barriers."""
+    """Dirty horizontal bands, for cones and barriers."""
     band = (np.arange(shape[0]) * n // shape[0]) % 2
     image = np.where(band[:, None, None] == 0, np.asarray(a, np.float32), np.asarray(b, np.float32))
     image = np.broadcast_to(image, (*shape, 3)).astype(np.float32)
@@ -351,6 +349,6 @@ def stripes(
 
 
 def resized(image: Array32, shape: tuple[int, int], smooth: bool = True) -> Array32:
-    """Scaled to (rows, columns), by cubic or linear interpolation."""
+    """The image scaled to (rows, columns), with cubic or linear interpolation."""
     how = cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR
     return cv2.resize(image, shape[::-1], interpolation=how).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The known-truth world as a MuJoCo model: what is filmed (geom groups 0 and 1), and what is driven in (group 3)."""
+"""The known-truth world as a MuJoCo model: visual geoms (groups 0 and 1), which are filmed, and collision geoms (3)."""
 
 from collections.abc import Callable
 from functools import cache
@@ -15,41 +15,40 @@ from twin.reality import primitives, textures
 from twin.reality.centerline import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, VERGE_WIDTH, ground_height
 from twin.reality.lighting import Lighting
 from twin.reality.place import BUILDINGS
-from twin.reality.things import ATLAS_CELL, ATLAS_SIDE, CELLS, SEED, KnownPlace, up
+from twin.reality.place_objects import ATLAS_CELL, ATLAS_SIDE, CELLS, SEED, KnownPlace, up
 from twin.types import Array
 
-# ---- How much of the sky a point of the ground sees, baked into the ground's textures: soft shadows where things stand.
+# ---- ambient occlusion of the ground
 
-
-_RAYS = 48
-_REACH = 7.0  # [m] what is further does not darken
-_STEP = 0.3  # [m] between points looked from
+_SKY_RAYS = 48
+_OCCLUDER_REACH = 7.0  # [m] within which objects occlude the sky
+_OCCLUSION_STEP = 0.3  # [m] between points of the map
 
 
 def sky_visibility(place: KnownPlace, points: Array) -> Array:
-    """Share of the cosine-weighted sky seen from points (..., 3) that nothing standing nearby hides, shape (...)."""
-    part = primitives.join([t.part for t in place.things if t.kind in ("obstacle", "foliage")])
-    k = np.arange(_RAYS) + 0.5
-    angle, sine = k * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(k / _RAYS)  # Malley: a uniform disc lifted to the dome
+    """Fraction of the cosine-weighted sky that objects nearby leave visible from points (..., 3), shape (...)."""
+    part = primitives.join([t.part for t in place.objects if t.kind in ("obstacle", "foliage")])
+    k = np.arange(_SKY_RAYS) + 0.5
+    angle, sine = k * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(k / _SKY_RAYS)  # Malley: a uniform disc lifted to the dome
     rays = np.stack([sine * np.cos(angle), sine * np.sin(angle), np.sqrt(1.0 - sine**2)], 1)
     flat = points.reshape(-1, 3) + up(0.02)
-    return Surface(part.vertices, part.faces).openness(flat, rays, _REACH).reshape(points.shape[:-1])
+    return Surface(part.vertices, part.faces).openness(flat, rays, _OCCLUDER_REACH).reshape(points.shape[:-1])
 
 
 def ground_visibility(place: KnownPlace) -> dict[str, Array]:
-    """Sky visibility over each texture of the ground, coarse, rows and columns as in the texture."""
+    """Coarse maps of the sky visibility by ground texture, with its rows and columns."""
     edge, outer = roads.ROAD_HALF_WIDTH, roads.ROAD_HALF_WIDTH + roads.KERB_WIDTH
     bands = {
         "road": (edge, -edge),
         "verge_left": (outer + roads.VERGE_WIDTH, outer),
         "verge_right": (-outer, -outer - roads.VERGE_WIDTH),
     }
-    along = np.linspace(roads.START, roads.END, round((roads.END - roads.START) / _STEP))
+    along = np.linspace(roads.START, roads.END, round((roads.END - roads.START) / _OCCLUSION_STEP))
     grids = {}
     for name, (first, last) in bands.items():
-        across = np.linspace(first, last, round(abs(first - last) / _STEP))
+        across = np.linspace(first, last, round(abs(first - last) / _OCCLUSION_STEP))
         grids[name] = place.route.at(along[None], across[:, None])
-    x0, x1, y0, y1 = places.LAND
+    x0, x1, y0, y1 = places.LAND_RANGE
     x, y = np.meshgrid(np.linspace(x0, x1, round(x1 - x0)), np.linspace(y1, y0, round(y1 - y0)))
     grids["land"] = np.stack([x, y], -1)
     return {
@@ -58,13 +57,15 @@ def ground_visibility(place: KnownPlace) -> dict[str, Array]:
     }
 
 
+# ---- textures and model
+
 ROAD_PIXEL = 0.0125  # [m] texel of the road
 VERGE_PIXEL = 0.022
 WALL_PIXEL = 0.03
-_HFIELD_CELL = 0.2  # [m] of the ground one drives on
+_HFIELD_CELL = 0.2  # [m] of the height field
 COLLISION_GROUP = 3
 
-WALLS = {  # building → brick or plaster, colour
+WALLS = {  # building → brick or plaster, color
     "hall": ("bricks", (0.50, 0.26, 0.19)),
     "library": ("plaster", (0.72, 0.66, 0.53)),
     "lodge": ("bricks", (0.56, 0.40, 0.28)),
@@ -77,37 +78,37 @@ WALLS = {  # building → brick or plaster, colour
     "sheds": ("bricks", (0.42, 0.38, 0.34)),
 }
 
-WETTED = ("road", "kerb", "verge_left", "verge_right", "land")
-"""Textures of the ground, which rain darkens."""
+WET_TEXTURES = ("road", "kerb", "verge_left", "verge_right", "land")
+"""Ground textures, which rain darkens."""
 
 
-def _bytes(image: NDArray) -> NDArray[np.uint8]:
+def _to_uint8(image: NDArray) -> NDArray[np.uint8]:
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 @cache
-def painted() -> dict[str, NDArray[np.uint8]]:
-    """Every texture of the place by name, uint8 RGB."""
+def place_textures() -> dict[str, NDArray[np.uint8]]:
+    """All textures of the place by name, uint8 RGB."""
 
     def rng(*key: int) -> np.random.Generator:
         return np.random.default_rng([SEED, 5, *key])
 
     length = END - START
-    out = {"road": _bytes(textures.road(rng(0), length, ROAD_HALF_WIDTH, ROAD_PIXEL))}
+    out = {"road": _to_uint8(textures.road(rng(0), length, ROAD_HALF_WIDTH, ROAD_PIXEL))}
     shape = (round(VERGE_WIDTH / VERGE_PIXEL), round(length / VERGE_PIXEL))
-    out["verge_right"] = _bytes(textures.grass(rng(1), shape, VERGE_PIXEL))
+    out["verge_right"] = _to_uint8(textures.grass(rng(1), shape, VERGE_PIXEL))
     left = textures.grass(rng(2), shape, VERGE_PIXEL)
     paved = round(PAVEMENT_WIDTH / VERGE_PIXEL)
     left[-paved:] = textures.slabs(rng(3), (paved, shape[1]), VERGE_PIXEL, (0.57, 0.75))
-    out["verge_left"] = _bytes(left)
-    out["kerb"] = _bytes(textures.kerb(rng(4), (16, round(length / 0.02)), 0.02))
-    out["land"] = _bytes(textures.grass(rng(5), (2292, 2172), 1 / 12))
-    for k, (name, (kind, colour)) in enumerate(WALLS.items()):
+    out["verge_left"] = _to_uint8(left)
+    out["kerb"] = _to_uint8(textures.kerb(rng(4), (16, round(length / 0.02)), 0.02))
+    out["land"] = _to_uint8(textures.grass(rng(5), (2292, 2172), 1 / 12))
+    for k, (name, (kind, color)) in enumerate(WALLS.items()):
         (_, size, _) = BUILDINGS[name]
         wall = (round(size[2] / WALL_PIXEL), round(2 * (size[0] + size[1]) / WALL_PIXEL))
         paint = textures.bricks if kind == "bricks" else textures.plaster
-        out[name] = _bytes(textures.weathered(paint(rng(6, k), wall, WALL_PIXEL, colour), WALL_PIXEL))
-    out["atlas"] = _bytes(_atlas(rng))
+        out[name] = _to_uint8(textures.weathered(paint(rng(6, k), wall, WALL_PIXEL, color), WALL_PIXEL))
+    out["atlas"] = _to_uint8(_atlas(rng))
     return out
 
 
@@ -156,8 +157,8 @@ def _atlas(rng: Callable[..., np.random.Generator]) -> NDArray[np.float32]:
     return image
 
 
-def solids(place: KnownPlace | None = None) -> mujoco.MjSpec:
-    """Only what one can touch, in group 3: the height field `ground`, boxes and cylinders. Quick to compile."""
+def collision_spec(place: KnownPlace | None = None) -> mujoco.MjSpec:
+    """The collision geoms alone, in group 3: the height field `ground`, boxes and cylinders. Quick to compile."""
     place = place or places.build()
     model = mujoco.MjSpec()
     low, high = np.array([-8.0, -58.0]), np.array([60.0, 22.0])
@@ -174,12 +175,12 @@ def solids(place: KnownPlace | None = None) -> mujoco.MjSpec:
         pos=[*((low + high) / 2), float(z.min())],
         group=COLLISION_GROUP,
     )
-    for thing in place.things:
-        for k, solid in enumerate(thing.solids):
+    for obj in place.objects:
+        for k, solid in enumerate(obj.solids):
             model.worldbody.add_geom(
-                name=f"{thing.name}_solid_{k}",
+                name=f"{obj.name}_solid_{k}",
                 type=mujoco.mjtGeom.mjGEOM_BOX if solid.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER,
-                pos=solid.centre,
+                pos=solid.center,
                 size=list(solid.half),
                 quat=[np.cos(solid.yaw / 2), 0, 0, np.sin(solid.yaw / 2)],
                 group=COLLISION_GROUP,
@@ -187,26 +188,25 @@ def solids(place: KnownPlace | None = None) -> mujoco.MjSpec:
     return model
 
 
-def spec(lighting: Lighting | str, place: KnownPlace | None = None) -> mujoco.MjSpec:
-    """The world under one lighting, with a camera named `film`, textures, lights and collision geoms.
+def world_spec(lighting: Lighting | str, place: KnownPlace | None = None) -> mujoco.MjSpec:
+    """The world under one lighting, with textures, lights, collision geoms and a camera named `film`.
 
-    Filmed geoms are in group 0 (ground) and 1 and touch nothing; geoms of group 3 are solid and not filmed: the height
-    field `ground` and boxes and cylinders for what stands on it.
+    Visual geoms are in groups 0 (ground) and 1 and do not collide; collision geoms are in group 3 and are not filmed.
     """
     light = lightings.LIGHTINGS[lighting] if isinstance(lighting, str) else lighting
     place = place or places.build()
-    model = solids(place)
+    model = collision_spec(place)
     model.modelname = f"reality_{light.name}"
     model.visual.map.znear, model.visual.map.zfar = 0.001, 10.0
     model.stat.extent, model.stat.center = 60.0, [20.0, -5.0, 0.0]
     visibility = ground_visibility(place) if light.occlusion > 0.0 else {}
-    for name, image in painted().items():
+    for name, image in place_textures().items():
         if name in visibility:
-            image = _shaded(image, 1.0 - light.occlusion * (1.0 - visibility[name]))
-        if light.wet > 0.0 and name in WETTED:
+            image = _darkened(image, 1.0 - light.occlusion * (1.0 - visibility[name]))
+        if light.wet > 0.0 and name in WET_TEXTURES:
             image = (image * (1.0 - light.wet)).astype(np.uint8)
         _add_texture(model, name, image)
-    sky = lightings.sky(light, SEED)
+    sky = lightings.sky_cube_map(light, SEED)
     box = model.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     box.width, box.height, box.nchannel, box.data = sky.shape[1], sky.shape[0], 3, sky.tobytes()
     for name, emission in (
@@ -216,31 +216,31 @@ def spec(lighting: Lighting | str, place: KnownPlace | None = None) -> mujoco.Mj
     ):
         _add_material(model, name, "atlas", emission)
     after_dark = light.glow > 0.0
-    for thing in place.things:
-        if thing.texture == ("windows_by_day" if after_dark else "windows_by_night"):
+    for obj in place.objects:
+        if obj.texture == ("windows_by_day" if after_dark else "windows_by_night"):
             continue
-        mesh = model.add_mesh(name=thing.name)
-        mesh.uservert = thing.part.vertices.astype(np.float32).ravel()
-        mesh.userface = thing.part.faces.ravel()
-        mesh.usertexcoord = thing.part.uv.astype(np.float32).ravel()
-        mesh.userfacetexcoord = thing.part.faces.ravel()
+        mesh = model.add_mesh(name=obj.name)
+        mesh.uservert = obj.part.vertices.astype(np.float32).ravel()
+        mesh.userface = obj.part.faces.ravel()
+        mesh.usertexcoord = obj.part.uv.astype(np.float32).ravel()
+        mesh.userfacetexcoord = obj.part.faces.ravel()
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         model.worldbody.add_geom(
-            name=thing.name,
+            name=obj.name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=thing.name,
-            material=thing.texture,
+            meshname=obj.name,
+            material=obj.texture,
             contype=0,
             conaffinity=0,
-            group=0 if thing.kind == "ground" else 1,
+            group=0 if obj.kind == "ground" else 1,
         )
     lightings.add_lights(model, light, np.array(place.lamp_heads))
     model.worldbody.add_camera(name="film", pos=[0, 0, 1.2])
     return model
 
 
-def _shaded(image: NDArray[np.uint8], factor: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A texture darkened by a coarse map of factors."""
+def _darkened(image: NDArray[np.uint8], factor: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """A texture multiplied by a coarse map of factors in [0, 1]."""
     fine = textures.resized(factor.astype(np.float32), image.shape[:2], smooth=False)
     return (image * np.clip(fine, 0.0, 1.0)[..., None]).astype(np.uint8)
 

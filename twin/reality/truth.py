@@ -1,6 +1,6 @@
-"""The truth about a filmed scene: poses, a few depth maps, and the geometry, regenerated from its parameters.
+"""Ground truth of a generated scene: poses, some depth maps, and the geometry, rebuilt from its parameters.
 
-Written by `python -m twin.reality film` into `<scene>/truth`; only `twin/reality/comparison.py` and the tests may read it.
+`python -m twin.reality film` writes it to `<scene>/truth`; only `twin/reality/comparison.py` and tests may read it.
 """
 
 from dataclasses import asdict, dataclass
@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -16,37 +15,36 @@ from twin.errors import InputError
 from twin.files import read_json, write_json
 from twin.reality import centerline as roads
 from twin.reality import place as places
-from twin.reality import primitives
 from twin.reality.centerline import RoadLine
-from twin.reality.things import SEED, KnownPlace
+from twin.reality.place_objects import SEED, KnownPlace
 from twin.types import Array
 
-HALF_WIDTH = 1.5  # [m] the corridor around the route that nothing reaches into
+HALF_WIDTH = 1.5  # [m] of the free corridor around the route
 
 
 @dataclass(frozen=True)
 class TrueFilm:
-    """True cameras of one source."""
+    """True camera poses and depth maps of one source."""
 
     times: Array
     """[s], shape (n,)."""
     camera_to_world: Array
     """OpenCV axes, metres, z up, shape (n, 4, 4)."""
     depth_frames: NDArray[np.int64]
-    """Frames whose depth is kept, shape (k,)."""
+    """Indices of the frames with a depth map, shape (k,)."""
     depth: NDArray[np.float16]
     """z-depth [m], 0 = sky, at a quarter of the film's size, shape (k, height / 4, width / 4)."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Everything known about one filmed scene."""
+    """The truth of one filmed scene."""
 
     route: RoadLine
     start: float
     """Station where the films start [m]."""
     length: float
-    """Length filmed [m]."""
+    """Filmed length [m]."""
     half_width: float
     """Half width of the free corridor [m]."""
     intrinsics: Array
@@ -54,7 +52,7 @@ class Truth:
     size: tuple[int, int]
     """Width, height of every film [px]."""
     films: dict[str, TrueFilm]
-    """By source name."""
+    """Films by source name."""
 
     def save(self, folder: Path) -> None:
         """Writes `truth.json` and `truth.npz`."""
@@ -67,10 +65,10 @@ class Truth:
 
     @staticmethod
     def load(folder: Path) -> "Truth":
-        """Reads a truth and builds its place anew.
+        """Reads a truth and rebuilds its place.
 
         Raises:
-            InputError: the films were made of another place than this version of the code builds.
+            InputError: this version of the code builds another place than the one filmed.
         """
         head = read_json(folder / "truth.json")
         with np.load(folder / "truth.npz", allow_pickle=False) as data:
@@ -87,7 +85,7 @@ class Truth:
 
     @cached_property
     def place(self) -> KnownPlace:
-        """The place itself, built anew."""
+        """The rebuilt place."""
         return places.build(self.route)
 
     def ground_height(self, xy: Array) -> Array:
@@ -95,19 +93,12 @@ class Truth:
         return roads.ground_height(self.route, xy)
 
     def path(self, step: float = 0.25) -> Array:
-        """The filmed part of the centre line on the ground [m], shape (m, 3)."""
+        """The filmed segment of the center line on the ground [m], shape (m, 3)."""
         xy = self.route.at(np.arange(self.start, self.start + self.length + step / 2, step))
         return np.concatenate([xy, self.ground_height(xy)[:, None]], 1)
 
-    def obstacle_mesh(self, foliage: bool = False) -> trimesh.Trimesh:
-        """The surface of everything solid that stands on the ground (and of leaves, if asked for)."""
-        kinds = ("obstacle", "foliage") if foliage else ("obstacle",)
-        parts = [thing.part for thing in self.place.things if thing.kind in kinds]
-        whole = primitives.join(parts)
-        return trimesh.Trimesh(whole.vertices, whole.faces, process=False)
-
     def poses(self, source: str, times: Array) -> Array:
-        """camera_to_world of one source at times [s] within its film, interpolated; shapes (n,) → (n, 4, 4)."""
+        """Interpolated camera_to_world of one source at times within its film [s], shapes (n,) → (n, 4, 4)."""
         film = self.films[source]
         at = np.clip(times, film.times[0], film.times[-1])
         out = np.tile(np.eye(4), (len(at), 1, 1))
@@ -118,6 +109,6 @@ class Truth:
 
 
 def fingerprint(place: KnownPlace) -> list[float]:
-    """What tells one version of the place from another: counts of things and vertices, and the vertices' moments."""
-    vertices = np.concatenate([thing.part.vertices for thing in place.things])
-    return [len(place.things), len(vertices), *vertices.mean(0).tolist(), *vertices.std(0).tolist()]
+    """Identifies a version of the place: counts of objects and vertices, mean and deviation of the vertices."""
+    vertices = np.concatenate([obj.part.vertices for obj in place.objects])
+    return [len(place.objects), len(vertices), *vertices.mean(0).tolist(), *vertices.std(0).tolist()]

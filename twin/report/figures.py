@@ -1,7 +1,7 @@
-"""The report's figures: each a function of numbers that were computed before it, none of which it changes.
+"""Figures of the reports, drawn by matplotlib without a display.
 
-A *figure* is drawn by matplotlib without a display and becomes inline SVG whose colours are CSS variables, so that it
-follows the page into the dark. What would make thousands of paths (points, height fields) is rasterised inside it.
+`svg` turns a figure into inline SVG whose colors are CSS variables of the page (light and dark mode). Points and height
+fields are rasterized inside it, since thousands of SVG paths are slow. Heatmaps show tables with many rows and columns.
 """
 
 import hashlib
@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 from twin.assets.ground import Ground
 from twin.types import Array
 
-# Colours that nothing else uses stand for the page's CSS variables, and are replaced by them in the SVG.
+# Placeholder colors, used by nothing else; `svg` replaces them by the page's CSS variables.
 INK, MUTED, LINE, CARD = "#0a0b01", "#0a0b02", "#0a0b03", "#0a0b04"
 SERIES = ("#0a0b11", "#0a0b12", "#0a0b13", "#0a0b14", "#0a0b15", "#0a0b16")
 _VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line", CARD: "--card"}
-_VARIABLES |= {colour: f"--c{i + 1}" for i, colour in enumerate(SERIES)}
+_VARIABLES |= {color: f"--c{i + 1}" for i, color in enumerate(SERIES)}
 
-_WIDTH = 4.8  # [in]; with 8.5 pt text legible on a phone, where the figure is as wide as the screen
+_WIDTH = 4.8  # [in]; 8.5 pt text stays legible where the figure is as wide as a phone's screen
 _RASTER_DPI = 200
-_MOST_POINTS = 20_000  # drawn in a map
+_MAX_POINTS = 20_000  # per map
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
     "font.family": "sans-serif",
@@ -58,19 +58,19 @@ _STYLE: dict[str, Any] = {
     "legend.fontsize": 8,
     "lines.linewidth": 1.6,
     "svg.fonttype": "none",
-    "svg.hashsalt": "twin",  # ids from the content alone, so that the same numbers give the same figure
-    # Names come from the user's files: a dollar sign is a dollar sign.
+    "svg.hashsalt": "twin",  # deterministic ids: the same numbers give the same SVG
+    # Names come from the user's files; a dollar sign is no math mode.
     "text.parse_math": False,
 }
 
 
 def style() -> AbstractContextManager[None]:
-    """How every figure looks; what draws text, lines or ticks stands within."""
+    """Context of the common matplotlib style; text, lines and ticks must be created inside it."""
     return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
 
 
 def svg(figure: Figure) -> str:
-    """The figure as an SVG element for a page, themed and without ids that another figure could share."""
+    """Returns a figure as an inline SVG element with CSS color variables and ids that no other figure shares."""
     buffer = io.BytesIO()
     with style():
         FigureCanvasSVG(figure)
@@ -84,32 +84,31 @@ def svg(figure: Figure) -> str:
         )
     text = buffer.getvalue().decode()
     text = text[text.index("<svg") :]
-    # Its style would hold for the whole page, which has the same rule for its figures.
+    # The style element would apply to the whole page, which has the same rule.
     text = re.sub(r"<(metadata|style)\b.*?</\1>", "", text, flags=re.DOTALL)
-    # Within HTML the parser knows the namespaces; left out, nothing in the page looks like an address.
+    # HTML parsers know the namespaces; without them the page contains no URL.
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
-    for colour, variable in _VARIABLES.items():
-        text = text.replace(colour, f"var({variable})")
-    # Only what is referred to needs an id; those get a prefix of their own.
+    for color, variable in _VARIABLES.items():
+        text = text.replace(color, f"var({variable})")
+    # Keep referenced ids only, with a prefix unique to the figure.
     referred = set(re.findall(r"#([\w.-]+)[\")]", text))
     prefix = "f" + hashlib.sha256(text.encode()).hexdigest()[:8]
     text = re.sub(r' id="([^"]+)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in referred else "", text)
     text = re.sub(r"#([\w.-]+)([\")])", lambda m: f"#{prefix}{m[1]}{m[2]}" if m[1] in referred else m[0], text)
-    # The picture fills its column: width and height are the page's business.
+    # The page sets width and height.
     return re.sub(
         r'<svg([^>]*?) width="[^"]*"', r"<svg\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     )
 
 
 def new_figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
-    """An empty figure [in] and its axes."""
     with style():
         figure = Figure(figsize=(width, height), layout="constrained")
         return figure, figure.add_subplot()
 
 
 def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
-    """Axes in metres, equal in both directions, for the rectangle from `low` to `high`."""
+    """Axes in meters with equal aspect for the rectangle from `low` to `high`."""
     extent = np.maximum(high - low, 1.0)
     figure, axes = new_figure(float(np.clip(_WIDTH * extent[1] / extent[0], 1.6, 5.6)) + 0.7)
     axes.set_aspect("equal")
@@ -128,13 +127,13 @@ def _legend(axes: Axes, columns: int) -> None:
         )
 
 
-def bounds_of(path: Array, margin: float = 8.0) -> tuple[Array, Array]:
-    """The rectangle around a path (n, 2) that a map shows [m]."""
+def map_bounds(path: Array, margin: float = 8.0) -> tuple[Array, Array]:
+    """Lower and upper corner [m] of a path (n, 2) with a margin."""
     return path.min(0) - margin, path.max(0) + margin
 
 
 def corridor_outline(route: Array, half_width: float) -> Array:
-    """The polygon of a route (m, 2) widened by `half_width` to both sides, shape (2 m, 2)."""
+    """Polygon of a route (m, 2) widened by `half_width` to both sides, shape (2 m, 2)."""
     along = np.gradient(route, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     side = np.stack([-along[:, 1], along[:, 0]], 1) * half_width
@@ -151,54 +150,46 @@ def place_map(
     half_width: float = 0.0,
     parts: Sequence[Array] = (),
 ) -> Figure:
-    """The place from above: reconstructed points, cameras by source, route with its corridor, and solid parts.
+    """Map of sparse points, cameras by source (held-out ones hollow), route with corridor, and solid parts [m].
 
-    Args:
-        positions: Camera centres [m], shape (n, 3).
-        sources: Source name per camera.
-        held_out: Which cameras were never trained on, shape (n,).
-        points: Sparse points [m], shape (m, 3).
-        point_rgb: Their colours, shape (m, 3).
-        route: Shape (k, 2) [m], or None.
-        half_width: Of the corridor [m].
-        parts: Outlines of convex parts [m], each (k, 2).
+    Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (uint8) (m, 3), `route` and each part (k, 2).
     """
-    low, high = bounds_of(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
+    low, high = map_bounds(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
     figure, axes = _map_axes(low, high)
     with style():
         shown = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(1))
-        if len(shown) > _MOST_POINTS:
-            shown = shown[np.linspace(0, len(shown) - 1, _MOST_POINTS).astype(int)]
-        # Dark points would vanish on a dark page and bright ones on a bright page: keep to the middle tones.
-        colours = 0.25 + 0.5 * point_rgb[shown] / 255.0
-        axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colours, linewidths=0, rasterized=True)
+        if len(shown) > _MAX_POINTS:
+            shown = shown[np.linspace(0, len(shown) - 1, _MAX_POINTS).astype(int)]
+        # Middle tones are visible on dark and on bright pages.
+        colors = 0.25 + 0.5 * point_rgb[shown] / 255.0
+        axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colors, linewidths=0, rasterized=True)
         _draw_route(axes, route, half_width)
         _draw_parts(axes, parts)
         for i, source in enumerate(dict.fromkeys(sources)):
             mine = np.array([name == source for name in sources])
-            colour = SERIES[i % len(SERIES)]
-            seen, unseen = positions[mine & ~held_out], positions[mine & held_out]
-            # Several films of one path lie on top of each other: the later ones are smaller, so that all show.
+            color = SERIES[i % len(SERIES)]
+            trained, unseen = positions[mine & ~held_out], positions[mine & held_out]
+            # Films of one path overlap; later sources get smaller markers so that all remain visible.
             size = 16.0 / (1.0 + 0.8 * i)
-            axes.scatter(seen[:, 0], seen[:, 1], s=size, c=colour, linewidths=0, label=source, zorder=4)
-            axes.scatter(unseen[:, 0], unseen[:, 1], s=size, facecolors="none", edgecolors=colour, lw=0.8, zorder=4)
+            axes.scatter(trained[:, 0], trained[:, 1], s=size, c=color, linewidths=0, label=source, zorder=4)
+            axes.scatter(unseen[:, 0], unseen[:, 1], s=size, facecolors="none", edgecolors=color, lw=0.8, zorder=4)
         axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
     _legend(axes, 3)
     return figure
 
 
 def ground_map(ground: Ground, path: Array, route: Array | None, half_width: float, parts: Sequence[Array]) -> Figure:
-    """Height of the ground [m] where it was measured, with the route, its corridor and the footprints of parts."""
-    low, high = bounds_of(path if route is None else route)
+    """Map of the measured ground height [m], the route with its corridor, and the footprints of parts."""
+    low, high = map_bounds(path if route is None else route)
     rows, columns = ground.height.shape
     x = ground.origin[0] + ground.cell * np.arange(columns)
     y = ground.origin[1] + ground.cell * np.arange(rows)
-    seen = ground.measured & ((x > low[0]) & (x < high[0])) & ((y > low[1]) & (y < high[1]))[:, None]
+    shown = ground.measured & ((x > low[0]) & (x < high[0])) & ((y > low[1]) & (y < high[1]))[:, None]
     figure, axes = _map_axes(low, high)
-    heights = ground.height[seen] if seen.any() else ground.height
+    heights = ground.height[shown] if shown.any() else ground.height
     lowest, highest = np.percentile(heights, [1, 99])
     with style():
-        picture = axes.imshow(
+        image = axes.imshow(
             np.ma.masked_array(ground.height, ~ground.measured),
             origin="lower",
             extent=(x[0], x[-1], y[0], y[-1]),
@@ -210,8 +201,8 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         _draw_route(axes, route, half_width)
         _draw_parts(axes, parts)
-        beside = axes.inset_axes((1.03, 0.0, 0.035, 1.0))  # as tall as the map, whatever its proportions
-        bar = figure.colorbar(picture, cax=beside, label="height of the ground [m]")
+        color_axes = axes.inset_axes((1.03, 0.0, 0.035, 1.0))  # as tall as the map
+        bar = figure.colorbar(image, cax=color_axes, label="height of the ground [m]")
         bar.outline.set_visible(False)
         bar.solids.set_rasterized(True)  # type: ignore[union-attr]
     if route is not None or len(parts):
@@ -243,7 +234,6 @@ def _draw_parts(axes: Axes, parts: Sequence[Array]) -> None:
 
 
 def training_curve(steps: Sequence[float], values: Sequence[float], label: str) -> Figure:
-    """How training went: a value per step."""
     figure, axes = new_figure(2.2)
     with style():
         axes.plot(steps, values, color=SERIES[0])
@@ -251,8 +241,8 @@ def training_curve(steps: Sequence[float], values: Sequence[float], label: str) 
     return figure
 
 
-def bars(values: dict[str, float], counts: dict[str, int], unit: str, label: str) -> Figure:
-    """A horizontal bar per name with its value and the number of samples behind it."""
+def bar_chart(values: dict[str, float], counts: dict[str, int], unit: str, label: str) -> Figure:
+    """Horizontal bars with value and, where known, number of samples."""
     figure, axes = new_figure(0.55 + 0.36 * max(1, len(values)))
     names = list(values)
     with style():
@@ -267,20 +257,16 @@ def bars(values: dict[str, float], counts: dict[str, int], unit: str, label: str
     return figure
 
 
-def histogram(values: NDArray, label: str, highest: float | None = None, whole: bool = False) -> Figure:
-    """How often each value occurs, with its median; what is above `highest` is counted in the last bin.
+def histogram(values: NDArray, label: str, highest: float | None = None, integer: bool = False) -> Figure:
+    """Histogram of nonnegative values (n,) with their median; values above `highest` are counted in the last bin.
 
-    Args:
-        values: Not negative, shape (n,).
-        label: What they are, with their unit.
-        highest: Right end; by default where 99.5 % of the values are.
-        whole: One bin per whole number.
+    `highest` defaults to the 99.5th percentile; `integer` uses one bin per integer.
     """
     figure, axes = new_figure(1.9)
     values = np.asarray(values, np.float64)
     top = float(highest if highest is not None else np.percentile(values, 99.5))
     with style():
-        edges = np.arange(np.floor(top) + 2) - 0.5 if whole else np.linspace(0.0, max(top, 1e-9), 41)
+        edges = np.arange(np.floor(top) + 2) - 0.5 if integer else np.linspace(0.0, max(top, 1e-9), 41)
         axes.hist(np.minimum(values, top), bins=edges, color=SERIES[0], rwidth=0.9)  # type: ignore[arg-type]
         median = float(np.median(values))
         axes.axvline(median, color=SERIES[1], lw=1.2)
@@ -292,14 +278,14 @@ def histogram(values: NDArray, label: str, highest: float | None = None, whole: 
     return figure
 
 
-def along_the_path(
+def curves_along_path(
     distance: Sequence[float],
     curves: dict[str, Sequence[float]],
     label: str,
     limit: float | None = None,
     lowest: float | None = None,
 ) -> Figure:
-    """Curves over the distance driven or filmed [m]; ± `limit` are dashed lines, the axis starts at `lowest`."""
+    """Curves over distance [m], with dashed lines at ± `limit`; the y axis starts at `lowest`."""
     figure, axes = new_figure(2.2)
     with style():
         for i, (name, values) in enumerate(curves.items()):
@@ -315,88 +301,83 @@ def along_the_path(
     return figure
 
 
-def errors_by_group(errors: dict[str, Sequence[float]], label: str, limit: float | None = None) -> Figure:
-    """Per-frame errors, one curve per group (a source), over the frame's place in its group."""
+def errors_by_group(errors: dict[str, Sequence[float]], label: str) -> Figure:
+    """Per-frame errors over the relative position in the group, one curve per group (source)."""
     figure, axes = new_figure(2.2)
     with style():
         for i, (name, values) in enumerate(errors.items()):
-            place = np.linspace(0.0, 100.0, len(values)) if len(values) > 1 else np.zeros(len(values))
-            axes.plot(place, values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)
-        if limit is not None:
-            axes.axhline(limit, color=SERIES[1], ls="--", lw=1.0)
-        axes.set(xlabel="place along the film [%]", ylabel=label)
+            position = np.linspace(0.0, 100.0, len(values)) if len(values) > 1 else np.zeros(len(values))
+            axes.plot(position, values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)
+        axes.set(xlabel="position in the film [%]", ylabel=label)
         axes.set_ylim(bottom=0.0)
     _legend(axes, 4)
     return figure
 
 
-# ---- Tables as pictures: where rows and columns are many, a shade is read faster than a number.
-#
-# A *tile* is a cell of such a table. Its *strength* from −1 to 1 is how deep its colour is, and its sign which of two
-# colours; without a strength (NaN) there is none.
+# ---- heatmaps
+
+HALF_WIDTH, FULL_WIDTH = 4.8, 7.2
+"""Figure widths [in] for half and for the full width of the page."""
+
+_ROW_HEIGHT = 0.28  # [in] per row
+_LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] per letter of a name; for the axis label
+_MAX_HORIZONTAL_LETTERS = 3  # longer column names are set vertically
+_MIN_ALPHA, _MAX_ALPHA = 0.08, 0.58  # of strength 0 and 1; keeps text legible in light and dark mode
+_CELL_HALF_SIZE = np.array([0.48, 0.46])  # in units of the cell spacing
+_MIN_FONT, _MAX_FONT = 4.5, 7.0  # [pt]; smaller texts are left out
+_DIGIT_WIDTH = 0.8  # including its gap, in units of the font size
 
 
-HALF, WHOLE = 4.8, 7.2
-"""Widths of a figure [in]: beside another, and with the page's width to itself."""
-
-_ROW = 0.28  # [in] per row
-_LETTER, _LABEL = 0.075, 0.35  # [in] for a letter of a name, and for the axis' label
-_LYING = 3  # letters of a column's name at most that does not stand upright
-_FAINT, _DEEP = 0.08, 0.58  # alpha of strength 0 and 1; over the page, and ink is legible on it in light and in dark
-_PART = np.array([0.48, 0.46])  # of a tile to either side of its middle, of the distance to the next
-_SMALL, _LARGE = 4.5, 7.0  # [pt] of texts; where these would have to be smaller there are none
-_DIGIT = 0.8  # width of a digit and its gap, of its size
-
-
-def tiles(
+def heatmap(
     strength: Array,
     rows: Sequence[str],
     columns: Sequence[str],
     texts: NDArray[np.str_],
     label: str = "",
-    width: float = HALF,
+    width: float = HALF_WIDTH,
 ) -> Figure:
-    """A figure of tiles, the first row on top.
+    """A table of colored cells, the first row at the top.
 
     Args:
-        strength: −1 to 1, or NaN, shape (n, m).
-        rows: Their names, n.
-        columns: Their names, m; long ones stand upright.
-        texts: Written into the tiles as far as there is room, shape (n, m).
-        label: What the columns are.
-        width: `HALF` or `WHOLE`.
+        strength: Color depth in [−1, 1], its sign selects one of two colors; NaN leaves a cell empty. Shape (n, m).
+        rows: Row names, n.
+        columns: Column names, m; long ones are set vertically.
+        texts: Cell texts, shape (n, m); left out where they would be too small.
+        label: Label of the column axis.
+        width: `HALF_WIDTH` or `FULL_WIDTH`.
     """
-    there = np.argwhere(np.isfinite(strength))
-    value = strength[tuple(there.T)]
-    corners = there[:, None, ::-1] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * _PART
-    colours = np.array([to_rgb(SERIES[0]), to_rgb(SERIES[1])])[(value < 0.0).astype(int)]
-    faces = np.column_stack([colours, _FAINT + (_DEEP - _FAINT) * np.abs(value)])
+    finite = np.argwhere(np.isfinite(strength))
+    value = strength[tuple(finite.T)]
+    corners = finite[:, None, ::-1] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * _CELL_HALF_SIZE
+    colors = np.array([to_rgb(SERIES[0]), to_rgb(SERIES[1])])[(value < 0.0).astype(int)]
+    faces = np.column_stack([colors, _MIN_ALPHA + (_MAX_ALPHA - _MIN_ALPHA) * np.abs(value)])
     longest = max(map(len, columns))
-    upright = longest > _LYING
-    figure, axes = new_figure(_ROW * len(rows) + _LABEL + (_LETTER * longest if upright else _LABEL), width)
-    room = 72.0 * (width - _LETTER * max(map(len, rows))) / len(columns)  # [pt]
-    size = min(_LARGE, room / (_DIGIT * max([1, *map(len, texts[tuple(there.T)].tolist())])))
+    upright = longest > _MAX_HORIZONTAL_LETTERS
+    figure, axes = new_figure(
+        _ROW_HEIGHT * len(rows) + _LABEL_HEIGHT + (_LETTER_WIDTH * longest if upright else _LABEL_HEIGHT), width
+    )
+    room = 72.0 * (width - _LETTER_WIDTH * max(map(len, rows))) / len(columns)  # [pt]
+    size = min(_MAX_FONT, room / (_DIGIT_WIDTH * max([1, *map(len, texts[tuple(finite.T)].tolist())])))
     with style():
         axes.grid(False)
         axes.add_collection(PolyCollection(corners, facecolors=faces, linewidths=0.0))
-        if size >= _SMALL:
-            for row, column in there:
+        if size >= _MIN_FONT:
+            for row, column in finite:
                 text = str(texts[row, column])
                 axes.annotate(text, (column, row), ha="center", va="center", fontsize=size, color=INK)
         axes.set_yticks(range(len(rows)), list(rows))
         axes.set_xticks(range(len(columns)), list(columns), rotation=90 if upright else 0)
-        axes.xaxis.tick_top()  # where a long figure begins to be read
+        axes.xaxis.tick_top()  # a long figure is read from the top
         axes.xaxis.set_label_position("top")
         axes.spines["bottom"].set_visible(False)
         axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), xlabel=label)
     return figure
 
 
-def matrix(found: Mapping[tuple[str, str], float | None], rows: Sequence[str], columns: Sequence[str]) -> Array:
+def matrix(values: Mapping[tuple[str, str], float | None], rows: Sequence[str], columns: Sequence[str]) -> Array:
     """Values by row and column, shape (n, m); NaN where there is none."""
-    return np.array([[found.get((row, column)) for column in columns] for row in rows], float)
+    return np.array([[values.get((row, column)) for column in columns] for row in rows], float)
 
 
-def percents(rate: Array) -> NDArray[np.str_]:
-    """Rates as texts of their tiles."""
+def percent_texts(rate: Array) -> NDArray[np.str_]:
     return np.array([[f"{100 * each:.0f}" for each in row] for row in rate])

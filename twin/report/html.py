@@ -1,4 +1,9 @@
-"""HTML that cannot be broken by a file name: text is escaped unless it is `Html` already. And the page's look."""
+"""HTML and text elements shared by the reports, and the style of their pages.
+
+A report consists of sections with verdicts, facts and cautions; numbers that a stage did not report are "not measured".
+Summaries contain headlines and cautions of sections only, so no summary is better than what it summarizes. `element`
+escapes text unless it is `Html` already.
+"""
 
 import base64
 import html
@@ -8,43 +13,33 @@ from typing import Any
 
 from PIL import Image
 
-from twin.errors import listing
+from twin.errors import join_names
 
-# ---- What a report is made of in words: numbers that may be missing, and the headlines they come to. No HTML here.
-#
-# A *verdict* is a sentence that a newcomer understands, with a mood: good, mixed, bad or plain. A *fact* is a number with
-# its unit and what it means. A *caution* names what is wrong and its *cure*. Whatever a stage did not report is "not
-# measured"; nothing is made up.
-#
-# A section has a verdict and cautions; `Section.headline` is the verdict, at best mixed where there is a caution. Every
-# summary is made of headlines and cautions of sections, so no summary is better than what it sums up.
-
+# ---- content of a report, without HTML
 
 NOT_MEASURED = "not measured"
-
-# From where on a number is worth a warning.
-ENOUGH_REGISTERED = 0.9  # share of frames
-LARGE_SCALE_UNCERTAINTY = 0.03  # relative
-LOW_PSNR = 18.0  # [dB]
-LARGE_PATH_ERROR = 0.08  # [m]
 
 MOOD_WORDS = {"good": "good", "mixed": "caution", "bad": "bad", "plain": ""}
 
 
 @dataclass(frozen=True)
 class Verdict:
+    """A sentence for newcomers with a mood."""
+
     text: str
     mood: str = "plain"
     """good, mixed, bad or plain."""
 
     @property
     def word(self) -> str:
-        """The mood for those who do not see its colour; empty where it is plain."""
+        """The mood in words, for readers who do not see its color; empty for plain."""
         return MOOD_WORDS[self.mood]
 
 
 @dataclass(frozen=True)
 class Fact:
+    """A number with its unit and meaning."""
+
     name: str
     value: str
     meaning: str = ""
@@ -58,23 +53,23 @@ class Caution:
 
 @dataclass(frozen=True)
 class Section:
-    """One stage in the report, or what is told beside the stages."""
+    """A stage of the build, or a topic beside the stages, in the report."""
 
     name: str
     """Stage name, as in `report.json`; or "seen_touched", "truth", "costs"."""
     title: str
     done: str
-    """What the stage did, for somebody who sees twin for the first time."""
+    """Description of what the stage did, for newcomers."""
     facts: list[Fact] = field(default_factory=list)
     cautions: list[Caution] = field(default_factory=list)
     not_applicable: str = ""
-    """Why there is nothing to show; empty where there is."""
+    """Reason why the section has no content; else empty."""
     verdict: Verdict | None = None
-    """The section in one sentence; None where nothing was measured."""
+    """Summary in one sentence; None if nothing was measured."""
 
     @property
     def headline(self) -> Verdict | None:
-        """The verdict, or else the title where there are cautions. With cautions its mood is mixed, or bad."""
+        """The verdict, or the title if there are cautions only; cautions lower its mood to mixed at best."""
         if not self.cautions:
             return self.verdict
         if self.verdict is None:
@@ -83,21 +78,21 @@ class Section:
 
 
 def pick(report: Any, path: str) -> Any:
-    """The value at a dotted path, or None where there is none."""
+    """Returns the value at a dotted path, or None."""
     for key in path.split("."):
         report = report.get(key) if isinstance(report, dict) else None
     return report
 
 
 def number(value: Any, form: str = "{:.3g}") -> str:
-    """A number in a format such as "{:.1f} m", or "not measured"."""
+    """Formats a number, for instance with "{:.1f} m"; "not measured" for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return NOT_MEASURED
     return form.format(value).replace("-", "−") if value < 0 else form.format(value)
 
 
 def duration(seconds: Any) -> str:
-    """Seconds as "8.2 s" or "3 min 05 s"."""
+    """Formats seconds as "8.2 s" or "3 min 05 s"."""
     if isinstance(seconds, bool) or not isinstance(seconds, int | float):
         return NOT_MEASURED
     if round(seconds, 1) < 60.0:
@@ -106,18 +101,20 @@ def duration(seconds: Any) -> str:
     return f"{minutes} min {rest:02d} s"
 
 
-def flat(value: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Every plain number and word below a JSON value with its dotted path; long lists are only counted."""
+def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """Lists the numbers and words of a JSON value with their dotted paths; long lists are only counted."""
     if isinstance(value, dict):
-        return [row for key, below in value.items() for row in flat(below, f"{prefix}.{key}" if prefix else str(key))]
+        return [
+            row for key, below in value.items() for row in flatten(below, f"{prefix}.{key}" if prefix else str(key))
+        ]
     if isinstance(value, list):
         if len(value) > 8 or any(isinstance(item, dict | list) for item in value):
             return [(prefix, f"{len(value)} values")]
-        return [(prefix, ", ".join(plain(item) for item in value) or "none")]
-    return [(prefix, plain(value))]
+        return [(prefix, ", ".join(format_value(item) for item in value) or "none")]
+    return [(prefix, format_value(value))]
 
 
-def plain(value: Any) -> str:
+def format_value(value: Any) -> str:
     if value is None:
         return NOT_MEASURED
     if isinstance(value, bool):
@@ -130,24 +127,8 @@ def numbers(value: Any) -> dict[str, float]:
     return {str(k): float(v) for k, v in table.items() if isinstance(v, int | float) and not isinstance(v, bool)}
 
 
-def scale_uncertainty(report: dict[str, Any]) -> float | None:
-    value = pick(report, "metric.scale_uncertainty")
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def source_words(source: str) -> str:
-    return {
-        "camera_height": "the camera’s height above the ground",
-        "distance": "a distance measured between two marked points",
-        "marker": "a printed marker of known size",
-        "gps": "the GPS positions of the images",
-        "poses": "the given poses, which are metric already",
-        "poses_are_metric": "the given poses, which are metric already",
-    }.get(str(source), str(source))
-
-
 def follower_verdict(report: dict[str, Any]) -> Verdict:
-    """Whether the Husky got through, in one sentence."""
+    """Outcome of the scripted drive in one sentence."""
     follower = pick(report, "review.follower")
     if not isinstance(follower, dict):
         reason = pick(report, "review.not_applicable") or "this build has no drive"
@@ -155,27 +136,29 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
     length = number(pick(report, "mjcf.route_length_m"), "{:.1f} m ")
     length = "" if length == NOT_MEASURED else length
     touched = follower.get("touched")
-    contact = "what it touched was not measured"
+    contact = "its contacts were not measured"
     if isinstance(touched, list):
-        contact = f"touched {listing(touched)}" if touched else "touched nothing but the ground"
+        contact = f"touched {join_names(touched)}" if touched else "touched nothing but the ground"
     if follower.get("reached_goal"):
         return Verdict(
             f"The Husky followed the {length}route from start to end and {contact}.",
             "mixed" if touched or touched is None else "good",
         )
-    gone = number(follower.get("distance_m"), "it came {:.1f} m far")
+    gone = number(follower.get("distance_m"), "it drove {:.1f} m")
     gone = "" if gone == NOT_MEASURED else f"{gone} and "
     return Verdict(f"The Husky did not reach the end of the {length}route: {gone}{contact}.", "bad")
 
 
-LONG = 24
-"""Rows that a table has at most; a longer one is folded away, below a figure that says the same."""
+# ---- HTML
 
-_STRIP = 2.4  # width over height from which on a picture is a strip
+MAX_TABLE_ROWS = 24
+"""Longer tables are collapsed, below a figure of the same data."""
+
+_STRIP_ASPECT = 2.4  # width over height from which on a picture spans the page
 
 
 class Html(str):
-    """Text that is HTML, and is not escaped again."""
+    """Text that is HTML already and is not escaped again."""
 
     __slots__ = ()
 
@@ -184,10 +167,10 @@ _VOID = frozenset({"img", "meta", "source", "br"})
 
 
 def element(tag: str, *children: str, **attributes: str | bool | None) -> Html:
-    """An element; children are escaped unless they are Html.
+    """Returns an element; escapes children unless they are Html.
 
-    Attribute names: a trailing underscore is dropped (`class_`), others become hyphens. True gives a bare attribute;
-    False and None leave it out.
+    Attribute names lose a trailing underscore (`class_`); other underscores become hyphens. True gives a bare
+    attribute; False and None leave it out.
     """
     parts = [tag]
     for key, value in attributes.items():
@@ -201,12 +184,12 @@ def element(tag: str, *children: str, **attributes: str | bool | None) -> Html:
 
 
 def join(*children: str) -> Html:
-    """Children one after another, escaped unless they are Html."""
+    """Concatenates children; escapes them unless they are Html."""
     return Html("".join(child if isinstance(child, Html) else html.escape(child, quote=False) for child in children))
 
 
 def document(title: str, style: str, *body: str) -> str:
-    """A whole page; `style` is added to `STYLE`."""
+    """A whole page; `style` is appended to `STYLE`."""
     head = element(
         "head",
         element("meta", charset="utf-8"),
@@ -218,18 +201,16 @@ def document(title: str, style: str, *body: str) -> str:
 
 
 def caution(it: Caution) -> Html:
-    """What is not to be relied on, and what helps."""
     return element("div", element("b", it.what), f"What helps: {it.cure}", class_="caution", role="note")
 
 
 def headline(it: Verdict, *below: str) -> Html:
-    """An entry of a list of verdicts: the mood in a word and a colour, the sentence, and what is below it."""
+    """List item of a verdict: mood, sentence, and further content."""
     word = element("b", f"{it.word}:", class_="mood") if it.word else ""
     return element("li", word, " " if word else "", it.text, *below, class_=it.mood)
 
 
 def table(head: list[str], rows: list[list[str]], numeric: tuple[int, ...] = ()) -> Html:
-    """A table that scrolls sideways where it is too wide; columns in `numeric` are set right."""
 
     def row(kind: str, cells: list[str]) -> Html:
         return element("tr", *(element(kind, c, class_="n" if i in numeric else None) for i, c in enumerate(cells)))
@@ -239,19 +220,33 @@ def table(head: list[str], rows: list[list[str]], numeric: tuple[int, ...] = ())
 
 
 def folded(title: str, *content: str) -> Html:
-    """What is shown when its title is clicked."""
     return element("details", element("summary", title), *content)
 
 
 def picture(path: Path, caption: str) -> Html:
-    """A JPEG or PNG within the page, over its caption; a long strip takes the whole width."""
+    """A JPEG or PNG embedded in the page, with its caption; wide strips span the page."""
     with Image.open(path) as image:
         width, height = image.size
     return element(
         "figure",
         element("img", src=data_url(path), alt=caption, loading="lazy"),
         element("figcaption", caption),
-        class_="strip" if width > _STRIP * height else None,
+        class_="strip" if width > _STRIP_ASPECT * height else None,
+    )
+
+
+def chart(title: str, drawing: str) -> Html:
+    return element("div", element("h3", title), Html(drawing))
+
+
+def page_header(title: str, kicker: str, *verdicts: Html) -> Html:
+    """Header of a page: title, one line of description, and its verdicts."""
+    return element(
+        "header",
+        element("h1", title),
+        element("p", kicker, class_="kicker"),
+        element("ul", *verdicts, class_="verdicts"),
+        class_="top",
     )
 
 

@@ -1,4 +1,4 @@
-"""The chapters of the review film that need no robot: the field beside the real frames, and the light turning."""
+"""Chapters of the review video: real against rendered frames, changing light, and the drive."""
 
 import math
 from collections.abc import Iterable
@@ -9,108 +9,104 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from twin.env.drivers import FollowedDrive
-from twin.errors import listing
+from twin.env.route_follower import RecordedDrive
+from twin.errors import join_names
 from twin.geometry.cameras import nearest_frame
 from twin.mjcf.world import World, arc_lengths
 from twin.report.chase_camera import frame_indices
-from twin.report.review_studio import Studio, as_picture, frames_to_compare, judged_row, side_by_side
+from twin.report.review_studio import Studio, comparison_row, frames_to_compare, side_by_side, to_uint8
 from twin.report.video_layout import (
     ACCENT,
     AMBER,
     GREEN,
     INK,
     MUTED,
+    PANEL_BACKGROUND,
     RED,
-    SUNKEN,
     Box,
-    Colour,
+    Color,
     MapView,
-    depth_colours,
+    depth_colors,
+    draw_depth_legend,
+    draw_facts,
+    draw_label,
     draw_text,
-    facts,
-    legend,
-    place,
-    plate,
+    paste,
     shorten,
 )
 from twin.robot import CAMERA_SIZE
 from twin.types import Array, Image
 
-COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip below: depth, plan, facts
-LIGHT_STRIP = (0.62, 0.38)  # slider, plan
+COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
+LIGHTING_STRIP = (0.62, 0.38)  # slider, map
 _CARD_SECONDS = 2.5
 _COMPARISON_SECONDS = 0.6
-_HOLD_SECONDS = 0.8  # a pure lighting stands still for this long
-_ROW_HEIGHT = 240  # [px] of the pictures kept for the page
+_HOLD_SECONDS = 0.8  # for which an unmixed lighting is shown
+_ROW_HEIGHT = 240  # [px] of the pictures for the page
 
 
-def title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:
-    """A card that says what comes next."""
+def write_title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:
     studio.writer.write(studio.layout.card(title, lines), max(1, round(seconds * studio.fps)))
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
-    """Which frames the first chapter shows, by lighting: with a render more per lighting, which is for the page, no
-    more than `budget` in all (one frame per lighting at least)."""
+    """Frames of chapter 1 by lighting, for at most `budget` renders (one more per lighting goes to the page)."""
     share = max(1, budget // max(1, len(studio.field.lightings)) - 1)
     return {name: frames_to_compare(studio.cameras, name, share) for name in studio.field.lightings}
 
 
-def compare_with_the_film(studio: Studio, plan: MapView, chosen: dict[str, list[int]], progress: tqdm) -> None:
-    """Chapter 1: real frame, the field from the same place, and its depth, lighting by lighting.
-
-    Of each lighting the page gets the frame in the middle of those never trained on, see `judged_row`.
-    """
-    title_card(
+def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str, list[int]], progress: tqdm) -> None:
+    """Chapter 1: real frame, render and depth. The middle held-out frame of each lighting goes to the page, too."""
+    write_title_card(
         studio,
         "1  The film and its twin",
         [
-            "Left: what the camera filmed. Right: what the radiance field renders there, in the same light.",
-            "Frames marked “never trained on” were kept from it: there it shows what it has understood, "
-            "not what it has memorised.",
+            "Left: the real frame. Right: the radiance field rendered at the same pose, in the same light.",
+            "Frames marked “held out” were excluded from training; they measure generalization.",
         ],
     )
     for number, (lighting, frames) in enumerate(chosen.items()):
         unseen = [i for i in frames if studio.cameras.held_out[i]]
         best = unseen[len(unseen) // 2] if unseen else None
         for i in frames:
-            view = studio.frame_view(i)
-            real, rgb = studio.real(i), as_picture(view.rgb[0])
-            depth = depth_colours(view.depth[0], view.opacity[0])
-            canvas = _comparison(studio, plan, i, lighting, (real, rgb, depth))
+            view = studio.render_frame(i)
+            real_frame, rgb = studio.real_frame(i), to_uint8(view.rgb[0])
+            depth = depth_colors(view.depth[0], view.opacity[0])
+            canvas = _comparison_canvas(studio, map_view, i, lighting, (real_frame, rgb, depth))
             studio.writer.write(canvas, max(1, round(_COMPARISON_SECONDS * studio.fps)))
             if i == best and number == 0:
-                studio.keep("poster_compare", "poster", "the film and its twin", canvas)
+                studio.save_picture("poster_compare", "poster", "the film and its twin", canvas)
             if i == best:
-                row, score = judged_row(studio, i)
+                row, score = comparison_row(studio, i)
                 caption = (
-                    f"{lighting}: filmed, rendered from the same place at {score:.1f} dB PSNR, how far away things "
-                    "are, and where the render is wrong. From the middle of the film, never trained on."
+                    f"{lighting}: real frame, render at the same pose ({score:.1f} dB PSNR), depth, and error. "
+                    "From the middle of the film, held out from training."
                 )
-                studio.keep(f"compare_{number}", "field", caption, row, row.shape[1])
+                studio.save_picture(f"compare_{number}", "field", caption, row, row.shape[1])
             progress.update()
 
 
-def _comparison(studio: Studio, plan: MapView, i: int, lighting: str, pictures: tuple[Image, Image, Image]) -> Image:
+def _comparison_canvas(
+    studio: Studio, map_view: MapView, i: int, lighting: str, pictures: tuple[Image, Image, Image]
+) -> Image:
     layout, cameras = studio.layout, studio.cameras
     held_out = bool(cameras.held_out[i])
-    real, rgb, depth = pictures
+    real_frame, rgb, depth = pictures
     canvas = layout.canvas(f"The film and its twin: {lighting}", studio.name)
-    place(canvas, real, layout.left)
-    place(canvas, rgb, layout.right)
-    plate(canvas, "filmed", layout.left, size=layout.text, bold=True)
-    plate(canvas, "rendered by the twin", layout.right, size=layout.text, bold=True)
+    paste(canvas, real_frame, layout.left)
+    paste(canvas, rgb, layout.right)
+    draw_label(canvas, "real", layout.left, size=layout.text, bold=True)
+    draw_label(canvas, "rendered by the twin", layout.right, size=layout.text, bold=True)
     if held_out:
-        plate(canvas, "never trained on", layout.right, "bottom right", layout.text, AMBER, True)
+        draw_label(canvas, "held out", layout.right, "bottom right", layout.text, AMBER, True)
     below, middle, right = layout.strip(*COMPARISON_STRIP)
-    place(canvas, depth, below)
-    plate(canvas, "rendered depth", below, size=round(layout.text * 0.85))
-    legend(canvas, below, round(layout.text * 0.75))
+    paste(canvas, depth, below)
+    draw_label(canvas, "depth", below, size=round(layout.text * 0.85))
+    draw_depth_legend(canvas, below, round(layout.text * 0.75))
     pose = cameras.camera_to_world[i]
     same = np.array([name == cameras.sources[i] for name in cameras.sources])
-    place(canvas, plan_with(plan, pose, cameras.positions[same][:, :2], layout.text), middle)
-    facts(
+    paste(canvas, map_with_pose(map_view, pose, cameras.positions[same][:, :2], layout.text), middle)
+    draw_facts(
         canvas,
         right,
         [
@@ -124,74 +120,73 @@ def _comparison(studio: Studio, plan: MapView, i: int, lighting: str, pictures: 
     return canvas
 
 
-def plan_with(plan: MapView, pose: NDArray[np.float64], dots: NDArray[np.float64] | None, text: int) -> Image:
-    """The plan with its label, a marker at a camera pose, and the other cameras as dots."""
-    picture = plan.with_marker(pose[:3, 3], pose[:3, 2], dots=dots)
-    plate(picture, "from above", (0, 0, picture.shape[1], picture.shape[0]), size=round(text * 0.85))
+def map_with_pose(map_view: MapView, pose: NDArray[np.float64], dots: NDArray[np.float64] | None, text: int) -> Image:
+    picture = map_view.with_marker(pose[:3, 3], pose[:3, 2], dots=dots)
+    draw_label(picture, "map", (0, 0, picture.shape[1], picture.shape[0]), size=round(text * 0.85))
     return picture
 
 
-def light_steps(lightings: int, budget: int) -> int:
-    """Views from one lighting to the next, so that all of them and the last one keep within the budget."""
+def lighting_steps(lightings: int, budget: int) -> int:
+    """Number of views from one lighting to the next within the budget, which includes the final view."""
     return max(2, (budget - 1) // max(1, lightings - 1))
 
 
-def turn_the_light(studio: Studio, plan: MapView, budget: int, progress: tqdm) -> None:
-    """Chapter 2: one place, while the appearance goes from lighting to lighting."""
+def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progress: tqdm) -> None:
+    """Chapter 2: one pose rendered while the appearance is interpolated between lightings."""
     lightings, cameras, layout = studio.field.lightings, studio.cameras, studio.layout
     start = frames_to_compare(cameras, lightings[0], 9)
     if not start:
         return
     i = start[len(start) // 3]
-    title_card(
+    write_title_card(
         studio,
-        "2  The light turns",
+        "2  Changing light",
         [
-            f"The same place rendered from {lightings[0]} to {lightings[-1]}. Nothing of the geometry changes: only "
-            "the appearance vector the field is asked for.",
-            "Right: the real frame taken nearest to this place in the light that prevails.",
+            f"One pose rendered from {lightings[0]} to {lightings[-1]}. The geometry is constant; only the appearance "
+            "embedding changes.",
+            "Right: the real frame nearest to this pose in the prevailing light.",
         ],
     )
     nearest = {name: nearest_frame(cameras, i, name) for name in lightings}
-    reals = {name: studio.real(k) for name, k in nearest.items() if k is not None}
-    steps = light_steps(len(lightings), budget)
-    shown = max(1, round(studio.fps / 6))  # video frames per rendered step
-    kept = []
+    reals = {name: studio.real_frame(k) for name, k in nearest.items() if k is not None}
+    steps = lighting_steps(len(lightings), budget)
+    shown = max(1, round(studio.fps / 6))  # video frames per view
+    stills = []
     for number, (a, b) in enumerate(pairwise(lightings)):
         for k in range(steps + (number == len(lightings) - 2)):
             share = k / steps
-            rgb = as_picture(studio.frame_view(i, _mixture(a, b, share)).rgb[0])
+            rgb = to_uint8(studio.render_frame(i, _lighting_mixture(a, b, share)).rgb[0])
             prevailing = a if share < 0.5 else b
-            canvas = layout.canvas("The light turns", studio.name)
-            place(canvas, rgb, layout.left)
-            plate(canvas, "rendered by the twin", layout.left, size=layout.text, bold=True)
+            canvas = layout.canvas("Changing light", studio.name)
+            paste(canvas, rgb, layout.left)
+            draw_label(canvas, "rendered by the twin", layout.left, size=layout.text, bold=True)
             if prevailing in reals:
-                place(canvas, reals[prevailing], layout.right)
-                plate(canvas, f"filmed: {prevailing}", layout.right, size=layout.text, bold=True)
-            slider, side = layout.strip(*LIGHT_STRIP)
-            _slider(canvas, slider, lightings, number + share, layout.text)
-            place(canvas, plan_with(plan, cameras.camera_to_world[i], None, layout.text), side)
+                paste(canvas, reals[prevailing], layout.right)
+                draw_label(canvas, f"real: {prevailing}", layout.right, size=layout.text, bold=True)
+            slider, side = layout.strip(*LIGHTING_STRIP)
+            _draw_slider(canvas, slider, lightings, number + share, layout.text)
+            paste(canvas, map_with_pose(map_view, cameras.camera_to_world[i], None, layout.text), side)
             pure = share in (0.0, 1.0)
             studio.writer.write(canvas, round(_HOLD_SECONDS * studio.fps) if pure else shown)
             if pure:
-                kept.append(rgb)
+                stills.append(rgb)
             progress.update()
-    studio.keep(
+    studio.save_picture(
         "lightings",
         "field",
-        f"one place under every lighting it was filmed in: {', '.join(lightings)}",
-        side_by_side(kept[:4], _ROW_HEIGHT),
+        f"one pose in every filmed lighting: {', '.join(lightings)}",
+        side_by_side(stills[:4], _ROW_HEIGHT),
     )
 
 
-def _mixture(a: str, b: str, share: float) -> str:
+def _lighting_mixture(a: str, b: str, share: float) -> str:
     return a if share <= 0.0 else b if share >= 1.0 else f"{a}:{b}:{share:.6g}"
 
 
-def _slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, size: int) -> None:
-    """A bar with a stop per lighting and a knob at `at`, counted in stops."""
+def _draw_slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, size: int) -> None:
+    """A slider with a stop per lighting and a knob at `at`, in stops."""
     x, y, width, height = box
-    canvas[y : y + height, x : x + width] = SUNKEN
+    canvas[y : y + height, x : x + width] = PANEL_BACKGROUND
     left, right, middle = x + round(0.08 * width), x + round(0.92 * width), y + height // 2
     stops = np.linspace(left, right, len(lightings)).round().astype(int)
     canvas[middle - 2 : middle + 2, left:right] = MUTED
@@ -208,20 +203,18 @@ def _slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, size
     draw_text(canvas, "appearance", x + 12, y + 8, size, MUTED)
 
 
-# ---- The chapter of the review film with the robot in it, and what its drive comes to in numbers.
-
+# ---- drive
 
 T = TypeVar("T")
 
-DRIVE_STRIP = (0.62, 0.38)  # shares of the strip below: plan, facts
-_LONGEST = 14.0  # [s] the drive may take in the film; a longer one is shown faster
-_CROSSFADE = 0.25  # share of a lighting's stretch of the route in which it turns into the next
-_TRACE_SAMPLES = 200  # of a drive, for the page
-_CONTROL_RATE = 10  # instants per second in a Drive
+DRIVE_STRIP = (0.62, 0.38)  # shares of the strip: map, facts
+_MAX_DRIVE_SECONDS = 14.0  # [s] in the video; longer drives are sped up
+_CROSSFADE_SHARE = 0.25  # share of a lighting's route segment that blends into the next
+_TRACE_SAMPLES = 200  # per drive, for the page
+_CONTROL_RATE = 10  # control steps per second of a FollowedDrive
 
 
-def drive_metrics(drive: FollowedDrive) -> dict[str, Any]:
-    """The numbers of a drive for the report."""
+def drive_metrics(drive: RecordedDrive) -> dict[str, Any]:
     base = drive.base_to_world
     yaw = np.unwrap(np.arctan2(base[:, 1, 0], base[:, 0, 0]))
     return {
@@ -236,8 +229,8 @@ def drive_metrics(drive: FollowedDrive) -> dict[str, Any]:
     }
 
 
-def speeds(drive: FollowedDrive) -> Array:
-    """Speed over ground at each instant [m/s], averaged over half a second, shape (k,)."""
+def smoothed_speed(drive: RecordedDrive) -> Array:
+    """Ground speed [m/s], averaged over half a second, shape (k,)."""
     steps = np.linalg.norm(np.diff(drive.base_to_world[:, :2, 3], axis=0), axis=1)
     each = np.concatenate([[0.0], steps / np.maximum(np.diff(drive.times), 1e-9)])
     window = min(5, len(each))
@@ -245,110 +238,107 @@ def speeds(drive: FollowedDrive) -> Array:
     return np.convolve(padded, np.full(window, 1.0 / window), "valid")
 
 
-def trace(drive: FollowedDrive) -> dict[str, list[float]]:
-    """A drive thinned out for a figure: distance along the route [m], cross-track error [m], speed [m/s]."""
+def drive_trace(drive: RecordedDrive) -> dict[str, list[float]]:
+    """A downsampled drive: distance along the route [m], cross-track error [m], speed [m/s]."""
     index = np.unique(np.linspace(0, len(drive.times) - 1, _TRACE_SAMPLES).round().astype(int))
-    columns = {"progress_m": drive.progress, "cross_track_m": drive.cross_track, "speed_m_s": speeds(drive)}
+    columns = {"progress_m": drive.progress, "cross_track_m": drive.cross_track, "speed_m_s": smoothed_speed(drive)}
     return {name: [round(float(v), 4) for v in values[index]] for name, values in columns.items()}
 
 
-def lighting_along(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
-    """The lighting at a share of the way, each having its stretch: as the field takes it, and for a reader."""
-    stretch = min(int(share * len(lightings)), len(lightings) - 1)
-    within = share * len(lightings) - stretch
-    if stretch == len(lightings) - 1 or within <= 1.0 - _CROSSFADE:
-        return lightings[stretch], lightings[stretch]
-    mixed = (within - (1.0 - _CROSSFADE)) / _CROSSFADE
-    a, b = lightings[stretch : stretch + 2]
+def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
+    """Lighting at a share of the route, which is divided evenly: name for the field, and label for readers."""
+    index = min(int(share * len(lightings)), len(lightings) - 1)
+    within = share * len(lightings) - index
+    if index == len(lightings) - 1 or within <= 1.0 - _CROSSFADE_SHARE:
+        return lightings[index], lightings[index]
+    mixed = (within - (1.0 - _CROSSFADE_SHARE)) / _CROSSFADE_SHARE
+    a, b = lightings[index : index + 2]
     return f"{a}:{b}:{mixed:.6g}", f"{a} → {b}"
 
 
-def stride(drive: FollowedDrive, fps: int) -> tuple[int, int]:
-    """Control steps between two pictures of the drive, and film frames each is shown for; `_LONGEST` [s] in all."""
-    speedup = max(1.0, float(drive.times[-1]) / _LONGEST)
+def frame_timing(drive: RecordedDrive, fps: int) -> tuple[int, int]:
+    """Control steps per picture, and video frames per picture, for a drive of at most `_MAX_DRIVE_SECONDS`."""
+    speedup = max(1.0, float(drive.times[-1]) / _MAX_DRIVE_SECONDS)
     every = max(1, math.ceil(speedup * _CONTROL_RATE / fps - 1e-9))
     return every, max(1, int(fps * every / (_CONTROL_RATE * speedup) + 1e-9))
 
 
 def rendered_instants(instants: list[T], budget: int) -> list[T]:
-    """Those instants of the film that get a view of the field of their own; in between the last one stays."""
+    """Instants that get a new view of the field within the budget; the others repeat the last view."""
     return instants[:: max(1, -(-len(instants) // max(1, budget)))]
 
 
-def film_drive(
+def write_drive_chapter(
     studio: Studio,
-    plan: MapView,
+    map_view: MapView,
     world: World,
-    drive: FollowedDrive,
+    drive: RecordedDrive,
     chase: Iterable[Image],
     budget: int,
     progress: tqdm,
 ) -> None:
-    """Chapter 3: the Husky from its own camera and from behind.
+    """Chapter 3: the drive from the robot's camera and from behind.
 
-    Args:
-        studio: What is filmed with.
-        plan: Of the route.
-        world: What is driven in.
-        drive: What is shown.
-        chase: Pictures from behind, one per `stride` of the drive and one of its last instant.
-        budget: How many views of the field may be rendered.
-        progress: Counts them.
+    `chase` has one picture per shot of `chase_shots`; at most `budget` views of the field are rendered.
     """
     layout = studio.layout
-    every, hold = stride(drive, studio.fps)
+    every, hold = frame_timing(drive, studio.fps)
     instants = frame_indices(len(drive.times), every)
     shown_speed = every * studio.fps / (_CONTROL_RATE * hold)
-    title_card(
+    write_title_card(
         studio,
         "3  The Husky drives",
         [
-            f"A scripted driver follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo. It sees nothing: "
-            "it shows that the place can be driven.",
-            "Left: what the radiance field shows to its camera. Right: the physics, with the solid parts drawn over. "
-            + (f"Shown {shown_speed:.3g} times as fast." if shown_speed > 1.01 else ""),
+            f"A scripted driver without camera follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo, which "
+            "shows that the route is drivable.",
+            "Left: the radiance field at the robot’s camera. Right: the physics, with solid parts. "
+            + (f"{shown_speed:.3g}× speed." if shown_speed > 1.01 else ""),
         ],
     )
     rendered = set(rendered_instants(instants, budget))
     moments = {instants[int(share * (len(instants) - 1))] for share in (0.08, 0.4, 0.65, 0.95)}
-    speed, driven = speeds(drive), arc_lengths(drive.base_to_world[:, :2, 3])
-    rgb, told = None, ""
-    seen, behind = [], []
+    speed, driven = smoothed_speed(drive), arc_lengths(drive.base_to_world[:, :2, 3])
+    rgb, label = None, ""
+    camera_stills, chase_stills = [], []
     for i, from_behind in zip(instants, chase, strict=True):
         if i in rendered or rgb is None:
             share = float(drive.progress[i] / max(arc_lengths(world.route)[-1], 1e-9))
-            lighting, told = lighting_along(studio.field.lightings, float(np.clip(share, 0.0, 1.0)))
-            view = studio.view(drive.camera_to_world[i], world.intrinsics, CAMERA_SIZE, lighting)
-            rgb = as_picture(view.rgb[0])
+            lighting, label = lighting_at(studio.field.lightings, float(np.clip(share, 0.0, 1.0)))
+            view = studio.render(drive.camera_to_world[i], world.intrinsics, CAMERA_SIZE, lighting)
+            rgb = to_uint8(view.rgb[0])
             progress.update()
         canvas = layout.canvas("The Husky drives", studio.name)
-        place(canvas, rgb, layout.left)
-        place(canvas, from_behind, layout.right)
-        plate(canvas, f"its camera in the twin: {told}", layout.left, size=layout.text, bold=True)
-        plate(canvas, "physics, solid parts drawn over", layout.right, size=layout.text, bold=True)
+        paste(canvas, rgb, layout.left)
+        paste(canvas, from_behind, layout.right)
+        draw_label(canvas, f"robot camera: {label}", layout.left, size=layout.text, bold=True)
+        draw_label(canvas, "physics, with solid parts", layout.right, size=layout.text, bold=True)
         left, right = layout.strip(*DRIVE_STRIP)
         base = drive.base_to_world[i]
         trail = drive.base_to_world[: i + 1, :2, 3]
-        place(canvas, plan.with_marker(base[:3, 3], base[:3, 0], trail), left)
-        facts(canvas, right, _captions(world, drive, i, speed[i], driven[i]), layout.text)
+        paste(canvas, map_view.with_marker(base[:3, 3], base[:3, 0], trail), left)
+        draw_facts(canvas, right, _drive_facts(world, drive, i, speed[i], driven[i]), layout.text)
         if i == instants[-1]:
-            _ending(canvas, studio, drive)
+            _draw_outcome(canvas, studio, drive)
         studio.writer.write(canvas, round(1.5 * studio.fps) if i == instants[-1] else hold)
         if i in moments:
-            seen.append(rgb)
-            behind.append(from_behind)
+            camera_stills.append(rgb)
+            chase_stills.append(from_behind)
         if i == instants[len(instants) // 2]:
-            studio.keep("poster_drive", "poster", "the Husky in the twin", canvas)
-    studio.keep("drive_camera", "review", "what its camera shows along the route", side_by_side(seen, 200))
-    studio.keep("drive_chase", "review", "the same moments in the physics", side_by_side(behind, 200))
+            studio.save_picture("poster_drive", "poster", "the Husky in the twin", canvas)
+    studio.save_picture(
+        "drive_camera", "review", "views of the robot’s camera along the route", side_by_side(camera_stills, 200)
+    )
+    studio.save_picture("drive_chase", "review", "the same moments in the physics", side_by_side(chase_stills, 200))
 
 
-def _captions(world: World, drive: FollowedDrive, i: int, speed: float, driven: float) -> list[tuple[str, str, Colour]]:
+def _drive_facts(
+    world: World, drive: RecordedDrive, i: int, speed: float, driven: float
+) -> list[tuple[str, str, Color]]:
     error = float(drive.cross_track[i])
     off = abs(error) > 0.5 * world.half_width
     side = "left" if error > 0 else "right"
     last = i == len(drive.times) - 1
-    touched = listing(drive.touched, 2) if last and drive.touched else "nothing but ground"
+    touched = join_names(drive.touched, 2) if last and drive.touched else "nothing but ground"
     return [
         ("time", f"{drive.times[i]:.1f} s", INK),
         ("speed", f"{speed:.2f} m/s", ACCENT),
@@ -358,12 +348,12 @@ def _captions(world: World, drive: FollowedDrive, i: int, speed: float, driven: 
     ]
 
 
-def _ending(canvas: NDArray[np.uint8], studio: Studio, drive: FollowedDrive) -> None:
+def _draw_outcome(canvas: NDArray[np.uint8], studio: Studio, drive: RecordedDrive) -> None:
     text = {
         "goal": "goal reached",
-        "touched": f"stopped: touched {listing(drive.touched, 2)}",
+        "touched": f"stopped: touched {join_names(drive.touched, 2)}",
         "off_corridor": "stopped: left the corridor",
         "timeout": "stopped: out of time",
     }.get(drive.outcome, f"stopped: {drive.outcome}")
-    colour = GREEN if drive.reached_goal else RED
-    plate(canvas, text, studio.layout.right, "bottom right", round(studio.layout.text * 1.2), colour, True)
+    color = GREEN if drive.reached_goal else RED
+    draw_label(canvas, text, studio.layout.right, "bottom right", round(studio.layout.text * 1.2), color, True)

@@ -1,7 +1,4 @@
-"""What every section of the review film shares: the field, the cameras, the canvas, and the count of what was rendered.
-
-A *view* is one rendered picture with its depth. A *picture* with a caption is kept for the page beside the film.
-"""
+"""Shared parts of the review video: rendering, saved pictures, panels, and prefetching in a second thread."""
 
 import queue
 import threading
@@ -24,16 +21,16 @@ from twin.geometry.images import psnr, read_image, resize
 from twin.nerf.rendering import RenderableField, Rendering
 from twin.report.video_layout import (
     AMBER,
+    BACKGROUND,
     FARTHEST_DEPTH,
-    GROUND,
     INK,
     MUTED,
     NEAREST_DEPTH,
-    SUNKEN,
-    Colour,
+    PANEL_BACKGROUND,
+    Color,
     FrameLayout,
-    depth_colours,
-    depth_share,
+    depth_colors,
+    depth_scale,
     draw_text,
     fit,
     shorten,
@@ -42,27 +39,25 @@ from twin.report.video_layout import (
 from twin.report.video_writer import VideoWriter, even
 from twin.types import Array, Image
 
-_PICTURE_WIDTH = 1000  # [px] at most, of a picture for the page
+_PICTURE_WIDTH = 1000  # [px] maximum, of pictures for the page
 _PICTURE_QUALITY = 82
 
 
 @dataclass(frozen=True)
-class KeptPicture:
-    """A picture for the page."""
-
+class PagePicture:
     file: str
-    """Within the stage folder."""
+    """Path within the stage folder."""
     section: str
-    """The stage whose section shows it."""
+    """Name of the report section."""
     caption: str
 
 
 @dataclass
 class Studio:
-    """Renders views and keeps the books."""
+    """Renders views of the field, counts renders, and saves pictures for the page."""
 
     name: str
-    """Of the scene."""
+    """Name of the scene."""
     field: RenderableField
     cameras: Cameras
     layout: FrameLayout
@@ -70,8 +65,8 @@ class Studio:
     out: Path
     render_width: int
     path: Array
-    """What the plan shows: the route, or the cameras of the longest source [m], shape (n, 2)."""
-    kept: list[KeptPicture] = with_default(default_factory=list)
+    """Path on the map: the route, or the camera positions of the longest source [m], shape (n, 2)."""
+    pictures: list[PagePicture] = with_default(default_factory=list)
     renders: int = 0
     render_seconds: float = 0.0
 
@@ -79,17 +74,13 @@ class Studio:
     def fps(self) -> int:
         return self.writer.fps
 
-    def view(
+    def render(
         self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str, width: int | None = None
     ) -> Rendering:
-        """One view of the field, shapes (1, h, w, ...).
+        """Renders one view of the field, shapes (1, h, w, ...).
 
-        Args:
-            camera_to_world: Shape (4, 4).
-            intrinsics: fx, fy, cx, cy [px] at `size`.
-            size: Of the camera [px]; the view is rendered smaller, with the same proportions.
-            lighting: As the field takes it.
-            width: Longer side of the view [px]; `render_width` unless given.
+        `intrinsics` are fx, fy, cx, cy [px] at `size`. The view has the same aspect and a longer side of `width` [px],
+        by default `render_width`.
         """
         shrink = (width or self.render_width) / max(size)
         small = (even(round(size[0] * shrink)), even(round(size[1] * shrink)))
@@ -99,21 +90,21 @@ class Studio:
         self.renders += 1
         return rendering
 
-    def frame_view(self, i: int, lighting: str | None = None, width: int | None = None) -> Rendering:
-        """The field seen from where frame i was taken, in that frame's light unless told otherwise; see `view`."""
+    def render_frame(self, i: int, lighting: str | None = None, width: int | None = None) -> Rendering:
+        """Renders the field at the pose of frame i, by default in that frame's own appearance; see `render`."""
         cameras = self.cameras
         size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
-        light = lighting or light_of_frame(cameras, i)
-        return self.view(cameras.camera_to_world[i], cameras.intrinsics[i], size, light, width)
+        light = lighting or appearance_of_frame(cameras, i)
+        return self.render(cameras.camera_to_world[i], cameras.intrinsics[i], size, light, width)
 
-    def real(self, i: int) -> Image:
-        """Frame i as it was filmed (undistorted), with what its mask ignores greyed out."""
+    def real_frame(self, i: int) -> Image:
+        """The undistorted frame i, with its masked part grayed out."""
         image = read_image(self.cameras.image_path(i))
         mask = self.cameras.mask_path(i)
-        return image if mask is None else greyed(image, read_image(mask)[..., 0] == 0)
+        return image if mask is None else gray_out(image, read_image(mask)[..., 0] == 0)
 
-    def keep(self, name: str, section: str, caption: str, picture: Image, width: int = _PICTURE_WIDTH) -> None:
-        """Stores a picture for the page as `pictures/<name>.jpg`, `width` [px] wide at most."""
+    def save_picture(self, name: str, section: str, caption: str, picture: Image, width: int = _PICTURE_WIDTH) -> None:
+        """Saves a picture for the page as `pictures/<name>.jpg`, at most `width` [px] wide."""
         if picture.shape[1] > width:
             height = round(picture.shape[0] * width / picture.shape[1])
             picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
@@ -124,20 +115,20 @@ class Studio:
         path = self.out / "pictures" / f"{name}.jpg"
         path.parent.mkdir(exist_ok=True)
         write_bytes(path, data.tobytes())
-        self.kept.append(KeptPicture(f"pictures/{name}.jpg", section, caption))
+        self.pictures.append(PagePicture(f"pictures/{name}.jpg", section, caption))
 
 
-def greyed(image: Image, ignored: NDArray[np.bool_]) -> Image:
-    """The image with its ignored part, shape (h, w), grey and striped: it was filmed, but not learnt."""
+def gray_out(image: Image, ignored: NDArray[np.bool_]) -> Image:
+    """Shows the ignored part of an image, shape (h, w), in gray stripes."""
     v, u = np.indices(ignored.shape)
     width = max(4, len(ignored) // 40)
     stripes = np.where((u + v) // width % 2 == 0, 0.55, 0.4)[..., None]
-    grey = image.mean(-1, keepdims=True) * stripes + 30.0
-    return np.where(ignored[..., None], grey, image).astype(np.uint8)
+    gray = image.mean(-1, keepdims=True) * stripes + 30.0
+    return np.where(ignored[..., None], gray, image).astype(np.uint8)
 
 
-def spread(indices: Sequence[int] | NDArray, count: int) -> list[int]:
-    """At most `count` of the indices, evenly spread, the first and last included."""
+def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
+    """At most `count` of the indices, evenly spaced, including the first and the last."""
     if count >= len(indices):
         return [int(i) for i in indices]
     if count <= 1:
@@ -146,7 +137,7 @@ def spread(indices: Sequence[int] | NDArray, count: int) -> list[int]:
 
 
 def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
-    """Frames of one lighting along its longest source, half of them held out where there are enough, in order."""
+    """Frames of a lighting along its longest source, in order, half of them held out if there are enough."""
     of_lighting = [i for i, name in enumerate(cameras.lightings) if name == lighting]
     sources = [cameras.sources[i] for i in of_lighting]
     if not sources:
@@ -155,15 +146,15 @@ def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
     mine = [i for i in of_lighting if cameras.sources[i] == longest]
     held_out = [i for i in mine if cameras.held_out[i]]
     trained = [i for i in mine if not cameras.held_out[i]]
-    unseen = spread(held_out, max(1, count // 2))
-    return sorted([*unseen, *spread(trained, count - len(unseen))])
+    unseen = evenly_spaced(held_out, max(1, count // 2))
+    return sorted([*unseen, *evenly_spaced(trained, count - len(unseen))])
 
 
-def light_of_frame(cameras: Cameras, i: int) -> str:
-    """What to ask the field for, to see the light of frame i.
+def appearance_of_frame(cameras: Cameras, i: int) -> str:
+    """Appearance of frame i, as a lighting for the field.
 
-    A trained frame has an appearance of its own. A held-out one was never looked at, so it gets what lies between the
-    trained frames before and after it in its film: light and exposure drift, and they are not what is judged.
+    A trained frame has its own embedding. A held-out frame gets the interpolation of the trained frames before and
+    after it in its film, because light and exposure drift and are not part of the evaluation.
     """
     if not cameras.held_out[i]:
         return cameras.names[i]
@@ -180,85 +171,88 @@ def light_of_frame(cameras: Cameras, i: int) -> str:
 
 
 def side_by_side(pictures: Sequence[Image], height: int) -> Image:
-    """Pictures in a row, scaled to one height, with a thin gap."""
+    """Concatenates pictures in a row, scaled to one height, with thin gaps."""
     gap = np.full((height, 6, 3), 255, np.uint8)
     row: list[Image] = []
     for picture in pictures:
         width = max(1, round(picture.shape[1] * height / picture.shape[0]))
-        way = cv2.INTER_AREA if picture.shape[0] > height else cv2.INTER_CUBIC
-        row += [gap, cv2.resize(picture, (width, height), interpolation=way).astype(np.uint8)]
+        interpolation = cv2.INTER_AREA if picture.shape[0] > height else cv2.INTER_CUBIC
+        row += [gap, cv2.resize(picture, (width, height), interpolation=interpolation).astype(np.uint8)]
     return np.concatenate(row[1:], 1)
 
 
-def as_picture(rgb: NDArray) -> Image:
-    """Colour in [0, 1] as uint8."""
+def to_uint8(rgb: NDArray) -> Image:
     return (np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-# ---- Pictures for the page in which a person can judge the field: film, render, depth and error of one frame in a row.
-#
-# The render has the lighting's own embedding, as it was learnt; nothing is fitted to the frame. *Error* is the mean over
-# red, green and blue of |render − film|, as a share of full brightness.
+# ---- rows of panels
 
-
-PANEL = 320  # [px] longer side of each picture, and of what is rendered
-MOST_ERROR = 0.3  # share of full brightness at the end of the error's colours
-_DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] between the ends
+PANEL_SIZE = 320  # [px] longer side of each panel and of the render
+MAX_ERROR = 0.3  # share of full brightness at the end of the color scale
+_DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] between the ends of the depth scale
 _GAP = 6  # [px]
 _TEXT = 15  # [px]
-_EDGE = 30  # [px] height of the lines above and below the pictures
+_LINE_HEIGHT = 30  # [px] height of the lines above and below a panel
 
 
-def judged_row(studio: Studio, i: int) -> tuple[Image, float]:
-    """Frame i filmed, rendered, its depth and its error side by side with their scales; and its PSNR [dB]."""
+def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
+    """Real frame, render, depth and error of frame i with their scales, and its PSNR [dB].
+
+    The render uses the lighting's trained embedding; nothing is fitted to the frame. The error is the mean over the
+    channels of |render − film|, as a share of full brightness.
+    """
     cameras = studio.cameras
-    view = studio.frame_view(i, cameras.lightings[i], PANEL)
-    rgb, depth = view.rgb[0], depth_colours(view.depth[0], view.opacity[0])
+    render = studio.render_frame(i, cameras.lightings[i], PANEL_SIZE)
+    rgb, depth = render.rgb[0], depth_colors(render.depth[0], render.opacity[0])
     height, width = depth.shape[:2]
     film = resize(read_image(cameras.image_path(i)), width, height) / 255.0
     path = cameras.mask_path(i)
-    # Any ignored pixel spoils the mean it goes into.
+    # A pixel of the resized mask is valid only if all its source pixels are.
     mask = None if path is None else resize((read_image(path)[..., 0] > 0).astype(np.float32), width, height) > 0.999
     score = psnr(rgb, film, mask)
-    wrong = error_colours(np.abs(rgb - film).mean(-1), mask)
+    error = error_colors(np.abs(rgb - film).mean(-1), mask)
     bar = max(40, width - 16)
-    far = [(float(depth_share(m)), f"{m:g}") for m in (NEAREST_DEPTH, *_DEPTH_TICKS)]
-    far.append((1.0, f"{FARTHEST_DEPTH:g} m"))
+    depth_ticks = [(float(depth_scale(m)), f"{m:g}") for m in (NEAREST_DEPTH, *_DEPTH_TICKS)]
+    depth_ticks.append((1.0, f"{FARTHEST_DEPTH:g} m"))
     ramp = NEAREST_DEPTH * (FARTHEST_DEPTH / NEAREST_DEPTH) ** np.linspace(0.0, 1.0, bar)
-    errors = [(share, f"{100 * share * MOST_ERROR:.0f}") for share in (0.0, 1 / 3, 2 / 3)]
-    errors.append((1.0, f"{100 * MOST_ERROR:.0f} %+"))
-    unseen = ("never trained on", AMBER) if cameras.held_out[i] else ("trained on", MUTED)
+    errors = [(share, f"{100 * share * MAX_ERROR:.0f}") for share in (0.0, 1 / 3, 2 / 3)]
+    errors.append((1.0, f"{100 * MAX_ERROR:.0f} %+"))
+    unseen = ("held out", AMBER) if cameras.held_out[i] else ("trained on", MUTED)
     panels = [
-        panel(fit(studio.real(i), (width, height)), "filmed", cameras.names[i], under(width, *unseen)),
-        panel(as_picture(rgb), "rendered", f"{score:.1f} dB PSNR", under(width, "light as learnt, nothing fitted")),
-        panel(depth, "depth", "grey: nothing solid", scale_bar(width, depth_colours(ramp[None]), far)),
-        panel(
-            wrong,
+        titled_panel(
+            fit(studio.real_frame(i), (width, height)), "real", cameras.names[i], caption_line(width, *unseen)
+        ),
+        titled_panel(
+            to_uint8(rgb), "rendered", f"{score:.1f} dB PSNR", caption_line(width, "trained appearance, not fitted")
+        ),
+        titled_panel(depth, "depth", "gray: nothing solid", scale_bar(width, depth_colors(ramp[None]), depth_ticks)),
+        titled_panel(
+            error,
             "error",
             "of full brightness",
-            scale_bar(width, error_colours(np.linspace(0, MOST_ERROR, bar)[None]), errors),
+            scale_bar(width, error_colors(np.linspace(0, MAX_ERROR, bar)[None]), errors),
         ),
     ]
-    gap = np.full((len(panels[0]), _GAP, 3), GROUND, np.uint8)
+    gap = np.full((len(panels[0]), _GAP, 3), BACKGROUND, np.uint8)
     return np.concatenate([part for panel in panels for part in (gap, panel)] + [gap], 1), score
 
 
-def error_colours(error: NDArray, mask: NDArray[np.bool_] | None = None) -> Image:
-    """Error as a share of full brightness, shape (h, w), as colours: dark is right, bright wrong; ignored is grey."""
-    colours = (colormaps["viridis"](np.clip(error / MOST_ERROR, 0.0, 1.0))[..., :3] * 255 + 0.5).astype(np.uint8)
+def error_colors(error: NDArray, mask: NDArray[np.bool_] | None = None) -> Image:
+    """Colors of an error, shape (h, w), as a share of full brightness: dark is small; masked pixels are gray."""
+    colors = (colormaps["viridis"](np.clip(error / MAX_ERROR, 0.0, 1.0))[..., :3] * 255 + 0.5).astype(np.uint8)
     if mask is not None:
-        colours[~mask] = MUTED
-    return colours
+        colors[~mask] = MUTED
+    return colors
 
 
 def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image:
-    """A bar of colours over labels at shares of its length; those without room are left out."""
-    out = np.full((2 * _EDGE - 10, width, 3), GROUND, np.uint8)
+    """A color bar with labels at shares of its length; labels without room are left out."""
+    out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
     bar = ramp.shape[1]
     left = (width - bar) // 2
     out[8:18, left : left + bar] = ramp[:1]
-    free = left  # where the next label may begin
-    last = width - text_width(labels[-1][1], _TEXT) - 2 * _GAP  # where the one at the end begins
+    free = left  # left end of the next label at least
+    last = width - text_width(labels[-1][1], _TEXT) - 2 * _GAP  # left end of the last label
     for k, (share, text) in enumerate(labels):
         at, half = left + round(share * (bar - 1)), text_width(text, _TEXT) // 2
         align = "left" if k == 0 else "right" if k == len(labels) - 1 else "middle"
@@ -270,38 +264,36 @@ def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image
     return out
 
 
-def under(width: int, text: str, colour: Colour = MUTED) -> Image:
-    """A line of words as tall as a scale."""
-    out = np.full((2 * _EDGE - 10, width, 3), GROUND, np.uint8)
-    draw_text(out, shorten(text, width - 8, _TEXT), 4, 8, _TEXT, colour)
+def caption_line(width: int, text: str, color: Color = MUTED) -> Image:
+    out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
+    draw_text(out, shorten(text, width - 8, _TEXT), 4, 8, _TEXT, color)
     return out
 
 
-def panel(picture: Image, title: str, note: str, below: Image) -> Image:
-    """A picture between its title and what stands below."""
+def titled_panel(picture: Image, title: str, note: str, below: Image) -> Image:
     width = picture.shape[1]
-    head = np.full((_EDGE, width, 3), GROUND, np.uint8)
+    head = np.full((_LINE_HEIGHT, width, 3), BACKGROUND, np.uint8)
     draw_text(head, title, 4, 5, _TEXT, INK, True)
     free = width - text_width(title, _TEXT, True) - 20
     if note and free > 20:
         draw_text(head, shorten(note, free, _TEXT), width - 4, 5, _TEXT, MUTED, align="right")
     body = picture.copy()
-    body[[0, -1]] = SUNKEN  # an edge where a picture is as dark as the ground
+    body[[0, -1]] = PANEL_BACKGROUND  # an edge for pictures as dark as the background
     return np.concatenate([head, body, below])
 
 
-# ---- Work done ahead of its use, in a second thread: Warp's kernels release the interpreter, so two cores are used.
-
+# ---- prefetching
 
 T = TypeVar("T")
 
-_WAIT = 0.2  # [s] between two looks at whether the reader has gone
+_POLL_INTERVAL = 0.2  # [s] between checks whether the reader has stopped
 
 
-class Prefetched(Generic[T]):
-    """Iterates over `items`, which a thread computes up to `depth` items ahead, from the moment of entering the block.
+class Prefetcher(Generic[T]):
+    """Iterates over `items`, which a thread computes up to `depth` items ahead from entering the block on.
 
-    An exception in the thread is raised where the next item is asked for. Leaving the block stops the thread.
+    Warp kernels release the GIL, so this uses a second core. An exception in the thread is raised at the next item.
+    Leaving the block stops the thread.
     """
 
     def __init__(self, items: Iterator[T], depth: int):
@@ -317,18 +309,18 @@ class Prefetched(Generic[T]):
                 if self._stop.is_set():
                     return
             self._put((False, None))
-        except BaseException as error:  # handed on, whatever it is
+        except BaseException as error:  # raised again in the reader
             self._put((False, error))
 
     def _put(self, entry: tuple[bool, T | BaseException | None]) -> None:
         while not self._stop.is_set():
             try:
-                self._queue.put(entry, timeout=_WAIT)
+                self._queue.put(entry, timeout=_POLL_INTERVAL)
                 return
             except queue.Full:
                 continue
 
-    def __enter__(self) -> "Prefetched[T]":
+    def __enter__(self) -> "Prefetcher[T]":
         self._thread.start()
         return self
 

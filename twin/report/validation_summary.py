@@ -1,8 +1,7 @@
-"""What a validation says: success per policy and lighting, why and where episodes failed, and who beats whom.
+"""Summary of a validation: success per policy and lighting, causes of failure, and paired comparisons of policies.
 
-*Paired* episodes are those of one lighting and seed that two policies both drove; only where one succeeded and the
-other failed do they differ, and whether the one does so more often than the other is a fair coin's question: the exact
-McNemar test.
+`results` is the content of `summary.json` (see `summarize` and `twin.validate`). Paired episodes share lighting and
+seed; the exact McNemar test compares the numbers of episodes in which only one of two policies succeeded.
 """
 
 from collections import Counter
@@ -17,90 +16,84 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from twin.config import ANY, HELD_OUT, RANDOMISED, TRAINING
-from twin.errors import listing
+from twin.config import ANY, HELD_OUT, RANDOMIZED, TRAINING
+from twin.errors import join_names
 from twin.evaluation.forecasting import Estimate
-from twin.evaluation.statistics import share
+from twin.evaluation.statistics import rate_summary
 from twin.evaluation.trials import CAUSES, Trial, tally
 from twin.mjcf.world import World, point_at
 from twin.report.figures import corridor_outline
-from twin.report.forecast_summary import show
+from twin.report.forecast_summary import format_estimate
 from twin.report.html import Caution, Verdict
 
-# ---- What a validation says in words: why episodes failed, who is better, what the numbers cannot tell. No HTML here.
-#
-# `said` is what `summary.json` holds, see `validation.summary` and `twin.validate`.
-
-
-LUCK = 0.1
-"""A paired difference that luck alone would bring more often than this is called within chance."""
-FEW = 30
-"""Episodes in a cell below which the intervals are called wide."""
+MAX_P_VALUE = 0.1
+"""Paired differences with a larger p-value are reported as within chance."""
+FEW_EPISODES = 30
+"""Number of episodes in a cell below which a caution about wide intervals is given."""
 FAILURES = {
-    "collision": ("hit something", "touched anything solid but the ground"),
-    "out_of_bounds": ("left the corridor", "its middle was more than half the corridor’s width off the route"),
-    "timeout": ("ran out of time", "drove on without arriving within the time limit"),
+    "collision": ("hit something", "touched anything solid except the ground"),
+    "out_of_bounds": ("left the corridor", "its center was more than half the corridor’s width off the route"),
+    "timeout": ("ran out of time", "did not reach the goal within the time limit"),
     "rollover": ("rolled over", "tipped onto its side"),
     "stuck": ("got stuck", "stood still too long"),
 }
-"""Cause of failure → what it is called, and what it means."""
-LIGHTS = {
-    HELD_OUT: "another light for every episode, drawn from those that no training may show",
-    TRAINING: "another light for every episode, drawn from those that trainings show",
-    ANY: "another light for every episode, any that could have been filmed",
+"""Cause of failure → its name and meaning."""
+LIGHTING_SETS = {
+    HELD_OUT: "another light for every episode, sampled from those reserved for evaluation",
+    TRAINING: "another light for every episode, sampled from those used in training",
+    ANY: "another light for every episode, sampled from all that could have been filmed",
 }
-"""Lightings that are sets, explained."""
+"""Lightings that are sets → their meaning."""
 
-_GOOD, _MIXED = 0.9, 0.5
-
-
-def percent(rate: dict[str, Any]) -> str:
-    """ "93% (87% to 96%)", or a dash where there was nothing to count."""
-    return show(Estimate(rate["rate"], rate["low"], rate["high"], rate["trials"]), percent=True)
+_GOOD_RATE, _MIXED_RATE = 0.9, 0.5
 
 
-def why(cell: dict[str, Any]) -> str:
-    """ "9 left the corridor, 2 hit something", most first; empty where none failed."""
+def rate_text(rate: dict[str, Any]) -> str:
+    """Formats a rate as "93% (87% to 96%)", or as a dash if there are no trials."""
+    return format_estimate(Estimate(rate["rate"], rate["low"], rate["high"], rate["trials"]), percent=True)
+
+
+def failure_text(cell: dict[str, Any]) -> str:
+    """Formats the causes of failure, most frequent first, for instance "9 left the corridor, 2 hit something"."""
     causes = sorted(cell["causes"].items(), key=lambda item: -item[1])
     return ", ".join(f"{n} {FAILURES[cause][0]}" for cause, n in causes)
 
 
-def light_words(lighting: str) -> str:
-    """What a lighting of the tables is."""
-    if lighting.endswith(RANDOMISED):
-        plain = light_words(lighting.removesuffix(RANDOMISED))
+def lighting_text(lighting: str) -> str:
+    if lighting.endswith(RANDOMIZED):
+        plain = lighting_text(lighting.removesuffix(RANDOMIZED))
         return (
-            f"{plain}; and for every episode another sun, other shadows, haze unless a photo told the air, things "
-            "beside the corridor, and another robot but for what is known of yours"
+            f"{plain}; and for every episode another sun, other shadows, haze unless a photo determines it, objects "
+            "beside the corridor, and other robot parameters except for the identified ones"
         )
     if lighting.startswith("drawn_"):
-        return f"light number {lighting[6:]} of those drawn in the search"
+        return f"light number {lighting[6:]} of those sampled in the search"
     if lighting.count(":") == 2:
         a, b, part = lighting.split(":")
         return f"{float(part):.0%} of the way from {a} to {b}"
-    return LIGHTS.get(lighting, "this one light in every episode")
+    return LIGHTING_SETS.get(lighting, "the same light in every episode")
 
 
-def trained_words(trained: dict[str, Any]) -> str:
-    """What a training was: "on straight, in varying light"."""
+def training_text(trained: dict[str, Any]) -> str:
+    """Describes a training, for instance "on straight, in varying light"."""
     if trained["observe"] == "simulator":
         return f"on {trained['task']}, from MuJoCo’s picture of the mesh"
     light = "in varying light" if trained["lighting"] in (TRAINING, ANY) else f"in the light {trained['lighting']}"
     return f"on {trained['task']}, {light}"
 
 
-def verdicts(said: dict[str, Any]) -> list[Verdict]:
-    """The headlines: for every task who arrives most often and where it fares worst."""
+def verdicts(results: dict[str, Any]) -> list[Verdict]:
+    """The headlines: the best policy of every task and its worst lighting."""
     out = []
-    for task in tasks(said):
+    for task in tasks(results):
         by_policy: dict[str, list[dict[str, Any]]] = {}
-        for cell in said["cells"]:
+        for cell in results["cells"]:
             if cell["task"] == task:
                 by_policy.setdefault(cell["policy"], []).append(cell)
-        # Only lightings that all have driven in compare them fairly.
+        # Only lightings in which all policies drove compare them fairly.
         common = set.intersection(*({c["lighting"] for c in cells} for cells in by_policy.values()))
         if not common:
-            out.append(Verdict(f"On {task} no lighting was driven in by all policies: there is no best one.", "mixed"))
+            out.append(Verdict(f"On {task} no lighting was used for all policies: there is no best one.", "mixed"))
             continue
         means = {
             policy: sum(c["rate"] for c in cells if c["lighting"] in common) / len(common)
@@ -112,110 +105,110 @@ def verdicts(said: dict[str, Any]) -> list[Verdict]:
         tied = [policy for policy in means if means[policy] == means[best] and policy != best]
         lead = " most often" if len(by_policy) > 1 and not tied else ""
         text = f"On {task}, {best} reaches the goal{lead}: in {won} of {of} episodes"
-        every = dict.fromkeys(c["lighting"] for c in said["cells"] if c["task"] == task)
+        every = dict.fromkeys(c["lighting"] for c in results["cells"] if c["task"] == task)
         if len(common) < len(every):
-            text += f" in the light that all have driven in ({listing(name for name in every if name in common)})"
-        text += f", and so does {listing(tied)} as often" if tied else ""
+            text += (
+                f" in the light that was used for all policies ({join_names(name for name in every if name in common)})"
+            )
+        text += f", and so does {join_names(tied)} as often" if tied else ""
         weakest = min(cells, key=lambda c: c["rate"])
         if weakest["rate"] < max(c["rate"] for c in cells):
             text += f"; least often in the light {weakest['lighting']}, {weakest['successes']} of {weakest['trials']}"
-        mood = "good" if means[best] >= _GOOD else "mixed" if means[best] >= _MIXED else "bad"
+        mood = "good" if means[best] >= _GOOD_RATE else "mixed" if means[best] >= _MIXED_RATE else "bad"
         out.append(Verdict(f"{text}.", mood))
-    low, of = (sum(c[k]["trials"] for c in said["cells"]) for k in ("low_trust", "trusted"))
+    low, of = (sum(c[k]["trials"] for c in results["cells"]) for k in ("low_trust", "trusted"))
     if low:
-        text = f"In {low} of {low + of} episodes the pictures are not to be trusted; they are counted apart below."
+        text = f"In {low} of {low + of} episodes the pictures are not trusted; these are counted separately below."
         out.append(Verdict(text, "mixed"))
     return out
 
 
-def pair_words(pair: dict[str, Any]) -> str:
-    """Whether a paired difference is more than luck."""
+def pair_text(pair: dict[str, Any]) -> str:
     if pair["only_a"] == pair["only_b"]:
         return "no difference"
     return (
-        "within chance" if pair["p"] > LUCK else f"{'first' if pair['only_a'] > pair['only_b'] else 'second'} is better"
+        "within chance"
+        if pair["p"] > MAX_P_VALUE
+        else f"{'first' if pair['only_a'] > pair['only_b'] else 'second'} is better"
     )
 
 
-def chance_words(p: float) -> str:
-    """How often luck alone would do it."""
-    return "<0.1%" if p < 0.001 else f"{100 * p:.1f}%" if p < LUCK else f"{p:.0%}"
+def p_value_text(p: float) -> str:
+    return "<0.1%" if p < 0.001 else f"{100 * p:.1f}%" if p < MAX_P_VALUE else f"{p:.0%}"
 
 
-def unknowns(said: dict[str, Any]) -> list[Caution]:
-    """What the numbers cannot tell, and what would."""
+def limitations(results: dict[str, Any]) -> list[Caution]:
+    """Limits of the validation, with cures."""
     out = [
         Caution(
-            "Success here is success in the twin. How often it means success on the road is another question.",
+            "These rates are success in the twin. Success on the road was not measured here.",
             "drive some of the policies on the road and run python -m twin.forecast.",
         )
     ]
-    few = [c for c in said["cells"] if c["trials"] < FEW]
+    few = [c for c in results["cells"] if c["trials"] < FEW_EPISODES]
     if few:
         smallest = min(c["trials"] for c in few)
         out.append(
             Caution(
-                f"{len(few)} of {len(said['cells'])} rates come from fewer than {FEW} episodes (the least: "
+                f"{len(few)} of {len(results['cells'])} rates come from fewer than {FEW_EPISODES} episodes (minimum: "
                 f"{smallest}), so their intervals are wide.",
-                "run the same command with more --episodes; what was driven is kept.",
+                "run the same command with more --episodes; earlier episodes are kept.",
             )
         )
-    drawn = dict.fromkeys(c["lighting"] for c in said["cells"] if c["lighting"].endswith(RANDOMISED))
-    if drawn and not said.get("robot_known"):
+    drawn = dict.fromkeys(c["lighting"] for c in results["cells"] if c["lighting"].endswith(RANDOMIZED))
+    if drawn and not results.get("robot_known"):
         out.append(
             Caution(
-                f"What your robot does: under {listing(drawn)} another one drives every episode, for nothing is known "
-                "of yours.",
-                "log five minutes of driving, run python -m twin.align, build again and validate anew.",
+                f"The result may differ for your robot: under {join_names(drawn)} another one drives every episode, "
+                "because none of its parameters are identified.",
+                "log five minutes of driving, run python -m twin.align, build again and validate again.",
             )
         )
-    searched = {(w["policy"], w["task"]) for w in said.get("worst", [])}
-    left = dict.fromkeys(c["policy"] for c in said["cells"] if (c["policy"], c["task"]) not in searched)
+    searched = {(w["policy"], w["task"]) for w in results.get("worst", [])}
+    left = dict.fromkeys(c["policy"] for c in results["cells"] if (c["policy"], c["task"]) not in searched)
     if left:
         out.append(
             Caution(
-                f"The worst light that {listing(left)} might meet was not searched for.",
+                f"The worst light that {join_names(left)} might meet was not searched for.",
                 "run the same command with --worst.",
             )
         )
     return out
 
 
-def tasks(said: dict[str, Any]) -> list[str]:
-    return list(dict.fromkeys(c["task"] for c in said["cells"]))
+def tasks(results: dict[str, Any]) -> list[str]:
+    return list(dict.fromkeys(c["task"] for c in results["cells"]))
 
 
 matplotlib.use("Agg")
 
 TRUSTED = 0.8
-"""Episodes whose pictures have less trust than this on average are counted apart."""
+"""Episodes with a lower mean trust of their pictures are counted separately."""
 
-_BIN = 2.0  # [m] of the route, within which failures are counted together
+_BIN = 2.0  # [m] bin of the route in the failure histogram
 _COLORS = dict(zip(CAUSES[1:], ("#d62728", "#ff7f0e", "#7f7f7f", "#9467bd", "#8c564b"), strict=True))
 
 
-def rate(trials: Sequence[Trial]) -> dict[str, Any]:
-    """`share` of trials."""
-    return share(sum(t.success for t in trials), len(trials))
+def success_rate(trials: Sequence[Trial]) -> dict[str, Any]:
+    return rate_summary(sum(t.success for t in trials), len(trials))
 
 
-def summary(trials: Sequence[Trial]) -> dict[str, Any]:
-    """All that is said of trials, JSON-able."""
+def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
     cells = []
     for cell in tally(trials):
-        mine = [t for t in trials if (t.policy, t.task, t.lighting) == cell.key]
-        trusted = [t for t in mine if t.trust is not None and t.trust >= TRUSTED]
+        own = [t for t in trials if (t.policy, t.task, t.lighting) == cell.key]
+        trusted = [t for t in own if t.trust is not None and t.trust >= TRUSTED]
         cells.append(
             {"policy": cell.policy, "task": cell.task, "lighting": cell.lighting}
-            | rate(mine)
-            | {"causes": {c: n for c, n in Counter(t.cause for t in mine).items() if c != "goal"}}
-            | {"trusted": rate(trusted), "low_trust": rate([t for t in mine if t not in trusted])}
+            | success_rate(own)
+            | {"causes": {c: n for c, n in Counter(t.cause for t in own).items() if c != "goal"}}
+            | {"trusted": success_rate(trusted), "low_trust": success_rate([t for t in own if t not in trusted])}
         )
-    return {"confidence": 0.9, "trusted_from": TRUSTED, "cells": cells, "pairs": pairs(trials)}
+    return {"confidence": 0.9, "trusted_from": TRUSTED, "cells": cells, "pairs": compare_pairs(trials)}
 
 
-def pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Every two policies on the episodes that both drove, if there are any."""
+def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """Compares every two policies on the episodes that both drove, if there are any."""
     by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
     for t in trials:
         by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
@@ -223,8 +216,8 @@ def pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     for (task, a), (other, b) in combinations(by_policy, 2):
         if task != other:
             continue
-        mine, theirs = by_policy[task, a], by_policy[task, b]
-        both = [(mine[key], theirs[key]) for key in mine if key in theirs]
+        first, second = by_policy[task, a], by_policy[task, b]
+        both = [(first[key], second[key]) for key in first if key in second]
         if not both:
             continue
         only_a, only_b = sum(x and not y for x, y in both), sum(y and not x for x, y in both)
@@ -236,25 +229,24 @@ def pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
 
 
 def typical_episode(trials: Sequence[Trial]) -> Trial:
-    """The episode whose way driven is the median; of an even number, the further one of the two in the middle."""
+    """The episode with the median progress; the upper one of an even number."""
     return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
 
 
 def worst_episode(trials: Sequence[Trial]) -> Trial:
-    """The failed episode that got least far; where none failed, the one whose pictures are trusted least."""
+    """The failed episode with the least progress; if none failed, the one with the lowest trust."""
     failed = [t for t in trials if not t.success]
     if failed:
         return min(failed, key=lambda t: t.progress)
     return min(trials, key=lambda t: 1.0 if t.trust is None else t.trust)
 
 
-def lines(said: dict[str, Any]) -> list[str]:
-    """The summary as a table for a terminal."""
+def summary_lines(results: dict[str, Any]) -> list[str]:
     out = []
-    wide = max((len(c["policy"]) for c in said["cells"]), default=0)
-    light = max((len(c["lighting"]) for c in said["cells"]), default=0)
-    for c in said["cells"]:
-        causes = why(c)
+    wide = max((len(c["policy"]) for c in results["cells"]), default=0)
+    light = max((len(c["lighting"]) for c in results["cells"]), default=0)
+    for c in results["cells"]:
+        causes = failure_text(c)
         out.append(
             f"{c['policy']:{wide}}  {c['task']}  {c['lighting']:{light}}  {c['successes']:3d}/{c['trials']:<3d} = "
             f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})" + (f"  {causes}" if causes else "")
@@ -263,32 +255,25 @@ def lines(said: dict[str, Any]) -> list[str]:
         if low["trials"]:
             t = c["trusted"]
             out.append(
-                f"{'':{wide}}  where the pictures are trusted {t['successes']}/{t['trials']}, "
-                f"elsewhere {low['successes']}/{low['trials']}"
+                f"{'':{wide}}  trusted pictures {t['successes']}/{t['trials']}, "
+                f"others {low['successes']}/{low['trials']}"
             )
-    for p in said["pairs"]:
+    for p in results["pairs"]:
         out.append(
             f"{p['a']} against {p['b']}, {p['task']}, the same {p['episodes']} episodes: only the first succeeded in "
             f"{p['only_a']}, only the second in {p['only_b']} (p = {p['p']:.2g})"
         )
-    for w in said.get("worst", []):
+    for w in results.get("worst", []):
         out.append(
-            f"{w['policy']}, {w['task']}: of {w['of']} lights drawn it fares worst in {w['lighting']}, in fresh "
+            f"{w['policy']}, {w['task']}: of {w['of']} sampled lights the worst is {w['lighting']}, in new "
             f"episodes {w['successes']}/{w['trials']} ({w['low']:.2f} to {w['high']:.2f})"
         )
     return out
 
 
-def failure_map(path: Path, trials: Sequence[Trial], world: World, stretch: tuple[float, float]) -> None:
-    """Draws where on the route episodes ended that failed.
-
-    Args:
-        path: The PNG.
-        trials: Of one task.
-        world: Route and corridor.
-        stretch: Start and end of the task on the route [m].
-    """
-    start, end = stretch
+def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tuple[float, float]) -> None:
+    """Plots where on the route the failed episodes of a task ended; `segment` is the task on the route [m]."""
+    start, end = segment
     line = point_at(world.route[:, :2], np.append(np.arange(start, end, 0.5), end))
     edges = np.arange(0.0, end - start + _BIN, _BIN)
     failed = {cause: [t.progress for t in trials if t.cause == cause] for cause in CAUSES[1:]}
@@ -304,10 +289,10 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, stretch: tupl
             name, at, xytext=(0, 10), textcoords="offset points", ha="center", fontsize=9, annotation_clip=False
         )
     before: NDArray = np.zeros(len(edges) - 1)
-    for cause, ways in failed.items():
-        if not ways:
+    for cause, distances in failed.items():
+        if not distances:
             continue
-        count = np.histogram(np.clip(ways, 0.0, edges[-1]), edges)[0]
+        count = np.histogram(np.clip(distances, 0.0, edges[-1]), edges)[0]
         at = point_at(line, edges[:-1] + _BIN / 2)
         above.scatter(*at[count > 0].T, s=30.0 * count[count > 0], color=_COLORS[cause], alpha=0.6, linewidths=0)
         along.bar(
@@ -318,14 +303,14 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, stretch: tupl
             align="edge",
             edgecolor="white",
             color=_COLORS[cause],
-            label=f"{FAILURES[cause][0]} ({len(ways)})",
+            label=f"{FAILURES[cause][0]} ({len(distances)})",
         )
         before = before + count
-    lost = sum(len(ways) for ways in failed.values())
-    above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{lost} of {len(trials)} episodes failed")
-    along.set(xlabel="way along the task [m]", ylabel="failed episodes", xlim=(0.0, edges[-1]))
+    failures = sum(len(distances) for distances in failed.values())
+    above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{failures} of {len(trials)} episodes failed")
+    along.set(xlabel="distance along the task [m]", ylabel="failed episodes", xlim=(0.0, edges[-1]))
     along.yaxis.get_major_locator().set_params(integer=True)
-    if lost:
+    if failures:
         along.legend(frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)

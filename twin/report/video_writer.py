@@ -1,7 +1,7 @@
-"""H.264 films that any player opens, written without a display or a system codec.
+"""Writes and reads H.264 mp4 videos with PyAV; needs no display and no system codec.
 
-A *frame* is RGB uint8, shape (height, width, 3). Films are yuv420p in BT.709 (which every browser plays), have even
-sizes, and carry their index at the front so that playing starts before the whole file has arrived.
+Frames are RGB uint8, shape (height, width, 3). Videos are yuv420p in BT.709 (every browser plays it), have even sides,
+and store their index first, so that playback starts before the download ends.
 """
 
 import io
@@ -18,33 +18,33 @@ from PIL import Image
 
 _BT709 = 1  # ITU-T H.273: matrix, primaries and transfer all number BT.709 as 1
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
-_THREADS = 4  # of x264, whose bytes depend on their number; left alone, it takes as many as the machine has cores free
+_THREADS = 4  # x264 threads; fixed, because the encoded bytes depend on the number of threads
 
 
 def even(size: int) -> int:
-    """The next even number at or below `size`, at least 2: 4:2:0 halves both sides of the chroma planes."""
+    """Largest even number up to `size`, at least 2; 4:2:0 chroma subsampling needs even sides."""
     return max(2, size // 2 * 2)
 
 
 class VideoWriter:
-    """Writes an mp4 frame by frame; a context manager.
+    """Context manager that writes an mp4 frame by frame.
 
-    The film is written as `<name>.partial` and renamed on a clean exit, so a reader never sees half of one; an
-    exception inside the block removes the partial file.
+    The video is written as `<name>.partial` and renamed on a clean exit, so that a reader never finds an incomplete
+    file. An exception inside the block removes the partial file.
 
     Args:
-        path: Where the finished mp4 goes.
+        path: The finished mp4.
         size: Width, height [px] of every frame; both even.
         fps: Frames per second.
         crf: Constant rate factor of x264: 18 looks lossless, 23 is its default, 28 is small.
 
     Raises:
-        ValueError: An odd size.
+        ValueError: A side is odd or below 2.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int, crf: int = 23):
         if size[0] % 2 or size[1] % 2 or min(size) < 2:
-            raise ValueError(f"film size {size[0]}×{size[1]}: expected even sides, see `even`")
+            raise ValueError(f"video size {size[0]}×{size[1]}: expected even sides, see `even`")
         self.path = path
         self.size = size
         self.fps = fps
@@ -52,7 +52,7 @@ class VideoWriter:
         self._partial = path.with_name(path.name + ".partial")
         self._container = av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
         self._stream = self._container.add_stream("libx264", rate=Fraction(fps))
-        # One key frame a second, so that a viewer can jump about in the film.
+        # One key frame per second allows seeking.
         self._stream.options = {"crf": str(crf), "preset": "veryfast", "g": str(fps)}
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
@@ -65,7 +65,7 @@ class VideoWriter:
         """Appends a frame, shown for `count` frame times.
 
         Raises:
-            ValueError: A frame of another shape or type.
+            ValueError: The frame has another shape or dtype.
         """
         width, height = self.size
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
@@ -98,23 +98,22 @@ class VideoWriter:
 
 
 def read_frames(path: Path, every: int = 1) -> Iterator[NDArray[np.uint8]]:
-    """Every `every`-th frame of a film, in order."""
     with av.open(str(path)) as container:
         for i, frame in enumerate(container.decode(video=0)):
             if i % every == 0:
                 yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
 
 
-def last_frame(path: Path, width: int = 640, quality: int = 80) -> bytes:
-    """The last picture of a film as a JPEG of this width [px]."""
+def last_frame_jpeg(path: Path, width: int = 640, quality: int = 80) -> bytes:
+    """Returns the last frame of a video as a JPEG of the given width [px]."""
     frame = Image.fromarray(deque(read_frames(path), maxlen=1)[0])
     out = io.BytesIO()
     frame.resize((width, round(width * frame.height / frame.width))).save(out, "JPEG", quality=quality)
     return out.getvalue()
 
 
-def describe(path: Path) -> dict[str, str | int | float]:
-    """What a film is: codec, pixel format, width, height [px], fps, frames."""
+def video_info(path: Path) -> dict[str, str | int | float]:
+    """Returns codec, pixel format, width, height [px], fps and number of frames of a video."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         return {

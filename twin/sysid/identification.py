@@ -1,7 +1,7 @@
-"""The whole alignment of a robot to a log, and what is written of it.
+"""System identification of a robot from a log, and the text of `robot.toml`.
 
-`robot.toml` gets what the log identified, one line each with its standard error, beside what stood there before; the
-rest of the robot stays as published or as `scene.toml` says. `align.json` has every figure.
+`robot.toml` has a line with value and standard error for each identified field, after the fields that it had before;
+all others keep their published values or those of `scene.toml`. `align.json` has all numbers.
 """
 
 from collections.abc import Callable
@@ -14,14 +14,14 @@ import numpy as np
 from twin.files import toml_string
 from twin.robot import HuskyParams
 from twin.sysid import rollout, tires
-from twin.sysid.drivetrain import Drivetrain, fit_drive
+from twin.sysid.drivetrain import Drivetrain, fit_drivetrain
 from twin.sysid.estimation import Fit
-from twin.sysid.kinematics import NOMINAL, Icr, Prediction, fit_icr, predict
-from twin.sysid.logs import Windows, without_acceleration
-from twin.sysid.plots import steady, track_ratios
+from twin.sysid.kinematics import NOMINAL, IcrModel, Prediction, fit_icr, predict
+from twin.sysid.logs import Windows
+from twin.sysid.plots import steady_windows, track_ratios
 from twin.types import Array
 
-_DRIVE_FIELDS = {  # a field of HuskyParams → what of the drive shows it
+_DRIVE_FIELDS = {  # field of HuskyParams → parameter of the drivetrain that determines it
     "separation_multiplier": ("half_gain",),
     "max_yaw_rate": ("half_limit",),
     "max_wheel_speed": ("wheel_limit",),
@@ -30,7 +30,7 @@ _DRIVE_FIELDS = {  # a field of HuskyParams → what of the drive shows it
     "max_yaw_acceleration": ("half_acceleration",),
     "servo_lag": ("lag",),
 }
-_GROUND_FIELDS = {
+_GROUND_FIELDS = {  # field of HuskyParams → parameters of `tires`
     "friction": ("friction",),
     "spin_friction": ("spin_friction",),
     "rolling_resistance": ("rolling_resistance",),
@@ -40,41 +40,40 @@ _GROUND_FIELDS = {
     "wheel_radius": ("radius_left", "radius_right"),
     "servo_gain": ("log10_servo_gain",),
 }
-_UNSEEN = "the log's commands are wheel speeds, so it never meets the controller's own multiplier; needs v and ω"
+_NO_TWIST = "the log's commands are wheel speeds, which bypass the controller's own multiplier; needs v and ω"
 
 
 @dataclass(frozen=True)
-class Alignment:
-    """What a log says of a robot."""
+class Identification:
+    """A robot identified from a log, with predictions of the log."""
 
     windows: Windows
-    icr: Icr
-    drive: Drivetrain
+    icr: IcrModel
+    drivetrain: Drivetrain
     drive_fit: Fit
     ground_fit: Fit
     robot: HuskyParams
-    """With everything the log identified in place."""
     nominal: Prediction
     baseline: Prediction
     fitted: Prediction
     level: Prediction
-    """As fitted, the ground taken for level."""
+    """As fitted, on level ground."""
 
     @property
     def identified(self) -> dict[str, tuple[float | tuple[float, ...], float | tuple[float | None, ...]]]:
-        """Fields of HuskyParams that the log identified: value and standard error, a number each or as many.
+        """Identified fields of HuskyParams: value and standard error, each a number or a tuple.
 
-        Errors of yaw rate and acceleration are those at the separation multiplier found; of a vector's components
-        those that were not fitted have None.
+        Errors of yaw rate and yaw acceleration hold at the fitted separation multiplier. In a tuple of errors, None
+        marks components that are not identified.
         """
         out: dict[str, tuple[Any, Any]] = {}
         twist = self.windows.twist
-        here = self.drive.robot(self.robot, twist)
+        here = self.drivetrain.robot_fields(self.robot, twist)
         for field, (name,) in _DRIVE_FIELDS.items():
             if name in self.drive_fit.errors and (twist or field != "separation_multiplier"):
-                # Every field is in proportion to what shows it.
-                off = replace(self.drive, **{name: getattr(self.drive, name) + self.drive_fit.errors[name]})
-                out[field] = getattr(self.robot, field), abs(off.robot(self.robot, twist)[field] - here[field])
+                # Every field is proportional to its parameter.
+                off = replace(self.drivetrain, **{name: getattr(self.drivetrain, name) + self.drive_fit.errors[name]})
+                out[field] = getattr(self.robot, field), abs(off.robot_fields(self.robot, twist)[field] - here[field])
         for field, names in _GROUND_FIELDS.items():
             errors: list[Any] = [self.ground_fit.errors.get(name) for name in names]
             if all(error is None for error in errors):
@@ -89,14 +88,14 @@ class Alignment:
 
     @property
     def refused(self) -> list[str]:
-        """One line per parameter that the log does not show."""
+        """One line per parameter that the log does not identify."""
         lines = [*self.drive_fit.refused.values(), *self.ground_fit.refused.values()]
         if not self.windows.twist:
-            lines.append(f"separation_multiplier = {self.robot.separation_multiplier:g}: {_UNSEEN}")
+            lines.append(f"separation_multiplier = {self.robot.separation_multiplier:g}: {_NO_TWIST}")
         return lines
 
     def figures(self) -> dict[str, Any]:
-        """Every figure, for JSON."""
+        """All numbers, for JSON."""
         windows = self.windows
         fitting, scoring = windows.fitting, ~windows.fitting
         predictions = {
@@ -105,30 +104,30 @@ class Alignment:
             "fitted": self.fitted,
             "fitted_on_level_ground": self.level,
         }
-        use = steady(windows)
-        real = track_ratios(windows.wheels, windows.poses[:, -1], windows.elapsed[:, -1])[use]
-        ours = track_ratios(windows.wheels, self.fitted.ends, windows.elapsed[:, -1])[use]
+        use = steady_windows(windows)
+        measured_ratios = track_ratios(windows.wheels, windows.poses[:, -1], windows.elapsed[:, -1])[use]
+        fitted_ratios = track_ratios(windows.wheels, self.fitted.ends, windows.elapsed[:, -1])[use]
         scores = {
-            name: {"fitted_to": p.score(fitting).told(), "held_out": p.score(scoring).told()}
+            name: {"fitted_to": p.score(fitting).rounded(), "held_out": p.score(scoring).rounded()}
             for name, p in predictions.items()
         }
-        ours_held, theirs = self.fitted.score(scoring), self.baseline.score(scoring)
+        fitted, baseline = self.fitted.score(scoring), self.baseline.score(scoring)
         return {
             "windows": {"fitted_to": int(fitting.sum()), "held_out": int(scoring.sum())},
             "scores": scores,
             "better_than_icr": {
-                "position": round(1 - ours_held.position_m / theirs.position_m, 4),
-                "yaw": round(1 - ours_held.yaw_deg / theirs.yaw_deg, 4),
+                "position": round(1 - fitted.position_m / baseline.position_m, 4),
+                "yaw": round(1 - fitted.yaw_deg / baseline.yaw_deg, 4),
             },
-            "track_ratio": {"measured": _quantiles(real), "fitted": _quantiles(ours)},
+            "track_ratio": {"measured": _quantiles(measured_ratios), "fitted": _quantiles(fitted_ratios)},
             "slope_deg": _quantiles(np.degrees(np.hypot(*self.slope.T) / rollout.GRAVITY)),
             "robot": {
                 name: {"value": _plain(value), "standard_error": _plain(error)}
                 for name, (value, error) in self.identified.items()
             },
             "log": {
-                "mean_gain": round(self.drive.mean_gain, 4),
-                "half_gain": round(self.drive.half_gain, 4),
+                "mean_gain": round(self.drivetrain.mean_gain, 4),
+                "half_gain": round(self.drivetrain.half_gain, 4),
                 "pose_x_m": round(self.ground_fit.values["pose_x"], 4),
                 "pose_y_m": round(self.ground_fit.values["pose_y"], 4),
                 "pose_late_s": round(self.ground_fit.values["pose_late"], 4),
@@ -138,78 +137,84 @@ class Alignment:
 
     @property
     def slope(self) -> Array:
-        """Gravity along x and y [m/s²], shape (n, 2); see `slope.gravity`."""
-        return rollout.gravity(self.windows, self.icr)
+        """Gravity along x and y [m/s²], shape (n, 2); see `rollout.slope_gravity`."""
+        return rollout.slope_gravity(self.windows, self.icr)
 
 
-def align(
+def identify(
     windows: Windows,
     params: HuskyParams,
     use_slope: bool = True,
     progress: Callable[[str], None] = lambda _: None,
-) -> Alignment:
-    """Fits baseline, drive, tyres and ground to the even groups of a log that `checks.check` let pass, and predicts all
-    of it."""
+) -> Identification:
+    """Fits baseline, drivetrain, tires and ground to the even groups of a log, and predicts all of it.
+
+    Args:
+        use_slope: Estimate the slope of the ground from accelerations; False: level ground.
+    """
     if not use_slope:
-        windows = without_acceleration(windows)
+        windows = replace(windows, acceleration=None)
     icr = fit_icr(windows)
     progress("commands and wheel speeds")
-    drive, drive_fit = fit_drive(windows, params)
-    tilt = rollout.gravity(windows, icr)
-    ground_fit = tires.fit_ground(params, drive, windows, tilt, progress)
-    robot = tires.robot(params, ground_fit.values)
-    seen: dict[str, Any] = {
+    drivetrain, drive_fit = fit_drivetrain(windows, params)
+    slope = rollout.slope_gravity(windows, icr)
+    ground_fit = tires.fit_ground(params, drivetrain, windows, slope, progress)
+    robot = tires.robot_with_values(params, ground_fit.values)
+    identified: dict[str, Any] = {
         field: value
-        for field, value in drive.robot(params, windows.twist).items()
+        for field, value in drivetrain.robot_fields(params, windows.twist).items()
         if _DRIVE_FIELDS[field][0] in drive_fit.errors and (windows.twist or field != "separation_multiplier")
     }
-    robot = replace(robot, **seen)
+    robot = replace(robot, **identified)
     progress("predicting every window")
 
-    def prediction(name: str, under: Array) -> Prediction:
-        out = tires.simulated(params, ground_fit.values, drive, windows, under)
+    def prediction(name: str, gravity: Array) -> Prediction:
+        out = tires.simulate_log(params, ground_fit.values, drivetrain, windows, gravity)
         return Prediction(name, windows, out.poses, out.wheels)
 
-    fitted = prediction("fitted MJCF", tilt)
-    return Alignment(
+    fitted = prediction("fitted MJCF", slope)
+    return Identification(
         windows,
         icr,
-        drive,
+        drivetrain,
         drive_fit,
         ground_fit,
         robot,
         Prediction("nominal kinematics", windows, predict(NOMINAL, windows)),
         Prediction("ICR kinematics", windows, predict(icr, windows)),
         fitted,
-        prediction("fitted, level ground", np.zeros_like(tilt)) if np.any(tilt) else fitted,
+        prediction("fitted, level ground", np.zeros_like(slope)) if np.any(slope) else fitted,
     )
 
 
-def robot_toml(alignment: Alignment, kept: dict[str, Any], log: str) -> str:
-    """The text of a `robot.toml`: what was identified, after what stood there before and still holds."""
-    scoring = int((~alignment.windows.fitting).sum())
-    ours = alignment.fitted.score(~alignment.windows.fitting)
-    told = (
-        f"Fitted to {Path(log).name} by python -m twin.align; on {scoring} windows it was not fitted to the robot is "
-        f"off by {ours.position_m:.3f} m and {ours.yaw_deg:.1f}° after 2 s (median)."
+def robot_toml(identification: Identification, previous: dict[str, Any], log: str) -> str:
+    """The text of a `robot.toml`: identified fields after those of the previous file that remain valid."""
+    scoring = int((~identification.windows.fitting).sum())
+    score = identification.fitted.score(~identification.windows.fitting)
+    comment = (
+        f"Fitted to {Path(log).name} by python -m twin.align; median error after 2 s on {scoring} held-out windows: "
+        f"{score.position_m:.3f} m, {score.yaw_deg:.1f}°."
     )
-    return toml_text(told, kept, alignment.identified)
+    return toml_text(comment, previous, identification.identified)
 
 
-def toml_text(told: str, kept: dict[str, Any], identified: dict[str, tuple[Any, Any]]) -> str:
+def toml_text(comment: str, previous: dict[str, Any], identified: dict[str, tuple[Any, Any]]) -> str:
     """The text of a `robot.toml`.
 
     Args:
-        told: How it came about; is made one line that TOML takes.
-        kept: What stood there before.
-        identified: What goes before that: value and standard error, None where there is none.
+        comment: For the first line; unprintable characters are replaced.
+        identified: Values and standard errors (or None) of fields that replace or follow those.
     """
     lines = [
-        "# " + "".join(c if c.isprintable() else "?" for c in told),
-        *([] if identified else ["# But nothing in it could be identified: what follows stood here before."]),
-        *(f"{name} = {_toml(value)}" for name, value in kept.items() if name not in identified),
+        "# " + "".join(c if c.isprintable() else "?" for c in comment),
         *(
-            f"{name} = {_toml(value)}" + ("" if error is None else f"  # ± {told_error(error)}")
+            []
+            if identified
+            else ["# But nothing in it could be identified; the fields below are those of the previous file."]
+        ),
+        *(f"{name} = {_toml(value)}" for name, value in previous.items() if name not in identified),
+        *(
+            f"{name} = {_toml(value)}" + ("" if error is None else f"  # ± {format_error(error)}")
             for name, (value, error) in identified.items()
         ),
     ]
@@ -229,8 +234,8 @@ def _toml(value: Any) -> str:
     return text if any(c in text for c in ".einf") else text + ".0"
 
 
-def told_error(error: float | tuple[float | None, ...]) -> str:
-    """A standard error in words."""
+def format_error(error: float | tuple[float | None, ...]) -> str:
+    """A standard error, or those of a tuple's components, as text."""
     each = error if isinstance(error, tuple) else (error,)
     return ", ".join("not fitted" if e is None else f"{e:.2g}" for e in each)
 

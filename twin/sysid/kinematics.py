@@ -1,9 +1,8 @@
-"""Skid steering without dynamics: what wheel speeds alone say of the motion, and how far off that is.
+"""Kinematic models of skid steering, the baseline for the fitted model, and the scores of predictions.
 
-*Nominal*: a differential drive whose wheels roll freely. *ICR model*: each side's tread meets the ground where it does
-not slip at a lateral offset of its own, the instantaneous centre of rotation of that side (Mandow et al. 2007); with a
-factor of slip per side and a common forward offset it is the usual baseline, five numbers, fitted as the MJCF is
-(`robust`).
+*Nominal*: a differential drive whose wheels roll without slip. *ICR model* (Mandow et al. 2007): each side's tread has
+an instantaneous center of rotation at its own lateral offset; with a slip factor per side and a common forward offset
+it has five parameters, fitted with the same robust loss as the MJCF.
 """
 
 from dataclasses import asdict, dataclass
@@ -14,23 +13,23 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from twin.robot import TRACK, WHEEL_RADIUS
-from twin.sysid.estimation import Kinds, in_turns, robust_loss
-from twin.sysid.logs import OLDEST, PERIOD, SAMPLES, Windows, retimed, wrapped
+from twin.sysid.estimation import Kinds, fit_with_scales, robust_loss
+from twin.sysid.logs import MAX_POSE_AGE, PERIOD, SAMPLES, Windows, resample_poses, wrap_angle
 from twin.types import Array
 
-POSE: Kinds = (0, 0, 1)
-"""Of the misses of x, y [m] and yaw [rad]."""
-LOOKS = (SAMPLES // 2, SAMPLES)
-"""Samples of a window at which a model is held against the poses."""
+POSE_KINDS: Kinds = (0, 0, 1)
+"""Residuals of x, y [m] and yaw [rad]."""
+EVALUATED_SAMPLES = (SAMPLES // 2, SAMPLES)
+"""Samples of a window at which predicted and measured poses are compared."""
 
 
 @dataclass(frozen=True)
-class Icr:
-    """The ICR model."""
+class IcrModel:
+    """The ICR model; the defaults are nominal kinematics."""
 
     slip_left: float = 1.0
     slip_right: float = 1.0
-    """Speed of a side's tread over the ground / of its wheels' circumference."""
+    """Speed of a side's tread over the ground / circumferential speed of its wheels."""
     y_left: float = TRACK / 2
     y_right: float = -TRACK / 2
     """[m]"""
@@ -46,11 +45,11 @@ class Icr:
         return np.stack([forward, -self.x * rate, rate], -1)
 
 
-NOMINAL = Icr()
+NOMINAL = IcrModel()
 
 
 def integrate(motion: Array) -> Array:
-    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for motions (n, k, 3) held `PERIOD` [s] each."""
+    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for velocities (n, k, 3) held `PERIOD` [s] each."""
     turned = motion[..., 2] * PERIOD
     yaw = np.concatenate([np.zeros((len(motion), 1)), np.cumsum(turned, 1)], 1)
     middle = yaw[:, :-1] + turned / 2
@@ -61,30 +60,35 @@ def integrate(motion: Array) -> Array:
     return np.stack([np.concatenate([start, x], 1), np.concatenate([start, y], 1), yaw], -1)
 
 
-def predict(model: Icr, windows: Windows) -> Array:
-    """Poses by measured wheel speeds, which are held afterwards, since each window's first pose was measured.
-    Shape (n, k + OLDEST + 1, 3)."""
-    before, after = windows.before[:, -1 - OLDEST : -1], np.repeat(windows.wheels[:, -1:], OLDEST, 1)
+def predict(model: IcrModel, windows: Windows) -> Array:
+    """Poses since each window's first pose was measured, by measured wheel speeds; the last ones are held.
+
+    Shape (n, k + MAX_POSE_AGE + 1, 3).
+    """
+    before, after = (
+        windows.preceding_wheels[:, -1 - MAX_POSE_AGE : -1],
+        np.repeat(windows.wheels[:, -1:], MAX_POSE_AGE, 1),
+    )
     poses = integrate(model.motion(np.concatenate([before, windows.wheels, after], 1)))
-    return retimed(poses, -windows.measured[:, 0], OLDEST)
+    return resample_poses(poses, -windows.measurement_times[:, 0], MAX_POSE_AGE)
 
 
-def fit_icr(windows: Windows) -> Icr:
-    """The ICR model that fits those of the windows best that are for fitting."""
+def fit_icr(windows: Windows) -> IcrModel:
+    """The ICR model fitted to the windows for fitting."""
     start = np.array([1.0, 1.0, 0.5, -0.5, 0.0])
     fitting = windows.fitting
 
-    def missed(x: Array) -> Array:
-        return residuals(predict(Icr(*x), windows), windows)[fitting]
+    def pose_residuals(x: Array) -> Array:
+        return residuals(predict(IcrModel(*x), windows), windows)[fitting]
 
-    def solve(x: Array, unit: Array) -> Array:
-        return least_squares(lambda x: robust_loss(missed(x) / unit).ravel(), x, x_scale=0.1).x
+    def solve(x: Array, scale: Array) -> Array:
+        return least_squares(lambda x: robust_loss(pose_residuals(x) / scale).ravel(), x, x_scale=0.1).x
 
-    return Icr(*in_turns(start, missed, POSE, solve).tolist())
+    return IcrModel(*fit_with_scales(start, pose_residuals, POSE_KINDS, solve).tolist())
 
 
-def at(poses: Array, time: Array) -> Array:
-    """Poses (n, m, 3), `PERIOD` [s] apart, at one time [s] per window, shape (n,), interpolated. Shape (n, 3)."""
+def interpolate_poses(poses: Array, time: Array) -> Array:
+    """Poses (n, m, 3), `PERIOD` [s] apart, interpolated at one time [s] per window (n,). Shape (n, 3)."""
     position = np.clip(time / PERIOD, 0, poses.shape[1] - 1 - 1e-9)
     before = position.astype(int)
     share = (position - before)[:, None]
@@ -93,25 +97,25 @@ def at(poses: Array, time: Array) -> Array:
 
 
 def residuals(predicted: Array, windows: Windows) -> Array:
-    """Predicted minus measured x, y [m] and yaw [rad] at `LOOKS`. Shape (n, looks, 3)."""
+    """Predicted minus measured x, y [m] and yaw [rad] at `EVALUATED_SAMPLES`, shape (n, instants, 3)."""
     elapsed = windows.elapsed
-    error = np.stack([at(predicted, elapsed[:, i]) - windows.poses[:, i] for i in LOOKS], 1)
-    error[..., 2] = wrapped(error[..., 2])
+    error = np.stack([interpolate_poses(predicted, elapsed[:, i]) - windows.poses[:, i] for i in EVALUATED_SAMPLES], 1)
+    error[..., 2] = wrap_angle(error[..., 2])
     return error
 
 
 def end_errors(predicted: Array, windows: Windows) -> tuple[Array, Array]:
-    """Distance [m] and angle [°] between predicted and measured pose at the end of each window, shapes (n,)."""
-    error = at(predicted, windows.elapsed[:, -1]) - windows.poses[:, -1]
-    return np.hypot(error[:, 0], error[:, 1]), np.abs(np.degrees(wrapped(error[:, 2])))
+    """Position error [m] and yaw error [°] at the end of each window, shapes (n,)."""
+    error = interpolate_poses(predicted, windows.elapsed[:, -1]) - windows.poses[:, -1]
+    return np.hypot(error[:, 0], error[:, 1]), np.abs(np.degrees(wrap_angle(error[:, 2])))
 
 
-# ---- How well a prediction meets the windows it was not fitted to. Errors are of the pose at a window's end.
+# ---- scores of predictions
 
 
 @dataclass(frozen=True)
 class Score:
-    """Over windows."""
+    """Errors over several windows; position and yaw are those of the pose at a window's end."""
 
     windows: int
     position_m: float
@@ -123,21 +127,19 @@ class Score:
     wheels_rad_s: float
     """Median over windows, samples and sides."""
 
-    def told(self) -> dict[str, float]:
-        """For JSON, rounded."""
+    def rounded(self) -> dict[str, float]:
+        """All numbers, rounded for JSON."""
         return {name: round(value, 4) for name, value in asdict(self).items()}
 
 
 class Prediction:
-    """What a model makes of every window of a log."""
+    """A model's prediction of every window of a log."""
 
     def __init__(self, name: str, windows: Windows, poses: Array, wheels: Array | None = None) -> None:
         """
         Args:
-            name: For the legend.
-            windows: The log.
-            poses: `PERIOD` apart since each window's first was measured, shape (n, k + OLDEST + 1, 3).
-            wheels: Shape (n, ≥ k, 2); the measured ones where the model is told them.
+            poses: `PERIOD` [s] apart since each window's first was measured, shape (n, k + OLDEST + 1, 3).
+            wheels: Shape (n, ≥ k, 2) [rad/s]; None: the model takes the measured ones.
         """
         self.name = name
         self.windows = windows
@@ -146,8 +148,8 @@ class Prediction:
 
     @cached_property
     def ends(self) -> Array:
-        """Poses when the last one was measured, shape (n, 3)."""
-        return at(self.poses, self.windows.elapsed[:, -1])
+        """Poses at the measurement of each window's last pose, shape (n, 3)."""
+        return interpolate_poses(self.poses, self.windows.elapsed[:, -1])
 
     @cached_property
     def _errors(self) -> tuple[Array, Array]:
@@ -155,16 +157,16 @@ class Prediction:
 
     @property
     def distance(self) -> Array:
-        """[m], shape (n,)."""
+        """Position errors [m], shape (n,)."""
         return self._errors[0]
 
     @property
     def angle(self) -> Array:
-        """[°], shape (n,)."""
+        """Yaw errors [°], shape (n,)."""
         return self._errors[1]
 
     def score(self, which: NDArray[np.bool_]) -> Score:
-        """Over some of the windows."""
+        """The score over some of the windows, a mask (n,)."""
         off = np.abs(self.wheels - self.windows.wheels)[which]
         return Score(
             int(which.sum()),

@@ -1,10 +1,10 @@
-"""Whether a log can be what it says: units, turns, length. Each doubt is one line with value, expectation and cure."""
+"""Plausibility checks of a log: units, turns, length. Each error is one line with value, expectation and cure."""
 
 import numpy as np
 
 from twin.errors import InputError
 from twin.robot import TRACK, WHEEL_RADIUS
-from twin.sysid.drivetrain import requested
+from twin.sysid.drivetrain import commanded_speeds
 from twin.sysid.logs import DURATION, Windows
 from twin.types import Array
 
@@ -12,12 +12,12 @@ MIN_WINDOWS = 20  # to fit to; half as many to score on
 MIN_TURNS = 10  # windows that turn by more than TURN, at least a quarter of them to either side
 TURN = 0.25  # [rad]
 
-_MOVING = 0.15  # [m/s] of wheels or robot: what is judged by its units must move this fast at least
+_MOVING = 0.15  # [m/s] of wheels or robot: slower windows are not used to check units
 _DEGREE = np.pi / 180
 
 
 def check(windows: Windows, where: str) -> None:
-    """Raises InputError where a log is too short or too straight to fit anything, or its units cannot be right."""
+    """Checks that a log is long enough, turns enough and has plausible units. Raises InputError: it is not."""
     driving = windows.fresh[windows.turning].sum(1)
     if len(driving) and np.median(driving) < 2:
         raise InputError(
@@ -44,7 +44,7 @@ def _check_units(windows: Windows, where: str) -> None:
     mean, half = _speeds(windows.wheels)
     distance = np.hypot(windows.poses[:, -1, 0], windows.poses[:, -1, 1]) / DURATION
     straight = (np.maximum(np.abs(mean), distance) > _MOVING) & (np.abs(half) < 0.3 * np.abs(mean))
-    _judge(
+    _check_ratio(
         _median(distance[straight] / np.abs(mean[straight])),
         (0.3, 2.0),
         where,
@@ -57,7 +57,7 @@ def _check_units(windows: Windows, where: str) -> None:
     )
     rate = np.abs(windows.poses[:, -1, 2]) / DURATION
     turning = np.maximum(np.abs(half), rate * TRACK / 2) > _MOVING
-    _judge(
+    _check_ratio(
         _median(rate[turning] * TRACK / 2 / np.abs(half[turning])),
         (0.1, 1.3),
         where,
@@ -67,14 +67,14 @@ def _check_units(windows: Windows, where: str) -> None:
             _DEGREE: "yaw looks π/180 times too small; divide it by π/180",
         },
     )
-    asked = requested(windows)[:, -1] * WHEEL_RADIUS
+    commanded = commanded_speeds(windows)[:, -1] * WHEEL_RADIUS
     end = windows.wheels[:, -1] * WHEEL_RADIUS
-    got = np.stack([end.mean(1), (end[:, 1] - end[:, 0]) / 2], -1)
+    measured = np.stack([end.mean(1), (end[:, 1] - end[:, 0]) / 2], -1)
     names = ("cmd_v", "cmd_yaw_rate") if windows.twist else ("the mean of the wheel commands", "their difference")
     for i, name in enumerate(names):
-        use = (np.abs(got[:, i]) > 0.5 * _MOVING) & (np.abs(asked[:, i]) > 0)
-        _judge(
-            _median(np.abs(got[use, i] / asked[use, i])),
+        use = (np.abs(measured[:, i]) > 0.5 * _MOVING) & (np.abs(commanded[:, i]) > 0)
+        _check_ratio(
+            _median(np.abs(measured[use, i] / commanded[use, i])),
             (0.1, 6.0),
             where,
             f"wheels do {{:.3g}} times what {name} asks for",
@@ -82,15 +82,17 @@ def _check_units(windows: Windows, where: str) -> None:
         )
 
 
-def _judge(ratio: float | None, expected: tuple[float, float], where: str, says: str, cures: dict[float, str]) -> None:
-    """Raises InputError where a ratio is out of range, with the cure whose factor is nearest to it."""
+def _check_ratio(
+    ratio: float | None, expected: tuple[float, float], where: str, message: str, cures: dict[float, str]
+) -> None:
+    """Raises InputError if a ratio is out of range, with the cure whose factor is nearest to it."""
     low, high = expected
     if ratio is None or low <= ratio <= high:
         return
     nearest = min(cures, key=lambda factor: abs(np.log(max(ratio, 1e-9) / factor)))
     close = abs(np.log(max(ratio, 1e-9) / nearest)) < np.log(6)
     cure = cures[nearest] if close else "check the units of the columns"
-    raise InputError(f"{where}: {says.format(ratio)}; expected {low:g} to {high:g}; {cure}")
+    raise InputError(f"{where}: {message.format(ratio)}; expected {low:g} to {high:g}; {cure}")
 
 
 def _speeds(wheels: Array) -> tuple[Array, Array]:

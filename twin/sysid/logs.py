@@ -1,18 +1,16 @@
-"""Drive logs: what a robot was told, what its wheels did, and where it went, cut into windows.
+"""Drive logs: commands, wheel speeds and poses of a robot, cut into windows of two seconds.
 
-A *window* is two seconds of a log, sampled evenly: commands, wheel speeds, poses relative to the first one, and, where
-there was an IMU, accelerations. Windows of one *group* share an experiment; groups of even number are for fitting, odd
-ones for scoring. A window *follows* the one before it where it begins when that one ends. A pose is *fresh* when it
-differs from the one before, *stale* when it repeats it. Windows in which the robot stands, as it was told to, or in
-which poses cease while the wheels turn, are left out.
+A *window* holds evenly spaced samples of commands, wheel speeds, poses relative to the first one and, with an IMU,
+accelerations. Windows of one *group* belong to one experiment; even groups are for fitting, odd ones for scoring. A
+window *follows* the previous one if it begins when that one ends. A pose is *fresh* if it differs from the one before.
 
-`read_log` takes
+`read_log` reads
 
 - a table (.csv, or .npz of equally long columns) with one row per instant: `time` [s]; commands, either `cmd_v` [m/s]
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
   [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
   [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
-- a ROS 2 bag (`twin.sysid.ros_bags`), which becomes such a table;
+- a ROS 2 bag (`twin.sysid.ros_bags`), which is converted to such a table;
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
@@ -28,34 +26,52 @@ from scipy.stats import theilslopes
 
 from twin import runtime
 from twin.errors import InputError
-from twin.files import damaged, exists, load_arrays, read_text
+from twin.files import exists, load_arrays, read_text, wrap_read_errors
 from twin.types import Array
 
-# ---- When the poses of a log were measured, told from when they got into it.
-#
-# A sensor of poses measures at a steady rate, but what it measures gets into the log sooner or later: from a fresh pose
-# to the next a robot moves as far after 0.05 s as after 0.15 s (DRIVE's log: within windows that turn, yaw is smooth to
-# 0.3° over the number of fresh poses, to 0.7° over when they appeared). So the n-th measurement counts as of n periods
-# after the first one. Where fresh poses are later for good by more than half a period, some were lost. The first one
-# may be older than the window, by at most `OLDEST`.
-#
-# Windows that disagree with their log's period by more than a late delivery explains count as they appeared, and their
-# first pose as older than the next by as much as those are apart; so do all of a log in which many do, or of a fast
-# sensor. All times are in samples; a window starts at 0.
+PERIOD = 0.05  # [s] between two samples of a window
+DURATION = 2.0  # [s]
+SAMPLES = round(DURATION / PERIOD)
+MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are left out
+MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
+MAX_POSE_AGE = 20  # samples between the measurement of a window's first pose and the window's start, at most
+
+TWIST = ("cmd_v", "cmd_yaw_rate")
+WHEEL_COMMANDS = ("cmd_left", "cmd_right")
+WHEEL_SPEEDS = ("left_wheel_vel", "right_wheel_vel")
+POSE = ("x", "y", "yaw")
+ACCELERATION = ("acceleration_x", "acceleration_y")
+
+_FAST = 1.75  # samples; for sensors of a shorter period, times of appearance are more accurate than counts of poses
+_JITTER = 4  # samples, at most, between measurement and appearance of a pose, apart from the common delay
+_UNSTEADY = 0.1  # fraction of windows that contradict the period, above which the sensor counts as aperiodic
+_DROPOUT = 30  # samples without a fresh pose; windows with more in which the wheels turn are left out
+_TURNING = 0.5  # [rad/s] mean of both sides' wheels
+_STANDING = 0.05  # [rad/s], [m/s]; windows in which neither wheels nor commands are ever faster are left out
+_MAX_BYTES = 512 << 20  # of a log, unpacked
+_TICK = 1e-6  # [s] instants closer than this are the same
+_GROUP_WINDOWS = 3  # of a table without groups: six seconds
+_CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change between consecutive windows
+
+# ---- measurement times of poses
 
 
-OLDEST = 20  # samples that the first pose of a window may have been measured before its start, at most
+def measurement_times(fresh: NDArray[np.bool_]) -> Array:
+    """When every pose of a log's windows was measured, estimated from when poses changed.
 
-_FAST = 1.75  # samples; sensors of a shorter period tell more by when their poses appear than by how many did
-_JITTER = 4  # samples, at most, between when a pose was measured and when it appeared, but for what is common to all
-_UNSTEADY = 0.1  # share of windows that disagree with their log's period by more, from which on there is none
+    A pose sensor measures at a steady rate, but its poses reach the log with varying delay: from one fresh pose to the
+    next a robot moves as far after 0.05 s as after 0.15 s (DRIVE's log: in windows that turn, yaw is smooth to 0.3°
+    over the number of fresh poses, to 0.7° over their time of appearance). So the n-th fresh pose counts as measured n
+    periods after the first; where later ones stay late by more than half a period, poses were lost.
 
-
-def measured(fresh: NDArray[np.bool_]) -> Array:
-    """When every pose of a log's windows was measured [samples], shape (n, k + 1).
+    Windows that contradict the log's period by more than `_JITTER` use times of appearance instead, and so do all
+    windows of a log in which many do, or of a fast sensor.
 
     Args:
-        fresh: Which poses but the first differ from the one before, shape (n, k).
+        fresh: Which poses, without the first, differ from the one before, shape (n, k).
+
+    Returns:
+        Times [samples], shape (n, k + 1); a window starts at 0.
     """
     appeared = [np.flatnonzero(row).astype(np.float64) + 1 for row in fresh]
     slopes = [theilslopes(each).slope for each in appeared if len(each) > 1]
@@ -74,51 +90,32 @@ def measured(fresh: NDArray[np.bool_]) -> Array:
 
 
 def _steady(appeared: Array, period: float) -> Array:
-    """When a window's first pose and its fresh ones were measured by a steady sensor.
+    """When a window's first pose and its fresh ones were measured by a sensor of this period [samples].
 
     Args:
-        appeared: When fresh poses did.
-        period: Of the sensor.
+        appeared: When fresh poses appeared [samples].
     """
     if not len(appeared):
         return np.zeros(1)
     number = np.arange(1.0, len(appeared) + 1)
     lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
-    number += np.minimum.accumulate(lost[::-1])[::-1]  # what comes late, but comes, was not lost
+    number += np.minimum.accumulate(lost[::-1])[::-1]  # late, but not lost
     start = float(np.median(appeared - period * number))
-    if start > period / 2:  # the robot rested, or as many were lost at first
+    if start > period / 2:  # the robot rested, or the first poses were lost
         first = start - period * np.ceil(start / period)
-    else:  # there was a pose when the window began
+    else:  # the window begins with a pose
         first = start = min(start, 0.0)
-    first = max(first, -OLDEST)
+    first = max(first, -MAX_POSE_AGE)
     return np.append(first, np.maximum(first, start + period * number))
 
 
 def _as_appeared(appeared: Array, period: float) -> Array:
-    """The same, by any other sensor; the period stands in where one fresh pose does not tell how far they are apart."""
+    """The same by times of appearance; `period` stands in for the interval if there is a single fresh pose."""
     apart = float(np.median(np.diff(appeared))) if len(appeared) > 1 else period
-    return np.append(max(min(float(appeared[0]) - apart, 0.0), -OLDEST), appeared)
+    return np.append(max(min(float(appeared[0]) - apart, 0.0), -MAX_POSE_AGE), appeared)
 
 
-PERIOD = 0.05  # [s] between two samples of a window
-DURATION = 2.0  # [s]
-SAMPLES = round(DURATION / PERIOD)
-MAX_GAP = 0.5  # [s] between two rows of a table; a window that reaches into a longer one is left out
-MIN_INTERVAL = 5e-4  # [s] between rows, median; the least a clock in seconds would show
-
-_DROPOUT = 30  # samples without a fresh pose; a window with more of them in which the wheels turn is left out
-_TURNING = 0.5  # [rad/s] mean of both sides' wheels
-_STANDS = 0.05  # [rad/s], [m/s]; a window in which neither wheels nor commands ever are faster is left out
-_MOST_LOG = 512 << 20  # [bytes], unpacked
-_TICK = 1e-6  # [s] instants nearer than this are the same
-_GROUP_WINDOWS = 3  # of a table without groups: six seconds
-_CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change from one window to the next
-
-TWIST = ("cmd_v", "cmd_yaw_rate")
-WHEEL_COMMANDS = ("cmd_left", "cmd_right")
-WHEEL_SPEEDS = ("left_wheel_vel", "right_wheel_vel")
-POSE = ("x", "y", "yaw")
-ACCELERATION = ("acceleration_x", "acceleration_y")
+# ---- windows
 
 
 @dataclass(frozen=True)
@@ -126,13 +123,12 @@ class Windows:
     """n windows of k samples, `PERIOD` [s] apart."""
 
     commands: Array
-    """v [m/s] and ω [rad/s], or left and right [rad/s], see `twist`; shape (n, k, 2)."""
+    """v [m/s] and ω [rad/s] if `twist`, else wheel speeds left and right [rad/s]; shape (n, k, 2)."""
     twist: bool
-    """Whether commands are v and ω."""
     wheels: Array
-    """Measured speed of the left and of the right wheels [rad/s], shape (n, k, 2)."""
+    """Measured wheel speeds, left and right [rad/s], shape (n, k, 2)."""
     poses: Array
-    """x, y [m], yaw [rad] relative to the first, which is zero; one more than samples, shape (n, k + 1, 3)."""
+    """x, y [m], yaw [rad] relative to the first, shape (n, k + 1, 3)."""
     groups: NDArray[np.int64]
     """Shape (n,)."""
     follows: NDArray[np.bool_]
@@ -145,22 +141,22 @@ class Windows:
 
     @property
     def fitting(self) -> NDArray[np.bool_]:
-        """Which windows may be fitted to; the others are for scoring. Shape (n,)."""
+        """Windows to fit to, shape (n,); the others are for scoring."""
         return self.groups % 2 == 0
 
     @property
-    def before(self) -> Array:
-        """Wheel speeds of the `DURATION` before each window and at its start [rad/s], shape (n, k + 1, 2).
+    def preceding_wheels(self) -> Array:
+        """Wheel speeds in the `DURATION` before each window and at its start [rad/s], shape (n, k + 1, 2).
 
-        Those of the window before, where this one follows it, else as they are at the start.
+        They come from the previous window if this one follows it; else the speed at the start is repeated.
         """
         out = np.repeat(self.wheels[:, :1], self.wheels.shape[1] + 1, 1)
         follows = np.flatnonzero(self.follows)
         out[follows, :-1] = self.wheels[follows - 1]
         return out
 
-    def of(self, which: NDArray) -> "Windows":
-        """Some of the windows; none of them follows another."""
+    def select(self, which: NDArray) -> "Windows":
+        """Some of the windows, by mask or index; none of them follows another."""
         return Windows(
             self.commands[which],
             self.twist,
@@ -173,48 +169,48 @@ class Windows:
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
-        """Which poses but the first are fresh, shape (n, k)."""
+        """Which poses, without the first, are fresh, shape (n, k)."""
         return np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
 
     @property
     def turning(self) -> NDArray[np.bool_]:
-        """In which windows the wheels turn, shape (n,)."""
+        """Windows in which the wheels turn, shape (n,)."""
         return np.abs(self.wheels).mean((1, 2)) > _TURNING
 
     @cached_property
-    def measured(self) -> Array:
-        """When each pose was measured [s], but for a lateness common to all; time starts with the first sample.
-
-        See `timing`. Shape (n, k + 1).
-        """
-        return measured(self.fresh) * PERIOD
+    def measurement_times(self) -> Array:
+        """When each pose was measured, up to a common delay [s since the first sample], shape (n, k + 1)."""
+        return measurement_times(self.fresh) * PERIOD
 
     @property
     def elapsed(self) -> Array:
-        """Time from the measurement of the first pose to that of each [s], shape (n, k + 1)."""
-        return self.measured - self.measured[:, :1]
+        """Time since the measurement of the first pose [s], shape (n, k + 1)."""
+        return self.measurement_times - self.measurement_times[:, :1]
 
 
 def read_log(path: Path) -> Windows:
-    """Reads any kind of log. Raises InputError: unreadable, columns missing, times or values impossible, too short."""
+    """Reads a log, see the module's head.
+
+    Raises InputError: unreadable, columns missing, or times or values impossible.
+    """
     if not exists(path):
         raise InputError(f"{path}: no such log; expected a .csv, an .npz or the folder of a ROS 2 bag")
     if path.is_dir() or path.suffix in (".db3", ".mcap", ".bag"):
         from twin.sysid.ros_bags import read_bag
 
-        return cut(read_bag(path), str(path))
+        return cut_windows(read_bag(path), str(path))
     if path.suffix == ".csv":
-        return cut(_read_csv(path), str(path))
+        return cut_windows(_read_csv(path), str(path))
     if path.suffix == ".npz":
-        columns = _read_npz(path)
+        columns = read_npz(path)
         if columns.get("icp_x", np.zeros(0)).ndim == 2:
             return _published_windows(columns, str(path))
-        return cut(columns, str(path))
+        return cut_windows(columns, str(path))
     raise InputError(f"{path}: expected a log in .csv, .npz or a ROS 2 bag; convert it to one of those")
 
 
 def _read_csv(path: Path) -> dict[str, Array]:
-    text = read_text(path, _MOST_LOG)
+    text = read_text(path, _MAX_BYTES)
     try:
         head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row]
         values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
@@ -225,21 +221,22 @@ def _read_csv(path: Path) -> dict[str, Array]:
     return {name.strip(): values[:, i] for i, name in enumerate(head)}
 
 
-def _read_npz(path: Path) -> dict[str, Array]:
-    arrays = load_arrays(path, _MOST_LOG)
-    with damaged(path, "expected plain arrays of numbers; save it anew with numpy.savez"):
+def read_npz(path: Path) -> dict[str, Array]:
+    """Numeric arrays of an .npz file by name."""
+    arrays = load_arrays(path, _MAX_BYTES)
+    with wrap_read_errors(path, "expected plain arrays of numbers; save it anew with numpy.savez"):
         return {name: np.asarray(values, np.float64) for name, values in arrays.items()}
 
 
-def cut(columns: dict[str, Array], where: str) -> Windows:
-    """Windows of a table; rows may come at any rate, the newest one counts.
+def cut_windows(columns: dict[str, Array], where: str) -> Windows:
+    """Cuts a table into windows; a sample takes the newest row at its instant.
 
     Args:
         columns: By name, shape (rows,) each; see the module's head.
-        where: What to call the log in an error.
 
     Raises:
-        InputError: a column is missing or not a number throughout, or time does not increase or cannot be in seconds.
+        InputError: a column is missing or has values that are not finite, or time does not increase or is not in
+            seconds.
     """
     twist = all(name in columns for name in TWIST)
     commands = TWIST if twist else WHEEL_COMMANDS
@@ -275,47 +272,43 @@ def cut(columns: dict[str, Array], where: str) -> Windows:
         sampled(commands),
         twist,
         sampled(WHEEL_SPEEDS),
-        relative(pose[rows]),
+        relative_poses(pose[rows]),
         np.asarray(group, np.int64),
         np.diff(order, prepend=-2) == 1,
         sampled(accelerations) if accelerations else None,
     )
-    return _telling(windows, where)
+    return _informative(windows, where)
 
 
-def _telling(windows: Windows, where: str) -> Windows:
-    """Leaves out windows that tell nothing of a model.
+def _informative(windows: Windows, where: str) -> Windows:
+    """Leaves out windows without information: lost poses while the wheels turn, or a robot that stands as commanded.
 
-    Where the wheels turn and poses cease, nobody knows where the robot went; to stand where told to, any model can.
-
-    Raises:
-        InputError: those are more than half of the ones in which the wheels turn.
+    Raises InputError: poses are lost in more than half of the windows in which the wheels turn.
     """
     edge = np.ones((len(windows), 1), bool)
     appeared = np.concatenate([edge, windows.fresh, edge], 1)
-    ceased = np.array([np.diff(np.flatnonzero(row)).max() > _DROPOUT for row in appeared], bool)
+    lost_poses = np.array([np.diff(np.flatnonzero(row)).max() > _DROPOUT for row in appeared], bool)
     turning = windows.turning
-    lost = int((ceased & turning).sum())
+    lost = int((lost_poses & turning).sum())
     if lost > turning.sum() / 2:
         raise InputError(
             f"{where}: no new pose for {_DROPOUT * PERIOD:g} s in {lost} of {turning.sum()} windows in which the "
             "wheels turn; expected at least one a second; record poses at 1 Hz or more, better at 10 Hz"
         )
     if lost:
-        runtime.say(f"{lost} windows left out: the wheels turn and poses cease")
-    stands = np.maximum(np.abs(windows.wheels), np.abs(windows.commands)).max((1, 2), initial=0.0) < _STANDS
-    if stands.any():
-        runtime.say(f"{stands.sum()} windows left out: the robot stands")
-    keep = ~(ceased & turning) & ~stands
+        runtime.log_line(f"{lost} windows left out: no new poses while the wheels turn")
+    standing = np.maximum(np.abs(windows.wheels), np.abs(windows.commands)).max((1, 2), initial=0.0) < _STANDING
+    if standing.any():
+        runtime.log_line(f"{standing.sum()} windows left out: the robot stands still")
+    keep = ~(lost_poses & turning) & ~standing
     before = np.concatenate([[False], keep[:-1]])
-    return replace(windows.of(keep), follows=(windows.follows & before)[keep])
+    return replace(windows.select(keep), follows=(windows.follows & before)[keep])
 
 
 def _gapless(time: Array, where: str) -> NDArray[np.int64]:
-    """Which of the windows that begin every `DURATION` [s] from the first row on have no gap in them, shape (n,).
+    """Numbers of the windows without a gap, shape (n,); window i begins i · `DURATION` [s] after the first row.
 
-    Raises:
-        InputError: by its rows' median interval time is not in seconds, or there are too few rows a second.
+    Raises InputError: the median interval between rows shows that time is not in seconds, or that rows are too rare.
     """
     if len(time) < 2:
         return np.zeros(0, np.int64)
@@ -330,7 +323,7 @@ def _gapless(time: Array, where: str) -> NDArray[np.int64]:
         raise InputError(
             f"{where}: rows are {interval:.3g} s apart (median), expected {MIN_INTERVAL:g} to {MAX_GAP:g} s; {cure}"
         )
-    after = np.flatnonzero(steps > MAX_GAP) + 1  # a stretch without gaps begins
+    after = np.flatnonzero(steps > MAX_GAP) + 1  # rows at which a segment without gaps begins
     first, last = time[np.append(0, after)], time[np.append(after - 1, len(time) - 1)]
     low = np.ceil((first - time[0]) / DURATION - _TICK).astype(np.int64)
     high = np.floor((last - time[0]) / DURATION + _TICK).astype(np.int64)
@@ -338,10 +331,10 @@ def _gapless(time: Array, where: str) -> NDArray[np.int64]:
 
 
 def _published_windows(columns: dict[str, Array], where: str) -> Windows:
-    """DRIVE's: the pose at 2 s, `gt_icp_*`, is the 41st sample; the robot's IMU looks backwards.
+    """Windows of DRIVE: the pose at 2 s, `gt_icp_*`, is the 41st sample; x and y of the robot's IMU point backwards.
 
-    That it does is seen in the data: `imu_acceleration_x` falls when the wheels speed up, and `imu_acceleration_y`
-    points out of the turn (correlations −0.16 and −0.11 over 16,000 samples), whereas the yaw rate has the right sign.
+    The data show the latter: `imu_acceleration_x` falls when the wheels speed up, and `imu_acceleration_y` points out
+    of the turn (correlations −0.16 and −0.11 over 16,000 samples), whereas the yaw rate has the right sign.
     """
     poses = [f"{{}}icp_{name}" for name in POSE]
     imu = ("imu_acceleration_x", "imu_acceleration_y")
@@ -365,34 +358,34 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
         np.stack([columns[name] for name in WHEEL_COMMANDS], -1),
         False,
         wheels,
-        relative(pose),
+        relative_poses(pose),
         step,
         np.concatenate([[False], (jump < _CONTINUES) & (np.diff(step) <= 1) & (np.diff(step) >= 0)]),
         -np.stack([columns[name] for name in imu], -1),
     )
-    return _telling(windows, where)
+    return _informative(windows, where)
 
 
-def retimed(poses: Array, late: Array, before: int) -> Array:
-    """Poses from when each robot's first one was measured.
+def resample_poses(poses: Array, late: Array, before: int) -> Array:
+    """Poses relative to each robot's pose when its first pose was measured.
 
     Args:
         poses: `PERIOD` [s] apart, shape (n, m, 3).
-        late: How old the first one is when time starts [s], at most `before` samples; negative where it is yet to come.
-            Shape (n,).
-        before: Which of the poses is that at which time starts.
+        late: Age of the first measured pose at time zero [s], at most `before` samples; negative if it is measured
+            later. Shape (n,).
+        before: Index of the pose at time zero.
 
     Returns:
-        Relative to the first, shape (n, k + OLDEST + 1, 3); straight on beyond the last one there is.
+        Shape (n, k + MAX_POSE_AGE + 1, 3); extrapolated linearly beyond the last pose.
     """
-    position = before - late[:, None] / PERIOD + np.arange(SAMPLES + OLDEST + 1)
+    position = before - late[:, None] / PERIOD + np.arange(SAMPLES + MAX_POSE_AGE + 1)
     whole = np.clip(position.astype(int), 0, poses.shape[1] - 2)
     share = (position - whole)[..., None]
     row = np.arange(len(poses))[:, None]
-    return relative(poses[row, whole] * (1 - share) + poses[row, whole + 1] * share)
+    return relative_poses(poses[row, whole] * (1 - share) + poses[row, whole + 1] * share)
 
 
-def relative(poses: Array) -> Array:
+def relative_poses(poses: Array) -> Array:
     """Poses in the frame of the first: x, y [m], yaw [rad], shape (n, k, 3)."""
     turned = poses - poses[:, :1]
     cos, sin = np.cos(poses[:, :1, 2]), np.sin(poses[:, :1, 2])
@@ -400,14 +393,9 @@ def relative(poses: Array) -> Array:
     return np.stack([cos * x + sin * y, cos * y - sin * x, turned[..., 2]], -1)
 
 
-def wrapped(angle: Array) -> Array:
-    """The same angle from −π to π [rad]."""
+def wrap_angle(angle: Array) -> Array:
+    """The same angle in [−π, π) [rad]."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
-
-
-def without_acceleration(windows: Windows) -> Windows:
-    """The same, as if there had been no IMU."""
-    return replace(windows, acceleration=None)
 
 
 def _need(columns: dict[str, Array], names: tuple[str, ...], where: str) -> None:

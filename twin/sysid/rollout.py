@@ -1,9 +1,8 @@
-"""Windows of a log driven by the Husky's MJCF on a plane, many at once.
+"""Simulates the windows of a log with the Husky's MJCF on a plane, in parallel threads of `mujoco.rollout`.
 
-Each starts rolling: the robot stands settled on the plane, and before time starts its wheels do what the log's did
-before the window (`Windows.before`), so that body and tyres are in the motion that goes with them. Then the servo is
-told what the controller makes of the log's commands (`commands.targets`). Nothing else of the log enters but the slope.
-`mujoco.rollout` steps windows in threads; gravity is tilted rather than the plane.
+Each simulation starts with the robot settled on the plane. Before time zero its wheels repeat those of the log before
+the window (`Windows.preceding_wheels`), so that body and tires have the momentum that goes with them. From then on the
+servos receive the targets of the drivetrain model. Nothing else of the log enters but the slope, as tilted gravity.
 """
 
 import copy
@@ -16,207 +15,208 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from twin.mjcf.husky import add_husky, set_options
-from twin.mjcf.husky_visuals import LOOK_GROUP
+from twin.mjcf.husky_visuals import ROBOT_VISUAL_GROUP
 from twin.robot import WHEELS, HuskyParams
-from twin.runtime import cores
-from twin.sysid.drivetrain import AHEAD, STEP
-from twin.sysid.kinematics import Icr, integrate
-from twin.sysid.logs import OLDEST, PERIOD, SAMPLES, Windows
+from twin.runtime import available_cores
+from twin.sysid.drivetrain import CONTROL_STEP, EXTRA_SAMPLES
+from twin.sysid.kinematics import IcrModel, integrate
+from twin.sysid.logs import MAX_POSE_AGE, PERIOD, SAMPLES, Windows, relative_poses
 from twin.types import Array
 
-# ---- How the ground slopes under a drive, from the log's own accelerometer.
-#
-# At rest an accelerometer reads gravity upside down; tyres that scrub sideways over soft ground slide downhill by more
-# than a good model's error, so a log on real ground is fitted with the slope it was driven on. Two seconds of a rattling
-# robot tell it badly, but the next two are on nearly the same ground: from window to window the slope forgets itself at a
-# steady rate (a first-order autoregression), a window's reading adds noise, and a Kalman smoother (Rauch, Tung and
-# Striebel 1965) weighs all that follow each other. How steep the ground is, for how long, and how noisy the readings are
-# is what makes the log's own readings most likely, so that slopes of a rough IMU shrink towards level ground. What is
-# constant in the robot's own frame (the IMU's mounting, a pitched chassis) is taken off by the median over the log.
-#
-# Only headings and speeds reckoned from wheels (`kinematics.Icr`) are used to turn accelerations into one frame and to
-# take the motion's own off: never the poses that are to be predicted.
+# ---- slope of the ground
 
 
 Complex = NDArray[np.complex128]
-"""Gravity along x, and along y as the imaginary part [m/s²]."""
+"""Gravity along x, with that along y as the imaginary part [m/s²]."""
 
 GRAVITY = 9.81  # [m/s²]
-STEEPEST = 0.2  # of gravity; a reading of more than 11° is rather a bump or a glitch
+MAX_SLOPE = 0.2  # of gravity; readings above 11° are bumps or glitches
 
 
 @dataclass(frozen=True)
-class Slopes:
-    """What slopes are like, along x and along y alike."""
+class SlopeModel:
+    """Statistics of the slope along x and along y: a first-order autoregression over windows with noisy readings."""
 
     steepness: float
-    """[m/s²], standard deviation."""
+    """Standard deviation of the slope [m/s²]."""
     windows: float
-    """After how many of them a slope has forgotten itself but for 1 / e."""
+    """Correlation length: windows after which the autocorrelation is 1 / e."""
     noise: float
-    """Of a window's reading [m/s²], standard deviation."""
+    """Standard deviation of a window's reading [m/s²]."""
 
 
-_USUAL = Slopes(0.25, 5.0, 0.25)  # gentle: 1.5°
-_DOUBT = 1.0  # standard deviation of the logarithms of those three, before any log
-_RANGE = 1e-3, 1e3  # of each, so that readings without any noise do no harm
+_PRIOR = SlopeModel(0.25, 5.0, 0.25)  # gentle: 1.5°
+_PRIOR_STD = 1.0  # prior standard deviation of the logarithms of those three
+_RANGE = 1e-3, 1e3  # of each, for readings without noise
 
 
-def gravity(windows: Windows, model: Icr) -> Array:
-    """Gravity along x and y [m/s²] of the robot where each window's `Windows.before` begins, shape (n, 2).
+def slope_gravity(windows: Windows, model: IcrModel) -> Array:
+    """Gravity along x and y [m/s²] of the robot where each window's `preceding_wheels` begin, shape (n, 2).
 
-    Zeros without accelerations.
+    Tires that scrub sideways over soft ground slide downhill by more than a good model's error, so a log on real ground
+    is fitted with its slope. At rest an accelerometer reads minus gravity. Its mean over a window of a rattling robot
+    is noisy, but consecutive windows have similar slopes, so the readings are smoothed (`smooth_slopes`) with the
+    statistics that make them most likely (`fit_slope_model`); a rough IMU's slopes shrink towards level ground. The
+    median over the log removes what is constant in the robot's frame (mounting of the IMU, a pitched chassis). Headings
+    and the motion's own acceleration come from wheel speeds alone, never from the poses that are to be predicted.
+
+    Args:
+        windows: All of a log; without accelerations the result is zero.
+        model: Kinematics for headings and velocities.
     """
     if windows.acceleration is None:
         return np.zeros((len(windows), 2))
     motion = model.motion(windows.wheels)
     turned = integrate(motion)[..., 2]
     yaw, turn = turned[:, :-1], turned[:, -1]
-    own = np.stack([np.gradient(motion[..., 0], PERIOD, axis=1), motion[..., 0] * motion[..., 2]], -1)
-    down = -(windows.acceleration - own)
+    motion_acceleration = np.stack([np.gradient(motion[..., 0], PERIOD, axis=1), motion[..., 0] * motion[..., 2]], -1)
+    down = -(windows.acceleration - motion_acceleration)
     down = down - np.median(down.mean(1), axis=0)
     readings = ((down[..., 0] + 1j * down[..., 1]) * np.exp(1j * yaw)).mean(1)
-    readings *= np.minimum(1.0, STEEPEST * GRAVITY / np.maximum(np.abs(readings), 1e-9))
-    slopes, _ = smoothed(terrain(readings, turn, windows.follows), readings, turn, windows.follows)
-    slopes *= np.exp(1j * model.motion(windows.before[:, :-1])[..., 2].sum(1) * PERIOD)
+    readings *= np.minimum(1.0, MAX_SLOPE * GRAVITY / np.maximum(np.abs(readings), 1e-9))
+    slopes, _ = smooth_slopes(fit_slope_model(readings, turn, windows.follows), readings, turn, windows.follows)
+    slopes *= np.exp(1j * model.motion(windows.preceding_wheels[:, :-1])[..., 2].sum(1) * PERIOD)
     return np.stack([slopes.real, slopes.imag], -1)
 
 
-def terrain(readings: Complex, turn: Array, follows: NDArray[np.bool_]) -> Slopes:
-    """The terrain that makes a log's readings most likely, beside what is usual.
+def fit_slope_model(readings: Complex, turn: Array, follows: NDArray[np.bool_]) -> SlopeModel:
+    """The slope statistics with the highest posterior probability.
 
     Args:
-        readings: Of every window's slope, in the frame of its first pose, shape (n,).
-        turn: What each window turns by [rad], shape (n,).
-        follows: Of `Windows`, shape (n,).
+        readings: Slope of every window in the frame of its first pose, shape (n,).
+        turn: Yaw change of each window [rad], shape (n,).
+        follows: See `Windows`, shape (n,).
     """
-    usual = np.log([_USUAL.steepness, _USUAL.windows, _USUAL.noise])
+    prior = np.log([_PRIOR.steepness, _PRIOR.windows, _PRIOR.noise])
 
-    def unlikely(logs: Array) -> float:
-        _, cost = smoothed(Slopes(*np.exp(logs).tolist()), readings, turn, follows)
-        return cost + float((((logs - usual) / _DOUBT) ** 2).sum()) / 2
+    def cost(logs: Array) -> float:
+        _, negative = smooth_slopes(SlopeModel(*np.exp(logs).tolist()), readings, turn, follows)
+        return negative + float((((logs - prior) / _PRIOR_STD) ** 2).sum()) / 2
 
     options = {"xatol": 0.01, "fatol": 0.01}
-    found = minimize(unlikely, usual, method="Nelder-Mead", bounds=[tuple(np.log(_RANGE))] * 3, options=options)
-    return Slopes(*np.exp(found.x).tolist())
+    found = minimize(cost, prior, method="Nelder-Mead", bounds=[tuple(np.log(_RANGE))] * 3, options=options)
+    return SlopeModel(*np.exp(found.x).tolist())
 
 
-def smoothed(terrain_: Slopes, readings: Complex, turn: Array, follows: NDArray[np.bool_]) -> tuple[Complex, float]:
-    """Every window's slope given all readings, shape (n,), and minus the logarithm of the readings' likelihood.
+def smooth_slopes(
+    model: SlopeModel, readings: Complex, turn: Array, follows: NDArray[np.bool_]
+) -> tuple[Complex, float]:
+    """Kalman smoother (Rauch, Tung and Striebel 1965): every window's slope given all readings, shape (n,).
 
-    For the arguments see `terrain`.
+    Also returns the negative log-likelihood of the readings. For the arguments see `fit_slope_model`.
     """
-    n, prior, noise = len(readings), terrain_.steepness**2, terrain_.noise**2
-    keep = np.exp(-1 / terrain_.windows)
-    guess, unsure = np.zeros(n, complex), np.full(n, prior)  # by the windows before
-    slope, left = np.zeros(n, complex), np.zeros(n)  # by these and its own reading
+    n, prior, noise = len(readings), model.steepness**2, model.noise**2
+    keep = np.exp(-1 / model.windows)
+    predicted, predicted_var = np.zeros(n, complex), np.full(n, prior)  # from previous windows
+    slope, var = np.zeros(n, complex), np.zeros(n)  # updated with the own reading
     cost = 0.0
     for i in range(n):
         if i and follows[i]:
-            guess[i] = keep * slope[i - 1] * np.exp(-1j * turn[i - 1])
-            unsure[i] = keep**2 * left[i - 1] + (1 - keep**2) * prior
-        spread, off = unsure[i] + noise, readings[i] - guess[i]
-        slope[i] = guess[i] + unsure[i] / spread * off
-        left[i] = unsure[i] * noise / spread
-        cost += np.log(2 * np.pi * spread) + abs(off) ** 2 / (2 * spread)
+            predicted[i] = keep * slope[i - 1] * np.exp(-1j * turn[i - 1])
+            predicted_var[i] = keep**2 * var[i - 1] + (1 - keep**2) * prior
+        total, off = predicted_var[i] + noise, readings[i] - predicted[i]
+        slope[i] = predicted[i] + predicted_var[i] / total * off
+        var[i] = predicted_var[i] * noise / total
+        cost += np.log(2 * np.pi * total) + abs(off) ** 2 / (2 * total)
     for i in range(n - 2, -1, -1):
         if follows[i + 1]:
-            back = keep * left[i] / unsure[i + 1]
-            slope[i] += back * np.exp(1j * turn[i]) * (slope[i + 1] - guess[i + 1])
+            back = keep * var[i] / predicted_var[i + 1]
+            slope[i] += back * np.exp(1j * turn[i]) * (slope[i + 1] - predicted[i + 1])
     return slope, float(cost)
 
 
-LATE, EARLY = 4, 3  # samples by which poses may be late against the wheel speeds, and ahead of them
-BEFORE = LATE + OLDEST  # samples before time starts that are kept
-COARSE = 0.005  # [s] time step to begin a fit with; poses after 2 s are up to 1 cm and 0.8° off those of a fine one
+# ---- simulation
 
-_SETTLE = 1.0  # [s]
+MAX_POSE_LAG, MAX_POSE_LEAD = 4, 3  # samples by which poses may be behind and ahead of the wheel speeds
+LEAD_SAMPLES = MAX_POSE_LAG + MAX_POSE_AGE  # samples before time zero in the result
+COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; poses after 2 s differ by up to 1 cm and 0.8° from a fine one
+
+_SETTLE = 1.0  # [s] at rest before a simulation
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """What the robots did."""
-
     poses: Array
-    """x, y [m], yaw [rad] of the base relative to the first, `PERIOD` [s] apart; time starts with number `BEFORE`.
-    Shape (n, BEFORE + k + AHEAD, 3)."""
+    """x, y [m], yaw [rad] of the base relative to the first, `PERIOD` [s] apart; number `LEAD_SAMPLES` is time zero.
+    Shape (n, LEAD_SAMPLES + k + EXTRA_SAMPLES, 3)."""
     wheels: Array
-    """Of the left and of the right side [rad/s], shape (n, k + AHEAD, 2)."""
+    """Wheel speeds, left and right [rad/s], shape (n, k + EXTRA_SAMPLES, 2)."""
     torques: Array
-    """Of the left and the right motor, at the wheels [N m], means over each `PERIOD`, shape (n, k + AHEAD − 1, 2)."""
+    """Motor torques at the wheels, left and right [N m], means over each `PERIOD`; (n, k + EXTRA_SAMPLES − 1, 2)."""
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:
-    """The Husky on a plane, without its looks: they take a third of the time and nearly all of the memory."""
+    """The Husky on a plane without visual geometry, which takes a third of the time and nearly all of the memory."""
     spec = mujoco.MjSpec()
     set_options(spec, params)
     if timestep:
         spec.option.timestep = timestep
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
     add_husky(spec, params=params)
-    for geom in [geom for geom in spec.geoms if geom.group == LOOK_GROUP]:
+    for geom in [geom for geom in spec.geoms if geom.group == ROBOT_VISUAL_GROUP]:
         spec.delete(geom)
     for mesh in list(spec.meshes):
         spec.delete(mesh)
     return spec.compile()
 
 
-def drive(params: HuskyParams, told: Array, before: Array, slope: Array, timestep: float | None = None) -> Rollouts:
-    """Drives every window.
+def simulate_windows(
+    params: HuskyParams, targets: Array, before: Array, slope: Array, timestep: float | None = None
+) -> Rollouts:
+    """Simulates every window.
 
     Args:
-        params: The robot and its ground; its `servo_lag` acts on `told`, but not on `before`.
-        told: Wheel speeds the servos are told, left and right [rad/s], `commands.STEP` [s] apart, shape (n, steps, 2).
-        before: Wheel speeds until time starts, left and right [rad/s], `PERIOD` [s] apart; the last are those at the
-            start. Shape (n, ≥ BEFORE + 2, 2).
+        params: The robot and its ground; its `servo_lag` acts on `targets`, but not on `before`.
+        targets: Of the servos, left and right [rad/s], `drivetrain.CONTROL_STEP` [s] apart, shape (n, steps, 2).
+        before: Wheel speeds up to time zero, left and right [rad/s], `PERIOD` [s] apart, shape (n, ≥ LEAD_SAMPLES + 2,
+            2).
         slope: Gravity along x and y of the robot where `before` begins [m/s²], shape (n, 2).
-        timestep: [s], a whole fraction of `PERIOD`; the shipped one by default.
+        timestep: [s], a whole fraction of `PERIOD`; None: the scene's.
     """
     model = plane_model(params, timestep)
     step = model.opt.timestep
     per_sample = round(PERIOD / step)
     lead = (before.shape[1] - 1) * per_sample
-    count = told.shape[1] * STEP
-    index = np.minimum((np.arange(round(count / step)) * step / STEP + 1e-9).astype(int), told.shape[1] - 1)
-    control = np.concatenate([_led(before, per_sample, params.servo_lag), told[:, index]], 1)
+    count = targets.shape[1] * CONTROL_STEP
+    index = np.minimum((np.arange(round(count / step)) * step / CONTROL_STEP + 1e-9).astype(int), targets.shape[1] - 1)
+    control = np.concatenate([_lag_compensated(before, per_sample, params.servo_lag), targets[:, index]], 1)
     limit = model.actuator_ctrlrange[0, 1]
-    states, joints = _starts(model, params, np.clip(before[:, 0], -limit, limit))
-    models = _tilted(model, slope)
-    threads = min(cores(), len(told))
+    states, joints = _initial_states(model, params, np.clip(before[:, 0], -limit, limit))
+    models = _tilted_models(model, slope)
+    threads = min(available_cores(), len(targets))
     states, sensors = rollout.rollout(models, [mujoco.MjData(model) for _ in range(threads)], states, control)
     torque = [model.sensor(f"{side}_torque").adr[0] for side in ("left", "right")]
     torques = sensors[:, lead:, torque]
-    # A rollout's first state is that after one step; the one before time starts is the last of the lead.
-    seen = states[:, lead - 1 - BEFORE * per_sample :: per_sample]
+    # A rollout's first state is that after one step, so time zero is the last step of the lead.
+    seen = states[:, lead - 1 - LEAD_SAMPLES * per_sample :: per_sample]
     position, velocity = seen[..., 1 : 1 + model.nq], seen[..., 1 + model.nq : 1 + model.nq + model.nv]
-    n, k = told.shape[0], SAMPLES + AHEAD
+    n, k = targets.shape[0], SAMPLES + EXTRA_SAMPLES
     return Rollouts(
-        _planar(position[:, : BEFORE + k, :7]),
-        np.stack([velocity[:, BEFORE : BEFORE + k, joints[[i, i + 2]]].mean(-1) for i in (0, 1)], -1),
+        _planar(position[:, : LEAD_SAMPLES + k, :7]),
+        np.stack([velocity[:, LEAD_SAMPLES : LEAD_SAMPLES + k, joints[[i, i + 2]]].mean(-1) for i in (0, 1)], -1),
         torques[:, : (k - 1) * per_sample].reshape(n, k - 1, per_sample, 2).mean(2),
     )
 
 
-def _led(wheels: Array, count: int, lag: float) -> Array:
-    """What servos that lag are told so that wheels go from sample to sample in straight lines.
+def _lag_compensated(wheels: Array, count: int, lag: float) -> Array:
+    """Targets for lagging servos that make the wheel speeds go linearly from sample to sample.
 
     Args:
         wheels: Shape (n, k, 2), `PERIOD` [s] apart.
-        count: Steps from one to the next.
-        lag: [s], of first order: what comes out is as much behind as it changes in that time.
+        lag: First-order lag [s]; the output is behind by its change in that time.
 
     Returns:
         Shape (n, (k − 1) · count, 2).
     """
     share = (np.arange(count) + 0.5)[:, None] / count
     change = np.diff(wheels, axis=1)[:, :, None]
-    told = wheels[:, :-1, None] + (share + lag / PERIOD) * change
-    return told.reshape(len(wheels), -1, wheels.shape[2])
+    targets = wheels[:, :-1, None] + (share + lag / PERIOD) * change
+    return targets.reshape(len(wheels), -1, wheels.shape[2])
 
 
-def _starts(model: mujoco.MjModel, params: HuskyParams, start: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Full states to start from, shape (n, ·), and the degrees of freedom of the wheels, shape (4,)."""
+def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Initial full-physics states, shape (n, ·), and the indices of the wheels' degrees of freedom, shape (4,)."""
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, round(_SETTLE / model.opt.timestep))
     data.qvel[:] = 0.0
@@ -226,7 +226,7 @@ def _starts(model: mujoco.MjModel, params: HuskyParams, start: Array) -> tuple[A
     for i, sides in enumerate(start):
         rolling = sides * params.wheel_radius
         data.qvel[0] = rolling.mean()
-        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # about half what a differential drive would turn
+        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # about half the yaw rate of a differential drive
         data.qvel[joints] = np.tile(sides, 2)
         if model.na:
             data.act[:] = sides
@@ -234,8 +234,8 @@ def _starts(model: mujoco.MjModel, params: HuskyParams, start: Array) -> tuple[A
     return states, joints
 
 
-def _tilted(model: mujoco.MjModel, slope: Array) -> list[mujoco.MjModel]:
-    """One model per window; the same one where the ground is level throughout."""
+def _tilted_models(model: mujoco.MjModel, slope: Array) -> list[mujoco.MjModel]:
+    """One model per window with tilted gravity; a single model if all slopes are zero."""
     if not np.any(slope):
         return [model]
     models = []
@@ -247,16 +247,7 @@ def _tilted(model: mujoco.MjModel, slope: Array) -> list[mujoco.MjModel]:
 
 
 def _planar(pose: Array) -> Array:
-    """x, y, yaw relative to the first, shape (n, k, 3), of free-joint positions (n, k, 7)."""
+    """Free-joint positions (n, k, 7) → x, y, yaw relative to the first, shape (n, k, 3)."""
     w, x, y, z = np.moveaxis(pose[..., 3:7], -1, 0)
     yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), axis=1)
-    moved = pose[..., :2] - pose[:, :1, :2]
-    cos, sin = np.cos(yaw[:, :1]), np.sin(yaw[:, :1])
-    return np.stack(
-        [
-            cos * moved[..., 0] + sin * moved[..., 1],
-            cos * moved[..., 1] - sin * moved[..., 0],
-            yaw - yaw[:, :1],
-        ],
-        -1,
-    )
+    return relative_poses(np.stack([pose[..., 0], pose[..., 1], yaw], -1))

@@ -1,10 +1,9 @@
-"""ROS 2 bags as tables, through `rosbags` (the extra `ros`; no ROS installation is needed).
+"""ROS 2 bags read as tables, with `rosbags` (the extra `ros`; no ROS installation is needed).
 
-Topics are found by the type of their messages and what they hold: commands are geometry_msgs/Twist or TwistStamped;
-wheel speeds are sensor_msgs/JointState with joints named like a Husky's wheels; poses are nav_msgs/Odometry,
-geometry_msgs/PoseStamped or PoseWithCovarianceStamped (with several, the one whose topic does not come from the wheels:
-no `platform` or `wheel` in its name); accelerations are sensor_msgs/Imu. A row is made at every joint state, with the
-newest of everything else.
+Topics are selected by message type: commands are geometry_msgs/Twist or TwistStamped; wheel speeds are
+sensor_msgs/JointState with joints named like a Husky's wheels; poses are nav_msgs/Odometry, geometry_msgs/PoseStamped
+or PoseWithCovarianceStamped (of several, one whose name does not contain a word of `_FROM_WHEELS`); accelerations are
+sensor_msgs/Imu. The table has a row per joint state, with the newest values of everything else.
 """
 
 from pathlib import Path
@@ -27,7 +26,10 @@ _FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 
 
 def read_bag(path: Path) -> dict[str, Array]:
-    """Columns of `twin.sysid.logs`. Raises InputError: no reader, no bag, a kind of message is missing."""
+    """Reads the columns that `twin.sysid.logs` describes.
+
+    Raises InputError: rosbags is not installed, the bag is not readable, or a kind of message is missing.
+    """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -38,7 +40,7 @@ def read_bag(path: Path) -> dict[str, Array]:
             chosen = _choose(reader.connections, path)
             rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
             kinds = {connection.id: kind for kind, connection in chosen.items()}
-            begin = reader.start_time  # [ns]; taken off while still a whole number, for a float would round to 0.2 µs
+            begin = reader.start_time  # [ns]; subtracted as an integer, because a float would round to 0.2 µs
             for connection, stamp, raw in reader.messages(connections=list(chosen.values())):
                 kind = kinds[connection.id]
                 values = _VALUES[kind](reader.deserialize(raw, connection.msgtype))
@@ -46,7 +48,7 @@ def read_bag(path: Path) -> dict[str, Array]:
                     rows[kind].append(((stamp - begin) * 1e-9, *values))
     except InputError:
         raise
-    except Exception as error:  # the reader's own errors: not a bag, a broken one, unknown messages
+    except Exception as error:  # any of the reader's errors: not a bag, a damaged one, unknown messages
         raise InputError(f"{path}: not a readable ROS 2 bag: {error}; record it anew or give a .csv") from None
     empty = [kind for kind, values in rows.items() if not values]
     if empty:
@@ -60,7 +62,7 @@ def _choose(connections: Any, path: Path) -> dict[str, Any]:
     chosen = {}
     for kind, types in wanted.items():
         found = [c for c in connections if c.msgtype in types and c.msgcount]
-        if kind == "commands":  # the controller's own input rather than one of the multiplexer's
+        if kind == "commands":  # prefer the controller's input to the multiplexer's
             found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
         elif kind == "poses":
             found.sort(key=lambda c: (any(word in c.topic for word in _FROM_WHEELS), -c.msgcount))
@@ -108,7 +110,7 @@ _NAMES = {
 
 
 def _columns(tables: dict[str, Array]) -> dict[str, Array]:
-    """One row per joint state from when everything has been heard of once."""
+    """One row per joint state, from when every topic has had a message."""
     begin = max(table[0, 0] for table in tables.values())
     time = np.unique(tables["wheels"][:, 0])
     time = time[time >= begin]

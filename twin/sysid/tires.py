@@ -1,41 +1,9 @@
-"""Tyres and ground fitted to where a robot went.
+"""Tires and ground fitted to the poses of a log.
 
-Why Coulomb friction is not enough, and what is. Four point contacts under Coulomb friction turn with the same track
-ratio chi at every speed and on every friction, and hold the body at the mean speed of the wheels. A Husky on grass
-(DRIVE's log) turns with chi 2.0 in gentle bends and 2.3 in hard ones, and in hard turns moves at only 0.4 to 0.7 of the
-wheels' mean speed, though it slips 2.5 % going straight. Tried in MuJoCo's own terms, each fitted to the even groups of
-that log and scored on its odd ones (median error of the pose after 2 s):
-
-    Coulomb, friction and centre of mass fitted        0.23 m, 13 to 26°
-    + spin friction of the contact patch               0.21 m, 6°: right turns, but bodies still as fast as wheels
-    + drag (`ground_viscosity`)                        0.15 m, 6.0°: what the wheels wade through takes thrust; tyres
-                                                       that scrub sideways have little to give lengthwise, so they slip
-    + creep (`slip_stiffness` < 1)                     0.15 m, 5.0°: gentle bends turn more easily than hard ones
-    + slope, from the log's accelerometer              0.13 m, 5.2°: scrubbing tyres slide downhill
-    + the lateness of poses against wheel speeds       0.13 m, 4.8°
-    + wheels and slope as before each window           0.12 m, 4.7°: a body keeps its motion for half a second
-    + poses as of when they were measured              0.12 m, 4.8°: and less of it is noise (`timing`)
-    + rolling resistance                               0.12 m, 4.8°: tyres that roll grip by their slip; drag goes
-    + a controller's ramp goes on between windows      0.12 m, 4.5°: wheels lag, so they do not show it (`commands`)
-    + misses of the log's own scales                   0.11 m, 4.6°: set ones cared too much for yaw (`robust`)
-
-The last row is what ships; `docs/benchmarks.md` records it. Before rolling resistance, drag on all bodies or on the
-chassis alone was worse by 5 % of what was made least, and a part of the weight that slides, instead of drag, by 1 %:
-better straight on, worse in turns.
-
-Rolling resistance costs power, which servos give without slowing down, but it also softens turns. In MuJoCo's elliptic
-cone (condim 6) sliding, spinning and rolling share one limit: a tyre that rolls at v and slides at u has the share
-u / √(u² + (v Crr / μ)²) of its grip across. That is a tyre's law of slip: grip grows with the slip ratio u / v, in
-proportion at first, as in a brush model of stiffness μ / Crr. On hard ground Crr is small, and the tyre Coulomb's; soft
-ground, of a large Crr, lets a rolling tyre turn more easily than a standing one. What poses tell is this; a Crr
-by motor currents (`currents`) is of power, and may differ.
-
-Fluid of a given density drags with the square of speed and adds mass. All terms are the MJCF's: contact coefficients,
-`impratio`, and the viscosity of a medium in which only the tyres stand. None acts on the body, and all are off by
-default, but for the rolling resistance of hard ground. Where the ground is level, poses do not tell the mass's height.
-
-Poses may be those of a sensor with a clock of its own: the offset of their origin from the base, and how late they are
-against the wheel speeds, are fitted along, as the log's own.
+All terms are parameters of the MJCF: contact coefficients, `impratio`, and the viscosity of a medium that surrounds
+only the tires. All are off by default, except for the rolling resistance of hard ground. Two more parameters belong to
+the log: the offset of the pose sensor's origin from the base, and the delay of poses against wheel speeds. On level
+ground poses contain no information on the height of the mass. Fluid drag grows with the square of speed and adds mass.
 """
 
 from collections.abc import Callable
@@ -45,24 +13,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.robot import WHEEL_RADIUS, HuskyParams
-from twin.sysid.drivetrain import Drivetrain, targets
-from twin.sysid.estimation import Fit, Parameter, fit, search
-from twin.sysid.kinematics import POSE, residuals
-from twin.sysid.logs import PERIOD, Windows, retimed
-from twin.sysid.rollout import BEFORE, COARSE, EARLY, LATE, Rollouts, drive
+from twin.sysid.drivetrain import Drivetrain, simulate_drivetrain
+from twin.sysid.estimation import Fit, Parameter, fit_parameters, maximize_posterior
+from twin.sysid.kinematics import POSE_KINDS, residuals
+from twin.sysid.logs import PERIOD, Windows, resample_poses
+from twin.sysid.rollout import COARSE_TIMESTEP, LEAD_SAMPLES, MAX_POSE_LAG, MAX_POSE_LEAD, Rollouts, simulate_windows
 from twin.types import Array
 
-# Guess, span, lowest and highest value, unit, and what would show it; guesses are those of soft ground and of the
-# published robot, whatever load it bears. Creep is the inverse of slip stiffness, which slip grows with in proportion.
-# The mass may well be as far behind as some publish it.
-_MANY = 100  # windows
-_NEAR = 0.25  # `reach` of the search that begins near the end
-_SPREAD = "hard turns at several speeds"
+# ---- choice of terms
+#
+# Four point contacts under Coulomb friction turn with the same track ratio chi at every speed and on every friction,
+# and move the body at the mean speed of the wheels. A Husky on grass (DRIVE's log) turns with chi 2.0 in gentle bends
+# and 2.3 in hard ones, and moves in hard turns at 0.4 to 0.7 of the wheels' mean speed, though it slips 2.5 % going
+# straight. Each model below was fitted to the even groups of that log and scored on its odd ones (median pose error
+# after 2 s):
+#
+#     Coulomb, friction and center of mass fitted        0.23 m, 13 to 26°
+#     + spin friction of the contact patch               0.21 m, 6°: turns correctly, but bodies as fast as wheels
+#     + drag (`ground_viscosity`)                        0.15 m, 6.0°: drag on the tires takes thrust; tires that scrub
+#                                                        sideways have little longitudinal grip left, so they slip
+#     + creep (`slip_stiffness` < 1)                     0.15 m, 5.0°: gentle bends turn more easily than hard ones
+#     + slope, from the log's accelerometer              0.13 m, 5.2°: scrubbing tires slide downhill
+#     + delay of poses against wheel speeds              0.13 m, 4.8°
+#     + wheels and slope as before each window           0.12 m, 4.7°: a body keeps its motion for half a second
+#     + measurement times of poses                       0.12 m, 4.8°: and less of it is noise
+# (`logs.measurement_times`)     + rolling resistance                               0.12 m, 4.8°: grip grows with slip,
+# instead of drag     + ramps continued between windows                  0.12 m, 4.5°: lagging wheels do not show them
+# (`drivetrain`)     + residual scales estimated from the log           0.11 m, 4.6°: fixed ones weighted yaw too much
+# (`estimation`)
+#
+# The last row is the shipped model (`docs/benchmarks.md`). Before rolling resistance, drag on all bodies or on the
+# chassis alone had a 5 % higher loss, and a part of the weight that slides, instead of drag, 1 %: better straight on,
+# worse in turns.
+#
+# In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire that rolls at v
+# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip across. Grip thus grows with the slip ratio u /
+# v, at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire is
+# Coulomb's; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes this; a Crr
+# by motor currents (`benchmarks/motor_currents.py`) describes power, and may differ.
+
+# Prior mean and standard deviation, lowest and highest value, unit, cure. Prior means are those of soft ground and of
+# the published robot without load. Creep is the inverse of slip stiffness, since slip is proportional to it. Published
+# positions of the center of mass differ by as much as the prior of `center_of_mass_x`.
+_MANY = 100  # windows; with fewer the delay of poses is not fitted and the search uses all
+_NEAR = 0.25  # `reach` of the search that starts near the solution
+_TURNS = "hard turns at several speeds"
 _TORQUE = "motor currents or torques"
 _BRAKING = "hard braking, or slopes"
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
-    "friction": (0.3, 0.2, 0.05, 1.5, "", _SPREAD),
-    "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _SPREAD),
+    "friction": (0.3, 0.2, 0.05, 1.5, "", _TURNS),
+    "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _TURNS),
     "rolling_resistance": (0.1, 0.1, 0.0, 0.5, "", "gentle bends as well as hard turns"),
     "creep": (15.0, 15.0, 0.01, 300.0, "", "gentle bends as well as hard turns"),
     "ground_viscosity": (1.0, 2.0, 0.0, 80.0, "Pa s", "turns while driving at several speeds"),
@@ -74,12 +74,12 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "log10_servo_gain": (np.log10(HuskyParams().servo_gain), 0.3, 1.0, 4.0, "", _TORQUE),
     "pose_x": (0.0, 0.2, -1.0, 1.0, "m", "turns on the spot"),
     "pose_y": (0.0, 0.1, -1.0, 1.0, "m", "turns on the spot"),
-    "pose_late": (0.0, 0.1, -EARLY * PERIOD, LATE * PERIOD, "s", "turns that begin and end"),
+    "pose_late": (0.0, 0.1, -MAX_POSE_LEAD * PERIOD, MAX_POSE_LAG * PERIOD, "s", "turns that begin and end"),
 }
 
 
-def robot(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
-    """The robot with fitted values in place."""
+def robot_with_values(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
+    """The robot with the values of parameters in its fields; `params` keeps the others."""
     x, y, z = params.center_of_mass
     left, right = params.wheel_radius
     return replace(
@@ -99,8 +99,7 @@ def robot(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
     )
 
 
-def usual(params: HuskyParams) -> dict[str, float]:
-    """The values of `_TABLE` that a robot has."""
+def values_of_robot(params: HuskyParams) -> dict[str, float]:
     x, y, z = params.center_of_mass
     left, right = params.wheel_radius
     return {
@@ -121,30 +120,32 @@ def usual(params: HuskyParams) -> dict[str, float]:
     }
 
 
-def simulated(
+def simulate_log(
     params: HuskyParams,
     values: dict[str, float],
-    drive_: Drivetrain,
+    drivetrain: Drivetrain,
     windows: Windows,
     slope: Array,
     timestep: float | None = None,
 ) -> Rollouts:
-    """What the robot with these values does with a log's commands; its poses are `told_poses`."""
-    told, _ = targets(drive_, windows)
-    fitted = robot(replace(params, servo_lag=drive_.lag, max_wheel_speed=5.0), values)
-    out = drive(fitted, told, windows.before, slope, timestep)
+    """Simulates the log's commands with these values; poses are those of `measured_poses`."""
+    targets, _ = simulate_drivetrain(drivetrain, windows)
+    fitted = robot_with_values(replace(params, servo_lag=drivetrain.lag, max_wheel_speed=5.0), values)
+    out = simulate_windows(fitted, targets, windows.preceding_wheels, slope, timestep)
     return replace(out, poses=measured_poses(out, values, windows))
 
 
-def measured_poses(drives: Rollouts, values: dict[str, float], windows: Windows) -> Array:
-    """Poses of drives as these windows tell them: of the log's own origin, with its own clock, since each one's first
-    pose was measured. Shape (n, k + OLDEST + 1, 3)."""
-    seen = retimed(drives.poses, values["pose_late"] - windows.measured[:, 0], BEFORE)
-    return moved_origin(seen, values["pose_x"], values["pose_y"])
+def measured_poses(rollouts: Rollouts, values: dict[str, float], windows: Windows) -> Array:
+    """Poses as the log's sensor measures them: of its own origin, with its own delay, relative to each first one.
+
+    Shape (n, k + MAX_POSE_AGE + 1, 3).
+    """
+    poses = resample_poses(rollouts.poses, values["pose_late"] - windows.measurement_times[:, 0], LEAD_SAMPLES)
+    return shift_origin(poses, values["pose_x"], values["pose_y"])
 
 
-def moved_origin(poses: Array, x: float, y: float) -> Array:
-    """Poses of a point of the robot, x forward and y left of its origin [m], relative to where it was. Any shape."""
+def shift_origin(poses: Array, x: float, y: float) -> Array:
+    """Poses (..., 3) of a point x forward and y left of the robot's origin [m], relative to its initial position."""
     cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     moved = np.stack([x * (cos - 1) - y * sin, x * sin + y * (cos - 1), np.zeros_like(cos)], -1)
     return poses + moved
@@ -152,52 +153,61 @@ def moved_origin(poses: Array, x: float, y: float) -> Array:
 
 def fit_ground(
     params: HuskyParams,
-    drive_: Drivetrain,
+    drivetrain: Drivetrain,
     windows: Windows,
     slope: Array,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
-    """What the log's poses say of tyres, ground and masses.
+    """Fits tires, ground and masses to the poses of a log.
 
     Args:
-        params: What is kept of what cannot be told.
-        drive_: From `commands.fit_drive`.
-        windows: All of a log; fitted are those for fitting.
-        slope: From `slope.gravity`, shape (n, 2).
-        progress: Told a line now and then.
+        params: The robot that gives the defaults.
+        drivetrain: From `drivetrain.fit_drivetrain`.
+        windows: All of a log; those for fitting are used.
+        slope: From `rollout.slope_gravity`, shape (n, 2).
     """
-    kept = usual(params)
-    hidden: dict[str, str] = {}
+    defaults = values_of_robot(params)
+    refused: dict[str, str] = {}
     if not slope.any():
-        height = kept["center_of_mass_z"]
-        hidden["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
+        height = defaults["center_of_mass_z"]
+        refused["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
     fitting = np.flatnonzero(windows.fitting)
-    if len(fitting) < _MANY:  # where it is next to nothing, others would go astray for it
-        hidden["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
+    if len(fitting) < _MANY:  # a delay near zero would bias the others
+        refused["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
     table = [
-        Parameter(name, guess, span, low, high, kept[name], unit, cure)
-        for name, (guess, span, low, high, unit, cure) in _TABLE.items()
-        if name not in hidden
+        Parameter(name, mean, std, low, high, defaults[name], unit, cure)
+        for name, (mean, std, low, high, unit, cure) in _TABLE.items()
+        if name not in refused
     ]
-    told, _ = targets(drive_, windows)
-    before = windows.before
-    base = replace(params, servo_lag=drive_.lag, max_wheel_speed=5.0)
+    targets, _ = simulate_drivetrain(drivetrain, windows)
+    before = windows.preceding_wheels
+    base = replace(params, servo_lag=drivetrain.lag, max_wheel_speed=5.0)
 
-    def misses_of(which: NDArray[np.int64], timestep: float | None) -> Callable[[dict[str, float]], Array]:
-        some = windows.of(which)
+    def residuals_of(which: NDArray[np.int64], timestep: float | None) -> Callable[[dict[str, float]], Array]:
+        some = windows.select(which)
 
-        def missed(values: dict[str, float]) -> Array:
-            out = drive(robot(base, kept | values), told[which], before[which], slope[which], timestep)
-            return residuals(measured_poses(out, kept | values, some), some)
+        def pose_residuals(values: dict[str, float]) -> Array:
+            out = simulate_windows(
+                robot_with_values(base, defaults | values), targets[which], before[which], slope[which], timestep
+            )
+            return residuals(measured_poses(out, defaults | values, some), some)
 
-        return missed
+        return pose_residuals
 
-    # At a coarse time step, with a third of many windows, the neighbourhood is found in a tenth of the time; nothing is
-    # judged there. What is fitted at a coarse step makes up for it: the shipped one has the last word.
+    # A coarse time step and a third of many windows find the neighborhood in a tenth of the time. The final fit and its
+    # evaluation use the shipped time step, since values fitted at a coarse one compensate for it.
     some = fitting
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))
-    progress(f"looking around with {len(some)} windows")
-    near = search(table, misses_of(some, COARSE), POSE, {p.name: _TABLE[p.name][0] for p in table}, progress=progress)
-    found = fit(table, misses_of(fitting, None), POSE, windows.groups[fitting], near, _NEAR, progress)
-    return replace(found, values=kept | found.values, refused=hidden | found.refused)
+    progress(f"coarse search with {len(some)} windows")
+    near = maximize_posterior(
+        table,
+        residuals_of(some, COARSE_TIMESTEP),
+        POSE_KINDS,
+        {p.name: _TABLE[p.name][0] for p in table},
+        progress=progress,
+    )
+    found = fit_parameters(
+        table, residuals_of(fitting, None), POSE_KINDS, windows.groups[fitting], near, _NEAR, progress
+    )
+    return replace(found, values=defaults | found.values, refused=refused | found.refused)

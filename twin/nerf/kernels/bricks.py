@@ -1,18 +1,16 @@
-"""Bricks: where samples of a field are stored, and how they are tuned.
+"""Bricks: sparse storage of a baked field's samples, and the kernels that fine-tune them; `march.py` renders them.
 
 *Brick*: 8³ cells of a grid, stored as the 9³ samples on their corners, so that interpolation never leaves it. A sample
-is `CHANNELS` bytes: the raw density and the features of a radiance field (see `composite.py`), each in its channel's
-range. *Slot*: row of a stored brick; the *index* gives it per brick of a grid, −1 where nothing is stored. *Block*: 2³
-cells. There are two grids: the *near* one over the near box, the *far* one, of larger cells, over all of the contracted
-cube. `march.py` renders them.
+is `CHANNELS` bytes: raw density and features (see `composite.py`), each in its channel's range. *Slot*: row of a stored
+brick; the *index* gives it per brick of a grid, −1 where none is stored. *Block*: 2³ cells. The *near* grid covers the
+near box, the *far* grid, of larger cells, the contracted cube.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
 # mypy: ignore-errors
-import warp as wp
-
 from twin.nerf.kernels.composite import CHANNELS, Channels
-from twin.nerf.kernels.sampler import in_near_box, is_near
+from twin.nerf.kernels.sampler import inside_near_box, near_box_position
+from twin.warp_runtime import wp
 
 CELLS = 8
 """Cells along a brick's side."""
@@ -25,13 +23,13 @@ Bytes = wp.types.vector(length=CHANNELS, dtype=wp.uint8)
 
 _CELLS = wp.constant(CELLS)
 _CORNERS = wp.constant(CORNERS)
-_LEAST_GRADIENT = wp.constant(1.0e-22)  # squared, from which a sample takes part in a step
+_MIN_GRADIENT = wp.constant(1.0e-22)  # squared norm from which a sample takes part in a step
 _SIDE = wp.constant(float(CELLS))
 
 
 @wp.struct
 class BrickPosition:
-    """Where a grid position falls: a slot (< 0: none), the cell's lowest corner, and how far into the cell."""
+    """Slot of a grid position (< 0: none), its cell's lowest corner, and the position in the cell."""
 
     slot: wp.int32
     corner: wp.int32
@@ -41,18 +39,16 @@ class BrickPosition:
 
 
 @wp.func
-def corner(x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
+def corner_index(x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
     return (x * _CORNERS + y) * _CORNERS + z
 
 
 @wp.func
-def place_of(
-    g: wp.vec3f, near_index: wp.array3d(dtype=wp.int32), far_index: wp.array3d(dtype=wp.int32)
-) -> BrickPosition:
+def locate(g: wp.vec3f, near_index: wp.array3d(dtype=wp.int32), far_index: wp.array3d(dtype=wp.int32)) -> BrickPosition:
     out = BrickPosition()
-    b = in_near_box(g)
+    b = near_box_position(g)
     p = wp.vec3f(0.0, 0.0, 0.0)
-    if is_near(b):
+    if inside_near_box(b):
         p = wp.vec3f(
             b[0] * float(near_index.shape[0]), b[1] * float(near_index.shape[1]), b[2] * float(near_index.shape[2])
         )
@@ -66,7 +62,7 @@ def place_of(
     x = wp.min(int(c[0]), _CELLS - 1)
     y = wp.min(int(c[1]), _CELLS - 1)
     z = wp.min(int(c[2]), _CELLS - 1)
-    out.corner = corner(x, y, z)
+    out.corner = corner_index(x, y, z)
     out.x = c[0] - float(x)
     out.y = c[1] - float(y)
     out.z = c[2] - float(z)
@@ -74,18 +70,18 @@ def place_of(
 
 
 @wp.func
-def corner_weight(place: BrickPosition, n: wp.int32) -> wp.float32:
+def corner_weight(position: BrickPosition, n: wp.int32) -> wp.float32:
     """Weight of the n-th corner of a cell, n = 4·x + 2·y + z."""
     w = float(1.0)
-    w *= wp.where((n & 4) > 0, place.x, 1.0 - place.x)
-    w *= wp.where((n & 2) > 0, place.y, 1.0 - place.y)
-    w *= wp.where((n & 1) > 0, place.z, 1.0 - place.z)
+    w *= wp.where((n & 4) > 0, position.x, 1.0 - position.x)
+    w *= wp.where((n & 2) > 0, position.y, 1.0 - position.y)
+    w *= wp.where((n & 1) > 0, position.z, 1.0 - position.z)
     return w
 
 
 @wp.func
 def corner_offset(n: wp.int32) -> wp.int32:
-    return corner((n >> 2) & 1, (n >> 1) & 1, n & 1)
+    return corner_index((n >> 2) & 1, (n >> 1) & 1, n & 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -94,19 +90,19 @@ def interpolate(
     near_index: wp.array3d(dtype=wp.int32),
     far_index: wp.array3d(dtype=wp.int32),
     values: wp.array2d(dtype=Channels),
-    nothing: wp.float32,
+    empty_raw: wp.float32,
     start: wp.int32,
     outputs: wp.array(dtype=Channels),
 ):
-    """Raw density and features at grid positions, from samples not in bytes; no brick means raw density `nothing`."""
+    """Raw density and features at grid positions, from float samples; raw density `empty_raw` outside bricks."""
     i = start + wp.tid()
-    place = place_of(positions[i], near_index, far_index)
+    position = locate(positions[i], near_index, far_index)
     out = Channels()
-    if place.slot < 0:
-        out[0] = nothing
+    if position.slot < 0:
+        out[0] = empty_raw
     else:
         for n in range(8):
-            out += values[place.slot, place.corner + corner_offset(n)] * corner_weight(place, n)
+            out += values[position.slot, position.corner + corner_offset(n)] * corner_weight(position, n)
     outputs[i] = out
 
 
@@ -120,15 +116,15 @@ def interpolate_backward(
     parts: wp.int32,
     gradient: wp.array2d(dtype=Channels),
 ):
-    """Adds the gradient of `interpolate`; launched once per `part` of the slots, so that the order of sums is fixed."""
+    """Adds the gradient of `interpolate`; launched once per `part` of the slots, which fixes the order of sums."""
     i = wp.tid()
     g = outputs_grad[i]
-    if wp.dot(g, g) < _LEAST_GRADIENT:
+    if wp.dot(g, g) < _MIN_GRADIENT:
         return
-    place = place_of(positions[i], near_index, far_index)
-    if place.slot >= 0 and place.slot % parts == part:
+    position = locate(positions[i], near_index, far_index)
+    if position.slot >= 0 and position.slot % parts == part:
         for n in range(8):
-            wp.atomic_add(gradient, place.slot, place.corner + corner_offset(n), g * corner_weight(place, n))
+            wp.atomic_add(gradient, position.slot, position.corner + corner_offset(n), g * corner_weight(position, n))
 
 
 @wp.kernel(enable_backward=False)
@@ -145,22 +141,22 @@ def adam_step(
     gradient: wp.array2d(dtype=Channels),
     second: wp.array2d(dtype=wp.vec2f),
 ):
-    """Adam (Kingma and Ba 2015) on samples that got a gradient, which is then cleared; β = (0, 0.99).
+    """Adam step (Kingma and Ba 2015) on samples with a gradient, which it clears; β = (0, 0.99).
 
-    To save memory there is no momentum, and a sample's features share one second moment. Goes where
-    `interpolate_backward` went, since most samples get none. On CUDA a corner may be met by two threads at once; both
-    then take the same step, or the later one none.
+    To save memory there is no momentum, and a sample's features share one second moment. Visits the positions of
+    `interpolate_backward`, as most samples get no gradient. On CUDA two threads may reach a corner at once; both then
+    take the same step, or the later one none.
     """
     i = wp.tid()
     g = outputs_grad[i]
-    if wp.dot(g, g) < _LEAST_GRADIENT:
+    if wp.dot(g, g) < _MIN_GRADIENT:
         return
-    place = place_of(positions[i], near_index, far_index)
-    if place.slot < 0 or place.slot % parts != part:
+    position = locate(positions[i], near_index, far_index)
+    if position.slot < 0 or position.slot % parts != part:
         return
-    slot = place.slot
+    slot = position.slot
     for n in range(8):
-        at = place.corner + corner_offset(n)
+        at = position.corner + corner_offset(n)
         g = gradient[slot, at]
         if wp.dot(g, g) > 0.0:
             own = g[0] * g[0]

@@ -1,7 +1,6 @@
-"""Shading: what was composited along a ray becomes its colour, by the head and backdrop of `network.py`.
+"""Color head on baked fields: composited features → colors, by the head and background networks of `network.py`.
 
-The appearance is in the first layer's *bias*, one per camera, so that every camera of a launch may have a lighting of
-its own.
+The first layer's *bias* includes the appearance, one per camera, so every camera of a launch can have its own lighting.
 """
 
 # Warp reads annotations as values.
@@ -9,21 +8,20 @@ its own.
 from functools import cache
 from typing import Any
 
-import warp as wp
-
 from twin.nerf.kernels.composite import CHANNELS
 from twin.nerf.kernels.march import ImageBuffers
-from twin.nerf.kernels.vectorised import OPTIONS, exponential
+from twin.nerf.kernels.vectorized import OPTIONS, fast_exp
 from twin.nerf.rendering import FAR
+from twin.warp_runtime import wp
 
 HARMONICS = 16
 FEATURES = CHANNELS - 1
 LANES = {"cpu": 16, "cuda": 1}
-"""Pixels a thread; see `march.py`."""
+"""Pixels per thread; see `march.py`."""
 
 wp.set_module_options(OPTIONS)
 
-Eight = wp.types.vector(length=8, dtype=wp.float32)
+Vec8 = wp.types.vector(length=8, dtype=wp.float32)
 """Weights of eight hidden units."""
 
 _HARMONICS = wp.constant(HARMONICS)
@@ -34,33 +32,34 @@ _FAR = wp.constant(FAR)
 
 @wp.func
 def sigmoid(x: wp.float32) -> wp.float32:
-    return 1.0 / (1.0 + exponential(-x))
+    return 1.0 / (1.0 + fast_exp(-x))
 
 
 @cache
-def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
-    """The kernel for `lanes` neighbouring pixels a thread and so many hidden units, and the struct of the weights.
+def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[Any, Any]:
+    """Builds the kernel for `lanes` neighboring pixels per thread and given layer widths, and its struct of weights.
 
-    Launched over cameras and runs of pixels, from `first` up to `last`. Where the march was to stop somewhere there is
-    no backdrop, and features are scaled up to a full share: the colour is that of what was met.
+    It is launched over cameras and runs of pixels, from `first` up to `last`. For images with `stop` depths there is no
+    background, and features are scaled to full opacity: the color is that of the field's own share.
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
     Inputs = wp.types.matrix(shape=(FEATURES + HARMONICS, lanes), dtype=wp.float32)
     Hidden = wp.types.matrix(shape=(hidden, lanes), dtype=wp.float32)
-    Behind = wp.types.matrix(shape=(backdrop_hidden, lanes), dtype=wp.float32)
+    Background = wp.types.matrix(shape=(background_hidden, lanes), dtype=wp.float32)
     count = wp.constant(lanes)
     units = wp.constant(hidden)
-    behind_units = wp.constant(backdrop_hidden)
+    background_units = wp.constant(background_hidden)
 
+    # Also written in network.py (torch): the compiler fuses operations by context, so sharing may change bits.
     @wp.func
-    def harmonics_of(film: ImageBuffers, camera: wp.int32, first: wp.int32, x: Inputs) -> Inputs:
-        """`network.spherical_harmonics` of the rays' directions, below the features."""
-        k = film.intrinsics[camera]
-        rotation = film.rotation[camera]
+    def harmonics_of(image: ImageBuffers, camera: wp.int32, first: wp.int32, x: Inputs) -> Inputs:
+        """Appends spherical harmonics of the ray directions to the features."""
+        k = image.intrinsics[camera]
+        rotation = image.rotation[camera]
         for j in range(count):
             pixel = first + j
-            u = (float(pixel % film.width) + 0.5 - k[2]) / k[0]
-            v = (float(pixel // film.width) + 0.5 - k[3]) / k[1]
+            u = (float(pixel % image.width) + 0.5 - k[2]) / k[0]
+            v = (float(pixel // image.width) + 0.5 - k[3]) / k[1]
             d = rotation * wp.normalize(wp.vec3f(u, v, 1.0))
             xx = d[0] * d[0]
             yy = d[1] * d[1]
@@ -85,13 +84,12 @@ def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
 
     @wp.struct
     class Weights:
-        """Matrices. Those of the head by eight hidden units, then by what else they connect; others flat, by input and
-        then output."""
+        """Weights: of the head in groups of eight hidden units, then the other axis; others flat, input then output."""
 
-        head_0: wp.array(dtype=Eight)
-        head_1: wp.array(dtype=Eight)
-        head_1_bias: wp.array(dtype=Eight)
-        head_2: wp.array(dtype=Eight)
+        head_0: wp.array(dtype=Vec8)
+        head_1: wp.array(dtype=Vec8)
+        head_1_bias: wp.array(dtype=Vec8)
+        head_2: wp.array(dtype=Vec8)
         head_2_bias: wp.vec3f
         backdrop_0: wp.array(dtype=wp.float32)
         backdrop_0_bias: wp.array(dtype=wp.float32)
@@ -100,8 +98,8 @@ def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
     def shade_rays(
         weights: Weights,
-        bias: wp.array2d(dtype=Eight),
-        film: ImageBuffers,
+        bias: wp.array2d(dtype=Vec8),
+        image: ImageBuffers,
         first: wp.int32,
         last: wp.int32,
         features: wp.array3d(dtype=wp.float32),
@@ -120,26 +118,26 @@ def shade(lanes: int, hidden: int, backdrop_hidden: int) -> tuple[Any, Any]:
         for n in range(_FEATURES):
             for j in range(count):
                 x[n, j] = features[camera, n + 1, wp.min(start + j, last - 1)]
-        x = harmonics_of(film, camera, start, x)
-        if film.stop.shape[0] > 0:
+        x = harmonics_of(image, camera, start, x)
+        if image.stop.shape[0] > 0:
             for n in range(_FEATURES):
                 for j in range(count):
                     x[n, j] = x[n, j] / wp.max(share[j], 1.0e-3)
         elif least < 0.999:
-            g = Behind()
-            for n in range(behind_units):
+            g = Background()
+            for n in range(background_units):
                 a = Floats(weights.backdrop_0_bias[n])
                 for i in range(_HARMONICS):
-                    a += x[_FEATURES + i] * weights.backdrop_0[i * behind_units + n]
+                    a += x[_FEATURES + i] * weights.backdrop_0[i * background_units + n]
                 for j in range(count):
                     a[j] = wp.max(a[j], 0.0) * (1.0 - share[j])
                 g[n] = a
             for i in range(_FEATURES):
                 a = x[i]
-                for n in range(behind_units):
+                for n in range(background_units):
                     a += g[n] * weights.backdrop_1[n * _FEATURES + i]
                 x[i] = a
-        # Eight outputs at a time: an input is read once for them all, and so many sums keep the processor's units busy.
+        # Eight outputs at a time: each input is read once for all, and eight sums keep the processor's units busy.
         h = Hidden()
         for q in range(units // 8):
             w = bias[camera, q]

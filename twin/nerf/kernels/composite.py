@@ -1,13 +1,13 @@
-"""Volume rendering of features along rays, with its hand-written backward pass and the per-sample regularisers.
+"""Volume rendering of features along rays, with a hand-written backward pass and per-sample regularizers.
 
-Per ray there are K strata between K + 1 edges [m], of contracted lengths δ [m]. Each sample's network output holds the
-raw density in slot 0 and features in the others. Weight wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)) (Max 1995). The composited output
-holds the *opacity* Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the others.
+A ray has K strata between K + 1 edges [m], of contracted lengths δ [contracted m]. A sample's network output holds raw
+density in slot 0 and features in the others. Weight wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)) (Max 1995). The composited output holds
+the *opacity* Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the others.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
 # mypy: ignore-errors
-import warp as wp
+from twin.warp_runtime import wp
 
 CHANNELS = 16
 """Network outputs per sample: raw density and 15 features."""
@@ -15,25 +15,25 @@ CHANNELS = 16
 Channels = wp.types.vector(length=CHANNELS, dtype=wp.float32)
 
 RAW_LIMIT = 14.0
-"""Raw outputs above this count as this: opaque at any sampling distance."""
+"""Raw densities are clamped to this, which is opaque at any sampling distance."""
 
 _RAW_LIMIT = wp.constant(RAW_LIMIT)
 
 
 @wp.func
 def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
-    """Density per contracted metre of the network's raw output; `unit` is the density at 0."""
+    """Density [1/contracted m] of a raw output; `unit` is the density at 0."""
     return unit * wp.exp(wp.min(raw, _RAW_LIMIT))
 
 
 @wp.kernel(enable_backward=False)
-def densities_of(
+def sample_densities(
     outputs: wp.array(dtype=Channels),
     unit: wp.float32,
     start: wp.int32,
     densities: wp.array(dtype=wp.float32),
 ):
-    """Densities of samples, per contracted metre."""
+    """Densities of samples [1/contracted m]."""
     i = start + wp.tid()
     densities[i] = density_of(outputs[i][0], unit)
 
@@ -51,7 +51,7 @@ def composite(
     inverse_distance: wp.array(dtype=wp.float32),
     median_distance: wp.array(dtype=wp.float32),
 ):
-    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and where half the light is stopped [m] (−1: nowhere)."""
+    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and the distance [m] that blocks half the light (−1: none)."""
     i = start + wp.tid()
     transmittance = float(1.0)
     total = Channels()
@@ -94,12 +94,12 @@ def composite_backward(
     start: wp.int32,
     outputs_grad: wp.array2d(dtype=Channels),
 ):
-    """Gradient of the network outputs, given that of the composited output and of Σwᵢ/tᵢ.
+    """Gradient of the network outputs, given the gradients of the composited output and of Σwᵢ/tᵢ.
 
-    Adds the gradient of two regularisers of the weights:
+    Adds the gradient of two regularizers of the weights:
         distortion · (Σᵢⱼ wᵢwⱼ|sᵢ − sⱼ| + ⅓ Σ wᵢ²Δsᵢ), s = log(t + log_offset)      (Barron et al. 2022, eq. 15)
         depth · (Σᵢ wᵢ·min(|tᵢ/target − 1|, reach) + (1 − Σwᵢ)·reach), where a target distance is known: the cost of
-        moving all weight to it, capped so that a wrong target does not tear.
+        moving all weight to it, capped to limit the effect of wrong targets.
     """
     i = start + wp.tid()
     count = distances.shape[1]

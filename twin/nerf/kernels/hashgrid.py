@@ -1,14 +1,13 @@
-"""Multi-resolution hash encoding (Müller et al. 2022, section 3), forward, hand-written backward, and its optimiser.
+"""Multi-resolution hash encoding (Müller et al. 2022, section 3): forward, hand-written backward, and optimizer.
 
-*Grid position*: a contracted position scaled to [0, 1]³ (see `kernels/space.py`). *Level*: one grid of vertices, from
-coarse to fine; a level small enough is stored densely, the others are hashed. *Table*: the features of all levels,
-`FEATURES` floats per vertex. The backward scatter is launched level by level, so that on the CPU every level is summed
-by one thread in a fixed order: the result does not depend on how many threads there are.
+*Grid position*: see `kernels/space.py`. *Level*: one grid of vertices, from coarse to fine; levels that fit are stored
+densely, the others are hashed. *Table*: features of all levels, `FEATURES` floats per vertex. The backward pass is
+launched level by level, so that on a CPU one thread sums each level in a fixed order, whatever the number of threads.
 """
 
 # Warp reads annotations as values.
 # mypy: ignore-errors
-import warp as wp
+from twin.warp_runtime import wp
 
 FEATURES = 4
 """Features per level; four floats are one aligned 16-byte load."""
@@ -117,10 +116,10 @@ def adam_step(
     first: wp.array2d(dtype=Feature),
     second: wp.array2d(dtype=Feature),
 ):
-    """Adam (Kingma and Ba 2015) on the rows that got a gradient, which is then cleared; launched over (levels, rows).
+    """Adam step (Kingma and Ba 2015) on the rows with a gradient, which it clears; launched over (levels, rows).
 
-    Rows without a gradient are left alone, moments too, as most of a table is untouched by any one batch. `rate` is
-    the learning rate over 1 − β₁ᵗ and `second_correction` is 1 / (1 − β₂ᵗ); β = (0.9, 0.99).
+    Rows without a gradient keep their values and moments, as a batch touches little of a table. `rate` is the learning
+    rate over 1 − β₁ᵗ and `second_correction` is 1 / (1 − β₂ᵗ); β = (0.9, 0.99).
     """
     k, i = wp.tid()
     level = first_level + k

@@ -1,29 +1,28 @@
-"""What the march reads of a baked field, in few bytes, as it mostly waits for memory; for bricks see `bricks.py`.
+"""Memory layout and lookups of a baked field for the march, compact as the march mostly waits for memory.
 
-*Leap*: of a block 0 where there is something in it, else d ≥ 1, the distance to the nearest such block, in blocks along
-the axis where it is furthest: so far a ray may go in that grid without looking.
+Bricks and blocks: see `bricks.py`. *Skip distance*: 0 for a block with matter in it, else the Chebyshev distance d ≥ 1
+in blocks to the nearest such block, for empty-space skipping.
 """
 
 # Warp reads annotations as values.
 # mypy: ignore-errors
-import warp as wp
-
 from twin.nerf.kernels.bricks import CORNERS, SAMPLES, Bytes
 from twin.nerf.kernels.composite import CHANNELS, RAW_LIMIT, Channels
-from twin.nerf.kernels.vectorised import exponential
+from twin.nerf.kernels.vectorized import fast_exp
+from twin.warp_runtime import wp
 
-HALF = CORNERS // 2 + 1
+HALF_CORNERS = CORNERS // 2 + 1
 """Samples along z of half a brick."""
-DENSITIES = CORNERS * 2 * CORNERS * HALF
+DENSITIES = CORNERS * 2 * CORNERS * HALF_CORNERS
 """Bytes of a brick's densities: along x, then by halves along z (the sample between them twice), then y, then z. So
-the four corners of a cell's face across x lie within eight bytes, and a line of the cache holds many cells."""
+the four corners of a cell's face across x lie within eight bytes, and a cache line holds many cells."""
 
 _SAMPLES = wp.constant(SAMPLES)
 _CORNERS = wp.constant(CORNERS)
-_HALF = wp.constant(HALF)
+_HALF = wp.constant(HALF_CORNERS)
 _DENSITIES = wp.constant(DENSITIES)
-_ACROSS = wp.constant(2 * CORNERS * HALF)  # from one face to the next
-_NEXT_Y = wp.constant(8 * HALF)  # bits
+_ACROSS = wp.constant(2 * CORNERS * HALF_CORNERS)  # from one face to the next
+_NEXT_Y = wp.constant(8 * HALF_CORNERS)  # bits
 _RAW_LIMIT = wp.constant(RAW_LIMIT)
 _X = wp.constant(CORNERS * CORNERS)  # from one sample to the next along each axis
 _Y = wp.constant(CORNERS)
@@ -32,21 +31,21 @@ _Z = wp.constant(1)
 
 @wp.struct
 class Bricks:
-    """A baked field as the march reads it. Grids are flat, the last axis fastest."""
+    """A baked field in the layout of the march. Grids are flat, the last axis fastest."""
 
     near_index: wp.array(dtype=wp.int32)
-    """Slot of a brick, or −d where none is stored: the least leap of its blocks is d."""
+    """Slot of a brick, or −d where none is stored, d being the least skip distance of its blocks."""
     far_index: wp.array(dtype=wp.int32)
-    leaps: wp.array(dtype=wp.uint8)
-    """Of the blocks of the stored bricks."""
+    skips: wp.array(dtype=wp.uint8)
+    """Skip distances of the stored bricks' blocks, 64 per slot."""
     near_blocks: wp.vec3i
     far_blocks: wp.vec3i
     densities: wp.array(dtype=wp.uint8)
-    """See `layout.density_codes`."""
+    """See `brick_layout.density_codes`."""
     features: wp.array(dtype=Bytes)
     low: Channels
     step: Channels
-    centre: wp.vec3f
+    center: wp.vec3f
     inverse_half: wp.vec3f
     near_cell: wp.float32
     far_cell: wp.float32
@@ -54,7 +53,7 @@ class Bricks:
     near_plane: wp.float32
 
 
-# A Warp array may have gaps between its elements; these have none, and the compiler does better where it knows.
+# Warp arrays may be strided; these are contiguous, and the compiler does better when it knows.
 @wp.func_native("return array.data[i];")
 def byte_of(array: wp.array(dtype=wp.uint8), i: wp.int32) -> wp.uint8: ...
 
@@ -73,21 +72,21 @@ def eight_of(array: wp.array(dtype=wp.uint8), i: wp.int32) -> wp.uint64: ...
 
 @wp.func
 def brick_at(index: wp.array(dtype=wp.int32), b1: wp.int32, b2: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
-    """What an index of (.., b1, b2) blocks says of the brick that block (i0, i1, i2) is in."""
+    """Index entry of the brick that contains block (i0, i1, i2), for a grid of (.., b1, b2) blocks."""
     return slot_of(index, ((i0 >> 2) * (b1 >> 2) + (i1 >> 2)) * (b2 >> 2) + (i2 >> 2))
 
 
 @wp.func
-def leap_at(bricks: Bricks, brick: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
-    """The leap of a block, or of its brick where none is stored."""
+def skip_at(bricks: Bricks, brick: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
+    """Skip distance of a block, or of its brick if that is not stored."""
     at = wp.max(brick, 0) * 64 + ((i0 & 3) * 4 + (i1 & 3)) * 4 + (i2 & 3)
-    stored = int(byte_of(bricks.leaps, at))
+    stored = int(byte_of(bricks.skips, at))
     return wp.where(brick < 0, -brick, stored)
 
 
 @wp.func
 def density_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, p2: wp.float32):
-    """Density [1/contracted m] at a place in blocks."""
+    """Density [1/contracted m] at a position [blocks]."""
     i0 = int(2.0 * p0)
     i1 = int(2.0 * p1)
     i2 = int(2.0 * p2)
@@ -108,11 +107,11 @@ def density_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, p
     v2 = az * float(c & byte) + z * float((c >> wp.uint32(8)) & byte)
     v3 = az * float(d & byte) + z * float((d >> wp.uint32(8)) & byte)
     code = (1.0 - x) * ((1.0 - y) * v0 + y * v1) + x * ((1.0 - y) * v2 + y * v3)
-    return bricks.unit * exponential(wp.min(bricks.low[0] + bricks.step[0] * code, _RAW_LIMIT))
+    return bricks.unit * fast_exp(wp.min(bricks.low[0] + bricks.step[0] * code, _RAW_LIMIT))
 
 
 @wp.func
-def codes(value: Bytes) -> Channels:
+def as_floats(value: Bytes) -> Channels:
     out = Channels()
     for c in range(CHANNELS):
         out[c] = float(value[c])
@@ -121,7 +120,7 @@ def codes(value: Bytes) -> Channels:
 
 @wp.func
 def features_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, p2: wp.float32) -> Channels:
-    """Feature codes at a place in blocks."""
+    """Interpolated feature bytes at a position [blocks]."""
     i0 = int(2.0 * p0)
     i1 = int(2.0 * p1)
     i2 = int(2.0 * p2)
@@ -132,12 +131,12 @@ def features_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, 
     ax = 1.0 - x
     ay = 1.0 - y
     az = 1.0 - z
-    value = codes(sample_of(bricks.features, at)) * (ax * ay * az)
-    value += codes(sample_of(bricks.features, at + _Z)) * (ax * ay * z)
-    value += codes(sample_of(bricks.features, at + _Y)) * (ax * y * az)
-    value += codes(sample_of(bricks.features, at + _Y + _Z)) * (ax * y * z)
-    value += codes(sample_of(bricks.features, at + _X)) * (x * ay * az)
-    value += codes(sample_of(bricks.features, at + _X + _Z)) * (x * ay * z)
-    value += codes(sample_of(bricks.features, at + _X + _Y)) * (x * y * az)
-    value += codes(sample_of(bricks.features, at + _X + _Y + _Z)) * (x * y * z)
+    value = as_floats(sample_of(bricks.features, at)) * (ax * ay * az)
+    value += as_floats(sample_of(bricks.features, at + _Z)) * (ax * ay * z)
+    value += as_floats(sample_of(bricks.features, at + _Y)) * (ax * y * az)
+    value += as_floats(sample_of(bricks.features, at + _Y + _Z)) * (ax * y * z)
+    value += as_floats(sample_of(bricks.features, at + _X)) * (x * ay * az)
+    value += as_floats(sample_of(bricks.features, at + _X + _Z)) * (x * ay * z)
+    value += as_floats(sample_of(bricks.features, at + _X + _Y)) * (x * y * az)
+    value += as_floats(sample_of(bricks.features, at + _X + _Y + _Z)) * (x * y * z)
     return value

@@ -1,10 +1,9 @@
-"""The march: rays through bricks of 8-bit samples, for one picture or many, on a CPU or on CUDA.
+"""Ray marching through bricks of 8-bit samples, for one image or many, on CPU and CUDA.
 
-*Packet*: neighbouring rays, eight to a row, that march together, one per *lane*. Every loop over lanes is free of
-branches, so that the compiler turns it into vector instructions; on CUDA, where the hardware does that, a packet has
-one lane.
-*Tile*: 8 × 8 pixels; no ray of it meets anything before the tile's *start*. For bricks, blocks and the two grids see
-`bricks.py`, for leaps `lookup.py`, for positions `space.py`.
+*Packet*: neighboring rays, eight to a row, that march together, one per *lane*. Loops over lanes have no branches, so
+the compiler vectorizes them; on CUDA, where the hardware does that, a packet has one lane. *Tile*: 8 × 8 pixels, whose
+rays are empty before the tile's *start*. Bricks, blocks and grids: `bricks.py`; skip distances: `lookup.py`; positions:
+`space.py`.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
@@ -13,13 +12,12 @@ one lane.
 from functools import cache
 from typing import Any
 
-import warp as wp
-
 from twin.nerf.kernels.bricks import BLOCKS
 from twin.nerf.kernels.composite import CHANNELS
-from twin.nerf.kernels.lookup import Bricks, brick_at, density_at, features_at, leap_at
+from twin.nerf.kernels.lookup import Bricks, brick_at, density_at, features_at, skip_at
 from twin.nerf.kernels.space import grid_position, max_norm
-from twin.nerf.kernels.vectorised import OPTIONS, exponential, logarithm, lowest_bit, nonzero
+from twin.nerf.kernels.vectorized import OPTIONS, fast_exp, fast_log, lowest_bit, nonzero
+from twin.warp_runtime import wp
 
 TILE = 8
 """Pixels along a tile's side."""
@@ -30,27 +28,27 @@ wp.set_module_options(OPTIONS)
 
 _TILE = wp.constant(TILE)
 _BLOCKS = wp.constant(BLOCKS)
-_FAR = wp.constant(100.0)  # unit positions beyond this are one with the horizon
-_NEVER = wp.constant(1.0e30)
-_STEP = wp.constant(1.0)  # step inside a brick [cells]
-_STRIDE = wp.constant(1.0)  # nor is one shorter than this [pixel widths]
-_OPAQUE = wp.constant(0.03)  # transmittance that counts as none
-_FAINT = wp.constant(0.06)  # weight from which features are looked up
-_PATIENCE = wp.constant(4)  # lanes alive per sampling one above which sampling waits
-_MOST_STEPS = wp.constant(1000)
-_MOST_APPROACHES = wp.constant(64)
-_LEAST_APPROACH = wp.constant(0.5)  # of the tiles' starts [cells]
+_FAR = wp.constant(100.0)  # unit positions beyond this count as the horizon
+_INFINITE = wp.constant(1.0e30)
+_STEP_CELLS = wp.constant(1.0)  # step inside a brick [cells]
+_MIN_STEP_PIXELS = wp.constant(1.0)  # least step [pixel widths]
+_OPAQUE = wp.constant(0.03)  # transmittance that counts as zero
+_MIN_WEIGHT = wp.constant(0.06)  # weight from which features are looked up
+_WAIT_RATIO = wp.constant(4)  # sampling waits while fewer than 1/4 of the live lanes need it
+_MAX_STEPS = wp.constant(1000)
+_MAX_CONE_STEPS = wp.constant(64)
+_MIN_CONE_STEP = wp.constant(0.5)  # least step of the cone march [cells]
 
 
 @wp.struct
 class ImageBuffers:
-    """Where the rays of a picture begin and end."""
+    """Cameras of images of one size, and the depth at which their rays end."""
 
     rotation: wp.array(dtype=wp.mat33f)
     position: wp.array(dtype=wp.vec3f)
     intrinsics: wp.array(dtype=wp.vec4f)
     stop: wp.array2d(dtype=wp.float32)
-    """z-depth [m] at which something else is in the way, (cameras, pixels), or of shape (0, 0)."""
+    """z-depth [m] of other objects, (cameras, pixels), or of shape (0, 0)."""
     width: wp.int32
     height: wp.int32
     across: wp.int32
@@ -58,17 +56,17 @@ class ImageBuffers:
 
 
 @wp.func
-def wall(p: wp.float32, slowness: wp.float32, first: wp.int32, size: wp.int32, leap: wp.int32):
-    """When something at p [blocks] leaves what it may leap over [m], at `slowness` metres a block.
+def exit_distance(p: wp.float32, slowness: wp.float32, first: wp.int32, size: wp.int32, skip: wp.int32):
+    """Distance [m] at which a ray at p [blocks] leaves the blocks it may skip, at `slowness` [m/block].
 
-    That is `size` blocks from `first` on and leap − 1 more to both sides.
+    These are `size` blocks from `first` on and skip − 1 more on both sides.
     """
-    return (float(wp.where(slowness > 0.0, first + size + leap - 1, first + 1 - leap)) - p) * slowness
+    return (float(wp.where(slowness > 0.0, first + size + skip - 1, first + 1 - skip)) - p) * slowness
 
 
 @wp.func
-def far_rate(u: wp.vec3f, v: wp.vec3f, m: wp.float32) -> wp.vec4f:
-    """Velocity of the contracted position [unit positions per metre], and of m; see `space.py`.
+def contracted_velocity(u: wp.vec3f, v: wp.vec3f, m: wp.float32) -> wp.vec4f:
+    """Velocity of the contracted position [unit positions per meter], and of the maximum norm m; see `space.py`.
 
     c = u·f(m) with f = (2 − 1/m)/m, so dc/dt = v·f + u·f′·dm/dt.
     """
@@ -84,34 +82,34 @@ def far_rate(u: wp.vec3f, v: wp.vec3f, m: wp.float32) -> wp.vec4f:
 
 @wp.func
 def unit_ray(k: wp.vec4f, u: wp.float32, v: wp.float32) -> wp.vec3f:
-    """Direction of the ray through (u, v) [px], in the camera."""
+    """Unit direction of the ray through (u, v) [px], in the camera frame."""
     return wp.normalize(wp.vec3f((u - k[2]) / k[0], (v - k[3]) / k[1], 1.0))
 
 
 @wp.kernel(enable_backward=False)
-def approach(bricks: Bricks, film: ImageBuffers, first: wp.int32, start: wp.array2d(dtype=wp.float32)):
-    """Starts of the tiles [first, first + dim) of every camera: distances from it [m] before which there is nothing.
+def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.array2d(dtype=wp.float32)):
+    """Cone march: distances [m] before which the tiles [first, first + dim) of every camera are empty.
 
-    Rays of a tile lie within a chord α of its axis, so at distance t in a ball of radius α·t around the axis.
+    The rays of a tile lie within a chord α of its axis, so at distance t within a ball of radius α·t around the axis.
     """
     camera, i = wp.tid()
     tile = first + i
-    k = film.intrinsics[camera]
+    k = image.intrinsics[camera]
     side = float(_TILE)
-    u = float(tile % film.across) * side
-    v = float(tile // film.across) * side
+    u = float(tile % image.across) * side
+    v = float(tile // image.across) * side
     axis = unit_ray(k, u + 0.5 * side, v + 0.5 * side)
     chord = wp.max(
         wp.max(wp.length(axis - unit_ray(k, u, v)), wp.length(axis - unit_ray(k, u + side, v))),
         wp.max(wp.length(axis - unit_ray(k, u, v + side)), wp.length(axis - unit_ray(k, u + side, v + side))),
     )
     blocks = wp.vec3f(float(bricks.near_blocks[0]), float(bricks.near_blocks[1]), float(bricks.near_blocks[2]))
-    unit = wp.cw_mul(film.position[camera] - bricks.centre, bricks.inverse_half)
+    unit = wp.cw_mul(image.position[camera] - bricks.center, bricks.inverse_half)
     o = wp.cw_mul(unit * 0.5 + wp.vec3f(0.5, 0.5, 0.5), blocks)
-    per_metre = wp.cw_mul(bricks.inverse_half, blocks) * 0.5
-    rate = wp.cw_mul(film.rotation[camera] * axis, per_metre)
+    per_meter = wp.cw_mul(bricks.inverse_half, blocks) * 0.5
+    rate = wp.cw_mul(image.rotation[camera] * axis, per_meter)
     t = float(bricks.near_plane)
-    for _ in range(_MOST_APPROACHES):
+    for _ in range(_MAX_CONE_STEPS):
         p = o + rate * t
         if wp.min(p) < 0.0 or p[0] >= blocks[0] or p[1] >= blocks[1] or p[2] >= blocks[2]:
             break
@@ -119,41 +117,40 @@ def approach(bricks: Bricks, film: ImageBuffers, first: wp.int32, start: wp.arra
         i1 = int(p[1])
         i2 = int(p[2])
         brick = brick_at(bricks.near_index, bricks.near_blocks[1], bricks.near_blocks[2], i0, i1, i2)
-        leap = leap_at(bricks, brick, i0, i1, i2)
+        skip = skip_at(bricks, brick, i0, i1, i2)
         size = wp.where(brick < 0, _BLOCKS, 1)
-        free = float(leap - 1)
+        margin_blocks = float(skip - 1)
         q = p - wp.vec3f(float(i0 & -size), float(i1 & -size), float(i2 & -size))
         whole = float(size)
-        margin = wp.vec3f(free, free, free) + wp.min(q, wp.vec3f(whole, whole, whole) - q)
-        ahead = (wp.min(wp.cw_div(margin, per_metre)) - t * chord) / (1.0 + chord)
-        if leap == 0 or ahead < _LEAST_APPROACH * bricks.near_cell:
+        margin = wp.vec3f(margin_blocks, margin_blocks, margin_blocks) + wp.min(q, wp.vec3f(whole, whole, whole) - q)
+        ahead = (wp.min(wp.cw_div(margin, per_meter)) - t * chord) / (1.0 + chord)
+        if skip == 0 or ahead < _MIN_CONE_STEP * bricks.near_cell:
             break
         t += ahead
     start[camera, tile] = t
 
 
 @cache
-def march(lanes: int) -> Any:
-    """The march's kernel for packets of `lanes` rays, 1, 8 or 16.
+def march_kernel(lanes: int) -> Any:
+    """Builds the marching kernel for packets of `lanes` rays, 1, 8 or 16.
 
-    Launched over cameras and `TILE`² / lanes packets for each of some tiles. It takes the bricks, the film, the first
-    of the tiles and the tiles' starts; it writes opacity and composited features (cameras, CHANNELS, pixels), and the
-    z-depth of half the light [m] (−1: nowhere).
+    It is launched over cameras and the packets of some tiles, `TILE`² / lanes each. It writes opacity and composited
+    features (cameras, CHANNELS, pixels), and the z-depth [m] at which half the light is blocked (−1: none).
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
     Ints = wp.types.vector(length=lanes, dtype=wp.int32)
     Totals = wp.types.matrix(shape=(lanes, CHANNELS), dtype=wp.float32)
-    Noted = wp.types.vector(length=32, dtype=wp.int32)
-    NotedFloats = wp.types.matrix(shape=(32, lanes), dtype=wp.float32)
-    NotedInts = wp.types.matrix(shape=(32, lanes), dtype=wp.int32)
-    notes = wp.constant(32)
+    QueueBits = wp.types.vector(length=32, dtype=wp.int32)
+    QueueFloats = wp.types.matrix(shape=(32, lanes), dtype=wp.float32)
+    QueueInts = wp.types.matrix(shape=(32, lanes), dtype=wp.int32)
+    queue_capacity = wp.constant(32)
     count = wp.constant(lanes)
     per_tile = wp.constant(TILE * TILE // lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
     def march_packets(
         bricks: Bricks,
-        film: ImageBuffers,
+        image: ImageBuffers,
         first: wp.int32,
         start: wp.array2d(dtype=wp.float32),
         features: wp.array3d(dtype=wp.float32),
@@ -161,13 +158,13 @@ def march(lanes: int) -> Any:
     ):
         camera, packet = wp.tid()
         tile = first + packet // per_tile
-        corner = (packet % per_tile) * count  # of the packet, in its tile
-        column = (tile % film.across) * _TILE + corner % _TILE
-        row = (tile // film.across) * _TILE + corner // _TILE
-        if row >= film.height:
+        corner = (packet % per_tile) * count  # of the packet in its tile
+        column = (tile % image.across) * _TILE + corner % _TILE
+        row = (tile // image.across) * _TILE + corner // _TILE
+        if row >= image.height:
             return
-        k = film.intrinsics[camera]
-        rotation = film.rotation[camera]
+        k = image.intrinsics[camera]
+        rotation = image.rotation[camera]
         near_blocks = wp.vec3f(float(bricks.near_blocks[0]), float(bricks.near_blocks[1]), float(bricks.near_blocks[2]))
         far_blocks = wp.vec3f(float(bricks.far_blocks[0]), float(bricks.far_blocks[1]), float(bricks.far_blocks[2]))
         n0 = bricks.near_blocks[0]
@@ -175,9 +172,9 @@ def march(lanes: int) -> Any:
         n2 = bricks.near_blocks[2]
         f1 = bricks.far_blocks[1]
         f2 = bricks.far_blocks[2]
-        unit = wp.cw_mul(film.position[camera] - bricks.centre, bricks.inverse_half)
+        unit = wp.cw_mul(image.position[camera] - bricks.center, bricks.inverse_half)
         o = wp.cw_mul(unit * 0.5 + wp.vec3f(0.5, 0.5, 0.5), near_blocks)
-        per_metre = wp.cw_mul(bricks.inverse_half, near_blocks) * 0.5
+        per_meter = wp.cw_mul(bricks.inverse_half, near_blocks) * 0.5
         begin = start[camera, tile]
 
         cosine = Floats()
@@ -198,9 +195,9 @@ def march(lanes: int) -> Any:
             y = (float(row + (j >> 3)) + 0.5 - k[3]) / k[1]
             c = 1.0 / wp.sqrt(x * x + y * y + 1.0)
             cosine[j] = c
-            a0 = nonzero((rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]) * c * per_metre[0])
-            a1 = nonzero((rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]) * c * per_metre[1])
-            a2 = nonzero((rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]) * c * per_metre[2])
+            a0 = nonzero((rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]) * c * per_meter[0])
+            a1 = nonzero((rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]) * c * per_meter[1])
+            a2 = nonzero((rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]) * c * per_meter[2])
             r0[j] = a0
             s0[j] = 1.0 / a0
             r1[j] = a1
@@ -215,89 +212,93 @@ def march(lanes: int) -> Any:
             l2 = wp.where(a2 > 0.0, near_blocks[2] - o[2], -o[2]) / a2
             into = wp.max(wp.max(e0, e1), e2)
             out = wp.min(wp.min(l0, l1), l2)
-            enter[j] = wp.where(into < out, into, _NEVER)
+            enter[j] = wp.where(into < out, into, _INFINITE)
             leave[j] = out
             t[j] = begin
             transmittance[j] = 1.0
             median[j] = -1.0
-            limit[j] = wp.where(column + (j & 7) < film.width, wp.where(row + (j >> 3) < film.height, _NEVER, 0.0), 0.0)
-        if film.stop.shape[0] > 0:
+            limit[j] = wp.where(
+                column + (j & 7) < image.width, wp.where(row + (j >> 3) < image.height, _INFINITE, 0.0), 0.0
+            )
+        if image.stop.shape[0] > 0:
             for j in range(count):
-                pixel = wp.min(row + (j >> 3), film.height - 1) * film.width + wp.min(column + (j & 7), film.width - 1)
-                limit[j] = wp.min(limit[j], film.stop[camera, pixel] / cosine[j])
+                pixel = wp.min(row + (j >> 3), image.height - 1) * image.width + wp.min(
+                    column + (j & 7), image.width - 1
+                )
+                limit[j] = wp.min(limit[j], image.stop[camera, pixel] / cosine[j])
 
-        footprint = _STRIDE / k[0]  # of a pixel, per metre
+        footprint = _MIN_STEP_PIXELS / k[0]  # width of a pixel per meter
         total = Totals()
-        dense = Ints()  # whether a lane samples, and if so what:
+        dense = Ints()  # 1 if a lane samples, and then:
         slot = Ints()
-        p0 = Floats()  # where, in blocks of its grid
+        p0 = Floats()  # position [blocks of its grid]
         p1 = Floats()
         p2 = Floats()
         length = Floats()  # of the step [m]
-        thick = Floats()  # ... in contracted metres
+        thick = Floats()  # of the step [contracted m]
         ahead = Floats()
-        pending = Floats()  # weight of steps too faint to look up features for, passed on to the next step
+        pending = Floats()  # weight of steps too faint for a feature lookup, passed on to the next step
         counted = Floats()
-        # Steps whose features are wanted are noted and looked up together: a look-up then waits for none but memory.
-        note = int(0)
-        noted = Noted()
-        noted_weight = NotedFloats()
-        noted_slot = NotedInts()
-        noted_0 = NotedFloats()
-        noted_1 = NotedFloats()
-        noted_2 = NotedFloats()
-        for _ in range(_MOST_STEPS):
-            alive = int(0)
-            outside = int(0)
-            sampling = int(0)
+        # Feature lookups are queued and done together, so that they wait for memory only.
+        queue_length = int(0)
+        queued = QueueBits()
+        queued_weight = QueueFloats()
+        queued_slot = QueueInts()
+        queued_0 = QueueFloats()
+        queued_1 = QueueFloats()
+        queued_2 = QueueFloats()
+        for _ in range(_MAX_STEPS):
+            alive_count = int(0)
+            outside_count = int(0)
+            sampling_count = int(0)
             for j in range(count):
                 tj = t[j]
-                living = wp.where(tj < limit[j], 1, 0) * wp.where(transmittance[j] > _OPAQUE, 1, 0)
-                near = living * wp.where(tj >= enter[j], 1, 0) * wp.where(tj < leave[j], 1, 0)
-                alive = alive + living
-                outside = outside + living - near
+                alive = wp.where(tj < limit[j], 1, 0) * wp.where(transmittance[j] > _OPAQUE, 1, 0)
+                near = alive * wp.where(tj >= enter[j], 1, 0) * wp.where(tj < leave[j], 1, 0)
+                alive_count = alive_count + alive
+                outside_count = outside_count + alive - near
                 x = o[0] + r0[j] * tj
                 y = o[1] + r1[j] * tj
                 z = o[2] + r2[j] * tj
-                # Lanes outside the box look up some block of it, in vain.
+                # Lanes outside the box read an unused block of it.
                 i0 = wp.clamp(int(wp.clamp(x, -1.0, 1.0e6)), 0, n0 - 1)
                 i1 = wp.clamp(int(wp.clamp(y, -1.0, 1.0e6)), 0, n1 - 1)
                 i2 = wp.clamp(int(wp.clamp(z, -1.0, 1.0e6)), 0, n2 - 1)
                 brick = brick_at(bricks.near_index, n1, n2, i0, i1, i2)
-                leap = leap_at(bricks, brick, i0, i1, i2)
+                skip = skip_at(bricks, brick, i0, i1, i2)
                 size = wp.where(brick < 0, _BLOCKS, 1)
-                w0 = wall(x, s0[j], i0 & -size, size, leap)
-                w1 = wall(y, s1[j], i1 & -size, size, leap)
-                w2 = wall(z, s2[j], i2 & -size, size, leap)
-                there = near * wp.where(leap > 0, 0, 1)
-                sampling = sampling + there
-                dense[j] = there
-                slot[j] = wp.where(there > 0, brick, -1)
+                w0 = exit_distance(x, s0[j], i0 & -size, size, skip)
+                w1 = exit_distance(y, s1[j], i1 & -size, size, skip)
+                w2 = exit_distance(z, s2[j], i2 & -size, size, skip)
+                occupied = near * wp.where(skip > 0, 0, 1)
+                sampling_count = sampling_count + occupied
+                dense[j] = occupied
+                slot[j] = wp.where(occupied > 0, brick, -1)
                 p0[j] = wp.clamp(x, 0.0, near_blocks[0] - 1.0e-3)
                 p1[j] = wp.clamp(y, 0.0, near_blocks[1] - 1.0e-3)
                 p2[j] = wp.clamp(z, 0.0, near_blocks[2] - 1.0e-3)
-                stride = _STEP * wp.max(bricks.near_cell, footprint * tj)
+                stride = _STEP_CELLS * wp.max(bricks.near_cell, footprint * tj)
                 length[j] = stride
                 thick[j] = stride
-                go = wp.min(wp.min(wp.min(w0, w1), w2), leave[j] - tj) + 0.02 * bricks.near_cell
-                ahead[j] = wp.where(near > 0, wp.where(leap > 0, go, stride), 0.0)
-            if alive == 0 or note == notes:
-                for n in range(note):
-                    bits = noted[n]
+                advance = wp.min(wp.min(wp.min(w0, w1), w2), leave[j] - tj) + 0.02 * bricks.near_cell
+                ahead[j] = wp.where(near > 0, wp.where(skip > 0, advance, stride), 0.0)
+            if alive_count == 0 or queue_length == queue_capacity:
+                for n in range(queue_length):
+                    bits = queued[n]
                     while bits != 0:
                         j = lowest_bit(bits)
                         bits = bits & (bits - 1)
-                        value = features_at(bricks, noted_slot[n, j], noted_0[n, j], noted_1[n, j], noted_2[n, j])
+                        value = features_at(bricks, queued_slot[n, j], queued_0[n, j], queued_1[n, j], queued_2[n, j])
                         for ch in range(CHANNELS):
-                            total[j, ch] = total[j, ch] + value[ch] * noted_weight[n, j]
-                note = 0
-                if alive == 0:
+                            total[j, ch] = total[j, ch] + value[ch] * queued_weight[n, j]
+                queue_length = 0
+                if alive_count == 0:
                     break
-            if outside > 0:
+            if outside_count > 0:
                 for j in range(count):
                     tj = t[j]
-                    living = wp.where(tj < limit[j], 1, 0) * wp.where(transmittance[j] > _OPAQUE, 1, 0)
-                    far = living * (1 - wp.where(tj >= enter[j], 1, 0) * wp.where(tj < leave[j], 1, 0))
+                    alive = wp.where(tj < limit[j], 1, 0) * wp.where(transmittance[j] > _OPAQUE, 1, 0)
+                    far = alive * (1 - wp.where(tj >= enter[j], 1, 0) * wp.where(tj < leave[j], 1, 0))
                     v = wp.cw_div(wp.vec3f(r0[j], r1[j], r2[j]), near_blocks) * 2.0
                     u = unit + v * wp.min(tj, 1.0e6)
                     m = wp.max(max_norm(u), 1.0)
@@ -306,73 +307,77 @@ def march(lanes: int) -> Any:
                     i1 = int(g[1])
                     i2 = int(g[2])
                     brick = brick_at(bricks.far_index, f1, f2, i0, i1, i2)
-                    leap = leap_at(bricks, brick, i0, i1, i2)
+                    skip = skip_at(bricks, brick, i0, i1, i2)
                     size = wp.where(brick < 0, _BLOCKS, 1)
-                    there = far * wp.where(leap > 0, 0, 1)
-                    c4 = far_rate(u, v, m)
+                    occupied = far * wp.where(skip > 0, 0, 1)
+                    c4 = contracted_velocity(u, v, m)
                     q0 = 1.0 / nonzero(c4[0] * 0.25 * far_blocks[0])
                     q1 = 1.0 / nonzero(c4[1] * 0.25 * far_blocks[1])
                     q2 = 1.0 / nonzero(c4[2] * 0.25 * far_blocks[2])
-                    w0 = wall(g[0], q0, i0 & -size, size, leap)
-                    w1 = wall(g[1], q1, i1 & -size, size, leap)
-                    w2 = wall(g[2], q2, i2 & -size, size, leap)
-                    cell = 0.5 * wp.min(wp.min(wp.abs(q0), wp.abs(q1)), wp.abs(q2))  # what a cell is long here [m]
-                    # Outwards a ray slows down: its position is about linear in 1/m. Inwards half the way is taken.
-                    go = wp.min(wp.min(w0, w1), w2)
-                    slack = 1.0 - go * c4[3] / m
-                    go = wp.where(c4[3] < 0.0, 0.5 * go, wp.where(slack > 0.0, go / wp.max(slack, 1.0e-6), _NEVER))
-                    go = go + 0.1 * bricks.far_cell * m
-                    stride = _STEP * wp.max(
+                    w0 = exit_distance(g[0], q0, i0 & -size, size, skip)
+                    w1 = exit_distance(g[1], q1, i1 & -size, size, skip)
+                    w2 = exit_distance(g[2], q2, i2 & -size, size, skip)
+                    cell = 0.5 * wp.min(wp.min(wp.abs(q0), wp.abs(q1)), wp.abs(q2))  # length of a cell here [m]
+                    # Outward the contracted position is about linear in 1/m. Inward half the way is taken.
+                    advance = wp.min(wp.min(w0, w1), w2)
+                    slack = 1.0 - advance * c4[3] / m
+                    advance = wp.where(
+                        c4[3] < 0.0,
+                        0.5 * advance,
+                        wp.where(slack > 0.0, advance / wp.max(slack, 1.0e-6), _INFINITE),
+                    )
+                    advance = advance + 0.1 * bricks.far_cell * m
+                    stride = _STEP_CELLS * wp.max(
                         wp.clamp(cell, bricks.far_cell * m, 3.0 * bricks.far_cell * m), footprint * tj
                     )
-                    go = wp.where(leap > 0, go, stride)
-                    # No step jumps into the near box.
-                    go = wp.where(tj < enter[j], wp.min(go, enter[j] - tj + 0.02 * bricks.near_cell), go)
-                    go = wp.where(m > _FAR, _NEVER, go)
-                    ahead[j] = wp.where(far > 0, go, ahead[j])
-                    slot[j] = wp.where(there > 0, brick, slot[j])
-                    p0[j] = wp.where(there > 0, g[0], p0[j])
-                    p1[j] = wp.where(there > 0, g[1], p1[j])
-                    p2[j] = wp.where(there > 0, g[2], p2[j])
-                    length[j] = wp.where(there > 0, stride, length[j])
-                    thick[j] = wp.where(there > 0, stride / (m * m), thick[j])
-                    dense[j] = wp.where(there > 0, 1, dense[j])
-                    sampling = sampling + there
-            if _PATIENCE * sampling < alive:  # those few wait for others
+                    advance = wp.where(skip > 0, advance, stride)
+                    # A step ends at the border of the near box.
+                    advance = wp.where(tj < enter[j], wp.min(advance, enter[j] - tj + 0.02 * bricks.near_cell), advance)
+                    advance = wp.where(m > _FAR, _INFINITE, advance)
+                    ahead[j] = wp.where(far > 0, advance, ahead[j])
+                    slot[j] = wp.where(occupied > 0, brick, slot[j])
+                    p0[j] = wp.where(occupied > 0, g[0], p0[j])
+                    p1[j] = wp.where(occupied > 0, g[1], p1[j])
+                    p2[j] = wp.where(occupied > 0, g[2], p2[j])
+                    length[j] = wp.where(occupied > 0, stride, length[j])
+                    thick[j] = wp.where(occupied > 0, stride / (m * m), thick[j])
+                    dense[j] = wp.where(occupied > 0, 1, dense[j])
+                    sampling_count = sampling_count + occupied
+            if _WAIT_RATIO * sampling_count < alive_count:  # the few sampling lanes wait for others
                 for j in range(count):
                     ahead[j] = wp.where(dense[j] > 0, 0.0, ahead[j])
             else:
                 bits = int(0)
-                # A step's density and features are those of its middle.
+                # Density and features of a step are those at its middle.
                 for j in range(count):
                     filled = wp.where(slot[j] >= 0, 1.0, 0.0)
                     density = density_at(bricks, wp.max(slot[j], 0), p0[j], p1[j], p2[j])
-                    # What of the step lies beyond the limit stops nothing.
+                    # The part of the step beyond the limit blocks nothing.
                     before_limit = wp.clamp((limit[j] - t[j]) / length[j] + 0.5, 0.0, 1.0)
                     optical = density * thick[j] * before_limit * filled
                     before = transmittance[j]
-                    after = before * exponential(-optical)
-                    half = logarithm(wp.clamp(2.0 * before, 1.0, 2.0)) / wp.max(optical, 1.0e-6)
+                    after = before * fast_exp(-optical)
+                    half = fast_log(wp.clamp(2.0 * before, 1.0, 2.0)) / wp.max(optical, 1.0e-6)
                     crossed = wp.where(before >= 0.5, 1, 0) * wp.where(after < 0.5, 1, 0)
                     median[j] = wp.where(crossed > 0, t[j] + (half - 0.5) * length[j], median[j])
                     transmittance[j] = after
                     due = pending[j] + before - after
-                    wanted = wp.where(due > _FAINT, 1, 0)
-                    pending[j] = wp.where(wanted > 0, 0.0, due)
-                    counted[j] = counted[j] + wp.where(wanted > 0, due, 0.0)
-                    bits = bits | (wanted << j)
-                    noted_weight[note, j] = due
-                    noted_slot[note, j] = wp.max(slot[j], 0)
-                    noted_0[note, j] = p0[j]
-                    noted_1[note, j] = p1[j]
-                    noted_2[note, j] = p2[j]
-                noted[note] = bits
-                note = note + wp.where(bits != 0, 1, 0)
+                    due_now = wp.where(due > _MIN_WEIGHT, 1, 0)
+                    pending[j] = wp.where(due_now > 0, 0.0, due)
+                    counted[j] = counted[j] + wp.where(due_now > 0, due, 0.0)
+                    bits = bits | (due_now << j)
+                    queued_weight[queue_length, j] = due
+                    queued_slot[queue_length, j] = wp.max(slot[j], 0)
+                    queued_0[queue_length, j] = p0[j]
+                    queued_1[queue_length, j] = p1[j]
+                    queued_2[queue_length, j] = p2[j]
+                queued[queue_length] = bits
+                queue_length = queue_length + wp.where(bits != 0, 1, 0)
             for j in range(count):
                 t[j] = t[j] + ahead[j]
         for j in range(count):
-            if column + (j & 7) < film.width and row + (j >> 3) < film.height:
-                pixel = (row + (j >> 3)) * film.width + column + (j & 7)
+            if column + (j & 7) < image.width and row + (j >> 3) < image.height:
+                pixel = (row + (j >> 3)) * image.width + column + (j & 7)
                 opacity = wp.where(transmittance[j] > _OPAQUE, 1.0 - transmittance[j], 1.0)
                 share = opacity / wp.max(counted[j], 1.0e-6)
                 features[camera, 0, pixel] = opacity

@@ -1,11 +1,9 @@
-"""From the gradient of samples' features back to the rays that the samples lie on; vocabulary as in `hashgrid.py` and
-`space.py`."""
+"""Gradients from samples' features back to the rays; terms as in `hashgrid.py` and `space.py`."""
 
 # Warp reads annotations as values.
 # mypy: ignore-errors
-import warp as wp
-
 from twin.nerf.kernels.hashgrid import Feature, vertex_index
+from twin.warp_runtime import wp
 
 
 @wp.kernel(enable_backward=False)
@@ -19,7 +17,7 @@ def encode_positions_backward(
     features_grad: wp.array2d(dtype=Feature),
     positions_grad: wp.array(dtype=wp.vec3f),
 ):
-    """Gradient of `hashgrid.encode` by the grid positions [start, start + dim)."""
+    """Gradient of `hashgrid.encode` with respect to grid positions [start, start + dim)."""
     i = start + wp.tid()
     p = positions[i]
     total = wp.vec3f()
@@ -49,7 +47,7 @@ def encode_positions_backward(
 
 @wp.func
 def grid_position_backward(u: wp.vec3f, g: wp.vec3f) -> wp.vec3f:
-    """Gradient of `space.grid_position` by the unit position u, given that of the grid position."""
+    """Gradient with respect to the unit position u, given the gradient g of `space.grid_position(u)`."""
     ax = wp.abs(u[0])
     ay = wp.abs(u[1])
     az = wp.abs(u[2])
@@ -73,14 +71,14 @@ def rays_backward(
     origins: wp.array(dtype=wp.vec3f),
     directions: wp.array(dtype=wp.vec3f),
     distances: wp.array2d(dtype=wp.float32),
-    centre: wp.vec3f,
+    center: wp.vec3f,
     inverse_half: wp.vec3f,
     start: wp.int32,
     positions_grad: wp.array2d(dtype=wp.vec3f),
     origins_grad: wp.array(dtype=wp.vec3f),
     directions_grad: wp.array(dtype=wp.vec3f),
 ):
-    """Gradients by origins and directions of rays [start, start + dim) whose samples keep their distances [m]."""
+    """Gradients with respect to origins and directions of rays [start, start + dim), at fixed sample distances [m]."""
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -88,7 +86,7 @@ def rays_backward(
     by_direction = wp.vec3f()
     for k in range(distances.shape[1]):
         t = distances[i, k]
-        u = wp.cw_mul(o + d * t - centre, inverse_half)
+        u = wp.cw_mul(o + d * t - center, inverse_half)
         g = wp.cw_mul(grid_position_backward(u, positions_grad[i, k]), inverse_half)
         by_origin += g
         by_direction += g * t

@@ -1,27 +1,26 @@
-"""Where along a ray the field is asked: inverse-CDF sampling from grids of what stops light.
+"""Ray sampling: inverse-CDF sampling from opacity grids.
 
-*Stop grid*: per cell the share of light that would not leave it, averaged over the samples that fell into it. (The mean
-of density itself would call a cell opaque that a thin post merely passes through.) A fine one covers the near box, a
-coarse one all of the contracted cube. *Bin*: one step of the march through them. *Stratum*: the stretch between two of
-K + 1 equal quantiles of the bins' weights; each is sampled once and stands for its whole length.
+*Opacity grid*: per cell the share of light that would not leave it, averaged over the samples that fell into it. (Mean
+density would make a cell opaque that only a thin post passes through.) A fine grid covers the near box, a coarse one
+the contracted cube. *Bin*: one step of the march through the grids. *Stratum*: interval between two of K + 1 equal
+quantiles of the bins' weights; it is sampled once, and the sample stands for its whole length.
 """
 
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
 # mypy: ignore-errors
 # ruff: noqa: RUF046
-import warp as wp
-
-from twin.nerf.kernels.space import grid_position, max_norm, widening
+from twin.nerf.kernels.space import expansion, grid_position, max_norm
+from twin.warp_runtime import wp
 
 BINS = wp.constant(256)
-_FAR = wp.constant(100.0)  # unit positions beyond this are one with the horizon
-_MOST = wp.constant(0.99)  # no cell is believed to stop more
+_FAR = wp.constant(100.0)  # unit positions beyond this count as the horizon
+_MAX_OPACITY = wp.constant(0.99)  # of a cell
 _STEP = wp.constant(0.75)  # bin length [cells]
-_BEYOND = wp.constant(2)  # bins behind an opaque one
-_OPAQUE = wp.constant(0.02)
-# A ray that grazes the ground runs for metres through cells that the ground passes through, before it meets the ground.
-# So a share of the weight is laid out as if cells stopped only a part of what they are said to stop.
-_SHARE = wp.constant(0.35)
+_BINS_BEHIND = wp.constant(2)  # bins behind an opaque one
+_OPAQUE = wp.constant(0.02)  # transmittance from which a ray counts as blocked
+# A grazing ray runs for meters through cells that contain ground before it reaches the ground. So _DOUBT_SHARE of the
+# weight is distributed as if cells had only _DOUBT of their opacity.
+_DOUBT_SHARE = wp.constant(0.35)
 _DOUBT = wp.constant(0.25)
 _WIDENING = wp.constant(0.02)  # least bin length as a share of the distance
 
@@ -37,13 +36,13 @@ def grid_cell(g: wp.vec3f, nx: wp.int32, ny: wp.int32, nz: wp.int32) -> wp.vec3i
 
 
 @wp.func
-def in_near_box(g: wp.vec3f) -> wp.vec3f:
-    """Grid position → position in the near box scaled to [0, 1), which it leaves outside the box."""
+def near_box_position(g: wp.vec3f) -> wp.vec3f:
+    """Grid position → position in the near box scaled to [0, 1), outside that range outside the box."""
     return 2.0 * g - wp.vec3f(0.5, 0.5, 0.5)
 
 
 @wp.func
-def is_near(n: wp.vec3f) -> wp.bool:
+def inside_near_box(n: wp.vec3f) -> wp.bool:
     low = wp.min(wp.min(n[0], n[1]), n[2])
     high = wp.max(wp.max(n[0], n[1]), n[2])
     return low >= 0.0 and high < 1.0
@@ -54,7 +53,7 @@ def sample_rays(
     origins: wp.array(dtype=wp.vec3f),
     directions: wp.array(dtype=wp.vec3f),
     targets: wp.array(dtype=wp.float32),
-    centre: wp.vec3f,
+    center: wp.vec3f,
     inverse_half: wp.vec3f,
     near_grid: wp.array3d(dtype=wp.float32),
     far_grid: wp.array3d(dtype=wp.float32),
@@ -70,16 +69,16 @@ def sample_rays(
     lengths: wp.array2d(dtype=wp.float32),
     positions: wp.array2d(dtype=wp.vec3f),
 ):
-    """K samples per ray: stratum edges (n, K + 1) [m], sampled distances (n, K) [m], contracted lengths of the strata
-    (n, K) [m], see `kernels/space.py`, and grid positions (n, K).
+    """Samples K strata per ray: edges (n, K + 1) [m], sampled distances (n, K) [m], contracted lengths (n, K)
+    [contracted m], and grid positions (n, K).
 
     Args:
-        targets: Distance at which something is known to be [m], 0 = unknown; gets `target_mass` of extra weight.
-        near_grid, far_grid: Stop grids over the near box and the contracted cube.
+        targets: Known distance of a surface [m], 0 = unknown; its bin gets `target_mass` of extra weight.
+        near_grid, far_grid: Opacity grids over the near box and the contracted cube.
         near_cell, far_cell: Side of their cells inside the near box [m].
-        near: Where rays begin [m].
+        near: Distance at which rays start [m].
         floor: Weight spread evenly over all bins, beside at most 1 of the surfaces.
-        seed: Of the jitter within strata; negative takes their middles.
+        seed: Seed of the jitter within strata; negative takes their middles.
     """
     i = start + wp.tid()
     o = origins[i]
@@ -90,43 +89,43 @@ def sample_rays(
 
     t = near
     transmittance = float(1.0)
-    reluctant = float(1.0)
+    doubting = float(1.0)
     n = int(0)
     beyond = int(0)
     bounds[0] = t
     while n < BINS:
-        u = wp.cw_mul(o + d * t - centre, inverse_half)
+        u = wp.cw_mul(o + d * t - center, inverse_half)
         m = max_norm(u)
         if m > _FAR:
             break
         length = near_cell
         if m > 1.0:
-            length = far_cell * widening(u)
+            length = far_cell * expansion(u)
         step = wp.max(_STEP * length, _WIDENING * t)
-        g = grid_position(wp.cw_mul(o + d * (t + 0.5 * step) - centre, inverse_half))
-        stop = float(0.0)
-        b = in_near_box(g)
-        if is_near(b):
+        g = grid_position(wp.cw_mul(o + d * (t + 0.5 * step) - center, inverse_half))
+        opacity = float(0.0)
+        b = near_box_position(g)
+        if inside_near_box(b):
             c = grid_cell(b, near_grid.shape[0], near_grid.shape[1], near_grid.shape[2])
-            stop = near_grid[c[0], c[1], c[2]]
+            opacity = near_grid[c[0], c[1], c[2]]
         else:
             c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
-            stop = far_grid[c[0], c[1], c[2]]
-        stop *= wp.min(1.0, step / length)
-        doubt = _DOUBT * stop
-        weights[n] = (1.0 - _SHARE) * transmittance * stop + _SHARE * reluctant * doubt
-        transmittance *= 1.0 - stop
-        reluctant *= 1.0 - doubt
+            opacity = far_grid[c[0], c[1], c[2]]
+        opacity *= wp.min(1.0, step / length)
+        doubt = _DOUBT * opacity
+        weights[n] = (1.0 - _DOUBT_SHARE) * transmittance * opacity + _DOUBT_SHARE * doubting * doubt
+        transmittance *= 1.0 - opacity
+        doubting *= 1.0 - doubt
         t += step
         n += 1
         bounds[n] = t
-        # The surface may lie a cell behind where the grid believes it; a target further back must be reached, too.
-        if reluctant < _OPAQUE and t > target:
+        # The surface may lie a cell behind the opaque one; a target further back must be reached, too.
+        if doubting < _OPAQUE and t > target:
             beyond += 1
-            if beyond > _BEYOND:
+            if beyond > _BINS_BEHIND:
                 break
 
-    # Neighbours share weight: a surface need not lie in the bin whose cell first saw it.
+    # Neighboring bins share weight, as the surface may lie beside the bin of its cell.
     total = float(0.0)
     before = float(0.0)
     uniform = floor / wp.float32(n)
@@ -152,21 +151,21 @@ def sample_rays(
         jitter = float(0.5)
         if seed >= 0:
             jitter = wp.randf(rng)
-        want = (wp.float32(k) + jitter) * share
-        while b + 1 < n and passed + weights[b] < want:
+        target_weight = (wp.float32(k) + jitter) * share
+        while b + 1 < n and passed + weights[b] < target_weight:
             passed += weights[b]
             b += 1
-        s = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((want - passed) / weights[b], 0.0, 1.0)
-        u = wp.cw_mul(o + d * s - centre, inverse_half)
+        s = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((target_weight - passed) / weights[b], 0.0, 1.0)
+        u = wp.cw_mul(o + d * s - center, inverse_half)
         distances[i, k] = s
         positions[i, k] = grid_position(u)
-        want = wp.float32(k + 1) * share
-        while b + 1 < n and passed + weights[b] < want:
+        target_weight = wp.float32(k + 1) * share
+        while b + 1 < n and passed + weights[b] < target_weight:
             passed += weights[b]
             b += 1
-        edge = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((want - passed) / weights[b], 0.0, 1.0)
+        edge = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((target_weight - passed) / weights[b], 0.0, 1.0)
         edges[i, k + 1] = edge
-        lengths[i, k] = (edge - edges[i, k]) / widening(u)
+        lengths[i, k] = (edge - edges[i, k]) / expansion(u)
 
 
 @wp.kernel(enable_backward=False)
@@ -182,22 +181,22 @@ def update_grids(
     near_grid: wp.array3d(dtype=wp.float32),
     far_grid: wp.array3d(dtype=wp.float32),
 ):
-    """Moves the cells that were sampled towards what was found there, faster up (`rise`) than down (`fall`).
+    """Moves sampled cells towards the opacity of their samples, at rate `rise` up and `fall` down.
 
-    Launched once per `part` of the cells, so that parts may run side by side and each cell sees its samples in order.
+    Launched once per `part` of the cells, so that parts can run in parallel and each cell gets its samples in order.
     """
     i = wp.tid()
     g = positions[i]
-    b = in_near_box(g)
-    if is_near(b):
+    b = near_box_position(g)
+    if inside_near_box(b):
         c = grid_cell(b, near_grid.shape[0], near_grid.shape[1], near_grid.shape[2])
         if (c[0] + c[1]) % parts == part:
-            stop = wp.min(1.0 - wp.exp(-densities[i] * near_cell), _MOST)
+            opacity = wp.min(1.0 - wp.exp(-densities[i] * near_cell), _MAX_OPACITY)
             old = near_grid[c[0], c[1], c[2]]
-            near_grid[c[0], c[1], c[2]] = old + wp.where(stop > old, rise, fall) * (stop - old)
+            near_grid[c[0], c[1], c[2]] = old + wp.where(opacity > old, rise, fall) * (opacity - old)
     else:
         c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
         if (c[0] + c[1]) % parts == part:
-            stop = wp.min(1.0 - wp.exp(-densities[i] * far_cell), _MOST)
+            opacity = wp.min(1.0 - wp.exp(-densities[i] * far_cell), _MAX_OPACITY)
             old = far_grid[c[0], c[1], c[2]]
-            far_grid[c[0], c[1], c[2]] = old + wp.where(stop > old, rise, fall) * (stop - old)
+            far_grid[c[0], c[1], c[2]] = old + wp.where(opacity > old, rise, fall) * (opacity - old)

@@ -1,16 +1,15 @@
-"""Unbounded space in a box: contraction, and the rays of pinhole cameras.
+"""Contraction of unbounded space to a cube, and rays of pinhole cameras.
 
-*Near box*: an axis-aligned box [m] that is mapped without distortion. *Unit position* u: metres from its centre over
-its half extent, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, and outside
-(2 − 1/|u|)·u/|u| in the maximum norm (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so that all
-of space lies in (−2, 2)³. *Grid position*: the contracted position scaled to [0, 1]³. *Contracted metre*: a metre
-inside the near box, and what a metre shrinks to outside; the field's density is per contracted metre, so that the far
-field starts out no more opaque than the near one.
+*Near box*: axis-aligned box [m] that is mapped without distortion. *Unit position* u: offset from its center over its
+half side, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, (2 − 1/|u|)·u/|u| in the
+maximum norm outside (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so all of space is in (−2, 2)³.
+*Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: a meter inside the near box, the contracted
+length of a meter outside. Density is per contracted meter, so the far field starts no more opaque than the near field.
 """
 
 # Warp reads annotations as values.
 # mypy: ignore-errors
-import warp as wp
+from twin.warp_runtime import wp
 
 _TOP = wp.constant(1.0 - 1.0e-6)
 
@@ -21,8 +20,8 @@ def max_norm(u: wp.vec3f) -> wp.float32:
 
 
 @wp.func
-def widening(u: wp.vec3f) -> wp.float32:
-    """Metres per contracted metre along the way out: 1 in the near box, |u|² outside."""
+def expansion(u: wp.vec3f) -> wp.float32:
+    """Meters per contracted meter in radial direction: 1 in the near box, |u|² outside."""
     m = max_norm(u)
     return wp.max(1.0, m * m)
 
@@ -41,14 +40,14 @@ def grid_position(u: wp.vec3f) -> wp.vec3f:
 @wp.kernel(enable_backward=False)
 def contract_points(
     points: wp.array(dtype=wp.vec3f),
-    centre: wp.vec3f,
+    center: wp.vec3f,
     inverse_half: wp.vec3f,
     start: wp.int32,
     positions: wp.array(dtype=wp.vec3f),
 ):
     """Grid positions of points [m]."""
     i = start + wp.tid()
-    positions[i] = grid_position(wp.cw_mul(points[i] - centre, inverse_half))
+    positions[i] = grid_position(wp.cw_mul(points[i] - center, inverse_half))
 
 
 @wp.kernel(enable_backward=False)
@@ -63,7 +62,7 @@ def pixel_rays(
     directions: wp.array(dtype=wp.vec3f),
     cosines: wp.array(dtype=wp.float32),
 ):
-    """Rays through pixels (u, v) [px]: origin [m], unit direction, and cosine to the optical axis.
+    """Rays through pixels (u, v) [px]: origin [m], unit direction, and cosine of the angle to the optical axis.
 
     `rotation`, `position` and `intrinsics` (fx, fy, cx, cy) are per camera; z-depth = distance × cosine.
     """

@@ -1,7 +1,7 @@
-"""The vocabulary of the place: things, their collision shapes, the atlas of small textures, and the place itself.
+"""Data of the place: its objects with their collision shapes, and the texture atlas.
 
-A *thing* has a kind: `ground` is driven or walked on, `obstacle` is solid, `foliage` lets light and wind through, and
-`detail` is too small to matter. Stations and laterals are those of `centerline.py`.
+The kind of an object is `ground` (driven or walked on), `obstacle` (solid), `foliage` (not solid) or `detail` (too
+small to matter). Stations and laterals are those of `centerline.py`.
 """
 
 from dataclasses import dataclass, field
@@ -12,9 +12,9 @@ from twin.reality.centerline import RoadLine, ground_height
 from twin.reality.primitives import MeshPart
 from twin.types import Array
 
-SEED = 20  # of everything random in the place, its textures, its sky and its films
+SEED = 20  # of the place, its textures, sky and films
 ATLAS_SIDE = 8  # cells per side of the atlas
-ATLAS_CELL = 256  # [px] side of a cell
+ATLAS_CELL = 256  # [px] per side of a cell
 CELLS = (
     *("bark0", "bark1", "bark2", "leaf0", "leaf1", "leaf2", "leaf3", "hedge"),
     *("zinc", "dark", "green", "red", "blue", "white", "rubber", "glass"),
@@ -23,25 +23,25 @@ CELLS = (
     *(f"window{k}" for k in range(16)),
     *(f"lit{k}" for k in range(8)),
 )
-"""Names of the atlas' cells, row by row."""
+"""Names of the atlas cells, row by row."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A collision shape: an upright `box` or `cylinder`."""
+    """An upright collision shape: `box` or `cylinder`."""
 
     kind: str
-    centre: Array
-    """Of its volume [m], shape (3,)."""
+    center: Array
+    """Center of its volume [m], shape (3,)."""
     half: tuple[float, float, float]
-    """Half sizes of a box; radius, half height, 0 of a cylinder [m]."""
+    """Half sizes of a box, or radius, half height and 0 for a cylinder [m]."""
     yaw: float = 0.0
-    """Of a box, about z [rad]."""
+    """Rotation of a box about z [rad]."""
 
 
 @dataclass(frozen=True)
-class Thing:
-    """Something of the place."""
+class PlaceObject:
+    """A textured mesh of the place with its collision shapes."""
 
     name: str
     kind: str
@@ -52,14 +52,14 @@ class Thing:
 
 @dataclass
 class KnownPlace:
-    """The whole place: its things, and the lamps' heads [m]."""
+    """The whole place: its road, its objects and the positions of its lamp heads [m]."""
 
     route: RoadLine
-    things: list[Thing] = field(default_factory=list)
+    objects: list[PlaceObject] = field(default_factory=list)
     lamp_heads: list[Array] = field(default_factory=list)
 
     def spot(self, station: float, lateral: float) -> Array:
-        """The point of the ground at a station and lateral, shape (3,)."""
+        """The ground point at a station and lateral [m], shape (3,)."""
         xy = self.route.at(station, lateral)
         return np.append(xy, ground_height(self.route, xy))
 
@@ -69,12 +69,12 @@ class KnownPlace:
 
 
 def up(height: float) -> Array:
-    """A vector straight up [m], shape (3,)."""
+    """A vertical vector [m], shape (3,)."""
     return np.array([0.0, 0.0, height])
 
 
 def cell(name: str, part: MeshPart) -> MeshPart:
-    """Maps a part's texture into its cell of the atlas."""
+    """Maps the texture coordinates of a part into a cell of the atlas."""
     row, column = divmod(CELLS.index(name), ATLAS_SIDE)
     low, inset = np.array([column, row]) / ATLAS_SIDE, 1.5 / (ATLAS_SIDE * ATLAS_CELL)
     return part.in_window(low + inset, low + 1.0 / ATLAS_SIDE - inset)

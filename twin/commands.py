@@ -1,0 +1,284 @@
+"""The command line of every verb: `twin VERB`, also `python -m twin.VERB`.
+
+Only options are defined here, so that help appears at once; a verb's module is imported when its work begins.
+"""
+
+import argparse
+import importlib
+import textwrap
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from twin import cli
+from twin.config import HELD_OUT, RANDOMIZED
+from twin.scene import STAGES
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the command `twin`."""
+
+    summary: str
+    define: Callable[[argparse.ArgumentParser], None]
+    """Adds the verb's description and options to a parser."""
+    module: str
+    """Its function `command` does the work, given the parsed options."""
+
+
+class _Help(argparse.HelpFormatter):
+    """Shows the default of every option that has one, and keeps the line breaks of an epilog."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text, value = action.help or "", action.default
+        if value is None or isinstance(value, bool) or value in ([], argparse.SUPPRESS) or "default" in text:
+            return text
+        return f"{text} (default: {' '.join(value) if isinstance(value, list) else value})"
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if "\n" in text else super()._fill_text(text, width, indent)
+
+
+def main(verb: str, arguments: list[str] | None = None) -> int:
+    """Runs a verb; returns the exit status, see `twin.cli`.
+
+    Args:
+        verb: A key of `VERBS`.
+        arguments: Those after the verb; of the process where None.
+    """
+
+    def work(options: argparse.Namespace) -> None:
+        importlib.import_module(VERBS[verb].module).command(options)
+
+    return cli.run(parser_of(verb), work, arguments)
+
+
+def parser_of(verb: str) -> argparse.ArgumentParser:
+    """The argument parser of a verb, a key of `VERBS`."""
+    parser = cli.Parser(prog=f"twin {verb}", formatter_class=_Help)
+    VERBS[verb].define(parser)
+    return parser
+
+
+def _new(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Start a scene folder from films."
+    parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
+    parser.add_argument("films", type=Path, nargs="+", metavar="VIDEO", help="films or image folders, one per lighting")
+    parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
+
+
+def _build(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Turn a filmed place into a drivable MuJoCo twin."
+    parser.epilog = """\
+a scene.toml of your own road:
+
+  [[source]]                      # one per film; several lightings make one twin
+  path = "input/morning.mp4"      # video, photo folder, COLMAP model or transforms.json
+  lighting = "morning"
+  # mask = "input/robot.png"      # 0 = ignore (an image, or a folder named like the frames)
+  # camera = { model = "PINHOLE", params = [fx, fy, cx, cy], width = 1280, height = 720 }
+
+  [metric]                        # the source of the scale, one of
+  camera_height = 1.2             #   lens above the ground [m]
+  # gps = true                    #   EXIF positions
+  # distance = { metres = 5.0, frame_a = "morning/000010", a = [u, v], b = [u, v] }
+  # marker = { family = "DICT_APRILTAG_36h11", id = 0, size = 0.2 }
+  # poses_are_metric = true       #   poses that came with the input
+
+twin new SCENE VIDEO... writes such a folder.
+"""
+    parser.add_argument("scene", type=Path, help="folder with scene.toml and input/")
+    parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"stop after: {', '.join(STAGES)}")
+    parser.add_argument("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="run it again")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _relight(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Add a lighting to a built scene from one photo: the photo is located, then the field's appearance embedding "
+        "and the fog are fitted to it. The twin can then be rendered in that light from everywhere."
+    )
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
+    parser.add_argument("--name", required=True, help="name of the lighting; an added one of that name is replaced")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _align(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Fit the Husky's parameters to a log of a real one driving, scored on windows not fitted to; or fit the pose "
+        "of its camera to a film by that camera."
+    )
+    parser.epilog = (
+        "A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
+        "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
+        "acceleration_x, acceleration_y [m/s²] and group. Or the folder of a ROS 2 bag with cmd_vel, joint states, a "
+        "pose and an IMU (pip install 'twin[ros]'). A film (.mp4, ...) is of the robot's front camera, rectified, "
+        "driving ten metres or more on the built scene's place, mostly ahead, in light like that of one of its films."
+    )
+    parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` for the published one")
+    parser.add_argument("log", type=Path, help="a .csv, an .npz, the folder of a ROS 2 bag, or a film")
+    parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: the scene's")
+    parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _film(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Film a drive in a built scene: robot view, chase view, map, speed and reward."
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument(
+        "--policy", help="a run, a checkpoint, an ONNX file or module:function; default: a scripted route follower"
+    )
+    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
+    parser.add_argument(
+        "--lighting",
+        help="a name, a mixture a:b:0.3, training, held-out or any; any of them with +randomised (default: training)",
+    )
+    parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
+    parser.add_argument("--obstacles", default="scene", help="number of random ones; scene: those of scene.toml")
+    parser.add_argument("--randomise", action="store_true", help="the seed also draws robot, weather and bystanders")
+    parser.add_argument("--seed", type=int, default=0, help="of the episode")
+    parser.add_argument("--out", type=Path, help="the mp4; default: a file in SCENE/films")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _export(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Write a built place for other programs: its mesh as glTF, its field as Gaussian splats."
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("--glb", type=Path, help="write the visual mesh with colors per vertex (binary glTF, y up)")
+    parser.add_argument("--ply", type=Path, help="write Gaussians as 3DGS viewers read them (z up)")
+    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _train(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Train a policy by SAC from pixels."
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument("--run", required=True, help="name of the run, a folder in SCENE/runs")
+    parser.add_argument("--observe", choices=("nerf", "simulator"), help="source of the pictures (default: nerf)")
+    parser.add_argument("--lighting", help="one lighting by name (default: training, which varies between episodes)")
+    parser.add_argument("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes of network, batch and run")
+    parser.add_argument("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
+    parser.add_argument("--steps", type=int, help="control steps of all worlds together (default: 12000; gpu: 120000)")
+    parser.add_argument("--worlds", type=int, help="number of worlds driven at once (default: 8; gpu: 32)")
+    parser.add_argument("--processes", type=int, help="processes that step the worlds (default: as many as pay)")
+    parser.add_argument("--updates", type=float, help="updates of the networks per step (default: 0.5)")
+    parser.add_argument(
+        "--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)"
+    )
+    parser.add_argument(
+        "--entropy", type=float, help="target entropy per action [nat]; more explores more (default: -0.5)"
+    )
+    parser.add_argument(
+        "--colours", type=float, help="strength of color augmentation where the lighting varies (default: 1.0)"
+    )
+    parser.add_argument("--seed", type=int, help="of every random draw (default: 0)")
+    parser.add_argument(
+        "--randomise",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="another robot in every episode and, where the lighting varies, weather and bystanders (the default)",
+    )
+    parser.add_argument(
+        "--privileged",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="critics receive the robot's pose in training (the default); the policy never does",
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _validate(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Measure how often policies succeed, lighting by lighting."
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
+    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument(
+        "--lightings",
+        nargs="+",
+        default=[HELD_OUT, HELD_OUT + RANDOMIZED],
+        help="names, mixtures a:b:0.3, held-out, any; any of them with +randomised",
+    )
+    parser.add_argument("--episodes", type=int, default=100, help="per policy and lighting")
+    parser.add_argument("--worst", action="store_true", help="search for each policy's worst lighting")
+    parser.add_argument("--films", action="store_true", help="film each policy's typical and worst episode")
+    parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
+    parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
+    parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no table")
+
+
+def _forecast(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Predict success on the road from success in the twin."
+    parser.epilog = """\
+results.csv, one line per policy and lighting:
+
+  policy,lighting,trials,successes
+  first,morning,10,8
+  first,dusk,10,6
+
+Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task. A lighting
+that the twin does not know by name is compared with one that it does, named in a column twin_lighting, such as
+held-out+randomised.
+"""
+    parser.add_argument("scene", type=Path, help="folder of a scene with validated policies")
+    parser.add_argument("--real", type=Path, metavar="CSV", help="trials on the road; see below")
+    parser.add_argument("--seed", type=int, default=0, help="of the resampling")
+    parser.add_argument("--quiet", action="store_true", help="no summary")
+
+
+def _reality(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "A generated place whose truth is known: film it, drive policies in it, compare a build with it."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=cli.Parser)
+
+    def add(name: str, text: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=text, description=text, formatter_class=_Help)
+
+    command = add("film", "film the place into a scene folder")
+    command.add_argument("--out", type=Path, required=True, help="scene folder to write")
+    command.add_argument("--lightings", nargs="+", metavar="NAME", help="default: sun overcast night")
+    command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
+    command = add("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
+    command.add_argument("scene", type=Path, help="folder of a built scene")
+    command = add("drive", "the real test: drive policy files in weather that was not filmed")
+    command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
+    command.add_argument("--task", choices=("straight", "right_turn"), required=True)
+    command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
+    command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
+    command.add_argument(
+        "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
+    )
+    command.add_argument("--twin-lighting", default=HELD_OUT + RANDOMIZED, help="the twin's lighting to compare with")
+    command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
+    command = add("log", "a drive log of the place's Husky, for twin align")
+    command.add_argument("--out", type=Path, required=True, help="drive.csv")
+    command.add_argument("--duration", type=float, default=300.0, help="[s]")
+    command = add("onboard", "a film by that Husky's own camera, for twin align")
+    command.add_argument("--out", type=Path, required=True, help="robot.mp4")
+    command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
+    command.add_argument("--lighting", required=True, metavar="NAME", help="a weather of the test")
+    command.add_argument("--out", type=Path, required=True, help="photo.png")
+
+
+VERBS = {
+    "new": Verb("start a scene folder from films or photos", _new, "twin.new"),
+    "build": Verb("turn a scene folder into a drivable twin, with a report and a review film", _build, "twin.build"),
+    "relight": Verb("add a lighting to a built scene, from one photo", _relight, "twin.relight"),
+    "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),
+    "film": Verb("film a drive in a built scene", _film, "twin.film"),
+    "export": Verb("write the place for other programs: glTF mesh, Gaussian splats", _export, "twin.export"),
+    "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
+    "validate": Verb("measure how often policies succeed, lighting by lighting", _validate, "twin.validate"),
+    "forecast": Verb("predict success on the real road from success in the twin", _forecast, "twin.forecast"),
+    "reality": Verb("a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__"),
+}
+"""In the order in which a user meets them."""
