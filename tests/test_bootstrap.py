@@ -13,7 +13,14 @@ from twin.evaluation.bootstrap import (
     pair_cells,
     resample,
 )
-from twin.evaluation.statistics import mmrv_batched, pearson_batched, spearman_batched, winner_batched
+from twin.evaluation.statistics import (
+    CONFIDENCE,
+    mmrv_batched,
+    pearson_batched,
+    rate_difference,
+    spearman_batched,
+    winner_batched,
+)
 from twin.evaluation.trials import Cell
 
 TWIN = [
@@ -60,6 +67,20 @@ def test_trials_are_driven_anew() -> None:
         assert drawn.mean() == pytest.approx(rate, abs=0.003)
         assert drawn.std() == pytest.approx(np.sqrt(rate * (1 - rate) / 30), rel=0.03)
     assert abs(np.corrcoef(rates.twin[:, 0], rates.real[:, 0])[0, 1]) < 0.03
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.9])
+def test_resampled_cells_agree_at_the_confidence_asked_for(confidence: float) -> None:
+    """One policy with one cell: its successes are known from its rates, and so is the interval of their difference."""
+    cells = [Cell("a", "t", "sun", 30, 12)]
+    data = pair_cells(cells, cells)
+    rates = resample(data, np.random.default_rng(0), 500, confidence)
+    won = {"twin_successes": np.rint(30 * rates.twin[:, 0]), "real_successes": np.rint(30 * rates.real[:, 0])}
+    _, low, high = rate_difference(**won, twin_trials=30, real_trials=30, confidence=confidence)
+    agree = (low <= 0.0) & (high >= 0.0)
+    assert 0.3 < agree.mean() < 0.95 and np.array_equal(rates.compatible == 1.0, agree)
+    if confidence == CONFIDENCE:  # which is the usual one
+        assert np.array_equal(resample(data, np.random.default_rng(0), 500).compatible, rates.compatible)
 
 
 def test_the_same_seed_gives_the_same_and_certain_rates_are_not_certain() -> None:

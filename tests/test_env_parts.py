@@ -105,6 +105,28 @@ def test_training_and_held_out_lights_never_mix(field):
     assert gap > 0.0
 
 
+def test_between_training_and_held_out_lights_is_a_gap(field):
+    """A light of a set is a fifth nearer to its own set than to the other one, and on the way from one to the other are
+    lights of neither: else training would see what is next to a held-out light."""
+    sets, rng = LightingSets(field), np.random.default_rng(2)
+    anchors = sets.anchors
+
+    def distances(embedding: np.ndarray) -> dict[str, float]:
+        colors = sets._probe_colors(embedding)
+        far = np.sqrt(((anchors.probe_colors - colors) ** 2).mean(1))
+        return {TRAINING: far[~anchors.held_out].min(), HELD_OUT: far[anchors.held_out].min()}
+
+    for which, other in ((TRAINING, HELD_OUT), (HELD_OUT, TRAINING)):
+        for _ in range(20):
+            far = distances(sets.sample(which, rng))
+            assert far[other] > 1.2 * far[which]
+    (start, *_), (end, *_) = anchors.embeddings[~anchors.held_out], anchors.embeddings[anchors.held_out]
+    way = [start + share * (end - start) for share in np.linspace(0.0, 1.0, 200).astype(np.float32)]
+    between = [light for light in way if sets.set_of(light) is None]
+    assert len(between) > 5 and sets.set_of(way[0]) == TRAINING and sets.set_of(way[-1]) == HELD_OUT
+    assert all(max(far.values()) < 1.3 * min(far.values()) for far in map(distances, between))
+
+
 def test_lights_of_rare_anchors_are_drawn_as_often_as_others(field):
     sets, rng = LightingSets(field), np.random.default_rng(3)
     for which, held_out in ((TRAINING, False), (HELD_OUT, True)):

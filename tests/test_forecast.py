@@ -2,11 +2,13 @@
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.special import expit
 
 from twin.env.options import CAUSES
@@ -165,6 +167,48 @@ def test_leaving_a_lighting_out() -> None:
     assert made.left_out[0].twin_error.value == pytest.approx(np.mean(dusk))
     alone = make_forecast("road", twin, [c for c in real if c.lighting == "dusk"])
     assert "a second real lighting" in alone.left_out[0].coverage.missing
+
+
+def predicted(twin: np.ndarray, real: np.ndarray, at: float) -> tuple[float, float, float]:
+    """Textbook regression: the value at a twin score, and the ends of its nine-in-ten interval."""
+    line, n = stats.linregress(twin, real), len(twin)
+    value = float(np.clip(line.intercept + line.slope * at, 0.0, 1.0))
+    spread = np.sqrt(np.sum((real - line.intercept - line.slope * twin) ** 2) / (n - 2))
+    lever = (at - twin.mean()) ** 2 / np.sum((twin - twin.mean()) ** 2)
+    half = float(stats.t.ppf(0.95, n - 2) * spread * np.sqrt(1 + 1 / n + lever))
+    return value, value - half, value + half
+
+
+def test_a_lighting_left_out_is_predicted_by_the_others_alone() -> None:
+    """Dusk is another world than the rest: a line that had seen it would come closer to it."""
+    twin, real = cells(n=9, driven=9)
+    real = [replace(c, successes=c.trials - c.successes) if c.lighting == "dusk" else c for c in real]
+    rates, lights = {c.key: c.rate for c in twin}, np.array([c.lighting for c in real])
+    score, rate = np.array([(rates[c.twin_key], c.rate) for c in real]).T
+    for out in make_forecast("road", twin, real).left_out:
+        mine = lights == out.lighting
+        told = np.array([predicted(score[~mine], rate[~mine], at) for at in score[mine]])
+        assert out.corrected_error.value == pytest.approx(np.abs(told[:, 0] - rate[mine]).mean())
+        inside = (told[:, 1] <= rate[mine]) & (rate[mine] <= told[:, 2])
+        assert out.coverage.value == pytest.approx(inside.mean())
+
+
+def test_policies_left_out_are_predicted_at_the_confidence_that_is_told() -> None:
+    """As many are within the interval as by the textbook; within the one of half the cases there are fewer."""
+    twin, real = cells(n=12, driven=12)
+    made = make_forecast("road", twin, real)
+    driven = [c for c in made.candidates if c.driven]
+    score, rate = np.array([(c.twin.value, c.real.value) for c in driven]).T
+    inside, inner = [], []
+    for i, c in enumerate(driven):
+        value, low, high = predicted(np.delete(score, i), np.delete(rate, i), score[i])
+        ends = max(low, 0.0), min(high, 1.0)
+        assert (c.corrected.value, c.corrected.low, c.corrected.high) == pytest.approx((value, *ends))
+        inside.append(low <= rate[i] <= high)
+        inner.append(abs(rate[i] - value) <= (high - value) * stats.t.ppf(0.75, 9) / stats.t.ppf(0.95, 9))
+    (group,) = made.groups
+    assert made.confidence == 0.9 and sum(inner) < sum(inside)
+    assert group.corrected_coverage.value == pytest.approx(np.mean(inside))
 
 
 # ---- refusals

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from twin.evaluation import ranking
 from twin.evaluation.ranking import (
     MARGIN,
+    MAX_TRIALS,
     SETTLED_PROBABILITY,
+    RankingConfidence,
     TrialCounts,
     expected_confidence,
     rank_interval,
@@ -99,6 +102,18 @@ def test_trials_to_settle_is_the_least_that_does() -> None:
     )
     assert trials_needed(of((100, 100), (1, 100)), "winner", 0) == 0
     assert trials_needed(of((100, 100), (1, 100)), "order", 0) == 0
+
+
+@pytest.mark.parametrize("needed", [MAX_TRIALS - 5, MAX_TRIALS, MAX_TRIALS + 5, 1.5 * MAX_TRIALS, np.inf])
+def test_more_trials_than_the_most_are_never_asked_for(needed: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a ranking that settles at a known number of trials: that number, or none if nobody would drive so many."""
+
+    def confidence(counts: TrialCounts, more: int, seed: int, so_far: bool = True) -> RankingConfidence:
+        assert more < 2 * MAX_TRIALS, "tried in vain"
+        return RankingConfidence(float(more >= needed), 0.0)
+
+    monkeypatch.setattr(ranking, "expected_confidence", confidence)
+    assert trials_needed(of((5, 10), (6, 10)), "winner", 0) == (needed if needed <= MAX_TRIALS else None)
 
 
 def test_equals_need_no_order() -> None:

@@ -2,7 +2,7 @@
 
 import ast
 import hashlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import av
@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from dm_control.rl import control
+from scipy.spatial.transform import Rotation
 
 from twin.config import MjcfConfig
 from twin.env.drivers import RouteDriver
@@ -144,6 +145,85 @@ def test_its_light_is_not_filmed():
     for one in WEATHER.values():
         for other in LIGHTINGS.values():
             assert one.ambient != other.ambient and one.suns != other.suns and one.zenith != other.zenith
+
+
+def test_some_days_are_hazy_and_some_are_clear():
+    """Of fifteen days of which two in five are expected to be hazy; the air of those is as thick as stated."""
+    sight = np.array([one.visibility for name, one in WEATHER.items() if name.startswith("day_")])
+    hazy = np.isfinite(sight)
+    assert len(sight) == 15 and 2 <= hazy.sum() <= 11
+    assert np.all((sight[hazy] >= 60.0) & (sight[hazy] <= 400.0))
+
+
+def test_the_camera_is_mounted_askew():
+    """By the hidden angles about its axes right, up and back, beside one that is mounted as its parameters say."""
+    mine = hidden_robot()
+    assert np.abs(mine.camera_misalignment).max() > 0.1
+    seen = []
+    for one in (mine, replace(mine, camera_misalignment=(0.0, 0.0, 0.0))):
+        physics = real_robot.TrueRoad("straight", one, STEERING).physics
+        physics.robot.set_pose(10.0, 0.0, 0.3)
+        seen.append(physics.camera_to_world[:3, :3] @ np.diag([1.0, -1.0, -1.0]))  # axes right, up, back
+    turned = Rotation.from_matrix(seen[1].T @ seen[0]).as_euler("XYZ", degrees=True)
+    assert turned == pytest.approx(np.array(mine.camera_misalignment), abs=1e-4)
+
+
+class Plain:
+    """Stands for a raster before which everything is of one color and equally far [m]; notes from where it is asked."""
+
+    def __init__(self, color: np.ndarray, distance: float) -> None:
+        self._color, self._distance, self.poses = color, distance, []
+
+    def __call__(self, pose):
+        self.poses.append(pose)
+        return np.full((90, 160, 3), self._color, np.float32), np.full((90, 160), self._distance, np.float32)
+
+
+@pytest.fixture
+def images(monkeypatch):
+    """What the robot's camera sees of a raster in a weather at some times, standing still at the start of a trial."""
+    policy = RealTest(steering(0.0), "straight")
+
+    def see(raster: Plain, lighting: str, times: np.ndarray) -> np.ndarray:
+        monkeypatch.setattr(real_test, "_rasterizer", lambda *_: raster)
+        camera = policy.reset(lighting, 1)
+        still = policy.road.physics.camera_to_world
+        return np.stack([camera.capture(still, time) for time in times.tolist()])
+
+    return see
+
+
+@pytest.mark.parametrize("distance", [5.0, 60.0])
+def test_haze_veils_what_the_robot_sees(images, monkeypatch, distance):
+    """A dark wall in the haze looks like a wall in clear air that is as bright as wall and haze together."""
+    light, dark, now = WEATHER["haze"], np.full(3, 0.1), np.zeros(1)
+    seen = images(Plain(dark, distance), "haze", now).astype(float)
+    left = np.exp(-distance / light.visibility)
+    monkeypatch.setitem(WEATHER, "haze", replace(light, visibility=np.inf))
+    veiled = images(Plain(left * dark + (1.0 - left) * np.array(light.horizon), distance), "haze", now).astype(float)
+    assert np.abs(seen - veiled).max() <= 1.0
+    assert seen.mean() > images(Plain(dark, distance), "haze", now).mean() + 10.0
+
+
+def test_the_camera_shakes_on_the_road(images):
+    """A robot that stands still looks in another direction in every picture, from the same place."""
+    wall = Plain(np.full(3, 0.4), 5.0)
+    images(wall, "rain", np.arange(0.0, 20.0, 0.1))
+    poses = np.array(wall.poses)
+    assert np.ptp(poses[:, :3, 3], axis=0).max() < 1e-9
+    turns = Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).as_rotvec(degrees=True)
+    assert turns.std(0).min() > 0.1
+    assert turns.std(0) == pytest.approx(np.full(3, hidden_robot().camera.vibration), rel=0.3)
+
+
+def test_the_cameras_exposure_drifts(images):
+    """Of a wall as gray as ever, pictures get brighter and darker over seconds, not from one to the next."""
+    times = np.arange(0.0, 590.0, 3.0)
+    seen = images(Plain(np.full(3, 0.2), 5.0), "afternoon", times).mean((1, 2, 3))
+    assert np.log(seen).std() > 0.04
+    assert np.log(seen).std() == pytest.approx(hidden_robot().exposure_drift, rel=0.2)
+    soon = images(Plain(np.full(3, 0.2), 5.0), "afternoon", times[:20] + 0.1).mean((1, 2, 3))
+    assert np.abs(np.log(soon / seen[:20])).max() < 0.3 * np.ptp(np.log(seen))
 
 
 def test_nothing_leaks():

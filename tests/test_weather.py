@@ -8,11 +8,17 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import runtime
-from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, RandomizationSample, Ranges
+from twin.env.domain_randomization import (
+    EVALUATION_RANGES,
+    KNOWN_WEATHER_FRACTION,
+    RandomizationSample,
+    Ranges,
+    lighting_options,
+)
 from twin.env.episode_lighting import LightingSets, sample_lighting
 from twin.env.suite import EnvFactory, fingerprint
 from twin.env.task import WEATHER, DriveTask
-from twin.env.weather import DirectionalRelighting, FogSample, Weather, _solid_shadows
+from twin.env.weather import CastShadows, DirectionalRelighting, FogSample, Weather, _solid_shadows
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.added_lightings import AddedLighting, field_result
 from twin.nerf.fog import Fog
@@ -246,6 +252,39 @@ def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]
     masks |= {"left": near & wall & (left > 0), "right": near & wall & (left < 0)}
     masks |= {name: masks[name] & (points[..., 2] > 0.2) for name in ("left", "right")}
     return depth.astype(np.float32), points.astype(np.float32), masks
+
+
+def test_days_of_an_evaluation_are_never_as_mild_as_those_of_training():
+    """The road never has the film's sun: every draw of an evaluation shows another one, and shadows not filmed. Those
+    of training begin at none."""
+    ranges, rng = lighting_options("day+randomised")["randomise"], np.random.default_rng(0)
+    tried, trained = ([one.sample(rng) for _ in range(300)] for one in (ranges, Ranges()))
+    for strength in ("sunlight", "shade"):
+        least, first = (min(getattr(one, strength) for one in many) for many in (tried, trained))
+        assert first < 0.02 and least > 0.3
+    depth, points, masks = street(1.0)
+    rgb = np.full((*depth.shape, 3), 0.5, np.float32)
+    mildest = min(tried, key=lambda one: one.sunlight)
+    lit = DirectionalRelighting(mildest.sunlight, LEFT, rng).apply(rgb, depth, points)[..., 1]
+    assert np.median(lit[masks["right"]]) > 1.4 * np.median(lit[masks["left"]])
+
+
+def test_a_shadow_lies_on_the_side_away_from_the_sun():
+    """What is dark above the ground darkens the ground where the sun's ray through it ends, and not before it."""
+    rng, differ = np.random.default_rng(0), []
+    one = np.ones((200, 200, 3), np.float32)
+    for turned in rng.uniform(0.0, 2.0 * np.pi, 8):
+        sun = np.array([np.cos(LOW) * np.cos(turned), np.cos(LOW) * np.sin(turned), np.sin(LOW)])
+        shadows = CastShadows(0.7, sun, rng)
+        above = np.append(rng.uniform(-10.0, 10.0, (200, 200, 2)), rng.uniform(0.5, 3.0, (200, 200, 1)), -1)
+        ray = above[..., 2:] / sun[2] * sun  # to as high as it is
+        light, away, towards = (
+            shadows.apply(one, one[..., 0], points)[..., 1]
+            for points in (above, above - ray, above + ray * [1.0, 1.0, -1.0])
+        )
+        np.testing.assert_allclose(away, light, atol=1e-3)
+        differ.append(np.abs(towards - light).mean())
+    assert np.mean(differ) > 0.05
 
 
 @pytest.mark.parametrize("ground", [1.0, 0.15])  # the latter is high enough to be lit

@@ -1,4 +1,4 @@
-"""What all verbs have in common: one line and an exit status, however they end.
+"""How a verb of the command line ends: errors as one line, exit statuses, signals. Options are in `commands.py`.
 
 | exit status | meaning |
 |---|---|

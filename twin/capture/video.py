@@ -1,4 +1,4 @@
-"""Frame selection from video files, decoded once from front to back and never held in memory as a whole.
+"""Video files: decoding, rotation (display matrix) and frame selection, once from front to back in little memory.
 
 A *slot* is one of n equal time spans of a film; the sharpest frame of each slot is its *candidate*. A candidate that
 hardly moved since the last kept frame is a *duplicate* and is dropped. A frame's *index* is its position in the film,

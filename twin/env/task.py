@@ -1,4 +1,4 @@
-"""Driving along a route segment as a dm_control task; it uses poses and contacts, never images.
+"""Driving along a route segment as a dm_control task: reward, termination, start, state; poses and contacts, no images.
 
 An *episode* starts at rest near the segment's start and ends with one of `CAUSES`. The discount at the end is 0; at a
 timeout it is 1, as the episode is only truncated. An episode's seed determines all its randomness. Start, robot,

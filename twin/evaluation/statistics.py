@@ -1,4 +1,4 @@
-"""Success rates with intervals, and statistics of the agreement of twin and real scores. Closed forms, no randomness.
+"""Success rates with intervals; Spearman, Pearson, MMRV and regret of twin against real scores, in closed form.
 
 A *rate* is successes over trials; its interval contains the true rate with probability `CONFIDENCE`. *Twin scores* and
 *real scores* are rates of the same policies in the twin and on the road, in the same order, along the last axis;

@@ -180,24 +180,24 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     leafy = _surface([(p.vertices, p.faces) for p in kinds["obstacle"] + kinds["foliage"]])
     whole = _surface([(p.vertices, p.faces) for kind in kinds.values() for p in kind])
     visible = visible_points(whole, viewpoints, truth)
-    seen = _obstacle_points(visible, truth)
-    seen = seen[solid.distance(seen) < 1e-3]  # without leaves and ground
-    if parts and len(seen):
+    seen_points = _obstacle_points(visible, truth)
+    seen_points = seen_points[solid.distance(seen_points) < 1e-3]  # without leaves and ground
+    if parts and len(seen_points):
         twin = _surface(parts)
         standing = _obstacle_points(visible_points(twin, viewpoints, truth), truth)
         if len(standing):
-            accuracy, completeness = np.median(leafy.distance(standing)), np.median(twin.distance(seen))
+            accuracy, completeness = np.median(leafy.distance(standing)), np.median(twin.distance(seen_points))
             out["obstacle_accuracy_m"], out["obstacle_completeness_m"] = float(accuracy), float(completeness)
             out["obstacle_median_m"] = float(max(accuracy, completeness))
     if (mesh / "visual.npz").exists():
         with np.load(mesh / "visual.npz", allow_pickle=False) as data:
             visual = _surface([(to_truth.points(data["vertices"].astype(np.float64)), data["faces"])])
-        near, seen = _near_route(visible_points(visual, viewpoints, truth), truth), _near_route(visible, truth)
-        if len(near) and len(seen):
-            to_mesh = visual.distance(seen)
+        near, seen_points = _near_route(visible_points(visual, viewpoints, truth), truth), _near_route(visible, truth)
+        if len(near) and len(seen_points):
+            to_mesh = visual.distance(seen_points)
             out |= mesh_quality(whole.distance(near), to_mesh)
             for kind, objects in kinds.items():
-                mine = _surface([(p.vertices, p.faces) for p in objects]).distance(seen) < 1e-3
+                mine = _surface([(p.vertices, p.faces) for p in objects]).distance(seen_points) < 1e-3
                 if mine.any():
                     out[f"mesh_completeness_10cm_{kind}"] = float((to_mesh[mine] <= 0.1).mean())
     return out

@@ -36,7 +36,7 @@ class FilmingPlan:
     start: float = 0.0
     """Station of the first frame [m]."""
     length: float = 60.0
-    """[m] along the centre line."""
+    """[m] along the center line."""
     speed: float = 2.0
     """Mean speed [m/s]."""
     fps: int = 4

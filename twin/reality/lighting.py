@@ -44,7 +44,7 @@ class Lighting:
     drift: float = 0.10
     """Standard deviation of the log exposure within a film."""
     noise: float = 0.004
-    """Sensor noise at mid grey [fraction of full scale]."""
+    """Sensor noise at mid gray [fraction of full scale]."""
     gain: Color = (1.0, 1.0, 1.0)
     """White balance."""
     glow_sun: Color = (0.0, 0.0, 0.0)

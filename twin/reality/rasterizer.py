@@ -260,18 +260,18 @@ def _reset(nearest_keys: wp.array[wp.int64]):
 
 
 @wp.func
-def _extend_box_by_edge(box: wp.vec4, a: wp.vec3, b: wp.vec3, lens: wp.vec4):
+def _extend_box_by_edge(box: wp.vec4, a: wp.vec3, b: wp.vec3, intrinsics: wp.vec4):
     """Extends a box (x0, y0, x1, y1) [samples] by a, and by the intersection of edge a–b with the near plane."""
     if a[2] >= _NEAR:
-        box = _extend_box_by_point(box, a, lens)
+        box = _extend_box_by_point(box, a, intrinsics)
     if (a[2] < _NEAR) != (b[2] < _NEAR):
-        box = _extend_box_by_point(box, a + (b - a) * ((_NEAR - a[2]) / (b[2] - a[2])), lens)
+        box = _extend_box_by_point(box, a + (b - a) * ((_NEAR - a[2]) / (b[2] - a[2])), intrinsics)
     return box
 
 
 @wp.func
-def _extend_box_by_point(box: wp.vec4, p: wp.vec3, lens: wp.vec4):
-    x, y = lens[0] * p[0] / p[2] + lens[2], lens[1] * p[1] / p[2] + lens[3]
+def _extend_box_by_point(box: wp.vec4, p: wp.vec3, intrinsics: wp.vec4):
+    x, y = intrinsics[0] * p[0] / p[2] + intrinsics[2], intrinsics[1] * p[1] / p[2] + intrinsics[3]
     return wp.vec4(wp.min(box[0], x), wp.min(box[1], y), wp.max(box[2], x), wp.max(box[3], y))
 
 
@@ -280,7 +280,7 @@ def _rasterize(
     corners: wp.array2d[wp.vec3],
     to_camera: wp.mat33,
     eye: wp.vec3,
-    lens: wp.vec4,
+    intrinsics: wp.vec4,
     width: int,
     height: int,
     nearest_keys: wp.array[wp.int64],
@@ -292,7 +292,9 @@ def _rasterize(
         return
     # Box around the part of the triangle beyond the near plane; sample k lies at k + 0.5.
     box = wp.vec4(_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, -_UNBOUNDED)
-    box = _extend_box_by_edge(_extend_box_by_edge(_extend_box_by_edge(box, a, b, lens), b, c, lens), c, a, lens)
+    box = _extend_box_by_edge(
+        _extend_box_by_edge(_extend_box_by_edge(box, a, b, intrinsics), b, c, intrinsics), c, a, intrinsics
+    )
     if box[2] < 0.5 or box[3] < 0.5 or box[0] > float(width) - 0.5 or box[1] > float(height) - 0.5:
         return
     x0, x1 = int(wp.ceil(wp.max(box[0] - 0.5, 0.0))), int(wp.floor(wp.min(box[2] - 0.5, float(width - 1))))
@@ -305,9 +307,9 @@ def _rasterize(
     if det == 0.0:
         return
     for y in range(y0, y1 + 1):
-        v = (float(y) + 0.5 - lens[3]) / lens[1]
+        v = (float(y) + 0.5 - intrinsics[3]) / intrinsics[1]
         for x in range(x0, x1 + 1):
-            u = (float(x) + 0.5 - lens[2]) / lens[0]
+            u = (float(x) + 0.5 - intrinsics[2]) / intrinsics[0]
             wa = u * na[0] + v * na[1] + na[2]
             wb = u * nb[0] + v * nb[1] + nb[2]
             wc = u * nc[0] + v * nc[1] + nc[2]
@@ -406,7 +408,7 @@ def _shade(
     nearest_keys: wp.array[wp.int64],
     to_camera: wp.mat33,
     eye: wp.vec3,
-    lens: wp.vec4,
+    intrinsics: wp.vec4,
     width: int,
     rgb: wp.array2d[wp.vec3],
     depth: wp.array2d[float],
@@ -417,7 +419,9 @@ def _shade(
     total = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES * SAMPLES):
         x, y = px * SAMPLES + sample % SAMPLES, py * SAMPLES + sample // SAMPLES
-        d = wp.vec3((float(x) + 0.5 - lens[2]) / lens[0], (float(y) + 0.5 - lens[3]) / lens[1], 1.0)
+        d = wp.vec3(
+            (float(x) + 0.5 - intrinsics[2]) / intrinsics[0], (float(y) + 0.5 - intrinsics[3]) / intrinsics[1], 1.0
+        )
         key = nearest_keys[y * width + x]
         if key == wp.int64(_NO_TRIANGLE):
             if sample == 0:
@@ -435,8 +439,8 @@ def _shade(
         if sample == 0:
             depth[py, px] = z
         # Barycentric coordinates here and one sample further right and down, which span the footprint.
-        wx = w + wp.vec3(na[0], nb[0], nc[0]) / lens[0]
-        wy = w + wp.vec3(na[1], nb[1], nc[1]) / lens[1]
+        wx = w + wp.vec3(na[0], nb[0], nc[0]) / intrinsics[0]
+        wy = w + wp.vec3(na[1], nb[1], nc[1]) / intrinsics[1]
         here = w / (w[0] + w[1] + w[2])
         uv = uvs[i, 0] * here[0] + uvs[i, 1] * here[1] + uvs[i, 2] * here[2]
         wx = wx / (wx[0] + wx[1] + wx[2])
@@ -483,7 +487,7 @@ class Rasterizer:
         if len(flat.corners) >= 1 << _INDEX_BITS:
             raise ValueError(f"{len(flat.corners)} triangles; the rasterizer takes fewer than {1 << _INDEX_BITS}")
         self._size = (SAMPLES * size[0], SAMPLES * size[1])
-        self._lens = wp.vec4(*(float(value) * SAMPLES for value in intrinsics))
+        self._intrinsics = wp.vec4(*(float(value) * SAMPLES for value in intrinsics))
         with wp.ScopedDevice("cpu"):
             self._corners = wp.array(flat.corners, dtype=wp.vec3)
             self._nearest = wp.empty(self._size[0] * self._size[1], dtype=wp.int64)
@@ -513,7 +517,7 @@ class Rasterizer:
         width, height = self._size
         with wp.ScopedDevice("cpu"):
             wp.launch(_reset, width * height, [self._nearest])
-            view = [to_camera, eye, self._lens, width]
+            view = [to_camera, eye, self._intrinsics, width]
             wp.launch(_rasterize, len(self._corners), [self._corners, *view, height, self._nearest])
             wp.launch(_shade, self._rgb.shape, [*self._inputs, self._nearest, *view, self._rgb, self._depth])
         return self._rgb.numpy().copy(), self._depth.numpy().copy()

@@ -1,4 +1,4 @@
-"""Stage 7: the review video, metrics of a scripted drive, and pictures for the report page.
+"""Stage `review`: the review video, metrics of a scripted drive, and pictures for the report page.
 
 The video has up to three chapters: real against rendered frames; changing light, if there are several lightings; and
 the Husky driven along the route by a scripted follower, if there is a route.

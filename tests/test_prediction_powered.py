@@ -102,6 +102,19 @@ def test_left_out_predictions_do_not_know_what_they_predict() -> None:
     assert leave_one_group_out(twin=F, real=changed, groups=range(6))[0][2] == value[2]
 
 
+@pytest.mark.parametrize("confidence", [0.5, 0.8, 0.9])
+def test_left_out_intervals_have_the_confidence_asked_for(confidence: float) -> None:
+    """An interval is as many times as wide as that of another confidence as Student's t says."""
+    real = 0.5 + 0.1 * (Y - Y.mean())  # far from 0 and 1, where intervals end
+    value, low, high = leave_one_group_out(twin=F, real=real, groups=range(6), confidence=confidence)
+    _, usual_low, usual_high = leave_one_group_out(twin=F, real=real, groups=range(6))
+    ratio = stats.t.ppf(0.5 + confidence / 2, 3) / stats.t.ppf(0.95, 3)
+    assert (high - low) / (usual_high - usual_low) == pytest.approx(np.full(6, ratio))
+    for i in range(6):
+        line = LinearCorrection.fit(twin=np.delete(F, i), real=np.delete(real, i))
+        assert (value[i], low[i], high[i]) == pytest.approx(line.predict(F[i], confidence))
+
+
 @pytest.mark.parametrize(("n", "real_trials", "noise"), [(12, 50, 0.5), (6, 20, 0.5), (12, 20, 3.0)])
 def test_predictions_hold_nine_times_in_ten(n: int, real_trials: int, noise: float) -> None:
     """Rates of new policies, seen in as many real trials: 600 experiments, Monte-Carlo error 0.012."""

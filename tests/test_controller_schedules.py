@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_follower import on_a_plane
+from test_route_follower import on_a_plane
 
 from twin.env.controller import Controller, VectorController
 from twin.env.physics import HuskyPhysics

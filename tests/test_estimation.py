@@ -80,6 +80,16 @@ def test_few_groups_do_not_make_sure(looks):
         assert found.errors["slope"] > 0.9 * 0.1 / np.linalg.norm(x)
 
 
+def test_of_few_groups_one_is_used_up_by_the_fit():
+    """Windows of a group miss alike, so groups count: the variance of a mean of G groups is Σ off² / (G (G − 1)). The
+    same groups eight times over have the same mean and scales, so errors tell what is divided by."""
+    off = np.repeat([0.18, -0.22, 0.1, -0.06], 50)
+    x = np.ones(len(off))
+    few, many = (slope_through(2.0 + np.tile(off, k), np.tile(x, k), np.repeat(np.arange(4 * k), 50)) for k in (1, 8))
+    assert few.values["slope"] == pytest.approx(many.values["slope"], abs=1e-3)
+    assert few.errors["slope"] / many.errors["slope"] == pytest.approx(np.sqrt((4 * 8 - 1) / (4 - 1)), rel=0.02)
+
+
 def test_errors_hold_where_windows_that_tell_most_miss_most():
     """A fifth of the windows is stuck, and would tell five times as much."""
     found, told = [], []

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from test_baked import baked
-from test_overlay import SIZE, K, nothing
+from test_compositor import SIZE, K, nothing
 
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor, ContactShadows
