@@ -15,8 +15,6 @@ import twin
 from twin import build as verb
 from twin.scene import STAGES
 
-pytestmark = pytest.mark.slow
-
 _QUICK = (
     "nerf.steps=400",
     "nerf.rays=2048",
@@ -111,6 +109,7 @@ def test_opening_the_twin(built):
         twin.load_scene(root / "input")
 
 
+@pytest.mark.slow
 def test_the_benchmark_of_the_field_runs(built, tmp_path):
     root, _ = built
     script, file = Path(__file__).parents[1] / "benchmarks/field.py", tmp_path / "figures.json"
@@ -127,6 +126,7 @@ def test_the_benchmark_of_the_field_runs(built, tmp_path):
     assert all(name in done.stdout for name in figures if name != "about")
 
 
+@pytest.mark.slow
 def test_it_is_driven_by_what_it_sees(built, tmp_path):
     """The environment on a real build: pictures that are those of the field, the goal reached, a film."""
     from twin.env.drivers import RouteDriver
@@ -147,6 +147,7 @@ def test_it_is_driven_by_what_it_sees(built, tmp_path):
     assert done.returncode == 0 and "goal after" in done.stdout and film.stat().st_size > 1e4, done.stderr[-3000:]
 
 
+@pytest.mark.slow
 def test_the_benchmark_of_the_environment_runs(built, tmp_path):
     root, _ = built
     script, file = Path(__file__).parents[1] / "benchmarks/env.py", tmp_path / "figures.json"

@@ -2,6 +2,9 @@
 
 import gc
 import json
+import re
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -15,13 +18,18 @@ from tiny_twin import tiny_twin
 import twin
 from twin import runtime
 from twin.config import ObstacleConfig
+from twin.env.camera_noise import CameraOptions
+from twin.env.chase_camera import chase_poses
 from twin.env.domain_randomization import Ranges
 from twin.env.drivers import BlindDriver, RouteDriver
 from twin.env.gym_env import DriveEnv
 from twin.env.options import CAUSES
 from twin.env.suite import EnvFactory
-from twin.env.vector_env_local import LocalVectorEnv
+from twin.env.task import Motion
+from twin.env.vector_env_local import LocalVectorEnv, mixture_text
 from twin.errors import InputError
+from twin.geometry.images import resize
+from twin.nerf.lightings import Lightings
 
 SMALL = {"size": (32, 18)}
 OPTION_SETS = {
@@ -100,8 +108,6 @@ def test_gymnasium_and_sb3_accept_it(scene, name):
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "The environment .* is different from the unwrapped version")
         warnings.filterwarnings("ignore", "The minimal resolution for an image is 36x36.*")
-        # A state of metres and radians has no bounds.
-        warnings.filterwarnings("ignore", ".*A Box observation space (minimum|maximum) value is.*")
         check_env(environment.unwrapped, skip_render_check=name == "state")
         sb3_check_env(environment.unwrapped, skip_render_check=True)
     _, info = environment.reset(seed=1)
@@ -312,9 +318,6 @@ def test_what_cannot_be_had_is_an_input_error(scene):
 
 
 def test_the_environment_needs_no_torch():
-    import subprocess
-    import sys
-
     code = "import sys, twin.env.suite, twin.env.gym_env, twin.env.vector_env_local; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -340,11 +343,163 @@ def test_twenty_thousand_steps(scene):
     worlds.close()
 
 
+def test_the_sampled_lighting_is_named(scene):
+    """Gymnasium names the mixture of each episode; the name in tables stays that of the set."""
+    options = SMALL | {"time_limit": 0.3}
+    mixture = r"(day|night) \d\.\d\d(, (day|night) \d\.\d\d)?"
+    for lighting, pattern in (
+        ("training", f"training: {mixture}"),
+        ("held-out", f"held-out: {mixture}"),
+        ("any", f"any: {mixture}"),
+        ("day", "day"),
+        (("day", "night"), "day|night"),
+        ("day:night:0.3", "day:night:0.3"),
+    ):
+        environment, names = DriveEnv(scene, "bend", lighting=lighting, **options), set()
+        for seed in range(4):
+            names.add(environment.reset(seed=seed)[1]["lighting"])
+            info = environment.step(environment.action_space.sample())[-1]
+            assert info["lighting"] in names and "sampled_lighting" not in info
+            table = environment.vector_env.info(0)
+            assert table["lighting"] == environment.vector_env.pixels.info(0)["lighting"]
+            assert table["lighting"] in ("training", "held-out", "any", "day", "night", "day:night:0.3")
+        assert all(re.fullmatch(pattern, name) for name in names), names
+        assert len(names) > 2 or lighting not in ("training", "held-out", "any")
+    drifting = DriveEnv(scene, "bend", lighting="training", lighting_drift=True, randomise=True, **options)
+    name = drifting.reset(seed=0)[1]["lighting"]
+    assert re.fullmatch(rf"training → training\+randomised: {mixture} → {mixture}", name)
+    many = gymnasium.make_vec(
+        "twin/Drive-v0", 2, vectorization_mode="vector_entry_point", scene=scene, task="bend", **options
+    )
+    names = many.reset(seed=0)[1]["lighting"].tolist()
+    one = DriveEnv(scene, "bend", **options)
+    assert names == [one.reset(seed=seed)[1]["lighting"] for seed in (0, 1)]
+
+
+def test_a_mixture_is_the_nearest_sum_of_the_filmed_lightings():
+    vectors = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
+    filmed = Lightings(("sun", "night", "rain"), vectors, (), vectors[:0])
+    blend = 0.62 * vectors[0] + 0.38 * vectors[1]
+    assert mixture_text(blend, filmed) == "sun 0.62, night 0.38"
+    assert mixture_text(blend + np.float32([0.0, 0.0, -5.0]), filmed).startswith("sun")  # no negative part
+    assert mixture_text(vectors[2], filmed) == "rain 1.00"
+
+
+@pytest.mark.parametrize("name", ["paper", "night", "crowded"])
+def test_a_large_view_changes_nothing(scene, name):
+    """Observations, rewards and infos are those without it, through the ends of episodes."""
+    camera = CameraOptions(vibration=0.5, exposure=0.2, shutter=0.02)
+    options = OPTION_SETS[name] | {"time_limit": 0.4, "camera": camera}
+    plain = DriveEnv(scene, "bend", "rgb_array", **options)
+    views = [
+        DriveEnv(scene, "bend", "rgb_array", render_size=(96, 54), **options),
+        DriveEnv(scene, "bend", "rgb_array", render_size=(64, 48), render_view="chase", **options),
+    ]
+    rng = np.random.default_rng(0)
+    for seed in (3, 4):
+        first = plain.reset(seed=seed)
+        for view in views:
+            observation, info = view.reset(seed=seed)
+            np.testing.assert_array_equal(observation, first[0])
+            assert info == first[1]
+        over = False
+        while not over:
+            action = rng.uniform(-1.0, 1.0, 2)
+            assert plain.render().shape == (18, 32, 3)
+            for view, shape in zip(views, ((54, 96, 3), (48, 64, 3)), strict=True):
+                picture = view.render()
+                assert picture.shape == shape and picture.dtype == np.uint8 and picture.std() > 1.0
+                np.testing.assert_array_equal(view.render(), picture)
+            wanted = plain.step(action)
+            for view in views:
+                np.testing.assert_array_equal((out := view.step(action))[0], wanted[0])
+                assert out[1:] == wanted[1:]
+            over = wanted[2] or wanted[3]
+
+
+def test_a_large_view_shows_what_the_policy_sees(scene):
+    """Scaled down, it is the observation: lighting, obstacles and weather included."""
+    obstacles = (ObstacleConfig("it", "box", station=3.0, color=(0.9, 0.1, 0.1)),)
+    pictures = {}
+    for name, more in (("plain", {}), ("box", {"obstacles": obstacles}), ("weather", {"randomise": True})):
+        options = {"size": (160, 90), "lighting": "day", **more}
+        environment = DriveEnv(scene, "bend", "rgb_array", render_size=(640, 360), **options)
+        observation, _ = environment.reset(seed=2)
+        for _ in range(5):
+            observation, *_ = environment.step(np.array([1.0, 0.0]))
+        pictures[name] = environment.render()
+        small = resize(pictures[name], 160, 90).astype(float)
+        assert np.abs(small - observation[-3:].transpose(1, 2, 0)).mean() < 3.0
+        assert np.abs(pictures[name].astype(float) - pictures["plain"]).mean() > 1.0 or name == "plain"
+
+
+def test_a_chase_view_follows_the_robot_and_shows_its_obstacles(scene):
+    """Also without pictures for the policy, and with other obstacles in every episode."""
+    environment = DriveEnv(scene, "bend", "rgb_array", render_view="chase", pixels=False, obstacles=2)
+    environment.reset(seed=1)
+    scenes = []
+    for seed in (1, 2):
+        environment.reset(seed=seed)
+        first = environment.render()
+        assert first.shape == (360, 640, 3)
+        bases = [environment.vector_env.physics[0].base_to_world]
+        for _ in range(5):
+            environment.step(np.array([1.0, 0.5]))
+            bases.append(environment.vector_env.physics[0].base_to_world)
+        assert np.abs(environment.render().astype(float) - first).mean() > 1.0
+        scenes.append(environment._scene)
+        np.testing.assert_array_equal(environment._chase_pose, chase_poses(np.array(bases))[-1])
+        parked = scenes[0].data.mocap_pos[:, 2] < -50.0
+        assert (~parked).sum() == 2
+    assert scenes[0] is scenes[1]
+
+
+def test_a_state_never_leaves_its_bounds(scene):
+    environment = DriveEnv(scene, "bend", pixels=False, start_offset=2.0, start_heading=180.0)
+    space = environment.observation_space
+    assert np.isfinite(space.low).all() and np.isfinite(space.high).all() and space.shape == (7,)
+    np.testing.assert_allclose(space.high[3:], np.pi, rtol=1e-6)
+    rng = np.random.default_rng(0)
+    for seed in range(20):
+        observation, _ = environment.reset(seed=seed)
+        assert space.contains(observation)
+        over = False
+        while not over:
+            observation, _, terminated, truncated, _ = environment.step(rng.uniform(-1.0, 1.0, 2))
+            over = terminated or truncated
+            assert space.contains(observation)
+            assert (np.abs(observation[:3]) < 0.9 * space.high[:3]).all()  # nothing is clipped in a drive
+    thrown = Motion(np.zeros((1, 3)), *(np.array([value]) for value in (1e3, -1e3, 1.0, False, 0.0)))
+    state = environment.vector_env.tasks[0]._evaluator.state([0], thrown)[0]
+    assert space.contains(state) and (state[0], state[1]) == (space.high[0], space.low[1])
+
+
+def test_a_fresh_process_makes_it_by_its_full_name(scene):
+    """As the processes of stable-baselines3's SubprocVecEnv, which have not imported `twin`."""
+    code = (
+        "import sys, gymnasium; assert 'twin' not in sys.modules; "
+        f"env = gymnasium.make('twin:twin/Drive-v0', scene={str(scene.scene.root)!r}, task='bend', pixels=False); "
+        "print(env.reset(seed=0)[0].shape)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "(7,)", done.stderr
+
+
 def test_what_gymnasium_is_asked_wrongly(scene):
     with pytest.raises(InputError, match="render_mode = 'human'; expected None or 'rgb_array'"):
         DriveEnv(scene, "bend", render_mode="human", pixels=False)
     with pytest.raises(InputError, match="lighting 'noon'"):
         DriveEnv(scene, "bend", lighting="noon")
+    for options, words in (
+        ({"render_view": "above"}, "render_view = 'above'; expected 'robot' or 'chase'"),
+        ({"render_size": (640,)}, r"render_size = \(640,\); expected \(width, height\), whole numbers from 8 to 4096"),
+        ({"render_size": (640, 3.5)}, "render_size"),
+        ({"render_size": (64, 36), "pixels": False}, "render_size = .* with pixels=False: no field is loaded"),
+    ):
+        with pytest.raises(InputError, match=words):
+            DriveEnv(scene, "bend", "rgb_array", **options)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="render before reset"):
+        DriveEnv(scene, "bend", "rgb_array", render_size=(64, 36)).render()
     environment = DriveEnv(scene, "bend", pixels=False)
     with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
         environment.step(environment.action_space.sample())

@@ -134,5 +134,5 @@ def test_photos_with_a_clock_are_kept_by_it_and_those_without_are_refused(tmp_pa
         write_image(tmp_path / f"bare/{i}.png", view)
     capture, _, _ = captured(tmp_path, [SourceConfig(path="clocked")], keep=((3.0, 12.0),))
     assert capture.names == tuple(f"clocked/{i:06d}" for i in range(1, 5))
-    refused(tmp_path, SourceConfig(path="bare", keep=((0.0, 3.0),)), "no clock.*folder of their own")
+    refused(tmp_path, SourceConfig(path="bare", keep=((0.0, 3.0),)), "EXIF times are missing.*folder of their own")
     refused(tmp_path, SourceConfig(path="clocked", keep=((40.0, 50.0),)), r"leaves 0 of 8 photos.*0 to 21\.00 s")

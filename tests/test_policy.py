@@ -226,7 +226,7 @@ def test_onnx_files_that_are_no_policies_are_refused(tmp_path):
         ("kind", {"kind": TensorProto.DOUBLE}, "uint8 or float32"),
         ("elsewhere", {"external": True}, "other files"),
         ("three", {"actions": 3}, "1 or 2"),
-        ("four_at_once", {"shape": (4, 12, 90, 160)}, "n open or 1"),
+        ("four_at_once", {"shape": (4, 12, 90, 160)}, "n dynamic or 1"),
     ):
         with pytest.raises(InputError, match=words) as caught:
             load_policy(foreign(tmp_path / f"{name}.onnx", **settings))

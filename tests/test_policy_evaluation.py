@@ -75,6 +75,7 @@ def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
     assert write_success_curve(run).exists()
 
 
+@pytest.mark.slow
 def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, tmp_path, scripted):
     _, asked = scripted
     (run / CHOICE_FILE).unlink(missing_ok=True)

@@ -20,7 +20,9 @@ from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.fog import Fog, mixed
 from twin.nerf.lightings import Lightings
-from twin.relight import fit_photo, main
+from twin.relight import PhotoFit, comparison, fit_photo, main
+from twin.report import video_layout
+from twin.report.video_layout import draw_label
 from twin.scene import SceneDir, write_stamp
 
 
@@ -129,7 +131,33 @@ def test_the_verb_adds_a_lighting_that_the_scene_then_has(scene, capsys):
     middle = 0.5 * field.embedding("day") + 0.5 * field.embedding("dusk")
     assert np.allclose(field.embedding("day:dusk:0.5"), middle, atol=1e-6)
     photo, fitted, _ = np.split(_without_gaps(read_image(scene.lightings / "dusk.png")) / 255.0, 3, axis=1)
-    assert psnr(fitted, photo) == pytest.approx(stored["figures"]["psnr_fitted"], abs=0.3)
+    below = np.arange(SIZE[1]) >= 40  # the labels
+    unlabelled = np.broadcast_to(below[:, None], photo.shape[:2])
+    assert psnr(fitted, photo, unlabelled) == pytest.approx(stored["figures"]["psnr_fitted"], abs=0.5)
+
+
+def test_the_picture_of_a_fit_names_its_panels(monkeypatch):
+    """In the corner of each panel; the rest is the images to the bit."""
+    rng = np.random.default_rng(0)
+    images = tuple(rng.uniform(0.0, 1.0, (150, 270, 3)).astype(np.float32) for _ in range(3))
+    relit = PhotoFit("sun", np.zeros(4, np.float32), Fog(), images, 16.3, 25.34, 24.0, 24.0)
+    drawn = []
+
+    def noted(canvas, text, box, **style):
+        drawn.append((text, box))
+        draw_label(canvas, text, box, **style)
+
+    monkeypatch.setattr(video_layout, "draw_label", noted)
+    out = comparison("dusk", relit)
+    assert drawn == [
+        ("photo", (0, 0, 270, 150)),
+        ("fitted: dusk, 25.3 dB", (274, 0, 270, 150)),
+        ("nearest filmed: sun, 16.3 dB", (548, 0, 270, 150)),
+    ]
+    for k, image in enumerate(images):
+        plain, panel = (image * 255.0 + 0.5).astype(np.uint8), out[:, k * 274 : k * 274 + 270]
+        assert out.shape == (150, 818, 3) and np.array_equal(panel[40:], plain[40:])
+        assert not np.array_equal(panel[:40], plain[:40])
 
 
 def _without_gaps(picture: np.ndarray) -> np.ndarray:
@@ -162,7 +190,7 @@ def test_what_cannot_be_used_ends_with_one_line_and_status_2(scene, tmp_path, ca
     write_image(tmp_path / "noise.png", noise)
     photo = str(scene.root / "photo.png")
     for arguments, words in (
-        ([str(scene.root), str(tmp_path / "noise.png"), "--name", "x"], "features of the photo fit the place (need 25"),
+        ([str(scene.root), str(tmp_path / "noise.png"), "--name", "x"], "agree with one camera pose (need 25)"),
         ([str(scene.root), str(tmp_path / "absent.png"), "--name", "x"], "absent.png: No such file"),
         ([str(scene.root), photo, "--name", "day"], "filmed under a lighting of this name"),
         ([str(scene.root), photo, "--name", "a:b"], "expected a name of letters"),

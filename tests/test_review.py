@@ -21,7 +21,6 @@ from twin.geometry.cameras import (
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
-from twin.report.chase_camera import overview_pose
 from twin.report.review_chapters import lighting_at
 from twin.report.review_studio import (
     Prefetcher,
@@ -36,6 +35,7 @@ from twin.report.review_studio import (
     side_by_side,
 )
 from twin.report.review_video import write_review_video
+from twin.report.shots import overview_pose
 from twin.report.video_layout import (
     FrameLayout,
     MapView,

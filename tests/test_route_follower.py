@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from tiny_world import tiny_config, tiny_scene, tiny_world
 
+from twin.env.chase_camera import SceneCamera, blend_parts, chase_poses
 from twin.env.physics import HuskyPhysics
 from twin.env.route_follower import follow_route, pursuit_curvature
 from twin.geometry.cameras import project
@@ -14,7 +15,7 @@ from twin.geometry.poses import inverse_pose
 from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
-from twin.report.chase_camera import SceneCamera, blend_parts, chase_poses, frame_indices
+from twin.report.shots import frame_indices
 from twin.robot import REAR_HEAVY, HuskyParams
 
 

@@ -60,6 +60,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_random_three_times_comes_to_its_end(scene, tmp_path):
     """As a process, with SIGKILL: all steps are there, tables have no gap and nothing twice, and the policy drives."""
     folder = tmp_path / "run"
@@ -160,6 +161,7 @@ def test_the_last_policy_is_a_checkpoint(scene, tmp_path):
     assert [path.name for path in sorted((tmp_path / "checkpoints").iterdir())] == ["000000040", "000000080"]
 
 
+@pytest.mark.slow
 def test_no_resumption_drives_what_validation_or_another_seed_drives(scene, tmp_path, monkeypatch):
     from twin.learn import training
 

@@ -120,6 +120,7 @@ def test_randomised_episodes_are_others_and_repeat(scene, monkeypatch):
         run_chunk(chunk(scene, [0], "day+randomized"))
 
 
+@pytest.mark.slow
 def test_a_killed_validation_ends_with_the_same_table(fresh, monkeypatch):
     monkeypatch.setattr(validate, "CHUNK", 3)
     whole = run(fresh, "ahead", "left")
@@ -275,6 +276,7 @@ def test_the_summary_splits_by_cause_and_trust():
     assert "2 got stuck" in summary_lines(summarize(trials))[0]
 
 
+@pytest.mark.slow
 def test_two_nodes_of_ray_give_the_table_of_one_process(fresh):
     ray = pytest.importorskip("ray", reason="ray is not installed")
     from ray.cluster_utils import Cluster

@@ -34,6 +34,7 @@ def scene(tmp_path_factory):
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin"), robot=HuskyParams(servo_lag=0.05)))
 
 
+@pytest.mark.slow
 def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
     """Robots of different make under different commands, one world after the other and all at once."""
     stage = EnvFactory.open(scene, "bend", OPTIONS)

@@ -187,7 +187,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command(options: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     if options.log.suffix.lower() in FILM_SUFFIXES:
         if options.out or options.level:
             raise InputError(f"{options.log} is a film; --out and --level are for logs")

@@ -35,20 +35,21 @@ from twin.scene import (
 
 @dataclass(frozen=True)
 class Stage:
-    """What a stage is and what its result depends on."""
+    """A build stage and the dependencies of its result."""
 
     name: str
     module: str
-    """Its `run(scene, config, out) -> metrics` lives here; imported only when it runs."""
+    """Module with the stage's `run(scene, config, out) -> metrics`; imported only when the stage runs."""
     version: int
-    """Raised when the same input would give another result."""
+    """Incremented when a code change alters the result for the same input."""
     config: tuple[str, ...]
-    """Sections of `scene.toml`, or `section.key`, that it reads."""
+    """Sections of `scene.toml`, or `section.key`, that the stage reads."""
     upstream: tuple[str, ...]
-    """Stages whose results it reads."""
+    """Stages whose results this stage reads."""
 
 
-_MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the rest only changes stage mjcf
+_MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")
+"""Settings that stage mesh reads, too; the other mjcf settings affect stage mjcf only."""
 
 PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
@@ -73,10 +74,11 @@ _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mes
 """Durations [s] on the demo with 2 cores; only their ratios matter, since the pace of a build is measured."""
 
 _LEAST_TIMED = 30.0
-"""Typical seconds that must have been measured before a time left is said: the first stage is too short to tell."""
+"""No remaining time is shown until stages worth this many typical seconds have run, because the first stage is too
+short to estimate the pace."""
 
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")
-"""Folders of a scene that twin writes: never an input."""
+"""Folders of a scene that twin writes; their files are never inputs."""
 
 
 def build(
@@ -148,17 +150,17 @@ def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
 
 def _check_folder(folder: Path) -> None:
     if (is_link(folder) and not folder.exists()) or (folder.exists() and not folder.is_dir()):
-        raise InputError(f"{folder} is no folder; move it away: what is built goes there")
+        raise InputError(f"{folder} is not a folder; move it away: builds are written there")
 
 
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     """SHA-256 of every file that the sources are read from, by path relative to the scene.
 
-    A folder of the scene counts with all that is in it, except for what twin writes; of a folder around the scene, and
-    of a posed image set elsewhere, only what is read of it does.
+    For a source folder inside the scene, all files are hashed except twin's own output. For a folder that contains the
+    scene, or a posed image set outside it, only the files that are read are hashed.
 
     Raises:
-        InputError: one is absent, or neither a file nor a folder.
+        InputError: a source is missing, or neither a file nor a folder.
     """
     from twin.capture.formats import is_image, source_files
     from twin.files import is_folder
@@ -167,13 +169,13 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     for source in config.source:
         for name in filter(None, (source.path, source.images, source.mask)):
             path = scene.root / name
-            is_folder(path, f"put {name!r} of {scene.config_file} there or correct the path")
+            is_folder(path, f"create {path}, or correct the path {name!r} in {scene.config_file}")
         path = scene.root / source.path
         images = scene.root / source.images if source.images else None
         read = source_files(path, source.kind, images)
         files.update(read)
         posed = path.suffix == ".json" or (path.is_dir() and any(path.glob("cameras.*")))
-        # Beside a posed set lies what else belongs to it, all below one folder of the scene.
+        # A posed image set's other files lie beside it, so the top-level scene folder that contains it is hashed.
         parts = Path(os.path.normpath(source.path)).parts
         for folder in (
             scene.root.joinpath(*parts[:1]) if posed and not Path(source.path).is_absolute() else path,
@@ -192,7 +194,7 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
 
 
 def _files_below(folder: Path, scene: SceneDir) -> list[Path]:
-    """The regular files below a folder; none of a folder around the scene, and none of what twin writes."""
+    """The regular files below a folder, without twin's output; empty if the folder contains the scene itself."""
     root, top = scene.root.resolve(), folder.resolve()
     written = {(root / name) for name in _WRITTEN}
     if not folder.is_dir() or root.is_relative_to(top) or top in written:
@@ -211,11 +213,11 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for name in stage.config:
         section, _, key = name.partition(".")
         settings[name] = table[section][key] if key else table[section]
-    # What came later and is not used: without it a result is what it was before.
+    # Drop settings added in later versions while they have no effect, so that older results stay valid.
     for one in (settings.get("capture", {}), *settings.get("source", ())):
         if "keep" in one and not one["keep"]:
             del one["keep"]
-    if stage.name == "metric" and settings["mjcf.route"]:  # read only to refuse a path that jumps
+    if stage.name == "metric" and settings["mjcf.route"]:  # only rejects a path with jumps; does not change results
         del settings["mjcf.route"]
     if not settings.get("nerf", {}).get("refine_cameras", True):
         del settings["nerf"]["refine_cameras"]
@@ -235,7 +237,7 @@ def _run(stage: Stage, scene: SceneDir, config: SceneConfig, depends: dict[str, 
     start = time.perf_counter()
     try:
         with PeakMemory() as peak:
-            choice = {"device": device} if stage.name in _ON_DEVICE else {}
+            choice = {"device": device} if device and stage.name in _ON_DEVICE else {}
             metrics = importlib.import_module(stage.module).run(scene, config, out, **choice)
         about = {"metrics": metrics, "seconds": time.perf_counter() - start, "peak_memory_bytes": peak.bytes}
         stamp = write_stamp(out, stage.name, depends, device=device or "auto", **about)
@@ -268,19 +270,19 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
         "inputs": stamps["capture"].depends["inputs"],
     }
     report |= {name: stamp.metrics for name, stamp in stamps.items()}
-    if "review" in report:  # beside the stages, as it is about all of them
+    if "review" in report:  # stored at the top level, because it concerns all stages
         report["review"] = {k: v for k, v in report["review"].items() if k != "seen_touched"}
         report["seen_touched"] = stamps["review"].metrics.get("seen_touched")
     return report
 
 
 def publish(scene: SceneDir, report: dict[str, Any]) -> None:
-    """Writes `report.json` and, where the build is whole, `report.html` with its film beside it.
+    """Writes `report.json` and, if the build is complete, `report.html` with its film beside it.
 
     Args:
         scene: A built scene.
-        report: All but `truth`, the comparison with the known truth if this build has one, and `cautions`, which are
-            put into it.
+        report: The report without `truth` (comparison with the ground truth, if there is one) and `cautions`; this
+            function adds both.
     """
     from twin.report.build_report import load_truth_comparison
     from twin.report.build_sections import cautions
@@ -297,7 +299,7 @@ def publish(scene: SceneDir, report: dict[str, Any]) -> None:
 
 
 def summary(report: dict[str, Any]) -> str:
-    """What is printed at the end of a build: a row per stage, then every caution of the report, a line each."""
+    """The text printed at the end of a build: a row per stage, then a line per caution of the report."""
     from twin.report.build_sections import cautions
 
     def pick(*path: str) -> Any:
@@ -341,7 +343,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command(options: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     report = build(options.scene, options.until, tuple(options.force), tuple(options.set), options.device)
     if not options.quiet:
         print(summary(report))

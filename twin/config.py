@@ -12,7 +12,7 @@ TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 """Not allowed as names of lightings."""
 RANDOMIZED = "+randomised"
-"""Suffix of a lighting's name in tables: driven in that lighting with domain randomization."""
+"""Suffix that tables add to a lighting's name for episodes driven with domain randomization."""
 
 KINDS = ("auto", "video", "images", "colmap", "transforms")
 MAPPERS = ("auto", "global", "incremental")
@@ -88,7 +88,7 @@ class CaptureConfig:
     """Selection of frames."""
 
     frames: int = 0
-    """Frames to keep per source, the sharpest of each of as many equal time slots; 0 = by `fps`."""
+    """Number of frames to keep per source: the sharpest of each of that many equal time slots; 0: use `fps`."""
     fps: float = 2.0
     """Frames to keep per second of video, if `frames` is 0."""
     max_frames: int = 300
@@ -99,7 +99,8 @@ class CaptureConfig:
     """Every n-th frame of each source is held out from training."""
     keep: tuple[tuple[float, ...], ...] = ()
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
-    and disjoint; empty = all. A route is one pass: of a film of two passes, keep one. Photos need timestamps."""
+    and disjoint; empty = all. If the film drives the route twice, keep only one of the passes. Photos need
+    timestamps."""
     min_motion: float = 1.0
     """Frames with less motion since the last kept one [px, median optical flow at 320 px width] are dropped."""
 
@@ -182,14 +183,15 @@ class NerfConfig:
     bake_steps: int = 300
     """Fine-tuning steps of the baked field, which renders images."""
     max_bricks: int = 9000
-    """Upper bound of bricks of the baked field, which sets its cell size; 9,000 take about 105 MB. If cells are larger
-    than 15 cm, 1.39 times as many are allowed, 146 MB."""
+    """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field, which determines the
+    cell size; 9,000 take about 105 MB. If this limit would make cells larger than 15 cm, it is raised by a factor of
+    1.39 (146 MB)."""
     max_width: int = 480
     """Longer side of training images [px]."""
     refine_cameras: bool = False
     """Refine camera poses while training, for poses less accurate than the images. The field and its scores use the
-    refined poses; images in the report and photos of `twin.relight` use those of structure from motion and are offset
-    by `field.cameras_moved` in the report."""
+    refined poses. Report images and `twin.relight` use the structure-from-motion poses, so they are shifted by the
+    amount that the report lists as `field.cameras_moved`."""
     learning_rate: float = 3e-2
     appearance_dim: int = 32
     levels: int = 8
@@ -254,7 +256,7 @@ class ReviewConfig:
     render_width: int = 224
     """Longer side of renderings of the radiance field [px]; they are scaled up to the panel."""
     renders: int = 120
-    """Renderings of the radiance field in the film: more make it smoother and the build longer."""
+    """Number of renderings of the radiance field in the film. More give a smoother film and a longer build."""
 
 
 OBSTACLE_KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
@@ -275,7 +277,7 @@ class ObstacleConfig:
     yaw: float = 0.0
     """Yaw relative to the route's heading, or to its direction of motion if it moves [°]."""
     to: tuple[float, ...] = ()
-    """Station and lateral [m] it moves to, and back again; empty = static."""
+    """(station, lateral) [m] of the turning point; the obstacle moves between it and its start. Empty: static."""
     speed: float = 1.2
     """Speed if it moves [m/s]."""
     delay: float = 0.0

@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command(options: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     if options.glb is None and options.ply is None:
         raise InputError("nothing to write; give --glb FILE, --ply FILE or both")
     lines = export(options.scene, options.lighting, options.glb, options.ply)

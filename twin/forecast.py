@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command(options: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     result = forecast(options.scene, options.real, options.seed)

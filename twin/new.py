@@ -5,7 +5,7 @@
 writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
 `python -m twin.build scenes/my_road` builds it.
 
-A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the nearest
+A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the deepest
 folder that contains all of its files; they are copied with their paths relative to it.
 """
 
@@ -35,7 +35,8 @@ _SOURCE = """
 [[source]]
 path = {path}
 lighting = {lighting}  # sources filmed under the same light may share a name
-# mask = "input/mask.png"      # 0 = ignore: the robot's own hood, a person walking ahead; or a folder of masks
+# Mask image or folder of masks: pixels of value 0 are ignored, such as the robot's hood or a person ahead.
+# mask = "input/mask.png"
 # Calibrate the camera if possible: forward motion biases self-calibration. Lengths in pixels of the upright image.
 # camera = {{ model = "PINHOLE", params = [fx, fy, cx, cy], width = 1920, height = 1080 }}
 """
@@ -44,7 +45,7 @@ _REST = """
 [capture]
 fps = 2.0                      # frames kept per second of film, the sharpest of each time slot
 # frames = 80                  # or: so many per film
-# keep = [[0, 62.5]]           # only these parts of a film [s]: a route is one pass; in a [[source]] for that one
+# keep = [[0, 62.5]]           # use only these time ranges [s], such as one pass; under a [[source]]: for it only
 
 [metric]                       # source of the metric scale; exactly one
 {camera_height}
@@ -183,7 +184,7 @@ def _posed_files(film: Path) -> tuple[Path, list[Path]]:
 
 
 def _lighting(path: Path, kind: str) -> str:
-    """A lighting's name from a path under `input/`: that of the film, or of the root of a posed image set."""
+    """Derives a lighting's name from the film's file name, or from the name of a posed image set's root folder."""
     name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
     name = "".join(c if c.isprintable() and c not in ":/\\" else "_" for c in name).lstrip(".") or "film"
     name = name.replace(RANDOMIZED, RANDOMIZED.replace("+", "_"))
@@ -198,7 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command(options: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     config = new_scene(options.scene, options.films, options.camera_height)
     print(f"wrote {config}")
     if options.camera_height is None:

@@ -3,9 +3,9 @@
     python -m twin.relight scenes/demo photo.jpg --name afternoon
 
 localizes the photo (`capture/localize.py`), then fits an appearance embedding and fog so that renderings of the frozen
-field match it. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it: the photo, the
-field under the fitted lighting, and under the most similar filmed one. Afterwards `twin.load_scene(scene).field()` has
-it as `lighting="afternoon"` or `"sun:afternoon:0.5"`; environments apply its fog to their images.
+field match it. The lighting is saved as `<scene>/lightings/afternoon.json`, with a labelled image beside it: the photo,
+the field under the fitted lighting, and under the most similar filmed one. Afterwards `twin.load_scene(scene).field()`
+has it as `lighting="afternoon"` or `"sun:afternoon:0.5"`; environments apply its fog to their images.
 """
 
 import argparse
@@ -31,6 +31,7 @@ _RAYS = 10_000  # upper bound of fitted rays, spread evenly
 _START_RAYS = 1000  # for choosing the most similar filmed frame
 _FOG_GAIN = 0.2  # [dB] by which fog must improve the other half of the image
 _GAP = 4  # [px] between the images
+_LABEL_SIZE = 13  # [px] of text in the images; usual labels fit into the 270 px of an upright photo
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,25 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     )
 
 
+def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
+    """The picture of a fit: photo, fitted lighting and nearest filmed one side by side, each with a label."""
+    from twin.report.video_layout import draw_label
+
+    height, width = relit.images[0].shape[:2]
+    gap = np.ones((height, _GAP, 3), np.float32)
+    photo, fitted, nearest = relit.images
+    row = np.hstack([photo, gap, fitted, gap, nearest])
+    out = (np.clip(row, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    labels = (
+        "photo",
+        f"fitted: {name}, {relit.psnr_fitted:.1f} dB",
+        f"nearest filmed: {relit.nearest}, {relit.psnr_nearest:.1f} dB",
+    )
+    for k, label in enumerate(labels):
+        draw_label(out, label, (k * (width + _GAP), 0, width, height), size=_LABEL_SIZE)
+    return out
+
+
 def relight(root: Path, photo: Path, name: str) -> AddedLighting:
     """Adds the lighting of a photo to the scene at `root` under a name, and returns it.
 
@@ -160,9 +180,7 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
         "psnr_other_half": round(relit.psnr_other_half, 3),
         "psnr_clear_other_half": round(relit.psnr_clear_other_half, 3),
     }
-    gap = np.ones((lens.height, _GAP, 3), np.float32)
-    a, b, c = relit.images
-    write_image(scene.lightings / f"{name}.png", np.hstack([a, gap, b, gap, c]))
+    write_image(scene.lightings / f"{name}.png", comparison(name, relit))
     lighting = AddedLighting(name, [float(x) for x in relit.embedding], relit.fog, result, str(photo), figures)
     lighting.save(scene)
     return lighting

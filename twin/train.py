@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command(given: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     from twin.evaluation.training_curves import write_success_curve
     from twin.learn.train_config import PRESETS, TrainConfig
 

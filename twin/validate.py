@@ -355,7 +355,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command(given: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     for name, most in (("episodes", _PER_LIGHTING), ("processes", _MAX_PROCESSES)):
         if not 1 <= getattr(given, name) <= most:
             raise InputError(f"--{name} {getattr(given, name)}; expected 1 to {most}")

@@ -83,7 +83,7 @@ class SolidPiece:
     def from_mesh(
         vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None
     ) -> "SolidPiece":
-        """A piece from a mesh; `inside` replaces the default test by winding numbers with a faster one."""
+        """Makes a piece from a mesh. `inside` is an optional, faster inside test; the default uses winding numbers."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         samples = surface_samples(vertices, faces, _SAMPLE_SPACING)
 
@@ -274,7 +274,10 @@ def _run_coacd(
 
 
 def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
-    """Runs child processes one after another until each job succeeds or crashes one; returns early once stopped."""
+    """Runs child processes in sequence until every job has succeeded or crashed its process.
+
+    Returns early if `stopped` is set.
+    """
     pending = list(jobs)
     while pending:
         command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in pending for path in job)]

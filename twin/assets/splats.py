@@ -112,9 +112,10 @@ def surface_normals(points: Array) -> Array:
 
 
 def select_sharpest(points: Array, width: Array) -> NDArray[np.int64]:
-    """Indices of the points (k, 3) to keep: the sharpest in each cell without finer points.
+    """Indices of the points (k, 3) to keep.
 
-    The cell of a point has about its width [m]: `_MIN_CELL` times a power of two.
+    In every cell that holds no point of a finer level, the point with the smallest pixel width is kept. The cell size
+    is the point's pixel width [m], rounded up to `_MIN_CELL` times a power of two.
     """
     level = np.maximum(np.ceil(np.log2(width / _MIN_CELL)), 0).astype(int)
     kept: list[NDArray[np.int64]] = []

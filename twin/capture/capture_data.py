@@ -79,5 +79,5 @@ class Capture:
                 shapes["intrinsics"] = capture.intrinsics, (n, 4), "f"
             check_shapes(shapes)
             if n and not (capture.source_index.min() >= 0 and capture.source_index.max() < len(sources)):
-                raise ValueError(f"frames of sources that are not among the {len(sources)}")
+                raise ValueError(f"frames refer to a source index outside 0 to {len(sources) - 1}")
         return capture

@@ -97,9 +97,10 @@ def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir, seed: int = 0
 
 
 def candidate_lenses(size: tuple[int, int], exif: PhotoExif, scene: SceneDir) -> list[tuple[Lens, bool, str]]:
-    """Possible lenses of a photo, the most likely first: the lens at `size`, True if it stays fixed, its origin.
+    """Candidate lenses of a photo, most likely first.
 
-    From the photo's EXIF header, the scene's cameras with the same aspect, and a guess.
+    Returns tuples: the lens at `size`, True if it is held fixed, and its origin: the photo's EXIF header, a camera of
+    the scene with the same aspect, or a guess.
     """
 
     def simple(focal: float) -> Lens:
@@ -172,9 +173,9 @@ def solve_photo(job: dict[str, Any]) -> None:
     most = max((pose["inliers"] for pose in poses if pose), default=0)
     if most < MIN_INLIERS:
         raise InputError(
-            f"{most} features of the photo fit the place (need {MIN_INLIERS}; it has {len(pixels)}, of which "
-            f"{len(pairs)} resemble it); take a sharp photo from near the filmed path, in lighting similar to one of "
-            "the films: night and day have little texture in common"
+            f"only {most} of the photo's {len(pixels)} features agree with one camera pose (need {MIN_INLIERS}); "
+            f"{len(pairs)} looked similar to features of the scene; take a sharp photo from near the filmed path, in "
+            "lighting similar to one of the films: night and day have little texture in common"
         )
     best = next(pose for pose in poses if pose and pose["inliers"] * _LENS_SWITCH_RATIO >= most)
     write_json(work / "result.json", best | {"matches": len(pairs)})
@@ -436,10 +437,10 @@ def _localize_frame(
 
 
 def _shared_focal(frames: Sequence[_LocalizedFrame], lens: dict[str, Any]) -> tuple[float, float]:
-    """The focal length of least robust cost over all frames, and its standard error [px].
+    """The focal length that minimizes the robust cost over all frames, and its standard error [px].
 
-    A parabola is fitted through the costs. A frame counts as one measurement of two numbers, since the errors of its
-    inliers are correlated.
+    A parabola is fitted through the costs. Each frame counts as a single (x, y) measurement, because its inliers'
+    errors are correlated.
 
     Raises:
         InputError: the frames do not determine the focal length.

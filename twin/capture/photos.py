@@ -246,8 +246,8 @@ def _in_kept_segments(task: SourceTask, images: ImageSet) -> NDArray[np.int64]:
     clock = [read_exif(path).time for path in images.paths]
     if not strictly_rising(clock):
         raise InputError(
-            f"{task.path}: keep is in seconds, but these photos have no clock (EXIF) that rises with their names; put "
-            "the photos that are to be used into a folder of their own, and give keep to the films only"
+            f"{task.path}: keep is in seconds, but these photos' EXIF times are missing or do not increase in "
+            "file-name order; put the photos to be used into a folder of their own, and give keep to the films only"
         )
     times = np.array(photo_times(clock, list(range(count))))
     used = np.flatnonzero(in_segments(times, task.segments))
@@ -276,7 +276,7 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoExif]:
     if lens is not None and not lens.fits(image.shape[1], image.shape[0]):
         raise InputError(
             f"{path}: {image.shape[1]}x{image.shape[0]}, but its camera is for {lens.width}x{lens.height}; "
-            "give the images the poses were made with"
+            "use the images from which the poses were computed"
         )
     return image, exif
 

@@ -34,7 +34,9 @@ from twin.warp_runtime import wp
 
 # ---- contact shadows
 
-_PENUMBRA = 0.03, 0.10  # [m] half width at the foot, and per metre behind it: the sun's disk and halo, and its error
+_PENUMBRA = 0.03, 0.10
+"""Half width of the penumbra at the foot [m], and its growth per metre behind the foot; includes the sun's disk, its
+halo and the error of the estimated direction."""
 _FILL = 0.85  # fraction of a box's sides that an obstacle really fills
 _SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
 _SKY_REACH = 1.2  # [m] from an obstacle's side up to which it hides the sky
@@ -184,8 +186,8 @@ class Compositor:
         self.size, self.max_envs, self._field = size, max_envs, field
         self._camera = model.camera(FRONT_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
-        # Workers draw on the CPU in their own threads and set Warp's default device meanwhile, which belongs to the
-        # process. A field on a GPU has one stream of the process as well, so a single worker serves it.
+        # Warp's default device is global to the process and worker threads change it, so it is set to the CPU here.
+        # On a GPU all threads share one CUDA stream, so one worker is enough.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
         # One after the other, as Warp compiles kernels at their first use.
@@ -222,7 +224,7 @@ class Compositor:
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
         lightings: list[Lighting] = [lighting] * len(datas) if one else list(lighting)  # type: ignore[list-item]
 
-        todo = iter(range(len(datas)))  # shared by the workers: a free one takes the next, as cores differ in speed
+        todo = iter(range(len(datas)))  # shared: each idle worker takes the next env, because cores differ in speed
 
         def composite_all(worker: _CompositorWorker) -> None:
             for k in todo:
@@ -294,7 +296,8 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index of the window in its arrays.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`: color, depth and opacity of its own share, arrays (height, width).
+        front: The field up to `drawn.depth`, arrays (height, width): color (not premultiplied), depth and opacity of
+            the field alone.
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

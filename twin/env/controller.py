@@ -143,7 +143,7 @@ class VectorController:
         """
         self._latency[which], self._steps_to_update[which], self.time[which] = latency, steps_to_update, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._commands)
-        if missing > 0:  # the largest number of pending commands
+        if missing > 0:  # grow the buffers to the largest possible number of pending commands
             n = len(self._latency)
             self._arrivals = np.concatenate([np.full((missing, n), -np.inf), self._arrivals])
             self._commands = np.concatenate([np.zeros((missing, n, 2)), self._commands])

@@ -39,7 +39,8 @@ class Episode:
     progress: Array
     """Distance along the route segment [m], shape (k,)."""
     trust: Array
-    """Trust in the image at each instant, in [0, 1]; nan without images. Shape (k,)."""
+    """Estimated reliability of the image at each instant (see `twin.env.trust`), in [0, 1]; nan without images.
+    Shape (k,)."""
     cause: str
     """One of `CAUSES`; empty if the episode was cut off."""
     touched: tuple[str, ...]

@@ -1,12 +1,17 @@
 """Gymnasium environments: `twin/Drive-v0`, single or vectorized.
 
-    gymnasium.make("twin/Drive-v0", scene="scenes/demo", task="right_turn", lighting="night")
-    gymnasium.make_vec("twin/Drive-v0", 8, vectorization_mode="vector_entry_point", scene="scenes/demo")
+    gymnasium.make("twin:twin/Drive-v0", scene="scenes/demo", task="right_turn", lighting="night")
+    gymnasium.make_vec("twin:twin/Drive-v0", 8, vectorization_mode="vector_entry_point", scene="scenes/demo")
+
+`twin:` makes Gymnasium import `twin`, which registers the environment. Processes that have not imported it need this:
+`make_vec_env("twin:twin/Drive-v0", vec_env_cls=SubprocVecEnv, ...)` of stable-baselines3 starts such processes.
 
 Actions in [-1, 1] span the action range of the dm_control environment. Observations are images, uint8, shape
-(3 · stack, height, width), the newest three channels last; with `pixels=False` the privileged state. `info` contains
-`cause` (of the episode's end, or empty), `is_success`, `progress` [m], `start` [m] (offset of the start along the route
-segment), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed` [m/s] and `touched`.
+(3 · stack, height, width), the newest three channels last; with `pixels=False` the privileged state, float32, see
+`RewardAndTermination.state`, clipped to the bounds of the observation space. `info` contains `cause` (of the episode's
+end, or empty), `is_success`, `progress` [m], `start` [m] (offset of the start along the route segment), `cross_track`
+[m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed` [m/s] and `touched`. `lighting` is the episode's: its
+name, or for a sampled one the set and the nearest mixture of filmed lightings, `training: sun 0.62, night 0.38`.
 """
 
 from collections.abc import Sequence
@@ -20,11 +25,20 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from twin.env.chase_camera import ChaseCamera, SceneCamera
+from twin.env.observation import PixelObserver
+from twin.env.options import parse_options
 from twin.env.vector_env import make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.env.vector_env_processes import ProcessVectorEnv
 from twin.errors import InputError, short_repr
 from twin.loading import Twin
+from twin.warp_runtime import wp
+
+ROBOT, CHASE = "robot", "chase"
+
+_RENDER_SIZE = 640, 360  # [px] default width and height of a chase view
+_MIN_SIDE, _MAX_SIDE = 8, 4096  # [px]
 
 
 def make_spaces(envs: LocalVectorEnv | ProcessVectorEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -33,13 +47,41 @@ def make_spaces(envs: LocalVectorEnv | ProcessVectorEnv) -> tuple[gymnasium.spac
     if envs.pixels:
         width, height = envs.options.size
         return gymnasium.spaces.Box(0, 255, (3 * envs.options.stack, height, width), np.uint8), action
-    return gymnasium.spaces.Box(-np.inf, np.inf, (envs.state_size,), np.float32), action
+    low, high = envs.get(0, "state_bounds")
+    return gymnasium.spaces.Box(low, high, dtype=np.float32), action
+
+
+def _info(envs: LocalVectorEnv | ProcessVectorEnv, i: int) -> dict[str, Any]:
+    """Environment i's info with the sampled lighting in place of its name in tables."""
+    info = envs.info(i)
+    return info | {"lighting": info.pop("sampled_lighting")} if "sampled_lighting" in info else info
 
 
 def _check_render_mode(render_mode: str | None) -> str | None:
     if render_mode not in (None, "rgb_array"):
         raise InputError(f"render_mode = {short_repr(render_mode)}; expected None or 'rgb_array'")
     return render_mode
+
+
+def _check_view(size: Any, view: str, pixels: bool) -> tuple[int, int] | None:
+    """Returns the size of rendered pictures; None: pictures of the observation are shown."""
+    if view not in (ROBOT, CHASE):
+        raise InputError(f"render_view = {short_repr(view)}; expected {ROBOT!r} or {CHASE!r}")
+    if size is None:
+        return _RENDER_SIZE if view == CHASE else None
+    valid = isinstance(size, Sequence) and not isinstance(size, str) and len(size) == 2
+    if not valid or not all(
+        isinstance(n, int | np.integer) and not isinstance(n, bool) and _MIN_SIDE <= n <= _MAX_SIDE for n in size
+    ):
+        raise InputError(
+            f"render_size = {short_repr(size)}; expected (width, height), whole numbers from {_MIN_SIDE} to {_MAX_SIDE}"
+        )
+    if view == ROBOT and not pixels:
+        raise InputError(
+            f"render_size = {short_repr(size)} with pixels=False: no field is loaded; expected pixels=True, or "
+            f"render_view={CHASE!r}"
+        )
+    return int(size[0]), int(size[1])
 
 
 class DriveEnv(gymnasium.Env):
@@ -52,10 +94,27 @@ class DriveEnv(gymnasium.Env):
         scene: str | Path | Twin,
         task: str = "right_turn",
         render_mode: str | None = None,
+        render_size: tuple[int, int] | None = None,
+        render_view: str = ROBOT,
         **options: Any,
     ) -> None:
-        """See `twin.load`; `render_mode` is None or rgb_array."""
+        """
+        Args:
+            scene: See `twin.load`.
+            task: See `twin.load`.
+            render_mode: None or rgb_array.
+            render_size: Width and height of the pictures of `render` [px]; None: those of the observation, and
+                640 × 360 for the chase view.
+            render_view: robot (what the robot's camera sees) or chase (MuJoCo's picture of the scene from behind the
+                robot, with collision parts, as in the videos of `twin film`).
+            options: See `twin.env.options.Options`.
+        """
         self.render_mode = _check_render_mode(render_mode)
+        self._render_size = _check_view(render_size, render_view, parse_options(options).pixels)
+        self._render_view = render_view
+        self._large: PixelObserver | None = None
+        self._scene: SceneCamera | None = None
+        self._chase: ChaseCamera | None = None
         self.vector_env = make_vector_env(scene, task, options, [None])
         self._started = False
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vector_env.options.control_timestep)}
@@ -69,20 +128,51 @@ class DriveEnv(gymnasium.Env):
             self.vector_env.seed(0, seed)
         self.vector_env.begin([0])
         self._started = True
-        return self.vector_env.observation()[0], self.vector_env.info(0)
+        if self._render_view == CHASE and self.render_mode:
+            base = self._local.physics[0].base_to_world
+            self._chase = ChaseCamera(base)
+            self._chase_pose = self._chase.follow(base)
+        return self.vector_env.observation()[0], _info(self.vector_env, 0)
 
     def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
         if not self._started:
             raise ResetNeeded("step before reset; call reset() first")
         out = self.vector_env.step(np.asarray(action)[None])
+        if self._chase:
+            self._chase_pose = self._chase.follow(self._local.physics[0].base_to_world)
         end = bool(out.terminated[0]), bool(out.truncated[0])
-        return self.vector_env.observation()[0], float(out.reward[0]), *end, self.vector_env.info(0)
+        return self.vector_env.observation()[0], float(out.reward[0]), *end, _info(self.vector_env, 0)
 
     def render(self) -> NDArray | None:
-        """The newest image, uint8 (height, width, 3); None without pixels."""
-        if self.render_mode is None or not self.vector_env.pixels:
+        """A picture, uint8 (height, width, 3).
+
+        By default it is the newest image of the observation; None without pixels. With `render_size`, it is what the
+        robot's camera sees at that instant, with the episode's lighting, obstacles and weather, but without camera
+        noise. The chase view is of the present instant. Rendering changes no observation and no random draw.
+        """
+        if self.render_mode is None:
             return None
-        return self.vector_env.pixels.stacks[0, -1].transpose(1, 2, 0).copy()
+        if self._render_size is None:
+            pixels = self.vector_env.pixels
+            return pixels.stacks[0, -1].transpose(1, 2, 0).copy() if pixels else None
+        if not self._started:
+            raise ResetNeeded("render before reset; call reset() first")
+        envs = self._local
+        physics = envs.physics[0]  # with physics on a GPU, this downloads the state
+        if self._chase:
+            with wp.ScopedDevice("cpu"):
+                if self._scene is None:
+                    self._scene = SceneCamera(envs.factory.world, self._render_size, envs.factory.obstacles.pool)
+                self._scene.obstacles = envs.tasks[0].obstacles
+                return self._scene.render(physics.data.qpos, self._chase_pose, physics.time())
+        self._large = self._large or envs.make_view(self._render_size)
+        self._large.observe([0])
+        return self._large.stacks[0, -1].transpose(1, 2, 0).copy()
+
+    @property
+    def _local(self) -> LocalVectorEnv:
+        assert isinstance(self.vector_env, LocalVectorEnv)  # as a single environment is
+        return self.vector_env
 
     def close(self) -> None:
         self.vector_env.close()
@@ -151,5 +241,5 @@ class DriveVectorEnv(VectorEnv):
     def _infos(self, which: Sequence[int]) -> dict[str, Any]:
         infos: dict[str, Any] = {}
         for i in which:
-            infos = self._add_info(infos, self.vector_env.info(i), i)
+            infos = self._add_info(infos, _info(self.vector_env, i), i)
         return infos

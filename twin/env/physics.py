@@ -96,7 +96,7 @@ class HuskyPhysics:
         self.begin()
 
     def begin(self) -> None:
-        """Starts an episode in the present state, with no command pending and only present contacts touched."""
+        """Starts an episode in the present state: no command is pending, only geoms in contact now count as touched."""
         self.controller = Controller(self.params)
         phase_steps = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6))
         self.steps_to_update = phase_steps % self._steps_per_update

@@ -36,6 +36,7 @@ _BUMPER_OFFSET = 0.5  # [m] ahead of the base
 _SEARCH_WINDOW = (1.0, 3.0)  # [m] behind and ahead of the last foot
 _ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 _STUCK_TIME, _STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: stuck if it moves less than this distance in this time
+_STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, in multiples of the controller's own limits
 _LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route, at which the state contains the change of heading
 
 
@@ -83,6 +84,12 @@ class RewardAndTermination:
         # Position and time of the last movement by _STUCK_DISTANCE.
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
+        speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
+        # An episode ends beyond the corridor, at the latest one control step later.
+        cross_track = max(self.half_width, options.start_offset) + speed * options.control_timestep
+        high = np.array([speed, yaw_rate, cross_track, *[np.pi] * 4], np.float32)
+        self.state_bounds = np.stack([-high, high])
+        """Lowest and highest values of the components of `state`, float32, shape (2, 7)."""
         self._cause_rewards = np.array([0.0, *(getattr(terms, cause) for cause in CAUSES)])
         self._cause_rewards[[0, _CODES["goal"]]] += terms.step
 
@@ -136,13 +143,16 @@ class RewardAndTermination:
 
         `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] left positive, `heading_error` [rad] of the robot against
         the route, `turns` [rad]: change of the route's heading 1, 2 and 4 m ahead.
+
+        The state is clipped to `state_bounds`. Angles cannot leave them; the others do only if the robot moves ten
+        times as fast as its controller allows, as in a fall.
         """
         foot = self.foot[which]
         heading = heading_at(self._route, foot)
         turns = heading_error(heading_at(self._route, foot[:, None] + np.array(_LOOKAHEADS)), heading[:, None])
         error = heading_error(motion.pose[:, 2], heading)
         columns = (motion.speed, motion.yaw_rate, self.cross_track[which], error)
-        return np.column_stack([*columns, turns]).astype(np.float32)
+        return np.clip(np.column_stack([*columns, turns]).astype(np.float32), *self.state_bounds)
 
     def _nearest(self, position: Array, foot: Array) -> tuple[Array, Array]:
         return nearest_on_route(self._route, position, (foot - _SEARCH_WINDOW[0], foot + _SEARCH_WINDOW[1]))
@@ -270,14 +280,24 @@ class DriveTask(control.Task):
         ends = np.cumsum(list(STATE_SIZES.values()))
         return OrderedDict(zip(STATE_SIZES, np.split(state, ends[:-1]), strict=True))
 
-    def observation_spec(self, physics: DrivePhysics) -> "OrderedDict[str, specs.Array]":
-        return OrderedDict((name, specs.Array((n,), np.float32, name)) for name, n in STATE_SIZES.items())
+    def observation_spec(self, physics: DrivePhysics) -> "OrderedDict[str, specs.BoundedArray]":
+        ends = np.cumsum(list(STATE_SIZES.values()))
+        lows, highs = (np.split(bound, ends[:-1]) for bound in self.state_bounds)
+        return OrderedDict(
+            (name, specs.BoundedArray(low.shape, np.float32, low, high, name))
+            for name, low, high in zip(STATE_SIZES, lows, highs, strict=True)
+        )
 
     def action_spec(self, physics: DrivePhysics) -> specs.BoundedArray:
         low, high = self._bounds()
         return specs.BoundedArray(low.shape, np.float64, low, high, name="\t".join(self.action_names))
 
     # ---- state of the episode
+
+    @property
+    def state_bounds(self) -> NDArray[np.float32]:
+        """See `RewardAndTermination.state_bounds`."""
+        return self._evaluator.state_bounds
 
     @property
     def action_names(self) -> tuple[str, ...]:

@@ -355,7 +355,7 @@ class GpuVectorEnv(LocalVectorEnv):
 
     def info(self, i: int) -> dict[str, Any]:
         info = self.tasks[i].episode_info(float(self._speed[i]), self._simulation.touched(i))
-        return info | (self.pixels.info(i) if self.pixels else {})
+        return info | self._pixel_info(i)
 
     def _advance(self, wanted: Array, which: Sequence[int]) -> StepResult:
         some = np.array(which, int)

@@ -7,6 +7,7 @@ the environments, outside the interpreter's lock. See `vector_env_processes.py` 
 `vector_env_gpu.py` for a GPU.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,11 +17,15 @@ import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import RESERVED_LIGHTINGS
 from twin.env.dm import DrivePhysics, control
+from twin.env.episode_lighting import EpisodeLighting
+from twin.env.observation import PixelObserver
 from twin.env.suite import EnvFactory
 from twin.env.task import DriveTask, check_actions
+from twin.nerf.lightings import Lightings
 from twin.runtime import available_cores
-from twin.types import Array
+from twin.types import Array, Array32
 
 T = TypeVar("T")
 
@@ -46,6 +51,9 @@ class LocalVectorEnv:
     def __init__(self, factory: EnvFactory, seeds: Sequence[int | None]) -> None:
         """`seeds`: seed of each environment's sequence of episodes; None: unpredictable."""
         envs = self._make_envs(factory, seeds)
+        self.factory = factory
+        self._mixtures: list[tuple[EpisodeLighting, str] | None] = [None] * len(envs)
+        """Lighting of which the mixture was last computed, and its text."""
         self._physics, self.tasks = [p for p, _ in envs], [t for _, t in envs]
         self.pixels = factory.make_observer(envs)
         self.options = factory.options
@@ -129,8 +137,44 @@ class LocalVectorEnv:
         return self._states[i].copy()
 
     def info(self, i: int) -> dict[str, Any]:
-        """Info of environment i's episode so far, JSON-able."""
-        return self.tasks[i].info(self._physics[i]) | (self.pixels.info(i) if self.pixels else {})
+        """Info of environment i's episode so far, JSON-able.
+
+        With images, `lighting` is the lighting's name in tables, such as `training`, and `sampled_lighting` adds what
+        was sampled: `training: sun 0.62, night 0.38`, see `mixture_text`.
+        """
+        return self.tasks[i].info(self._physics[i]) | self._pixel_info(i)
+
+    def _pixel_info(self, i: int) -> dict[str, Any]:
+        if not self.pixels:
+            return {}
+        info, lighting = self.pixels.info(i), self.pixels.lightings[i]
+        return info | {"sampled_lighting": info["lighting"] + (self._mixture(i, lighting) if lighting else "")}
+
+    def _mixture(self, i: int, lighting: EpisodeLighting) -> str:
+        """The part of environment i's `sampled_lighting` after the name; empty for a named lighting."""
+        known, field = self._mixtures[i], self.factory.field
+        if known is not None and known[0] is lighting:
+            return known[1]
+        text = ""
+        if field and not set(lighting.name.split(" → ")).isdisjoint(RESERVED_LIGHTINGS):
+            ends = [lighting.start] if lighting.end is None else [lighting.start, lighting.end]
+            filmed = field.lightings_by_name.filmed()
+            text = ": " + " → ".join(mixture_text(end, filmed) for end in ends)
+        self._mixtures[i] = lighting, text
+        return text
+
+    def make_view(self, size: tuple[int, int]) -> PixelObserver:
+        """Returns an observer that renders the present episodes at another size (width, height), without camera noise.
+
+        It has stacks of one image, and shares lighting and weather with `pixels`, which must exist. Its images change
+        neither the observations nor any random draw.
+        """
+        options = dataclasses.replace(self.options, size=size, stack=1, camera=None)
+        factory = dataclasses.replace(self.factory, options=options)
+        view = factory.make_observer(list(zip(self._physics, self.tasks, strict=True)))
+        assert view and self.pixels
+        view.lightings, view._weather = self.pixels.lightings, self.pixels._weather
+        return view
 
     def get(self, i: int, name: str) -> Any:
         """Returns an attribute of environment i's task."""
@@ -150,6 +194,22 @@ class LocalVectorEnv:
 
     def _each(self, function: Callable[[int], T], which: Iterable[int]) -> list[T]:
         return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]
+
+
+def mixture_text(embedding: Array32, filmed: Lightings) -> str:
+    """Text of the mixture of filmed lightings that is nearest to an embedding (dim,), such as `sun 0.62, night 0.38`.
+
+    The parts are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding also has a deviation
+    like that of a single frame, which the text omits.
+    """
+    from scipy.optimize import nnls  # slow to import
+
+    vectors = filmed.vectors.astype(np.float64)
+    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # of the equation that the parts add up to 1
+    equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])
+    parts, _ = nnls(equations, np.append(embedding, sum_weight))
+    order = np.argsort(-parts, kind="stable")
+    return ", ".join(f"{filmed.names[k]} {parts[k]:.2f}" for k in order if parts[k] >= 0.005)
 
 
 def frame_stack(stacks: NDArray[np.uint8]) -> NDArray[np.uint8]:

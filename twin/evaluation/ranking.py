@@ -95,7 +95,7 @@ def expected_confidence(
     Args:
         counts: Trials so far.
         more: Further trials per policy.
-        seed: Equal seeds compare numbers of trials on the same samples.
+        seed: Use the same seed for different `more` to compare them on the same samples.
         so_far: False: the trials so far are only the prior of the rates, and do not count for the ranking.
         samples: Number of samples of the true rates.
     """

@@ -6,8 +6,8 @@ in `results.csv`:
 
     policy,lighting,trials,successes            optional columns: task, twin_lighting
 
-`task` is required only if a policy was validated on several. `twin_lighting` names the twin's lighting that the cell is
-compared with, for a lighting whose name the twin does not have: `dusk_on_monday` compared with `held-out+randomised`.
+`task` is required only if a policy was validated on several. If the twin has no lighting of that name, `twin_lighting`
+names the twin's lighting to compare with: for `dusk_on_monday`, for example, `held-out+randomised`.
 """
 
 import csv
@@ -23,7 +23,8 @@ from twin.evaluation.statistics import wilson
 from twin.files import read_text
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
-"""Columns of `validation/episodes.csv`. `trust` is the mean over the trial's pictures, empty without pictures."""
+"""Columns of `validation/episodes.csv`. `trust` is the mean estimated image reliability over the trial
+(see `twin.env.trust`); empty without images."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
@@ -31,7 +32,8 @@ RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting")
 """Optional columns of `results.csv`."""
 RECENT_EPISODES = 20
-"""Complete episodes that a success rate in training is taken over; a training on a CPU has about 40."""
+"""The training success rate is the mean over this many latest complete episodes; a training on a CPU has about 40 in
+total."""
 
 _MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # of trials and steps in a cell; of a seed
 _VALIDATE_COMMAND = "python -m twin.validate"
@@ -194,7 +196,8 @@ def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> t
     task = row.get("task", "")
     if not task and len(tasks) > 1:
         raise InputError(
-            f"{where}: policy {row['policy']!r} was validated on {' and '.join(tasks)}; say which in a column task"
+            f"{where}: policy {row['policy']!r} was validated on {' and '.join(tasks)}; "
+            "add a column task that says which"
         )
     if task and task not in tasks:
         raise InputError(
@@ -211,8 +214,8 @@ def _unknown_lighting(cell: Cell, known: set[tuple[str, str, str]]) -> str:
             f"policy {cell.policy!r} was not validated under {name!r}; run {_VALIDATE_COMMAND} with --lightings {name}"
         )
     return (
-        f"lighting {name!r} is not in the twin; {name_hint(name, here)}; for light the twin does not know, "
-        "name the one to compare with in a column twin_lighting"
+        f"lighting {name!r} is not in the twin; {name_hint(name, here)}; or add a column "
+        "twin_lighting with the twin's lighting to compare with"
     )
 
 
@@ -236,8 +239,13 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
         missing = [name for name in needed if name not in header]
         unknown = [name for name in header if name not in (*needed, *optional)]
         if missing or unknown or len(set(header)) != len(header):
+            twice = [name for name in header if header.count(name) > 1]
             fault = (
-                f"no column {missing[0]}" if missing else f"{(unknown or ['a column'])[0]!r} is unknown or there twice"
+                f"no column {missing[0]}"
+                if missing
+                else f"unknown column {unknown[0]!r}"
+                if unknown
+                else f"column {twice[0]!r} appears twice"
             )
             raise InputError(f"{path}: header {','.join(header)!r}: {fault}; expected {wanted}")
         count = 0

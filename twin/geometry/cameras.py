@@ -194,7 +194,10 @@ def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> 
     own = np.asarray(cameras.sizes)
     if size is None:
         if len(own) == 0 or (own != own[0]).any():
-            raise InputError(f"cameras of {len(np.unique(own, axis=0))} sizes; give render one size=(width, height)")
+            raise InputError(
+                f"the cameras have {len(np.unique(own, axis=0))} different image sizes; "
+                "pass size=(width, height) to render"
+            )
         size = int(own[0, 0]), int(own[0, 1])
     return np.asarray(cameras.intrinsics) * np.tile(np.array(size) / own, 2), size
 
@@ -282,5 +285,5 @@ class SparsePoints:
                 }
             )
             if k and not (points.point.min() >= 0 and points.point.max() < m and points.frame.min() >= 0):
-                raise ValueError(f"observations of points that are not among the {m}")
+                raise ValueError(f"an observation has a point index outside 0 to {m - 1}, or a negative frame index")
         return points

@@ -48,11 +48,11 @@ class Control:
     action: str = STEERING
     """steering: one number, the yaw rate; twist: two, speed and yaw rate."""
     speed: float = 1.0
-    """Constant speed of steering; highest speed of a twist, whose -1 is standstill [m/s]."""
+    """Steering: the constant speed [m/s]. Twist: the maximum speed; action -1 means standstill."""
     yaw_rate: float = 1.0
-    """Yaw rate of the value 1, to the left [rad/s]."""
+    """Yaw rate at action 1, to the left [rad/s]."""
     control_timestep: float = 0.1
-    """Between actions, and between the pictures of a stack [s]."""
+    """Time between two actions, and between two pictures of a stack [s]."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a number out of range."""
@@ -153,7 +153,10 @@ def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
 
 
 def find_policy(root: Path, source: str) -> str:
-    """Source of a scene's policy for `load_policy`; `run` and `run/checkpoint`, as in tables, become their folders."""
+    """Resolves a policy's name to a path for `load_policy`.
+
+    `run` and `run/checkpoint`, as in tables, become the folders under `runs/`; other names are returned unchanged.
+    """
     run, _, checkpoint = source.partition("/")
     folder = root / "runs" / run
     folder = folder / "checkpoints" / checkpoint if checkpoint else folder
@@ -231,17 +234,17 @@ def _from_onnx(path: Path) -> Policy:
     inputs = [one for one in model.graph.input if one.name not in names]
     shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
     fits = len(inputs) == 1 and [len(shape) for shape in shapes] == [4, 2]
-    # A size of 0 is open.
+    # A size of 0 means a dynamic axis.
     if not fits or shapes[0][1] % 3 or 0 in shapes[0][1:] or shapes[0][0] > 1 or shapes[1][1] not in (1, 2):
         raise InputError(
             f"{path}: inputs and outputs {shapes}; expected one input (n, 3 · stack, height, width) and one output "
-            "(n, 1 or 2), n open or 1"
+            "(n, 1 or 2), with n dynamic or 1"
         )
     _, channels, height, width = shapes[0]
     if channels > 3 * _MAX_STACK or max(height, width) > _MAX_SIDE:
         raise InputError(
             f"{path}: takes pictures of {width} × {height} px in {channels} channels; expected at most {_MAX_SIDE} px "
-            f"a side and {_MAX_STACK} pictures of 3"
+            f"per side and {_MAX_STACK} stacked pictures of 3 channels"
         )
     notes = {one.key: one.value for one in model.metadata_props}
     control, trained = Control(STEERING if shapes[1][1] == 1 else TWIST), {}

@@ -1,11 +1,11 @@
 """The policy network, from a stack of pictures to an action, and its export as an ONNX graph.
 
-A *stack* is uint8, (3 · stack, height, width), the newest three channels last. Preprocessing averages squares of `pool`
-pixels and normalizes each color of each picture to a fixed mean and standard deviation in the lower half, where the
-ground is; that removes exposure, white balance and most of the lighting. Both steps return bytes, so that training and
-driving use the same values. Then follow convolutions with ReLU, a linear layer with layer normalization and tanh (the
-encoder of DrQ, Kostrikov et al. 2020, at another size), hidden layers with ReLU, and a tanh: an action with numbers in
-[-1, 1].
+A *stack* is uint8, (3 · stack, height, width), the newest three channels last. Preprocessing averages blocks of `pool`
+× `pool` pixels and normalizes each color of each picture to a fixed mean and standard deviation in the lower half,
+where the ground is; that removes exposure, white balance and most of the lighting. Both steps return bytes, so that
+training and driving use the same values. Then follow convolutions with ReLU, a linear layer with layer normalization
+and tanh (the encoder of DrQ, Kostrikov et al. 2020, at another size), hidden layers with ReLU, and a tanh: an action
+with numbers in [-1, 1].
 """
 
 from dataclasses import dataclass
@@ -44,14 +44,14 @@ class Architecture:
     def __post_init__(self) -> None:
         """Raises ValueError: sizes that do not fit together, or are too large for a robot's computer."""
         if len(self.size) != 2:
-            raise ValueError(f"size = {self.size} is not a width and a height")
+            raise ValueError(f"size = {self.size}: expected (width, height)")
         numbers = [*self.size, self.stack, self.features, self.actions, *self.hidden, *sum(self.convolutions, ())]
         if not all(isinstance(n, int) and 1 <= n <= 4096 for n in numbers):
-            raise ValueError("sizes are whole numbers from 1 to 4096")
+            raise ValueError(f"sizes {numbers}: expected whole numbers from 1 to 4096")
         if self.pool not in (1, 2, 4) or any(n % self.pool for n in self.size):
-            raise ValueError(f"pool = {self.pool} is 1, 2 or 4 and divides the pictures' sides")
+            raise ValueError(f"pool = {self.pool}: expected 1, 2 or 4, and a divisor of both picture sides")
         if any(len(one) != 3 for one in self.convolutions) or not 1 <= len(self.convolutions) <= 8:
-            raise ValueError("convolutions are 1 to 8 times channels, kernel, stride")
+            raise ValueError("convolutions: expected 1 to 8, each (channels, kernel, stride)")
         if len(self.hidden) > 8 or min(self.grid) < 1:
             raise ValueError(f"pictures of {self.size} px are too small for the convolutions")
 
@@ -89,7 +89,7 @@ class Architecture:
 
 
 def average_pool(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
-    """Means of squares of `pool` pixels, halves rounded up; shapes (..., h, w) → (..., h/pool, w/pool)."""
+    """Averages blocks of `pool` × `pool` pixels (.5 rounds up); shapes (..., h, w) → (..., h/pool, w/pool)."""
     if pool == 1:
         return pictures
     *rest, height, width = pictures.shape

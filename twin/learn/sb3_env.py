@@ -17,7 +17,8 @@ class DriveVecEnv(VecEnv):
     """n environments; one whose episode ends is reset in the same step, with its last observation in
     `terminal_observation`.
 
-    Every `info` has the privileged `state`, and at an episode's end `first_state`, that of the next episode.
+    Every `info` has the privileged `state`, and at an episode's end `first_state`, that of the next episode. Its
+    `lighting` is the lighting's name in tables; `sampled_lighting` is what Gymnasium's `info` has as `lighting`.
     """
 
     def __init__(

@@ -1,6 +1,7 @@
 """Appearance embeddings in training: a vector per lighting plus a small residual per frame.
 
-The residual models drift within a film, such as exposure. `lightings.py` looks embeddings up by name.
+The per-frame residual captures gradual changes within a film, such as exposure. `lightings.py` looks embeddings up by
+name.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Evaluation of a field on held-out frames, and its control across lightings.
+"""Evaluation of a field on held-out frames, and a control experiment: places rendered under other lightings.
 
 The embedding of a held-out frame is fitted on one half of the image, left or right, starting from its lighting's, and
 scored on the other half; the score is the mean of both ways. Nothing else is fitted. *Unfitted* scores use the
@@ -129,11 +129,12 @@ def cross_lighting(
     * `poses`: number of poses, each rendered under every lighting.
     * `filmed_colour[i]`: mean color of the film at the poses of lighting i.
     * `mean_colour[i][j]`: mean color of the poses of lighting i, rendered under j.
-    * `to_shown_rms[j]`: rms distance to `filmed_colour[j]` of poses filmed under other lightings, rendered under j.
+    * `to_shown_rms[j]`: poses filmed under other lightings are rendered under j; rms distance of their mean colors to
+      `filmed_colour[j]`.
     * `to_filmed_rms[j]`: rms distance of the same images to `filmed_colour` of the lighting of their pose.
-    * `colour_follows[j]`: share of the same images that are nearer to the nearest frame of j than to the film at their
-      own pose: 1 if the lighting decides the color, 0 if the pose does. A tie counts one half, so equal lightings give
-      about one half.
+    * `colour_follows[j]`: share of those renderings whose color is closer to that of the nearest frame filmed under j
+      than to that of their own filmed frame: 1 if the lighting decides the color, 0 if the pose does. A tie counts one
+      half, so equal lightings give about one half.
     * `follows_by_pair[i][j]`: the same for the poses of lighting i alone.
     * `depth_moves_m`: greatest change of any pixel's depth between two lightings [m], 0 by construction.
     """

@@ -92,7 +92,7 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
 
 
 def command(options: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs this verb with the options parsed by `twin.commands`."""
     if options.command == "film":
         _check_lightings(options.lightings or [], LIGHTINGS)
         plan = TINY if options.tiny else FilmingPlan()

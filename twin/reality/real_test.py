@@ -55,7 +55,7 @@ def load_policy_file(path: Path) -> Policy:
         InputError: no such file, or a policy that could run code here, such as a Python callable.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such policy file; reality is driven by a policy folder or an .onnx file only")
+        raise InputError(f"{path}: no such policy file; the real test accepts only a policy folder or an .onnx file")
     return load_policy(path)
 
 
@@ -143,7 +143,7 @@ def run(
     """
     for name in lightings:
         if name not in WEATHER:
-            raise InputError(f"lighting {name!r}: reality's are {', '.join(WEATHER)}")
+            raise InputError(f"unknown lighting {name!r}; the real test offers {', '.join(WEATHER)}")
     if not 1 <= trials <= _SEEDS_PER_LIGHTING:
         raise InputError(f"trials = {trials}; expected 1 to {_SEEDS_PER_LIGHTING}")
     table = out.with_name(f"{out.stem}_trials.csv")

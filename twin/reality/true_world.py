@@ -36,7 +36,7 @@ def sky_visibility(place: KnownPlace, points: Array) -> Array:
 
 
 def ground_visibility(place: KnownPlace) -> dict[str, Array]:
-    """Coarse maps of the sky visibility by ground texture, with its rows and columns."""
+    """Per ground texture, a coarse sky-visibility map whose rows and columns run along those of the texture."""
     edge, outer = roads.ROAD_HALF_WIDTH, roads.ROAD_HALF_WIDTH + roads.KERB_WIDTH
     bands = {
         "road": (edge, -edge),

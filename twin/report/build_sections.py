@@ -79,11 +79,11 @@ def truth_section(report: dict[str, Any]) -> Section:
         ("ground_p95_m", "ground height, worst places", "{:.3f} m", "95 of 100 places are better"),
         ("obstacle_accuracy_m", "solid parts to true surface", "{:.3f} m", "median: accuracy of the parts"),
         ("obstacle_completeness_m", "true surface to solid parts", "{:.3f} m", "median: completeness of the parts"),
-        ("mesh_accuracy_median_m", "visible mesh to true surface", "{:.3f} m", "median: accuracy of the mesh"),
+        ("mesh_accuracy_median_m", "visual mesh to true surface", "{:.3f} m", "median: accuracy of the mesh"),
         ("mesh_accuracy_mean_m", "the same, mean", "{:.3f} m", "errors above 1 m count as 1 m"),
-        ("mesh_completeness_5cm", "true surface within 5 cm of it", "{:.0%}", "of all that the cameras saw nearby"),
-        ("mesh_completeness_10cm", "true surface within 10 cm of it", "{:.0%}", _completeness_by_kind(truth)),
-        ("mesh_chamfer_m", "visible mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),
+        ("mesh_completeness_5cm", "true surface within 5 cm of the mesh", "{:.0%}", "of what the cameras saw nearby"),
+        ("mesh_completeness_10cm", "true surface within 10 cm of the mesh", "{:.0%}", _completeness_by_kind(truth)),
+        ("mesh_chamfer_m", "visual mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),
         ("corridor_intrusions", "parts inside the true corridor", "{}", "the corridor must be free"),
         ("route_median_m", "route", "{:.3f} m", "median distance to the true centre line"),
         ("depth_median_m", "depth of the field", "{:.3f} m", "median error, up to 20 m"),
@@ -127,7 +127,7 @@ def _truth_verdict(truth: dict[str, Any]) -> Verdict | None:
 
 
 def _completeness_by_kind(truth: dict[str, Any]) -> str:
-    words = (("ground", "ground"), ("obstacle", "solid things up to their roofs"), ("foliage", "leaves"))
+    words = (("ground", "ground"), ("obstacle", "obstacles up to full height"), ("foliage", "leaves"))
     shares = [(name, truth.get(f"mesh_completeness_10cm_{kind}")) for kind, name in words]
     shares_text = [f"{number(share, '{:.0%}')} of {name}" for name, share in shares if share is not None]
     return join_names(shares_text) if shares_text else "completeness of the mesh"
@@ -140,9 +140,13 @@ def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
     facts, cautions = [], []
     for name, share in follows.items():
         off, own = (number(pick(cross, f"{key}.{name}"), "{:.0%}") for key in ("to_shown_rms", "to_filmed_rms"))
-        text = f"of places filmed in other light resemble its film when rendered in it: error {off} of full brightness"
+        text = "of the places filmed in another lighting look like the film of this lighting when rendered in it"
         facts.append(
-            Fact(f"{name}, swapped in", f"{share:.0%}", f"{text}, compared with {own} to the light they were filmed in")
+            Fact(
+                f"{name}, swapped in",
+                f"{share:.0%}",
+                f"{text}. RMS color error: {off} to this lighting's film, {own} to their own film",
+            )
         )
         if share < _LOW_LIGHTING_AGREEMENT:
             cautions.append(
@@ -380,7 +384,8 @@ def field_section(report: dict[str, Any]) -> Section:
         Fact("training steps", number(pick(report, "field.steps"), "{:,}"), "more steps are sharper but slower")
     )
     if (found := pick(report, "field.stereo.sightings")) is not None:
-        share = number(pick(report, "field.stereo.share"), "depth supervision; {:.0%} of the attempted ones")
+        form = "used for depth supervision; {:.0%} of the attempted stereo estimates succeeded"
+        share = number(pick(report, "field.stereo.share"), form)
         facts.append(Fact("stereo depths", number(found, "{:,}"), share))
     for name, value in (pick(report, "field.psnr_baked") or {}).items():
         lost = value - float(pick(report, f"field.psnr_unfitted.{name}") or value)
@@ -390,9 +395,9 @@ def field_section(report: dict[str, Any]) -> Section:
         "field",
         "Radiance field",
         "A NeRF models the appearance of every point from every direction, in each lighting. It is evaluated on "
-        "held-out frames: only the appearance is fitted on one half of such a frame, and the other half is scored; for "
-        "the pictures nothing is fitted. Above about 20 dB a view is easy to recognize; above 30 dB it is hard to "
-        "distinguish from the film.",
+        "held-out frames: only the appearance is fitted on one half of such a frame, and the other half is scored. "
+        "Images on this page are rendered without fitting. Above about 20 dB a view is easy to recognize; above 30 dB "
+        "it is hard to distinguish from the film.",
         facts + swapped,
         cautions + more,
         verdict=_field_verdict(psnr),
@@ -485,7 +490,7 @@ def mjcf_section(report: dict[str, Any]) -> Section:
         Fact("route", "none" if routeless else number(mjcf.get("route_length_m"), "{:.1f} m"), "the filmed path"),
         Fact("turn", number(mjcf.get("turn_deg"), "{:+.0f}°"), "from the first heading to the last; right is negative"),
         Fact("corridor", number(mjcf.get("half_width_m"), "± {:.2f} m"), "kept free of solid parts"),
-        Fact("free at the start", number(mjcf.get("spawn_clearance_m"), "{:.2f} m"), "from the robot to the next part"),
+        Fact("free at the start", number(mjcf.get("spawn_clearance_m"), "{:.2f} m"), "robot to the nearest part"),
         Fact("geoms", number(mjcf.get("geoms"), "{:,}"), "shapes in the scene"),
         Fact("folder", number(megabytes, "{:.1f} MB"), "may be moved or zipped"),
     ]
@@ -536,7 +541,7 @@ def review_section(report: dict[str, Any]) -> Section:
             Fact(
                 "trust in its pictures",
                 number((review.get("trust") or {}).get("mean"), "{:.2f}"),
-                "0 to 1, in the corridor",
+                "mean estimated reliability of pictures rendered in the corridor, 0 (poor) to 1 (like the film)",
             ),
         ]
     facts += [

@@ -7,11 +7,12 @@ import cv2
 import numpy as np
 
 from twin.assets.ground import Ground
+from twin.env.chase_camera import SceneCamera, chase_poses
 from twin.env.episode import Episode
 from twin.env.obstacles import obstacle_pose
 from twin.errors import join_names
 from twin.mjcf.world import World, point_at
-from twin.report.chase_camera import SceneCamera, chase_poses, frame_indices
+from twin.report.shots import frame_indices
 from twin.report.video_layout import (
     ACCENT,
     AMBER,

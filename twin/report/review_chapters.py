@@ -13,8 +13,8 @@ from twin.env.route_follower import RecordedDrive
 from twin.errors import join_names
 from twin.geometry.cameras import nearest_frame
 from twin.mjcf.world import World, arc_lengths
-from twin.report.chase_camera import frame_indices
 from twin.report.review_studio import Studio, comparison_row, frames_to_compare, side_by_side, to_uint8
+from twin.report.shots import frame_indices
 from twin.report.video_layout import (
     ACCENT,
     AMBER,

@@ -21,7 +21,6 @@ from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import World, arc_lengths
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import RenderableField
-from twin.report.chase_camera import Shot, camera_shots, chase_shots, render_shots, route_shots
 from twin.report.html import follower_verdict
 from twin.report.review_chapters import (
     COMPARISON_STRIP,
@@ -39,6 +38,7 @@ from twin.report.review_chapters import (
     write_title_card,
 )
 from twin.report.review_studio import Prefetcher, Studio, evenly_spaced, side_by_side
+from twin.report.shots import Shot, camera_shots, chase_shots, render_shots, route_shots
 from twin.report.trust_map import trust_grid, trust_metrics, trust_picture
 from twin.report.video_layout import AMBER, GREEN, RED, Box, FrameLayout, MapView, load_footprints
 from twin.report.video_writer import VideoWriter

@@ -3,8 +3,9 @@
 `capture/localize.py` localizes the film's frames. The extrinsics are the camera's height above flat ground and its
 rotation from straight ahead: yaw to the left, pitch down, roll to the right. Height, pitch and roll follow from the
 frames' poses relative to a base at rest on the ground below. Yaw follows from the direction of travel: a base that does
-not slide sideways moves along its heading, so its sideways steps must not add up. The distance from the point that the
-robot turns about is estimated along with it, since a camera ahead of that point swings outwards in turns.
+not slide sideways moves along its heading, so its sideways steps must not add up. The forward offset of the
+robot's turning point from the base's origin is estimated together with yaw, because a camera ahead of the turning point
+swings outwards in turns.
 """
 
 from collections.abc import Callable
@@ -50,7 +51,7 @@ _AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 class CameraExtrinsics:
     """Values or standard errors of a camera's extrinsics.
 
-    An error of the principal point is absorbed by yaw and pitch, as it should be: in pictures they are the same.
+    Yaw and pitch absorb an error of the principal point. This is intended, because both shift the image alike.
     """
 
     height: float
@@ -71,7 +72,7 @@ def estimate_extrinsics(
     Args:
         camera_to_world: OpenCV axes, in the order of the film [m], shape (n, 4, 4).
         ground_at: Returns the ground's height [m], shape (n,), at points (n, 2).
-        offset: Of the lens forward and left of the base's origin [m].
+        offset: Position of the lens relative to the base's origin, (forward, left) [m].
 
     Raises:
         InputError: too few frames, or too short a path.
@@ -179,7 +180,10 @@ def _relative_to_base(
 def _base_pose(
     position: Array, heading: float, ground_at: Callable[[Array], Array], lens: Array
 ) -> tuple[Array, Array]:
-    """Origin [m] and axes (3, 3) of a base at rest whose lens, at `lens` (3,) in the base [m], is at x, y (2,) [m]."""
+    """Pose (origin [m], axes (3, 3)) of a base at rest whose lens is above a world position (2,) [m].
+
+    `lens` (3,) [m] is the lens's position in the base.
+    """
     rotation = Rotation.from_euler("Z", heading).as_matrix()
     arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # from the ground
     for _ in range(2):  # a tilted base moves its lens sideways
@@ -246,7 +250,7 @@ def calibrate_camera(film: Path, scene: SceneDir, params: HuskyParams) -> tuple[
     """Estimates the camera's extrinsics, and its focal length unless given; also returns the film's frames.
 
     Args:
-        film: By the robot's front camera, driving on the place, mostly ahead; rectified.
+        film: Undistorted film of the front camera while the robot drives through the scene, mostly straight ahead.
         params: The robot; its intrinsics, if any, are used.
 
     Raises:

@@ -147,7 +147,9 @@ def identify(
     use_slope: bool = True,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Identification:
-    """Fits baseline, drivetrain, tires and ground to the even groups of a log, and predicts all of it.
+    """Fits baseline, drivetrain, tires and ground to the even-numbered groups, then predicts every window.
+
+    Even-numbered groups are the training half of a log; see `logs.py`.
 
     Args:
         use_slope: Estimate the slope of the ground from accelerations; False: level ground.
@@ -203,7 +205,9 @@ def toml_text(comment: str, previous: dict[str, Any], identified: dict[str, tupl
 
     Args:
         comment: For the first line; unprintable characters are replaced.
-        identified: Values and standard errors (or None) of fields that replace or follow those.
+        previous: Fields of the previous file, by name.
+        identified: Identified fields (value, standard error or None). They replace fields of `previous` with the same
+            name; the rest is appended.
     """
     lines = [
         "# " + "".join(c if c.isprintable() else "?" for c in comment),

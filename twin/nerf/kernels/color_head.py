@@ -39,8 +39,9 @@ def sigmoid(x: wp.float32) -> wp.float32:
 def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[Any, Any]:
     """Builds the kernel for `lanes` neighboring pixels per thread and given layer widths, and its struct of weights.
 
-    It is launched over cameras and runs of pixels, from `first` up to `last`. For images with `stop` depths there is no
-    background, and features are scaled to full opacity: the color is that of the field's own share.
+    The kernel is launched over cameras and runs of pixels, from `first` up to `last`. If rays stop at given depths (the
+    images have `stop`), no background is added and features are divided by opacity, so that the color is that of the
+    field alone (not premultiplied).
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
     Inputs = wp.types.matrix(shape=(FEATURES + HARMONICS, lanes), dtype=wp.float32)
@@ -50,7 +51,8 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
     units = wp.constant(hidden)
     background_units = wp.constant(background_hidden)
 
-    # Also written in network.py (torch): the compiler fuses operations by context, so sharing may change bits.
+    # Duplicates the torch version in network.py on purpose: a shared function may be compiled differently by Warp and
+    # change the last bits.
     @wp.func
     def harmonics_of(image: ImageBuffers, camera: wp.int32, first: wp.int32, x: Inputs) -> Inputs:
         """Appends spherical harmonics of the ray directions to the features."""
@@ -84,7 +86,10 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
 
     @wp.struct
     class Weights:
-        """Weights: of the head in groups of eight hidden units, then the other axis; others flat, input then output."""
+        """Head weights have shape (hidden / 8, other axis), each entry a vector of eight hidden units.
+
+        Background weights are flat, index = input · n_out + output.
+        """
 
         head_0: wp.array(dtype=Vec8)
         head_1: wp.array(dtype=Vec8)

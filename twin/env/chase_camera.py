@@ -1,11 +1,11 @@
 """Pictures of a scene from free camera poses with `mujoco_warp`'s ray caster; needs no OpenGL and no display.
 
 The scene is rendered twice: visual geometry (ground, visual mesh, robot), and the convex collision parts with their
-ids. Visible parts are blended over the first picture, half transparent and with outlines. A *shot* is a robot
-configuration (MuJoCo's qpos; None for the initial one) and a camera pose.
+ids. Visible parts are blended over the first picture, half transparent and with outlines. The *chase camera* follows
+the robot from behind and above.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from twin.config import ObstacleConfig
 from twin.env.obstacle_models import OBSTACLE_GROUP
 from twin.env.obstacles import add_obstacles, place
-from twin.env.route_follower import RecordedDrive
-from twin.geometry.cameras import Cameras, opencv_to_mujoco
+from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.poses import look_at
-from twin.mjcf.world import World, arc_lengths, point_at
+from twin.mjcf.world import World
 from twin.types import Array, Image
 
 _FOVY = 50.0  # [°]
@@ -41,13 +40,16 @@ class SceneCamera:
         size: tuple[int, int],
         obstacles: Sequence[ObstacleConfig] = (),
     ) -> None:
-        """Compiles the scene with obstacles and a free camera for pictures of `size` (width, height) [px]."""
+        """Compiles the scene with obstacles and a free camera for pictures of `size` (width, height) [px].
+
+        `obstacles` may then be set to some of them; the others are not shown.
+        """
         import mujoco_warp as mjw  # slow to import
 
         self._mjw = mjw
         spec = mujoco.MjSpec.from_file(str(world.model_path))
-        self._obstacles = tuple(obstacles)
-        add_obstacles(spec, self._obstacles, world)
+        self.obstacles = tuple(obstacles)
+        add_obstacles(spec, self.obstacles, world)
         spec.worldbody.add_camera(name="free", fovy=_FOVY)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
@@ -79,7 +81,7 @@ class SceneCamera:
     def render(self, qpos: Array, camera_to_world: Array, time: float = 0.0) -> Image:
         """Renders the scene with the robot at `qpos` at a time [s] from an OpenCV camera pose, shape (h, w, 3)."""
         self.data.qpos[:] = qpos
-        place(self._obstacles, self.data, time)
+        place(self.obstacles, self.data, time)
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         pose = opencv_to_mujoco(camera_to_world)
@@ -124,68 +126,24 @@ def blend_parts(rgb: Image, depth: Array, part_rgb: Image, part_depth: Array, id
     return out.astype(np.uint8)
 
 
+class ChaseCamera:
+    """Poses of a camera behind and above a robot; it looks along the robot's low-passed heading."""
+
+    def __init__(self, base_to_world: Array) -> None:
+        """Starts an episode at the robot's pose, shape (4, 4)."""
+        forward = base_to_world[:2, 0]
+        self._direction = forward / np.linalg.norm(forward)
+
+    def follow(self, base_to_world: Array) -> Array:
+        """Returns the camera's pose (OpenCV) at the next control step, shape (4, 4)."""
+        direction = self._direction + _SMOOTHING * (base_to_world[:2, 0] - self._direction)
+        self._direction = direction / np.linalg.norm(direction)
+        along = np.array([*self._direction, 0.0])
+        eye = base_to_world[:3, 3] - _BEHIND * along + [0.0, 0.0, _ABOVE]
+        return look_at(eye, base_to_world[:3, 3] + _AHEAD * along + [0.0, 0.0, 0.2])
+
+
 def chase_poses(base_to_world: Array) -> Array:
-    """Camera poses (OpenCV) behind and above a moving robot with low-passed heading, shape (k, 4, 4)."""
-    forward = base_to_world[:, :2, 0]
-    direction = forward[0] / np.linalg.norm(forward[0])
-    poses = []
-    for base, ahead in zip(base_to_world, forward, strict=True):
-        direction = direction + _SMOOTHING * (ahead - direction)
-        direction = direction / np.linalg.norm(direction)
-        along = np.array([*direction, 0.0])
-        eye = base[:3, 3] - _BEHIND * along + [0.0, 0.0, _ABOVE]
-        poses.append(look_at(eye, base[:3, 3] + _AHEAD * along + [0.0, 0.0, 0.2]))
-    return np.array(poses)
-
-
-def frame_indices(count: int, every: int) -> list[int]:
-    indices = list(range(0, count, every))
-    return indices if indices[-1] == count - 1 else [*indices, count - 1]
-
-
-# ---- shots
-
-Shot = tuple[Array | None, Array]
-
-_OVERVIEW_BEHIND, _OVERVIEW_ABOVE, _OVERVIEW_AHEAD = 9.0, 7.0, 10.0  # [m] camera position and look-at point
-_OVERVIEW_POSITIONS = (0.0, 0.45)  # of the overview, as shares of the route length
-
-
-def overview_pose(route: Array, s: float) -> Array:
-    """Camera pose behind and above the point at arc length s [m] of a route (m, 3), looking along it."""
-    ahead, here = point_at(route, s + _OVERVIEW_AHEAD), point_at(route, s)
-    if np.linalg.norm((ahead - here)[:2]) < 1e-6:  # at the end of the route: use its last heading
-        here = point_at(route, s - 1.0)
-    along = (ahead - here) * [1.0, 1.0, 0.0]
-    along /= np.linalg.norm(along)
-    return look_at(here - _OVERVIEW_BEHIND * along + [0.0, 0.0, _OVERVIEW_ABOVE], here + _OVERVIEW_AHEAD * along)
-
-
-def route_shots(route: Array) -> list[Shot]:
-    """Shots of the scene from above the route's start and from further along; the robot is at its initial pose."""
-    length = float(arc_lengths(route)[-1])
-    return [(None, overview_pose(route, share * length)) for share in _OVERVIEW_POSITIONS]
-
-
-def camera_shots(cameras: Cameras) -> list[Shot]:
-    """Shots from two of the filmed cameras, for a scene without a route."""
-    n = len(cameras)
-    return [(None, cameras.camera_to_world[i]) for i in dict.fromkeys((n // 4, 3 * n // 4))]
-
-
-def chase_shots(drive: RecordedDrive, every: int) -> list[Shot]:
-    """Shots of a drive from behind, every `every` control steps and at the last one."""
-    poses = chase_poses(drive.base_to_world)
-    return [(drive.qpos[i], poses[i]) for i in frame_indices(len(drive.times), every)]
-
-
-def render_shots(world: World, shots: list[Shot], size: tuple[int, int]) -> Iterator[Image]:
-    """Renders shots in order. All share one camera, because building it takes seconds."""
-    if not shots:
-        return
-    camera = SceneCamera(world, size)
-    data = mujoco.MjData(camera.model)
-    if camera.model.nkey:
-        mujoco.mj_resetDataKeyframe(camera.model, data, 0)
-    for qpos, pose in shots:
-        yield camera.render(data.qpos if qpos is None else qpos, pose)
+    """Camera poses (OpenCV) behind and above a robot at k successive control steps, shape (k, 4, 4)."""
+    camera = ChaseCamera(base_to_world[0])
+    return np.array([camera.follow(base) for base in base_to_world])
