@@ -1,9 +1,11 @@
 """The report page: what it says follows from the numbers, nothing is made up, and no name can break it."""
 
+import argparse
 import ast
 import copy
 import inspect
 import re
+import shlex
 import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -14,8 +16,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from jinja2 import UndefinedError
 
 from twin.build import summary
+from twin.commands import VERBS
 from twin.errors import join_names
 from twin.files import write_json
 from twin.geometry.images import write_image
@@ -27,14 +31,13 @@ from twin.report.build_sections import SECTIONS, cautions, headline_sections, se
 from twin.report.html import (
     NOT_MEASURED,
     Caution,
-    Html,
+    Chart,
     duration,
-    element,
     flatten,
     follower_verdict,
     number,
     pick,
-    table,
+    render,
 )
 from twin.scene import STAGES, SceneDir
 
@@ -408,13 +411,38 @@ def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
     assert "Ground and solid parts" not in text  # no mesh stage on disk
 
 
-def test_elements_escape_all_but_html() -> None:
-    assert element("p", "a < b & c") == "<p>a &lt; b &amp; c</p>"
-    assert element("p", Html("<b>x</b>")) == "<p><b>x</b></p>"
-    assert element("a", "x", href='"><script>') == '<a href="&quot;&gt;&lt;script&gt;">x</a>'
-    assert element("video", controls=True, poster=None) == "<video controls></video>"
-    assert element("img", src="a") == '<img src="a">'
-    assert '<td class="n">1</td>' in table(["a"], [["1"]], (0,))
+def test_a_chart_has_its_heading_as_accessible_name() -> None:
+    markup = Chart('a < b & "c"', "<svg viewBox='0'></svg>").markup
+    assert markup == '<svg role="img" aria-label="a &lt; b &amp; &#34;c&#34;" viewBox=\'0\'></svg>'
+
+
+def test_templates_escape_text_and_refuse_missing_data() -> None:
+    data: dict[str, Any] = {"title": "<b>", "kicker": "a & b", "verdicts": [], "headings": {}, "files": ["x"]}
+    html = render("base.html", **data)
+    assert "<h1>&lt;b&gt;</h1>" in html and "a &amp; b" in html and "{" + "#" not in html
+    with pytest.raises(UndefinedError, match="kicker"):
+        render("base.html", **{key: value for key, value in data.items() if key != "kicker"})
+
+
+def test_the_page_says_what_to_do_next_in_commands_that_parse(scene: SceneDir) -> None:
+    """For a place whose folder needs quoting; and no training is offered where nothing drives."""
+    odd = SceneDir(scene.root.parent / "my road's")
+    text = read(page(odd, changed("mesh.parts", 0))).text
+    assert "Look at the caution above." in text
+    commands = [line for line in next_commands(odd, REPORT) if "twin." in line]
+    for line in commands:
+        python, m, module, *arguments = shlex.split(line)
+        assert (python, m) == ("python", "-m") and str(odd.root) in arguments
+        parser = argparse.ArgumentParser()
+        VERBS[module.removeprefix("twin.")].define(parser)
+        parser.parse_args(arguments)
+    assert [line.split()[2] for line in commands] == ["twin.align", "twin.build", "twin.train", "twin.validate"]
+    without = changed("review.not_applicable", "this is no drive")
+    assert [line.split()[2] for line in next_commands(odd, without)] == ["twin.export"]
+
+
+def next_commands(scene: SceneDir, report: dict[str, Any]) -> list[str]:
+    return [line for _, commands in report_page._next_steps(scene, report) for line in commands]
 
 
 def test_small_words() -> None:

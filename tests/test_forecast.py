@@ -14,7 +14,7 @@ from scipy.special import expit
 from twin.env.options import CAUSES
 from twin.errors import InputError
 from twin.evaluation.forecasting import ALL_TASKS, Estimate, Forecast, make_forecast
-from twin.evaluation.statistics import mmrv, pearson, spearman, wilson
+from twin.evaluation.statistics import MIN_POLICIES, mmrv, pearson, spearman, wilson
 from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
 from twin.report import forecast_report
@@ -26,6 +26,7 @@ from twin.report.forecast_summary import (
     candidates_csv,
     format_estimate,
     limitations,
+    next_trials,
     summary_text,
     verdicts,
 )
@@ -260,6 +261,21 @@ def test_without_real_trials_it_says_what_it_cannot_know() -> None:
     assert any("Whether the road ranks" in caution.what for caution in limitations(made))
     (plan,) = made.plans
     assert plan.basis == "twin" and plan.more_for_winner is not None and plan.more_for_winner > 0
+
+
+def test_the_next_trials_are_of_policies_that_may_be_best_or_were_not_driven() -> None:
+    twin, real = cells(n=9, driven=7)
+    made = make_forecast("road", twin, real)
+    again, new = next_trials(made)
+    for c in made.candidates:
+        assert (c.policy in again) == bool(c.real_ranks and c.real_ranks[0] >= 0.05)
+        assert (c.policy in new) == (not c.driven)
+    (first,) = next_trials(make_forecast("road", twin, []))
+    ranked = [c.policy for c in make_forecast("road", twin, []).candidates]
+    assert ranked[0] in first and ranked[-1] in first and sum(name in first for name in ranked) == MIN_POLICIES
+    html = forecast_page(made)
+    assert "python -m twin.forecast SCENE --real real.csv" in html and again in Text(html).text
+    assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 
 def test_uneven_lightings_are_told() -> None:

@@ -228,6 +228,8 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
     assert list(said["training"]) == ["ahead"]  # the other's run has no episodes
     won = [success for step, success in EPISODES if step <= TRAINED["step"]][-RECENT_EPISODES:]
     assert rate_text(rate_summary(sum(won), len(won))) in shown.text and "How they were trained" in shown.text
+    assert f"python -m twin.forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHT" in shown.text
+    assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 
 class NoCamera:

@@ -5,50 +5,25 @@ from `twin.report.build_sections`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from twin.assets.ground import Ground
+from twin.env.route_segments import scene_tasks
 from twin.files import read_json, wrap_read_errors, write_text
 from twin.geometry.cameras import Cameras, SparsePoints
+from twin.mjcf.world import World
 from twin.report import figures
 from twin.report.build_sections import SECTIONS, costs_section, headline_sections, sections
-from twin.report.html import (
-    NOT_MEASURED,
-    Html,
-    Section,
-    caution,
-    chart,
-    data_url,
-    document,
-    duration,
-    element,
-    flatten,
-    folded,
-    headline,
-    number,
-    numbers,
-    page_header,
-    pick,
-    picture,
-    table,
-)
+from twin.report.html import Chart, Picture, command, data_url, duration, flatten, number, numbers, pick, render
 from twin.report.video_layout import load_footprints
 from twin.scene import SceneDir, stage_result
 from twin.types import Array
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram
 _MAX_TRACK_LENGTH = 30.0  # frames, right end of the histogram
-
-
-@dataclass(frozen=True)
-class Chart:
-    section: str
-    title: str
-    svg: str
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
@@ -77,11 +52,11 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     half_width = pick(report, "mjcf.half_width_m")
     wide = float(half_width) if isinstance(half_width, int | float) else 0.0
     drawn = figures.place_map(cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide)
-    out = [Chart("metric", "Map of points, cameras and route", figures.svg(drawn))]
+    out = [Chart("Map of points, cameras and route", figures.svg(drawn), "metric")]
     if ground is not None:
         path = cameras.positions[:, :2] if route is None else route
         drawn = figures.ground_map(ground, path, route, wide, parts)
-        out.append(Chart("mesh", "Ground and solid parts", figures.svg(drawn)))
+        out.append(Chart("Ground and solid parts", figures.svg(drawn), "mesh"))
     return out
 
 
@@ -102,8 +77,8 @@ def _reconstruction_charts(scene: SceneDir) -> list[Chart]:
     error = figures.histogram(points.error, "reprojection error of a point [px]", _MAX_REPROJECTION)
     tracks = figures.histogram(points.track_length, "frames that observe a point", _MAX_TRACK_LENGTH, integer=True)
     return [
-        Chart("cameras", "Reprojection error of points", figures.svg(error)),
-        Chart("cameras", "Track length of points", figures.svg(tracks)),
+        Chart("Reprojection error of points", figures.svg(error), "cameras"),
+        Chart("Track length of points", figures.svg(tracks), "cameras"),
     ]
 
 
@@ -113,12 +88,12 @@ def _field_charts(report: dict[str, Any]) -> list[Chart]:
     if psnr:
         counts = {name: int(n) for name, n in numbers(pick(report, "field.n")).items()}
         drawn = figures.bar_chart(psnr, counts, "dB", "PSNR on held-out frames [dB]")
-        out.append(Chart("field", "Similarity of rendered and real frames", figures.svg(drawn)))
+        out.append(Chart("Similarity of rendered and real frames", figures.svg(drawn), "field"))
     curve = pick(report, "field.curve")
     if isinstance(curve, list) and len(curve) > 1 and all(isinstance(row, list) and len(row) == 2 for row in curve):
         steps, values = zip(*curve, strict=True)
         drawn = figures.training_curve(steps, values, "PSNR on training pixels [dB]")
-        out.append(Chart("field", "How training went", figures.svg(drawn)))
+        out.append(Chart("How training went", figures.svg(drawn), "field"))
     return out
 
 
@@ -133,7 +108,7 @@ def _drive_charts(report: dict[str, Any]) -> list[Chart]:
     )
     speed = figures.curves_along_path(trace["progress_m"], {"speed": trace["speed_m_s"]}, "speed [m/s]", lowest=0.0)
     title = "How far off the route it drove" + ("" if limit is None else "; dashed: the corridor")
-    return [Chart("review", title, figures.svg(off)), Chart("review", "How fast it drove", figures.svg(speed))]
+    return [Chart(title, figures.svg(off), "review"), Chart("How fast it drove", figures.svg(speed), "review")]
 
 
 def _geometry_charts(report: dict[str, Any]) -> list[Chart]:
@@ -150,7 +125,7 @@ def _geometry_charts(report: dict[str, Any]) -> list[Chart]:
         )
     }
     drawn = figures.curves_along_path(along["station_m"], known, "in the corridor [m]", lowest=0.0)
-    return [Chart("seen_touched", "Difference of visual and collision geometry along the route", figures.svg(drawn))]
+    return [Chart("Difference of visual and collision geometry along the route", figures.svg(drawn), "seen_touched")]
 
 
 def _truth_charts(scene: SceneDir) -> list[Chart]:
@@ -159,7 +134,7 @@ def _truth_charts(scene: SceneDir) -> list[Chart]:
         return []
     errors = compared["camera_errors_m"]
     drawn = figures.errors_by_group(errors, "camera position error [m]")
-    return [Chart("truth", "Camera position error along the films", figures.svg(drawn))]
+    return [Chart("Camera position error along the films", figures.svg(drawn), "truth")]
 
 
 def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
@@ -197,144 +172,100 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
     drawn, pictures = charts(scene, report), _pictures(scene)
     name = str(report.get("scene") or scene.root.name)
     shown = [section for section in sections(report) if section.name != "costs"]
-    return document(
-        f"{name}: build report",
-        "",
-        _header(name, report),
-        _video_section(scene, pictures),
-        element(
-            "nav", *(element("a", s.title, href=f"#{s.name}") for s in shown), element("a", "Costs", href="#costs")
-        ),
-        *(_stage_section(k + 1, s, report, drawn, pictures) for k, s in enumerate(shown)),
-        _costs_section(report),
-        element("footer", "Every number is in ", element("a", "report.json", href="report.json"), " beside this page."),
+    stages: dict[str, Any] = report.get("stages") or {}
+    posters = [picture.path for picture in pictures if picture.section == "poster"]
+    return render(
+        "build_report.html",
+        title=f"{name}: build report",
+        kicker=_kicker(report),
+        headlines=headline_sections(report),
+        has_video=(scene.stage("review") / "review.mp4").exists() or scene.review_mp4.exists(),
+        poster=data_url(posters[-1]) if posters else None,  # the last one shows the drive, if there is one
+        headings={s.name: s.title for s in shown} | {"costs": "Costs", "next": "What to do next"},
+        shown=[
+            {
+                "section": section,
+                "is_stage": section.name in SECTIONS,
+                "ran": section.name in report or section.name in stages,
+                "pictures": [picture for picture in pictures if picture.section == section.name],
+                "charts": [chart for chart in drawn if chart.section == section.name],
+                "numbers": flatten(report.get(section.name)),
+            }
+            for section in shown
+        ],
+        costs=costs_section(report),
+        stages=_stage_costs(stages),
+        seed=report.get("seed"),
+        versions=report.get("versions") or {},
+        inputs=report.get("inputs") or {},
+        settings=[row for name, stage in stages.items() for row in flatten(pick(stage, "config") or {}, name)],
+        next_steps=_next_steps(scene, report),
+        files=["report.json"],
     )
 
 
-def _header(name: str, report: dict[str, Any]) -> Html:
+def _kicker(report: dict[str, Any]) -> str:
     seconds = report.get("seconds")
     if seconds is None:
         each = [pick(stage, "seconds") for stage in (report.get("stages") or {}).values()]
         seconds = sum(s for s in each if isinstance(s, int | float)) if each else None
-    cost = f"built in {duration(seconds)}"
     memory = number(_gibibytes(report.get("peak_memory_bytes")), "peak memory {:.1f} GiB")
-    kicker = f"A filmed place as a MuJoCo twin: {cost}, {memory}."
-    return page_header(name, kicker, *map(_summary, headline_sections(report)))
+    return f"A filmed place as a MuJoCo twin: built in {duration(seconds)}, {memory}."
 
 
-def _summary(section: Section) -> Html:
-    assert section.headline is not None
-    below = [element("li", element("a", problem.what, href=f"#{section.name}")) for problem in section.cautions]
-    return headline(section.headline, element("ul", *below) if below else "")
-
-
-def _video_section(scene: SceneDir, pictures: list[tuple[str, Path, str]]) -> Html:
-    """The review video, which is stored beside the page, with an embedded poster."""
-    if not (scene.stage("review") / "review.mp4").exists() and not scene.review_mp4.exists():
-        return Html("")
-    posters = [path for section, path, _ in pictures if section == "poster"]
-    # The last one shows the drive, if there is one.
-    poster = data_url(posters[-1]) if posters else None
-    return element(
-        "section",
-        element("video", src="review.mp4", poster=poster, controls=True, preload="none", playsinline=True),
-        element(
-            "p",
-            "The video shows real and rendered frames side by side, the changing light, and the drive. "
-            "It is stored beside this page: ",
-            element("a", "review.mp4", href="review.mp4"),
-            class_="meaning",
-        ),
-        id="film",
-    )
-
-
-def _pictures(scene: SceneDir) -> list[tuple[str, Path, str]]:
-    """Section, file and caption of every picture of the review stage."""
+def _pictures(scene: SceneDir) -> list[Picture]:
+    """Pictures of the review stage."""
     folder = scene.stage("review")
     if not (folder / "review.json").exists():
         return []
     stored = read_json(folder / "review.json").get("pictures", [])
-    rows = [(str(row["section"]), folder / str(row["file"]), str(row["caption"])) for row in stored]
-    return [row for row in rows if row[1].is_file()]
+    pictures = [Picture(folder / str(row["file"]), str(row["caption"]), str(row["section"])) for row in stored]
+    return [picture for picture in pictures if picture.path.is_file()]
 
 
-def _stage_section(
-    position: int, section: Section, report: dict[str, Any], drawn: list[Chart], pictures: list[tuple[str, Path, str]]
-) -> Html:
-    title = element("h2", element("small", str(position)) if section.name in SECTIONS else "", section.title)
-    ran = section.name in report or section.name in (report.get("stages") or {})
-    if not ran and section.name in SECTIONS:
-        return element("section", title, element("p", "This stage has not run.", class_="na"), id=section.name)
-    if section.not_applicable and not section.done:
-        return element("section", title, _not_applicable(section), id=section.name)
-    facts = [
-        element(
-            "div",
-            element("dt", fact.name),
-            element(
-                "dd",
-                element("b", fact.value),
-                element("span", fact.meaning, class_="meaning"),
-                class_="none" if fact.value == NOT_MEASURED else None,
-            ),
-        )
-        for fact in section.facts
+def _stage_costs(stages: dict[str, Any]) -> list[dict[str, Any]]:
+    seconds = {name: pick(stage, "seconds") for name, stage in stages.items()}
+    longest = max([s for s in seconds.values() if isinstance(s, int | float)], default=0.0)
+    return [
+        {
+            "title": _STAGE_TITLES.get(name, name),
+            "skipped": pick(stage, "skipped"),
+            "seconds": spent,
+            "share": 100.0 * spent / longest if isinstance(spent, int | float) and longest > 0 else 0.0,
+            "memory": number(_gibibytes(pick(stage, "peak_memory_bytes")), "{:.2f} GiB"),
+        }
+        for (name, stage), spent in zip(stages.items(), seconds.values(), strict=True)
     ]
-    images = [picture(path, caption) for name, path, caption in pictures if name == section.name]
-    plots = [chart(c.title, c.svg) for c in drawn if c.section == section.name]
-    rows = flatten(report.get(section.name))
-    return element(
-        "section",
-        title,
-        element("p", section.done, class_="done"),
-        _not_applicable(section) if section.not_applicable else "",
-        *map(caution, section.cautions),
-        element("dl", *facts),
-        element("div", *images, class_="pictures") if images else "",
-        element("div", *plots, class_="charts") if plots else "",
-        folded("All numbers of this stage", table(["key", "value"], [[*row] for row in rows])),
-        id=section.name,
-    )
-
-
-def _not_applicable(section: Section) -> Html:
-    return element("p", f"Does not apply here: {section.not_applicable}.", class_="na")
 
 
 def _gibibytes(size: Any) -> float | None:
     return size / 2**30 if isinstance(size, int | float) else None
 
 
-def _costs_section(report: dict[str, Any]) -> Html:
-    stages: dict[str, Any] = report.get("stages") or {}
-    seconds = {name: pick(stage, "seconds") for name, stage in stages.items()}
-    longest = max([s for s in seconds.values() if isinstance(s, int | float)], default=0.0)
-    rows = []
-    for name, stage in stages.items():
-        spent = seconds[name]
-        share = 100.0 * spent / longest if isinstance(spent, int | float) and longest > 0 else 0.0
-        rows.append(
-            [
-                _STAGE_TITLES.get(name, name) + (" (up to date)" if pick(stage, "skipped") else ""),
-                duration(spent),
-                element("span", class_="bar", style=f"width:{share:.1f}%"),
-                number(_gibibytes(pick(stage, "peak_memory_bytes")), "{:.2f} GiB"),
-            ]
+def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list[str]]]:
+    """What to do after a build: texts with their commands."""
+    root, wrong = scene.root, sum(len(section.cautions) for section in sections(report))
+    build = command("build", root)
+    first = "Watch the video and look at the pictures above: is this the place that you filmed?"
+    if wrong:
+        first = (
+            f"Look at the {'caution' if wrong == 1 else f'{wrong} cautions'} above. Change what helps, in scene.toml "
+            "or in the films, and build again; only what depends on the change is computed again:"
         )
-    settings = [row for name, stage in stages.items() for row in flatten(pick(stage, "config") or {}, name)]
-    inputs = [[str(name), element("code", str(digest)[:16])] for name, digest in (report.get("inputs") or {}).items()]
-    versions = [[str(name), str(version)] for name, version in (report.get("versions") or {}).items()]
-    seed, section = report.get("seed"), costs_section(report)
-    return element(
-        "section",
-        element("h2", section.title),
-        element("p", section.done, class_="done"),
-        *map(caution, section.cautions),
-        table(["stage", "time", "", "peak memory"], rows, (1, 3)),
-        element("p", f"Seed: {NOT_MEASURED if seed is None else seed}"),
-        folded("Versions", table(["package", "version"], versions)),
-        folded("Input files", table(["file", "SHA-256 (start)"], inputs)),
-        folded("Settings", table(["setting", "value"], [[*row] for row in settings])),
-        id="costs",
-    )
+    out = [(first, [build] if wrong else [])]
+    if pick(report, "review.not_applicable"):
+        mesh = command("export", root, "--glb", "place.glb")
+        return [*out, ("There is no drive here, so no policy can be trained. Other programs can use the mesh:", [mesh])]
+    task = "straight"
+    if scene.has_route and task not in scene_tasks(World.load(scene.stage("mjcf"))):
+        task = "route"
+    align = "Log five minutes of your robot’s driving, fit the simulated robot to the log, and build again:"
+    return [
+        *out,
+        (align, [command("align", root, "drive.csv"), build]),
+        (f"Train a policy on the task “{task}”:", [command("train", root, "--task", task, "--run", "first")]),
+        (
+            "Validate it: how often it reaches the goal in lights that it was not trained in:",
+            [command("validate", root, "--task", task, "--policy", "first", "--films")],
+        ),
+    ]

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.config import RANDOMIZED
-from twin.evaluation.forecasting import Agreement, Candidate, CellPair, Estimate, Forecast
+from twin.evaluation.forecasting import Candidate, CellPair, Estimate, Forecast
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.files import write_text
 from twin.report.figures import CARD, FULL_WIDTH, MUTED, SERIES, heatmap, matrix, new_figure, percent_texts, style, svg
@@ -20,22 +21,11 @@ from twin.report.forecast_summary import (
     format_estimate,
     format_probability,
     limitations,
+    next_trials,
     percentage_points,
     verdicts,
 )
-from twin.report.html import (
-    MAX_TABLE_ROWS,
-    Html,
-    caution,
-    chart,
-    document,
-    element,
-    folded,
-    headline,
-    join,
-    page_header,
-    table,
-)
+from twin.report.html import MAX_TABLE_ROWS, Chart, command, render
 
 # ---- figures
 
@@ -203,259 +193,85 @@ def shorten_name(name: str) -> str:
 
 # ---- page
 
-_STYLE = ".whole, td code { white-space:nowrap }\n"
-
 
 def write_forecast_page(forecast: Forecast, folder: Path) -> None:
-    """Writes `forecast.html`, atomically."""
-    write_text(folder / "forecast.html", forecast_page(forecast))
+    """Writes `forecast.html`, atomically; `folder` is in the scene's folder."""
+    write_text(folder / "forecast.html", forecast_page(forecast, folder.parent))
 
 
-def forecast_page(forecast: Forecast) -> str:
-    sections = [
-        ("road", "Does the twin predict the road?", _agreement_section(forecast)),
-        ("stages", "From training to the road", _stages_section(forecast)),
-        ("policies", "Which policy is best?", _policies_section(forecast)),
-        ("predictions", "What to expect on the road", _predictions_section(forecast)),
-        ("more", "How many more trials?", _trials_section(forecast)),
-        ("cells", "Cell by cell", _cells_section(forecast)),
-        ("unknown", "Limitations", join(*map(caution, limitations(forecast)))),
-    ]
-    links = (
-        element("a", "forecast.json", href="forecast.json"),
-        " and ",
-        element("a", "forecast.csv", href="forecast.csv"),
-    )
-    return document(
-        f"{forecast.scene}: forecast",
-        _STYLE,
-        _header(forecast),
-        element("nav", *(element("a", title, href=f"#{name}") for name, title, _ in sections)),
-        *(element("section", element("h2", title), content, id=name) for name, title, content in sections),
-        element("footer", "Every number is in ", *links, " beside this page."),
-    )
-
-
-def _header(forecast: Forecast) -> Html:
+def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
+    """The whole page; `root` is the scene's folder in the commands to type."""
     policies = len({c.policy for c in forecast.candidates})
     tasks = f"{len(forecast.tasks)} tasks" if len(forecast.tasks) > 1 else "one task"
-    trials = f"{forecast.twin_trials} trials in the twin, {forecast.real_trials} on the road"
-    kicker = f"{policies} policies on {tasks}: {trials}."
-    return page_header(f"{forecast.scene}: forecast", kicker, *map(headline, verdicts(forecast)))
-
-
-def _agreement_section(forecast: Forecast) -> Html:
-    lead = element(
-        "p",
-        "Policies were driven in the twin and on the road. If the twin is a good predictor, policies that succeed more "
-        "often in the twin also succeed more often on the road. Brackets are 90% intervals of the average over other "
-        "policies of this kind with as many trials.",
-        class_="done",
-    )
-    doubt = element(
-        "div", element("b", "The intervals may be too narrow."), NOMINAL_INTERVALS, class_="caution", role="note"
-    )
-    if not forecast.groups:
-        return element("p", "No real trials were given, so this was not measured.", class_="na")
-    shown = [group for group in forecast.groups if not group.missing]
-    refused = [_refusal(group) for group in forecast.groups if group.missing]
-    rows: list[list[str]] = [
-        [
-            element("b", title, class_="whole"),
-            *(_estimate(getattr(group, name), name in PERCENT_STATISTICS) for group in shown),
-            element("span", meaning, class_="meaning"),
-        ]
-        for name, title, meaning in STATISTICS
-    ]
-    heads = ["", *(f"{g.task} (n = {g.policies}, {g.cells} cells)" for g in shown), "meaning"]
-    drawn = chart(
-        "Success on the road over success in the twin; on the dashed line they are equal",
-        svg(twin_against_road(forecast)),
-    )
-    return join(lead, *refused, *((table(heads, rows), doubt) if shown else ()), element("div", drawn, class_="charts"))
-
-
-def _estimate(estimate: Estimate, percent: bool = False) -> Html:
-    """A number whose interval does not break across lines, or the reason why there is none."""
-    if estimate.value is None:
-        return element("span", estimate.missing, class_="meaning")
-    value, _, ends = format_estimate(estimate, percent).partition(" ")
-    return join(value, " ", element("span", ends, class_="whole"))
-
-
-def _refusal(group: Agreement) -> Html:
-    needed = f"At least {MIN_POLICIES} policies and {MIN_TRIALS} trials in every cell are needed."
-    return element(
-        "div",
-        element("b", f"{group.task}: no correlation is given."),
-        f"{needed} Missing: {'; '.join(group.missing)}.",
-        class_="caution",
-        role="note",
-    )
-
-
-def _stages_section(forecast: Forecast) -> Html:
-    """The table common in papers: training, validation and real success rate per policy and task."""
-    lead = element(
-        "p",
-        "Train: success in the last training episodes before the policy was saved, with exploration. Validate: "
-        "success in the twin, in the lightings that are compared with those of the road. Real: success on the road. A "
-        "drop from the first to the second rate is overfitting to the training; a drop from the second to the third "
-        "is the twin’s error, or chance.",
-        class_="done",
-    )
-    parts = [lead]
-    for task in forecast.tasks:
-        rows: list[list[str]] = [
-            [element("code", c.policy), *map(_stage_rate, (c.trained, c.twin, c.real))]
-            for c in forecast.candidates_of(task)
-        ]
-        parts += [element("h3", task), table(["policy", "train", "validate", "real"], rows)]
-    return join(*parts)
-
-
-def _stage_rate(estimate: Estimate) -> Html:
-    return Html("–") if estimate.value is None else _estimate(estimate, True)
-
-
-def _policies_section(forecast: Forecast) -> Html:
-    parts: list[Html] = [
-        element(
-            "p",
-            "A policy’s rate is the mean over its lightings. Its interval assumes independent trials; correlated "
-            "trials of one day contain less information. Ranks have 90% intervals under the same assumption: the "
-            "order of two policies with nearly the same rate is uncertain.",
-            class_="done",
-        )
-    ]
-    for task in forecast.tasks:
-        mine = forecast.candidates_of(task)
-        rows = [
-            [
-                element("code", c.policy),
-                _estimate(c.twin, True),
-                str(c.twin.n),
-                f"{c.twin_rank.low:.0f} to {c.twin_rank.high:.0f}",
-                format_probability(c.twin_ranks[0]),
-                _estimate(c.real, True),
-                str(c.real.n) if c.driven else "",
-                format_probability(c.real_ranks[0]) if c.real_ranks else "",
-            ]
-            for c in mine
-        ]
-        heads = ["policy", "twin", "trials", "rank in twin", "best in twin", "road", "trials", "best on road"]
-        figures = [chart("Success rates with 90% intervals", svg(rate_figure(mine)))]
-        if len(mine) > 1:
-            figures.append(chart("Probability of each rank in the twin", svg(rank_heatmap(mine))))
-        parts += [element("h3", task), element("div", *figures, class_="charts"), table(heads, rows, (2, 4, 6, 7))]
-    return join(*parts)
-
-
-def _predictions_section(forecast: Forecast) -> Html:
-    lead = element(
-        "p",
-        "The driven policies measure the bias of the twin’s rates; the same correction predicts the rates of the "
-        "others. Each prediction excludes the policy’s own real trials, so the driven policies test it. Intervals are "
-        "for the rate observed in as many real trials.",
-        class_="done",
-    )
+    measured = [group for group in forecast.groups if not group.missing]
     known = [c for c in forecast.candidates if c.corrected.value is not None]
+    agreement, predictions, unpredicted = None, [], ""
+    if forecast.groups:
+        title = "Success on the road over success in the twin; on the dashed line they are equal"
+        agreement = Chart(title, svg(twin_against_road(forecast)))
+    if any(c.driven for c in known):
+        title = "Observed rate over the rate predicted from the other policies"
+        predictions = [Chart(title, svg(predicted_against_road(forecast)))]
     if not known:
         reasons = dict.fromkeys(c.corrected.missing for c in forecast.candidates)
-        why = (
-            f"Not given: {'; '.join(reasons)}." if forecast.groups else "No real trials were given to estimate it from."
-        )
-        return join(lead, element("p", why, class_="na"))
-    rows: list[list[str]] = [
-        [
-            element("code", c.policy),
-            c.task,
-            _estimate(c.twin, True),
-            _estimate(c.corrected, True),
-            _estimate(c.real, True),
-        ]
-        for c in known
-    ]
-    heads = ["policy", "task", "twin", "predicted for the road", "road"]
-    further = [row for row, c in zip(rows, known, strict=True) if not c.driven]
-    driven = [row for row, c in zip(rows, known, strict=True) if c.driven]
-    parts = [lead]
-    if any(c.driven for c in known):
-        drawn = chart(
-            "Observed rate over the rate predicted from the other policies", svg(predicted_against_road(forecast))
-        )
-        parts.append(element("div", drawn, class_="charts"))
-    if further:
-        parts += [element("h3", "Not yet driven"), table(heads, further)]
-    if driven:
-        parts.append(folded("Driven policies, each predicted from the others", table(heads, driven)))
-    if forecast.left_out:
-        out = [
-            [
-                x.task,
-                x.lighting,
-                str(x.cells),
-                _estimate(x.twin_error, True),
-                _estimate(x.corrected_error, True),
-                _estimate(x.coverage, True),
-            ]
-            for x in forecast.left_out
-        ]
-        heads = ["task", "lighting", "cells", "twin is off by", "prediction is off by", "within its interval"]
-        words = "Each lighting is predicted from the others only; this tests the prediction for a new light."
-        parts += [
-            element("h3", "Leaving one lighting out"),
-            element("p", words, class_="done"),
-            table(heads, out, (2,)),
-        ]
-    return join(*parts)
-
-
-def _trials_section(forecast: Forecast) -> Html:
-    rule = (
-        f"The best policy is settled when the leading one is, with a probability of {forecast.sure:.0%}, the best or "
-        f"within {percentage_points(forecast.margin)} of it; the order is settled when {forecast.sure:.0%} of the "
-        "pairs that differ by more are in the right order. Trials are counted per policy, spread over its lightings, "
-        "and averaged over the posterior of the rates, assuming independent trials."
+        unpredicted = "No real trials were given to estimate it from."
+        unpredicted = f"Not given: {'; '.join(reasons)}." if forecast.groups else unpredicted
+    again = "Add the results to real.csv, and forecast again:"
+    return render(
+        "forecast.html",
+        title=f"{forecast.scene}: forecast",
+        kicker=f"{policies} policies on {tasks}: {forecast.twin_trials} trials in the twin, "
+        f"{forecast.real_trials} on the road.",
+        verdicts=verdicts(forecast),
+        headings={
+            "road": "Does the twin predict the road?",
+            "stages": "From training to the road",
+            "policies": "Which policy is best?",
+            "predictions": "What to expect on the road",
+            "cells": "Cell by cell",
+            "unknown": "Limitations",
+            "next": "What to do next",
+        },
+        files=["forecast.json", "forecast.csv"],
+        forecast=forecast,
+        tasks=[_task(forecast, task) for task in forecast.tasks],
+        measured=measured,
+        statistic_heads=["", *(f"{g.task} (n = {g.policies}, {g.cells} cells)" for g in measured), "meaning"],
+        agreement=agreement,
+        predicted=[c for c in known if not c.driven],
+        tested=[c for c in known if c.driven],
+        prediction_charts=predictions,
+        unpredicted=unpredicted,
+        beyond_chance=sum(not pair.within_chance for pair in forecast.pairs),
+        limitations=limitations(forecast),
+        next_steps=[
+            *((text, []) for text in next_trials(forecast)),
+            (again, [command("forecast", root, "--real", "real.csv")]),
+        ],
+        MIN_POLICIES=MIN_POLICIES,
+        MIN_TRIALS=MIN_TRIALS,
+        STATISTICS=STATISTICS,
+        PERCENT_STATISTICS=PERCENT_STATISTICS,
+        NOMINAL_INTERVALS=NOMINAL_INTERVALS,
+        allocation_text=allocation_text,
+        format_estimate=format_estimate,
+        format_probability=format_probability,
+        percentage_points=percentage_points,
     )
-    words = [element("p", allocation_text(forecast, allocation)) for allocation in forecast.plans]
-    return join(*words, element("p", rule, class_="done"))
 
 
-def _cells_section(forecast: Forecast) -> Html:
-    if not forecast.pairs:
-        return element("p", "No real trials were given.", class_="na")
-    rows, beyond_chance = [], 0
-    for pair in forecast.pairs:
-        light = (
-            pair.lighting if pair.lighting == pair.twin_lighting else f"{pair.lighting} (twin: {pair.twin_lighting})"
-        )
-        beyond_chance += not pair.within_chance
-        tag, words = ("span", "within chance") if pair.within_chance else ("b", "beyond chance")
-        luck = element(tag, words, class_="whole")
-        counts = _estimate(pair.twin, True), str(pair.twin.n), _estimate(pair.real, True), str(pair.real.n)
-        rows.append([element("code", pair.policy), pair.task, light, *counts, _estimate(pair.bias, True), luck])
-    heads = ["policy", "task", "lighting", "twin", "n", "road", "n", "road minus twin", ""]
-    lead = (
-        f"{beyond_chance} of {len(rows)} cells differ by more than chance; about one in ten at most would if the twin "
-        "were perfect."
-    )
-    parts, cells = [element("p", lead, class_="done")], table(heads, rows, (4, 6))
-    if len(rows) <= MAX_TABLE_ROWS:
-        return join(*parts, cells)
-    for task in forecast.tasks:
-        mine = [pair for pair in forecast.pairs if pair.task == task]
-        if mine:
-            every = forecast.candidates_of(task)
-            rates = element(
-                "div",
-                chart("In the twin [%]", svg(twin_heatmap(every, mine))),
-                chart("On the road [%]", svg(road_heatmap(every, mine))),
-                class_="charts",
-            )
-            title = (
-                "Road minus twin [points]: red where the twin was too optimistic, blue the opposite, pale within chance"
-            )
-            difference = element("div", chart(title, svg(difference_heatmap(every, mine))), class_="charts")
-            parts += [element("h3", task), rates, difference]
-    return join(*parts, folded("Every policy in every lighting, with intervals", cells))
+def _task(forecast: Forecast, task: str) -> dict[str, Any]:
+    """Candidates and charts of a task."""
+    mine, pairs = forecast.candidates_of(task), [pair for pair in forecast.pairs if pair.task == task]
+    charts = [Chart("Success rates with 90% intervals", svg(rate_figure(mine)))]
+    if len(mine) > 1:
+        charts.append(Chart("Probability of each rank in the twin", svg(rank_heatmap(mine))))
+    rates, differences = [], []
+    if pairs and len(forecast.pairs) > MAX_TABLE_ROWS:
+        rates = [
+            Chart("In the twin [%]", svg(twin_heatmap(mine, pairs))),
+            Chart("On the road [%]", svg(road_heatmap(mine, pairs))),
+        ]
+        title = "Road minus twin [points]: red where the twin was too optimistic, blue the opposite, pale within chance"
+        differences = [Chart(title, svg(difference_heatmap(mine, pairs)))]
+    return {"name": task, "candidates": mine, "charts": charts, "cell_rates": rates, "differences": differences}

@@ -2,6 +2,8 @@
 
 import textwrap
 
+import numpy as np
+
 from twin.errors import join_names
 from twin.evaluation.forecasting import ALL_TASKS, Agreement, Estimate, Forecast, TrialAllocation
 from twin.evaluation.ranking import MAX_TRIALS
@@ -204,6 +206,32 @@ _TRIALS_NEEDED = (
     f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
     "include good and bad ones, chosen before their real results are known."
 )
+
+
+_POSSIBLY_BEST = 0.05
+"""Policies with at least this probability of being the best are worth further trials."""
+
+
+def next_trials(forecast: Forecast) -> list[str]:
+    """The most useful next trials on the road, per task."""
+    out = []
+    for task in forecast.tasks:
+        mine = forecast.candidates_of(task)
+        driven = [c for c in mine if c.driven]
+        if len(driven) < min(MIN_POLICIES, len(mine)):
+            some = [mine[round(k)] for k in np.linspace(0, len(mine) - 1, min(MIN_POLICIES, len(mine)))]
+            names = join_names([c.policy for c in some if not c.driven], MIN_POLICIES)
+            out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each light: good and bad ones.")
+            continue
+        best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
+        if len(best) > 1:
+            odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], 6)
+            out.append(f"{task}: drive again those that may be the best of the driven, with this probability: {odds}.")
+        elif best:
+            out.append(f"{task}: drive {best[0].policy} on further days, in light that it has not met; it leads.")
+        if unseen := [c.policy for c in mine if not c.driven]:
+            out.append(f"{task}: drive what has not been driven, best in the twin first: {join_names(unseen, 6)}.")
+    return out
 
 
 def allocation_text(forecast: Forecast, allocation: TrialAllocation) -> str:
