@@ -158,7 +158,7 @@ DAMAGE = {
     "no network": (lambda f: edit(f, network=3), "policy.json: "),
     "no such size": (lambda f: edit(f, network__features=-1), "whole numbers"),
     "a huge size": (lambda f: edit(f, network__features=10**9), "whole numbers"),
-    "one side": (lambda f: edit(f, network__size=[16]), "not a width and a height"),
+    "one side": (lambda f: edit(f, network__size=[16]), r"expected \(width, height\)"),
     "no such control": (lambda f: edit(f, control__thrust=1.0), "thrust"),
     "no such speed": (lambda f: edit(f, control__speed="fast"), "speed = 'fast'"),
     "no such action": (lambda f: edit(f, control__action="fly"), "fly"),
