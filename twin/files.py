@@ -352,7 +352,7 @@ def is_folder(path: Path, cure: str) -> bool:
         cure: Ends the error message.
 
     Raises:
-        InputError: neither: a missing path, a dangling link, a pipe, a device, or an invalid file name.
+        InputError: the path is neither: it is missing, a dangling link, a pipe, a device, or an invalid file name.
     """
     try:
         if stat.S_ISDIR(path.stat().st_mode):

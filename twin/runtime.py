@@ -88,7 +88,7 @@ def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
         what: Description.
         total: Number of units.
         unit: Name of a unit.
-        after: Delay before the bar appears [s], for work that takes long the first time only.
+        after: Delay before the bar appears [s], for work that is slow only the first time.
     """
     every = 0.1 if sys.stderr.isatty() else 10.0
     return _Bar(

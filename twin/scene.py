@@ -93,7 +93,7 @@ class SceneDir:
 
     @property
     def lightings(self) -> Path:
-        """Lightings added to the built field; kept outside `build/`, which may be deleted."""
+        """Folder of the lightings added to the built field; kept outside `build/`, which may be deleted."""
         return self.root / "lightings"
 
     @property
@@ -316,7 +316,7 @@ def commit_stage(scene: SceneDir, stage: str) -> None:
 
 
 def recover_stages(scene: SceneDir) -> None:
-    """Cleans up after a killed build: removes partial folders and restores a former result under replacement."""
+    """Cleans up after a killed build: removes partial folders and restores results that were being replaced."""
     for stage in STAGES:
         final = scene.stage(stage)
         old = final.with_name(final.name + ".old")

@@ -2,7 +2,8 @@
 
 A *lens* is a camera model with its parameters at one image size. Its *intrinsics* are fx, fy, cx, cy [px]; the other
 parameters are its *distortion*. A *raw* image has the distortion; the *pinhole* image shows the same view without it.
-The pinhole's focal length is raised just enough that every pinhole pixel lies inside the raw image: none is invented.
+The pinhole's focal length is raised just enough that every pinhole pixel lies inside the raw image, so that
+no pixel is extrapolated.
 """
 
 import difflib

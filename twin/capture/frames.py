@@ -24,7 +24,7 @@ from twin.files import require_folder
 from twin.scene import SceneDir
 from twin.types import Image
 
-# Parts of a path that do not identify a source.
+# Generic path components, which do not identify a source.
 _GENERIC_NAMES = ("images", "image", "sparse", "colmap", "input", "0", "dense", "data")
 
 

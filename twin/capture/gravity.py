@@ -32,7 +32,8 @@ _REACHES = (1.0, 2.0, 4.0, 8.0)  # largest offsets [drops] of the points of the 
 _MIN_CAMERA_FRACTION = 0.2  # fraction of the cameras that must have road points below them for heights per camera
 _DEEPER_THAN = 1.25  # [drops]
 _MAX_DEEPER_FRACTION = 0.1
-"""A layer with more points than this fraction of its own far below it is no ground, which hides what is below it."""
+"""A layer is not the ground if the number of points far below it exceeds this fraction of its own: ground hides what
+lies below it."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
 
 
 def _solve_up(evidence: Array, prior_up: Array) -> tuple[Array, float]:
-    """The unit vector of least error under the evidence and a weak prior, and the standard deviation [rad]."""
+    """The unit vector that minimizes the error under evidence and a weak prior, and its standard deviation [rad]."""
     # Weak, since cameras may be pitched by 10° and more: it decides only what the evidence leaves open.
     prior = (np.eye(3) - np.outer(prior_up, prior_up)) / np.radians(15.0) ** 2
     values, vectors = np.linalg.eigh(evidence + prior)
@@ -109,9 +110,9 @@ def find_road(points: Array, centers: Array, up: Array) -> Road | None:
 
     The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h (seen more than
     45° below the horizon, at any scale). The lowest layer with at least half of the best support is the road, since
-    nothing solid lies below a road; a layer with many points below it is none (a camera led around an object). A road
-    without texture has no points, so the search goes on to larger offsets, where the verges are; if no layer has enough
-    points, the best supported one is returned.
+    nothing solid lies below a road; a layer with many points below it is not the road (the camera circled an
+    object). A road without texture has no points, so the search goes on to larger offsets, where the verges are; if no
+    layer has enough points, the best supported one is returned.
     """
     if not len(points):
         return None

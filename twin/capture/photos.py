@@ -76,7 +76,8 @@ def read_exif(path: Path) -> PhotoExif:
 def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
     """Focal length over the image's longer side from the Exif block of a header, or None.
 
-    From the 35 mm equivalent, which compares diagonals (CIPA DCG-001); else from focal length and sensor resolution.
+    It is computed from the 35 mm equivalent, which compares diagonals (CIPA DCG-001), or else from focal length and
+    sensor resolution.
     """
     longer, diagonal = max(width, height), math.hypot(width, height)
     equivalent = _finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
@@ -290,7 +291,7 @@ def photo_times(clock: list[float | None], index: list[int]) -> list[float]:
 
 
 def strictly_rising(clock: list[float | None]) -> bool:
-    """True for two or more times [s], none of them None, that rise strictly."""
+    """True if there are two or more times [s], all known and strictly increasing."""
     known = [t for t in clock if t is not None]
     return len(known) == len(clock) and len(known) > 1 and all(b > a for a, b in itertools.pairwise(known))
 

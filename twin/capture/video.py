@@ -31,7 +31,7 @@ _CORNERS = 200
 _MIN_TRACKED = 12  # corners needed to judge the motion of the whole image
 _MAX_RETURN_ERROR = 0.5  # [px] largest forward-backward tracking error
 _STILL_DIFFERENCE = 1.5  # [gray levels after contrast stretching] below it two texture-free frames are equal
-BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] shows nothing
+BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] counts as blank
 _LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 _MIN_DECODED_FRACTION = 0.98  # of the frames declared by the container; below it the user gets a note
 

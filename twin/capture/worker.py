@@ -110,7 +110,7 @@ class _ProgressBars:
         self._mapping = False
 
     def show(self, line: str) -> dict[str, Any]:
-        """Parses and shows a message of the worker; returns {} for a line that is none."""
+        """Parses and shows a message of the worker; returns {} for a line that is not a message."""
         try:
             message = json.loads(line)
         except json.JSONDecodeError:

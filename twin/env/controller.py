@@ -152,7 +152,7 @@ class VectorController:
     def schedules(self, which: NDArray[np.int64], commands: Array) -> SubstepSchedules:
         """Gives k robots commands, v [m/s] and ω [rad/s], shape (k, 2), and runs their controllers for a control step.
 
-        Time stands still for the other robots; their schedules are undefined.
+        The time of the other robots does not advance; their schedules are undefined.
         """
         for ring, new in ((self._arrivals, self.time[which] + self._latency[which]), (self._commands, commands)):
             ring[:-1, which] = ring[1:, which]

@@ -49,7 +49,7 @@ class Episode:
     lighting: str
     """Empty without images."""
     seed: int
-    """The episode's own seed."""
+    """Seed of this episode."""
     randomisation: dict[str, Any]
     obstacles: tuple[ObstacleConfig, ...]
 

@@ -30,8 +30,8 @@ from twin.types import Array
 GROUND_ALBEDO = 0.37
 """Reflectance assumed for the ground along the route, in film colors: worn asphalt reflects about 11 %, which the tone
 curve of a film (exponent 1 / 2.2) shows as 0.37. The value was tuned on the known-truth world: it was 0.38 (12 %), and
-became 0.37 when obstacles at night failed their bar of `benchmarks/overlay.py` (6 dB better than unshaded), which they
-meet with it. So that benchmark's figures are not independent of it."""
+became 0.37 when obstacles at night failed the threshold of `benchmarks/overlay.py` (6 dB better than unshaded),
+which they meet with 0.37. So that benchmark's figures are not independent of the value."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 """Horizontal directions that light is resolved into, shape (4, 3)."""

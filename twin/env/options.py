@@ -28,7 +28,7 @@ class Rewards:
     """Reward terms. The last step of an episode earns the term of its cause; the goal earns `step` as well."""
 
     step: float = 0.1
-    """Per step that does not end the episode."""
+    """Reward of each step that does not end the episode."""
     collision: float = -4.0
     out_of_bounds: float = -5.0
     timeout: float = -5.0
@@ -36,11 +36,13 @@ class Rewards:
     stuck: float = -5.0
     goal: float = 0.0
     progress: float = 0.0
-    """Per meter along the route; backward motion counts negative."""
+    """Reward per meter along the route; backward motion counts negative."""
     cross_track: float = 0.0
-    """Per step, times the distance from the route as a fraction of the corridor's half width; a penalty if negative."""
+    """Reward per step, times the distance from the route as a fraction of the corridor's half width; a penalty if
+    negative."""
     steering: float = 0.0
-    """Per step, times the square of the commanded yaw rate as a fraction of the largest; a penalty if negative."""
+    """Reward per step, times the square of the commanded yaw rate as a fraction of the largest; a penalty if
+    negative."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Options:
     half_width: float | None = None
     """Half width of the corridor [m]; None: the scene's."""
     time_limit: float | None = None
-    """[s]; None: twice the time that the route segment takes at `speed`."""
+    """Time limit [s]; None: twice the time that the route segment takes at `speed`."""
     start_offset: float = 0.3
     """The start's distance from the route is uniform within ± this [m]."""
     start_heading: float = 10.0

@@ -1,4 +1,5 @@
-"""Trust of an observation: how close the camera is to filmed frames, and whether the road is reconstructed there.
+"""Trust: estimated reliability of a rendered picture, from the distance of its camera to the filmed frames and from
+the completeness of the reconstruction in view.
 
 The trust of a picture is the smallest of three numbers in [0, 1]:
 

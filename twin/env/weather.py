@@ -1,6 +1,6 @@
 """Weather randomization of pictures: directional relighting, cast shadows, and fog from a photo or a sample.
 
-All work on a picture and its depth; the field itself stays as filmed.
+All three modify a picture by its depth; the field itself is not changed.
 """
 
 import cv2
@@ -14,7 +14,7 @@ from twin.types import Array, Array32
 # ---- fog
 
 _HORIZON_DISTANCE = 40.0  # [m] beyond it, pixels have nearly the horizon's color
-_MIN_HORIZON_SHARE = 0.01  # fraction of a picture that must be so far to determine the horizon's color
+_MIN_HORIZON_SHARE = 0.01  # fraction of a picture that must be beyond this depth to determine the horizon's color
 
 
 class FogSample:
@@ -119,7 +119,7 @@ _SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # a shadow keeps the sky
 
 
 class CastShadows:
-    """Shadows that were not filmed, fixed in the place, for one episode.
+    """Random cast shadows that were not filmed, fixed in the world, for one episode.
 
     The objects that throw them do not exist. A periodic pattern fills the plane z = 0 and is projected through space
     along the rays of the episode's sun, so it crosses ground, curbs and walls as a shadow does. It consists of patches,

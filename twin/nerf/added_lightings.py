@@ -1,6 +1,6 @@
 """Lightings added to a built scene: `<scene>/lightings/<name>.json`, fitted to a photo by `python -m twin.relight`.
 
-They lie outside `build/`, which may be deleted at any time. An embedding is valid for one field only, so each file
+The files lie outside `build/`, which may be deleted at any time. An embedding is valid for one field only, so each file
 stores the content digest of its field stage; with another build of the field it is *stale*.
 """
 

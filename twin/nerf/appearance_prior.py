@@ -23,7 +23,7 @@ _MAX_OUTLIER_SHARE = 0.02  # of the probes
 _RANGE_MARGIN = (0.02, 0.1)  # filmed ranges grow by this much plus this share of their width, at both ends
 _CLIPPED = (0.02, 0.98)  # colors beyond are black or burnt out
 _CONCENTRATION = 0.7  # of the Dirichlet distribution: below 1 favors single lightings over even mixtures
-_RESIDUAL_SCALE = 2.0  # scale of sampled frame residuals; the rule rejects what is too much
+_RESIDUAL_SCALE = 2.0  # scale of sampled frame residuals; the rule rejects implausible ones
 _MAX_TRIES = 200
 
 _STATISTICS = ("brightness", "contrast", "saturation", "red cast", "blue cast", "black share", "burnt share")

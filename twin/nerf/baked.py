@@ -170,7 +170,8 @@ class BakedField:
             lighting: A name, see `Lightings.embedding`, or an embedding (dim,); or one of either per camera.
             size: Image width and height [px]; by default the size of the cameras.
             stop: z-depth of other objects [m], shape (n, height, width), where the march ends. `opacity` is then the
-                share of the object's light that the field blocks, and `rgb` the color of the field's share alone.
+                fraction of the object's light that the field blocks, and `rgb` the color of the field up to the object
+                alone (not premultiplied).
 
         Raises:
             InputError: unknown lighting, or cameras of several sizes and no size given.

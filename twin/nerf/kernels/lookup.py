@@ -1,4 +1,4 @@
-"""Memory layout and lookups of a baked field for the march, compact as the march mostly waits for memory.
+"""Memory layout and lookups of a baked field for the march, compact because memory access limits the march.
 
 Bricks and blocks: see `bricks.py`. *Skip distance*: 0 for a block with matter in it, else the Chebyshev distance d ≥ 1
 in blocks to the nearest such block, for empty-space skipping.

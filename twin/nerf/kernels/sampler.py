@@ -1,8 +1,8 @@
 """Ray sampling: inverse-CDF sampling from opacity grids.
 
-*Opacity grid*: per cell the share of light that would not leave it, averaged over the samples that fell into it. (Mean
-density would make a cell opaque that only a thin post passes through.) A fine grid covers the near box, a coarse one
-the contracted cube. *Bin*: one step of the march through the grids. *Stratum*: interval between two of K + 1 equal
+*Opacity grid*: per cell the fraction of light that is blocked within it, averaged over the samples that fell into it.
+(Mean density would make a cell opaque that only a thin post passes through.) A fine grid covers the near box, a coarse
+one the contracted cube. *Bin*: one step of the march through the grids. *Stratum*: interval between two of K + 1 equal
 quantiles of the bins' weights; it is sampled once, and the sample stands for its whole length.
 """
 
