@@ -306,9 +306,9 @@ def _forged(rng: Random, suffix: str, data: bytes) -> bytes:
 
 
 def _image(case: Case) -> None:
+    from twin.capture.capture_data import read_mask
     from twin.capture.formats import image_size
     from twin.capture.photos import load_photo
-    from twin.capture.sources import read_mask
     from twin.geometry.images import read_image
 
     rng = case.rng
@@ -909,10 +909,9 @@ def _path(case: Case) -> None:
 
 def _readers(stuff: Stuff) -> list[tuple[str, Callable[[Path], Any]]]:
     from twin.assets.ground import Ground
-    from twin.capture import formats
-    from twin.capture.capture_data import Capture
+    from twin.capture import formats, frames
+    from twin.capture.capture_data import Capture, read_mask
     from twin.capture.photos import load_photo
-    from twin.capture.sources import read_mask
     from twin.capture.video import probe
     from twin.config_file import load_config, read_robot
     from twin.evaluation.forecasting import Forecast
@@ -937,7 +936,7 @@ def _readers(stuff: Stuff) -> list[tuple[str, Callable[[Path], Any]]]:
         ("image.png", read_image),
         ("mask.png", lambda p: read_mask(p, 8, 8)),
         ("film.mp4", probe),
-        ("any.mp4", formats.detect_kind),
+        ("any.mp4", frames.detect_kind),
         ("results.csv", lambda p: read_results(p, stuff.cells)),
         ("table.csv", read_trials),
         ("episodes.csv", lambda p: read_episodes(p.parent)),

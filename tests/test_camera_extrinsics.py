@@ -358,12 +358,12 @@ def sights(nearest: float, farthest: float) -> list[_LocalizedFrame]:
     for _ in range(12):
         place = np.column_stack([rng.uniform(-3, 3, (80, 2)), rng.uniform(nearest, farthest, 80)])
         image = 260.0 * place[:, :2] / place[:, 2:] + [160.0, 120.0] + rng.normal(0.0, 0.3, (80, 2))
-        out.append(_LocalizedFrame(image, place, pycolmap.Rigid3d(), 260.0))
+        out.append(_LocalizedFrame(image, place, pycolmap.Rigid3d(), simple(260.0)))
     return out
 
 
-def simple(focal: float) -> dict:
-    return vars(Lens("SIMPLE_PINHOLE", (focal, 160.0, 120.0), 320, 240))
+def simple(focal: float) -> Lens:
+    return Lens("SIMPLE_PINHOLE", (focal, 160.0, 120.0), 320, 240)
 
 
 @pytest.mark.parametrize("start", [245.0, 259.0, 275.0])

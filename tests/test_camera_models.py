@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 
-from twin.capture.camera_models import fitted_pinhole, undistortion_map, write_pinhole_image
+from twin.capture.camera_models import Lens, undistortion, write_pinhole_image
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
 
@@ -20,35 +19,33 @@ from twin.geometry.images import psnr, read_image, write_image
     ],
 )
 def test_undistorted_pixels_see_along_the_same_ray(model: str, params: list[float]) -> None:
-    camera = pycolmap.Camera(model=model, params=params, width=320, height=240)
-    pinhole = fitted_pinhole(camera)
-    mapping = undistortion_map(camera, pinhole)
+    lens = Lens(model, tuple(params), 320, 240)
+    pinhole, mapping = undistortion(lens)
     assert mapping is not None and mapping.shape == (240, 320, 2)
     assert mapping.min() >= -0.51 and (mapping.reshape(-1, 2).max(0) <= [319.51, 239.51]).all()  # nothing to fill in
-    rays = np.asarray(camera.cam_from_img(mapping.reshape(-1, 2).astype(np.float64) + 0.5))
-    wanted = unproject(pixel_grid(320, 240), np.array(pinhole)).reshape(-1, 3)[:, :2]
+    rays = np.asarray(lens.camera.cam_from_img(mapping.reshape(-1, 2).astype(np.float64) + 0.5))
+    wanted = unproject(pixel_grid(320, 240), pinhole.intrinsics).reshape(-1, 3)[:, :2]
     np.testing.assert_allclose(rays, wanted, atol=2e-4)
 
 
 def test_undistortion_undoes_distortion(tmp_path: Path) -> None:
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", params=[300.0, 160.0, 120.0, 0.1], width=320, height=240)
+    lens = Lens("SIMPLE_RADIAL", (300.0, 160.0, 120.0, 0.1), 320, 240)
 
     def picture(rays: np.ndarray) -> np.ndarray:
         return (127 + 60 * np.sin(9 * rays[..., 0]) + 60 * np.cos(7 * rays[..., 1])).astype(np.uint8)
 
-    raw_rays = np.asarray(camera.cam_from_img(pixel_grid(320, 240).reshape(-1, 2))).reshape(240, 320, 2)
+    raw_rays = np.asarray(lens.camera.cam_from_img(pixel_grid(320, 240).reshape(-1, 2))).reshape(240, 320, 2)
     write_image(tmp_path / "raw.png", picture(raw_rays))
-    pinhole = fitted_pinhole(camera)
-    write_pinhole_image(tmp_path / "raw.png", tmp_path / "a" / "flat.png", undistortion_map(camera, pinhole))
-    expected = picture(unproject(pixel_grid(320, 240), np.array(pinhole))[..., :2])
+    pinhole, mapping = undistortion(lens)
+    write_pinhole_image(tmp_path / "raw.png", tmp_path / "a" / "flat.png", mapping)
+    expected = picture(unproject(pixel_grid(320, 240), pinhole.intrinsics)[..., :2])
     flat = read_image(tmp_path / "a" / "flat.png")[..., 0]
     assert psnr(flat / 255.0, expected / 255.0) > 45.0
 
 
 def test_a_pinhole_image_is_left_alone(tmp_path: Path) -> None:
-    camera = pycolmap.Camera(model="PINHOLE", params=[300.0, 301.0, 160.0, 120.0], width=320, height=240)
-    assert fitted_pinhole(camera) == (300.0, 301.0, 160.0, 120.0)
-    assert undistortion_map(camera, fitted_pinhole(camera)) is None
+    lens = Lens("PINHOLE", (300.0, 301.0, 160.0, 120.0), 320, 240)
+    assert undistortion(lens) == (lens, None)
     image = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
     write_image(tmp_path / "raw.png", image)
     write_pinhole_image(tmp_path / "raw.png", tmp_path / "flat.png", None)

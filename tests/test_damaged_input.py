@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from twin import build as verb
+from twin.capture.capture_data import read_mask
 from twin.capture.formats import read_colmap, read_transforms
 from twin.capture.photos import load_photo
-from twin.capture.sources import read_mask
 from twin.config import SceneConfig, SourceConfig
 from twin.errors import InputError
 from twin.geometry.images import image_size, read_image, write_image

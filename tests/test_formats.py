@@ -13,7 +13,6 @@ from PIL import ExifTags, Image
 
 from twin.capture.camera_models import Lens, checked_lens, same_aspect, undistorted
 from twin.capture.formats import (
-    detect_kind,
     natural_key,
     read_colmap,
     read_image_folder,
@@ -21,6 +20,7 @@ from twin.capture.formats import (
     read_transforms,
     rotation_from_quaternion,
 )
+from twin.capture.frames import detect_kind
 from twin.capture.photos import focal_from_exif, read_exif
 from twin.errors import InputError
 from twin.geometry.images import write_image

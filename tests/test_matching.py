@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from twin.capture.mapping import path_outliers
 from twin.capture.matching import (
     SEQUENCE_STEPS,
     expanded_pairs,
@@ -13,6 +12,7 @@ from twin.capture.matching import (
     sequence_pairs,
 )
 from twin.geometry.poses import look_at
+from twin.geometry.route import path_outliers
 
 
 def test_sequence_stays_within_a_source() -> None:

@@ -167,25 +167,23 @@ def test_given_poses_are_kept(tmp_path: Path) -> None:
 
 
 def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) -> None:
-    from twin.capture import mapping
     from twin.capture.matching import open_database
 
     stage = street.scene.stage("capture")
     matcher = open_database(Capture.load(stage), stage, tmp_path, False, 2, 0)
     matcher.extract(1500, 1280)
-    mapping._match(matcher, np.random.default_rng(0))
-    job = {"seed": 0, "threads": 2, "mapper": "global", "min_registered": 0.6}
-    mapper = mapping._Mapper(matcher, job, tmp_path, fixed=[0, 1])
+    sfm._match(matcher, np.random.default_rng(0))
+    mapper = sfm._Mapper(matcher, {"mapper": "global", "min_registered": 0.6, "free_focal": False}, tmp_path)
     model = mapper.best({})
-    frames, poses = mapping._poses(model, matcher)
-    step = mapping._median_step(poses, frames, matcher.capture)
+    frames, poses = sfm._poses(model, matcher)
+    step = sfm._median_step(poses, frames, matcher.capture)
     image = model.images[int(matcher.image_ids[5])]
     moved = np.linalg.inv(poses[5] @ np.block([[np.eye(3), np.full((3, 1), 2 * step)], [np.zeros((1, 3)), 1.0]]))
     model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(moved[:3]))
     facts: dict = {}
     repaired = mapper.without_outliers(model, 0.3, facts)
     assert facts == {"outliers": [], "registered_anew": [matcher.capture.names[5]]}
-    frames, poses = mapping._poses(repaired, matcher)
+    frames, poses = sfm._poses(repaired, matcher)
     true = np.array([street.truth[matcher.capture.names[i]] for i in frames])
     fit = umeyama(poses[:, :3, 3], true[:, :3, 3])
     assert np.linalg.norm(fit.points(poses[5, :3, 3]) - true[5, :3, 3]) < 0.03
@@ -238,7 +236,7 @@ def test_a_dying_worker_is_an_error_with_a_cure(
     fake.chmod(0o755)
     monkeypatch.setattr(worker.sys, "executable", str(fake))
     with pytest.raises(InputError, match=rf"died \(SIG{signal}; Check failed: something\); {cure}") as error:
-        worker.run_worker({}, tmp_path)
+        worker.run_worker(sfm.solve_mapping, {}, tmp_path)
     assert "\n" not in str(error.value)
 
 
@@ -248,7 +246,7 @@ def test_a_full_disk_in_the_worker_is_a_full_disk(tmp_path: Path, monkeypatch: p
     fake.chmod(0o755)
     monkeypatch.setattr(worker.sys, "executable", str(fake))
     with pytest.raises(OSError, match="No space left"):
-        worker.run_worker({}, tmp_path)
+        worker.run_worker(sfm.solve_mapping, {}, tmp_path)
 
 
 def test_the_worker_ends_with_its_parent(street: Street, tmp_path: Path) -> None:

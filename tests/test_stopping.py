@@ -74,10 +74,10 @@ def cases(tmp_path_factory) -> dict[str, Case]:
     validate = ("--policy", "ahead", "--task", "ahead", "--lightings", "day", "--episodes", many, "--processes", "2")
     train = ("--task", "ahead", "--lighting", "day", "--run", "new", "--steps", steps, "--processes", "2")
     return {
-        "build": Case((str(filmed), "--until", "metric"), "twin.capture.solver"),
+        "build": Case((str(filmed), "--until", "metric"), "twin.capture.worker"),
         "train": Case((str(driven), *train), "twin.env.vector_env_child", 2),
         "validate": Case((str(driven), *validate), "multiprocessing.spawn", 2),
-        "relight": Case((str(corridor), str(corridor / "photo.png"), "--name", "new"), "twin.capture.solver"),
+        "relight": Case((str(corridor), str(corridor / "photo.png"), "--name", "new"), "twin.capture.worker"),
     }
 
 

@@ -162,7 +162,8 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     Raises:
         InputError: a source is missing, or neither a file nor a folder.
     """
-    from twin.capture.formats import is_image, source_files
+    from twin.capture.formats import is_image
+    from twin.capture.frames import source_files
     from twin.files import is_folder
 
     files: set[Path] = set()

@@ -16,7 +16,8 @@ import sys
 from pathlib import Path
 
 from twin import commands
-from twin.capture.formats import ImageSet, detect_kind, find_model, listed_files, read_colmap, read_transforms
+from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap, read_transforms
+from twin.capture.frames import detect_kind
 from twin.capture.video import probe
 from twin.config import RANDOMIZED, RESERVED_LIGHTINGS
 from twin.config_file import MAX_NAME

@@ -12,18 +12,22 @@ import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
-from twin.capture.pycolmap_import import pycolmap
 from twin.config import CAMERA_MODELS
 from twin.errors import InputError
-from twin.geometry.cameras import pixel_grid
+from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import decode_image, write_image
 from twin.geometry.poses import inverse_pose
 from twin.types import Array, Image
+
+PixelMap = NDArray[np.float32]
+"""Raw position of each pinhole pixel for `cv2.remap`, (height, width, 2) [px]; the first pixel's center is (0, 0)."""
 
 _NEGLIGIBLE_DISTORTION = 0.1  # [px] smaller displacements are ignored
 _MAX_ZOOM = 4.0
@@ -34,92 +38,6 @@ _MAX_SIDE = 1_000_000  # [px]
 def camera_to_world(camera_from_world: pycolmap.Rigid3d) -> Array:
     """The pose (4, 4) of a COLMAP pose, which maps the other way."""
     return inverse_pose(np.vstack([camera_from_world.matrix(), [0.0, 0.0, 0.0, 1.0]]))
-
-
-# ---- undistortion
-
-
-def fitted_pinhole(camera: pycolmap.Camera) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy [px] of the pinhole camera that replaces a distorted camera of the same size.
-
-    Raises InputError: the distortion is so strong that no pinhole view fits into the raw image.
-    """
-    fx, fy = camera.focal_length_x, camera.focal_length_y
-    cx, cy = camera.principal_point_x, camera.principal_point_y
-    if camera.is_undistorted():
-        return fx, fy, cx, cy
-    if _max_displacement(camera, (fx, fy, cx, cy)) < _NEGLIGIBLE_DISTORTION:
-        return fx, fy, cx, cy
-    border = _border(camera.width, camera.height)
-    low, high = 0.5, _MAX_ZOOM
-    if not _fits_inside(camera, border, (fx * high, fy * high, cx, cy)):
-        raise InputError(
-            f"camera {camera.model.name} {[round(float(p), 4) for p in camera.params]}: no pinhole view fits into it; "
-            "check the calibration, or give a fisheye model for a fisheye lens"
-        )
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        low, high = (
-            (low, middle) if _fits_inside(camera, border, (fx * middle, fy * middle, cx, cy)) else (middle, high)
-        )
-    return fx * high, fy * high, cx, cy
-
-
-def undistortion_map(camera: pycolmap.Camera, pinhole: tuple[float, float, float, float]) -> NDArray[np.float32] | None:
-    """Raw position of each pinhole pixel for `cv2.remap`, (height, width, 2) [px]; None if no resampling is needed.
-
-    In OpenCV's convention, where the center of the first pixel is (0, 0).
-    """
-    if camera.is_undistorted() or _max_displacement(camera, pinhole) < _NEGLIGIBLE_DISTORTION:
-        return None
-    grid = pixel_grid(camera.width, camera.height)
-    return (_raw_pixels(camera, grid.reshape(-1, 2), pinhole) - 0.5).reshape(grid.shape).astype(np.float32)
-
-
-def write_pinhole_image(raw: Path, target: Path, pixel_map: NDArray[np.float32] | None, mask: bool = False) -> None:
-    """Writes one image or mask without distortion; without a pixel map the file is hard-linked or copied.
-
-    Raises InputError: the raw image cannot be read.
-    """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if pixel_map is None:
-        try:
-            os.link(raw, target)
-        except OSError:
-            shutil.copyfile(raw, target)
-        return
-    flags = cv2.IMREAD_GRAYSCALE if mask else cv2.IMREAD_ANYCOLOR
-    image = decode_image(raw, flags, "delete the build folder and build again")
-    method = cv2.INTER_NEAREST if mask else cv2.INTER_CUBIC
-    flat = cv2.remap(image, pixel_map[..., 0], pixel_map[..., 1], method, borderMode=cv2.BORDER_REPLICATE)
-    write_image(target, flat if flat.ndim == 2 else cv2.cvtColor(flat, cv2.COLOR_BGR2RGB))
-
-
-def _raw_pixels(camera: pycolmap.Camera, pixels: Array, pinhole: tuple[float, float, float, float]) -> Array:
-    fx, fy, cx, cy = pinhole
-    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], 1)
-    return np.asarray(camera.img_from_cam(rays))
-
-
-def _border(width: int, height: int) -> Array:
-    u, v = np.linspace(0.5, width - 0.5, 65), np.linspace(0.5, height - 0.5, 65)
-    top, left = np.stack([u, 0 * u + 0.5], 1), np.stack([0 * v + 0.5, v], 1)
-    down, right = np.array([0.0, height - 1.0]), np.array([width - 1.0, 0.0])
-    return np.concatenate([top, top + down, left, left + right])
-
-
-def _fits_inside(camera: pycolmap.Camera, border: Array, pinhole: tuple[float, float, float, float]) -> bool:
-    raw = _raw_pixels(camera, border, pinhole)
-    within = (raw >= 0.0) & (raw <= [camera.width, camera.height])
-    return bool(np.all(np.isfinite(raw)) and np.all(within))
-
-
-def _max_displacement(camera: pycolmap.Camera, pinhole: tuple[float, float, float, float]) -> float:
-    """Largest displacement of a pixel by the distortion [px]."""
-    grid = pixel_grid(camera.width, camera.height)[:: max(camera.height // 20, 1), :: max(camera.width // 20, 1)]
-    pixels = np.concatenate([grid.reshape(-1, 2), _border(camera.width, camera.height)])
-    moved = _raw_pixels(camera, pixels, pinhole) - pixels
-    return float(np.abs(moved).max()) if np.all(np.isfinite(moved)) else np.inf
 
 
 # ---- lenses
@@ -137,12 +55,10 @@ class Lens:
     @property
     def camera(self) -> pycolmap.Camera:
         """The lens as a COLMAP camera."""
-        camera = pycolmap.Camera.create_from_model_name(0, self.model, 1.0, self.width, self.height)
-        camera.params = np.array(self.params)  # type: ignore[assignment]
-        return camera
+        return pycolmap.Camera(model=self.model, params=list(self.params), width=self.width, height=self.height)
 
     @property
-    def intrinsics(self) -> NDArray[np.float64]:
+    def intrinsics(self) -> Array:
         """fx, fy, cx, cy [px], shape (4,)."""
         matrix = self.camera.calibration_matrix()
         return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
@@ -158,7 +74,7 @@ class Lens:
             "FISHEYE" in self.model or any(value != 0.0 for value in self.distortion)
         )
 
-    def with_intrinsics(self, intrinsics: NDArray[np.float64]) -> "Lens":
+    def with_intrinsics(self, intrinsics: Array) -> "Lens":
         """The lens with other fx, fy, cx, cy [px]; a model with one focal length gets the mean of fx and fy."""
         params = list(self.params)
         focal, center = self.camera.focal_length_idxs(), self.camera.principal_point_idxs()
@@ -180,6 +96,11 @@ class Lens:
         return same_aspect((width, height), (self.width, self.height))
 
 
+def lens_from_json(entry: dict[str, Any]) -> Lens:
+    """The lens whose `vars` were stored as JSON."""
+    return Lens(entry["model"], tuple(entry["params"]), entry["width"], entry["height"])
+
+
 def checked_lens(model: str, params: tuple[float, ...], width: int, height: int, where: str) -> Lens:
     """A validated lens; `where` begins the error messages.
 
@@ -197,7 +118,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
             f"{where}: {len(params)} parameters for {model}; expected {len(camera.params)}: {camera.params_info}"
         )
     lens = Lens(model, tuple(float(p) for p in params), int(width), int(height))
-    if not all(math.isfinite(p) for p in lens.params):
+    if not all(map(math.isfinite, lens.params)):
         raise InputError(f"{where}: a parameter of the {model} camera is not a finite number; calibrate again")
     fx, fy, cx, cy = lens.intrinsics
     longer = max(width, height)
@@ -216,14 +137,94 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
     return error <= max(_MAX_ASPECT_ERROR * a[0] * b[1], a[0], a[1], b[0], b[1])
 
 
+# ---- undistortion
+
+
+def undistortion(lens: Lens) -> tuple[Lens, PixelMap | None]:
+    """The pinhole lens that replaces a lens at the same size, and the map of its pixels, None if nothing moves.
+
+    Raises InputError: the distortion is so strong that no pinhole view fits into the raw image.
+    """
+    pinhole = _fitted_pinhole(lens)
+    if lens.camera.is_undistorted() or _max_displacement(lens, pinhole) < _NEGLIGIBLE_DISTORTION:
+        return pinhole, None
+    grid = pixel_grid(lens.width, lens.height)
+    return pinhole, (_raw_pixels(lens, grid.reshape(-1, 2), pinhole) - 0.5).reshape(grid.shape).astype(np.float32)
+
+
 def undistorted(image: Image, lens: Lens, nearest: bool = False) -> tuple[Image, Lens]:
     """Undistorts an image (h, w) or (h, w, 3) at the lens's size; returns it with its pinhole lens of the same size.
 
     `nearest` selects nearest-neighbor sampling, for masks.
     """
-    pinhole = fitted_pinhole(lens.camera)
-    pixel_map = undistortion_map(lens.camera, pinhole)
+    pinhole, pixel_map = undistortion(lens)
     if pixel_map is not None:
-        method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        image = np.asarray(cv2.remap(image, pixel_map, None, method, borderMode=cv2.BORDER_REPLICATE), np.uint8)  # type: ignore[call-overload]
-    return image, Lens("PINHOLE", pinhole, lens.width, lens.height)
+        image = _remapped(image, pixel_map, cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR)
+    return image, pinhole
+
+
+def write_pinhole_image(raw: Path, target: Path, pixel_map: PixelMap | None, mask: bool = False) -> None:
+    """Writes one image or mask without distortion; without a pixel map the file is hard-linked or copied.
+
+    Raises InputError: the raw image cannot be read.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if pixel_map is None:
+        try:
+            os.link(raw, target)
+        except OSError:
+            shutil.copyfile(raw, target)
+        return
+    flags = cv2.IMREAD_GRAYSCALE if mask else cv2.IMREAD_ANYCOLOR
+    image = decode_image(raw, flags, "delete the build folder and build again")
+    image = _remapped(image, pixel_map, cv2.INTER_NEAREST if mask else cv2.INTER_CUBIC)
+    write_image(target, image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+def _remapped(image: Image, pixel_map: PixelMap, method: int) -> Image:
+    return np.asarray(cv2.remap(image, pixel_map, None, method, borderMode=cv2.BORDER_REPLICATE), np.uint8)  # type: ignore[call-overload]
+
+
+def _fitted_pinhole(lens: Lens) -> Lens:
+    fx, fy, cx, cy = lens.intrinsics
+
+    def zoomed(factor: float) -> Lens:
+        return Lens("PINHOLE", (float(fx * factor), float(fy * factor), float(cx), float(cy)), lens.width, lens.height)
+
+    if lens.camera.is_undistorted() or _max_displacement(lens, zoomed(1.0)) < _NEGLIGIBLE_DISTORTION:
+        return zoomed(1.0)
+    border = _border(lens)
+    low, high = 0.5, _MAX_ZOOM
+    if not _fits_inside(lens, border, zoomed(high)):
+        raise InputError(
+            f"camera {lens.model} {[round(p, 4) for p in lens.params]}: no pinhole view fits into it; "
+            "check the calibration, or give a fisheye model for a fisheye lens"
+        )
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if _fits_inside(lens, border, zoomed(middle)) else (middle, high)
+    return zoomed(high)
+
+
+def _raw_pixels(lens: Lens, pixels: Array, pinhole: Lens) -> Array:
+    return np.asarray(lens.camera.img_from_cam(unproject(pixels, pinhole.intrinsics)))
+
+
+def _border(lens: Lens) -> Array:
+    u, v = np.linspace(0.5, lens.width - 0.5, 65), np.linspace(0.5, lens.height - 0.5, 65)
+    rows = [np.stack([u, np.full_like(u, y)], 1) for y in (v[0], v[-1])]
+    columns = [np.stack([np.full_like(v, x), v], 1) for x in (u[0], u[-1])]
+    return np.concatenate(rows + columns)
+
+
+def _fits_inside(lens: Lens, pixels: Array, pinhole: Lens) -> bool:
+    raw = _raw_pixels(lens, pixels, pinhole)
+    return bool(np.all((raw >= 0.0) & (raw <= [lens.width, lens.height])))
+
+
+def _max_displacement(lens: Lens, pinhole: Lens) -> float:
+    """Largest displacement of a pixel by the distortion [px]."""
+    grid = pixel_grid(lens.width, lens.height)[:: max(lens.height // 20, 1), :: max(lens.width // 20, 1)]
+    pixels = np.concatenate([grid.reshape(-1, 2), _border(lens)])
+    moved = _raw_pixels(lens, pixels, pinhole) - pixels
+    return float(np.abs(moved).max()) if np.all(np.isfinite(moved)) else np.inf

@@ -1,12 +1,40 @@
-"""Output of stage `capture`: the kept frames and their metadata before any reconstruction."""
+"""The sources of a capture and their kept frames: while they are read, and as stage `capture` stores them.
 
+A *mask* marks the pixels of a frame that all later stages ignore: 0 = ignore, any other value = use.
+"""
+
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.files import check_shapes, load_arrays, read_json, require_text, wrap_read_errors, write_json
+from twin import runtime
+from twin.capture.camera_models import Lens, checked_lens, same_aspect
+from twin.config import CaptureConfig, SourceConfig
+from twin.errors import InputError
+from twin.files import (
+    check_shapes,
+    is_file,
+    load_arrays,
+    read_json,
+    require_text,
+    wrap_read_errors,
+    write_json,
+)
+from twin.geometry.images import decode_image, write_image
+from twin.types import Array, Image
+
+QUEUE_SIZE = 4  # images decoded or encoded in the background; bounds the memory
+NO_GPS = (math.nan, math.nan, math.nan)
+_LOSSY_THRESHOLD = 63  # compression changes the zeros of a JPEG mask
+
+
+# ---- the stored capture
 
 
 @dataclass(frozen=True)
@@ -40,15 +68,15 @@ class Capture:
     """`<source>/<six digits>`; the image is `images/<name>.png` in the stage folder, its mask `masks/<name>.png`."""
     source_index: NDArray[np.int64]
     """Shape (n,)."""
-    times: NDArray[np.float64]
+    times: Array
     """Time within the source [s]; the index for photos without a clock. Shape (n,)."""
     held_out: NDArray[np.bool_]
     """True for test frames, which are never trained on. Shape (n,)."""
-    gps: NDArray[np.float64]
+    gps: Array
     """Latitude [°], longitude [°], altitude [m]; NaN where unknown. Shape (n, 3)."""
-    camera_to_world: NDArray[np.float64] | None = None
+    camera_to_world: Array | None = None
     """Poses given with the input (OpenCV axes), shape (n, 4, 4); None unless all sources have them."""
-    intrinsics: NDArray[np.float64] | None = None
+    intrinsics: Array | None = None
     """fx, fy, cx, cy [px] per frame of posed input at the kept size, shape (n, 4); `SourceInfo` has the distortion."""
 
     def save(self, folder: Path) -> None:
@@ -81,3 +109,131 @@ class Capture:
             if n and not (capture.source_index.min() >= 0 and capture.source_index.max() < len(sources)):
                 raise ValueError(f"frames refer to a source index outside 0 to {len(sources) - 1}")
         return capture
+
+
+# ---- a source while it is read
+
+
+def read_mask(path: Path, width: int, height: int) -> Image:
+    """Reads a mask at a frame's size: 0 or 255, shape (height, width).
+
+    Raises InputError: unreadable, of another aspect than the frame, or all pixels ignored.
+    """
+    mask = decode_image(path, cv2.IMREAD_GRAYSCALE, "write the mask again as an 8-bit PNG")
+    if not same_aspect((mask.shape[1], mask.shape[0]), (width, height)):
+        raise InputError(
+            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its frame has the aspect of {width}x{height}; "
+            "draw it on an upright frame of this source"
+        )
+    use = mask > (_LOSSY_THRESHOLD if path.suffix.lower() in (".jpg", ".jpeg") else 0)
+    if not use.any():
+        raise InputError(f"{path}: this mask ignores the whole picture; 0 = ignore, 255 = use")
+    binary = np.where(use, 255, 0).astype(np.uint8)
+    return cv2.resize(binary, (width, height), interpolation=cv2.INTER_NEAREST).astype(np.uint8, copy=False)
+
+
+@dataclass(frozen=True)
+class SourceTask:
+    """The inputs for reading one source."""
+
+    path: Path
+    name: str
+    lighting: str
+    kind: str
+    source: SourceConfig
+    config: CaptureConfig
+    masks: Path | None
+    """One mask for all frames, or a folder with a mask per frame."""
+    writer: "FrameWriter"
+
+    @property
+    def segments(self) -> tuple[tuple[float, ...], ...]:
+        """Segments of the source to use, [from, to] each [s]; empty for all of it."""
+        return self.source.keep or self.config.keep
+
+    def given_lens(self, native: tuple[int, int]) -> Lens | None:
+        """The calibration in `scene.toml`, or None; `native` is the upright size of the input [px].
+
+        Raises InputError: an impossible calibration, or one for another aspect.
+        """
+        camera = self.source.camera
+        if camera is None:
+            return None
+        where = f"{self.path.name}: camera"
+        width, height = (camera.width, camera.height) if camera.width or camera.height else native
+        lens = checked_lens(camera.model, camera.params, width, height, where)
+        if not lens.fits(*native):
+            raise InputError(
+                f"{where} is for {width}x{height}, but the upright picture is {native[0]}x{native[1]}; "
+                "give the calibration of the upright picture"
+            )
+        return lens
+
+    def info(self, size: tuple[int, int], lens: Lens | None, calibrated: bool) -> SourceInfo:
+        """The `SourceInfo` for a frame size [px]; SIMPLE_RADIAL, which fits most cameras, if the lens is unknown."""
+        model, params = (lens.model, lens.params) if lens else ("SIMPLE_RADIAL", ())
+        height = self.source.camera_height
+        return SourceInfo(self.name, self.lighting, self.kind, *size, model, params, calibrated, height)
+
+    def mask(self, keys: tuple[str, ...], width: int, height: int) -> Image | None:
+        """The mask (height, width) of a frame, whose file may be named by any of the keys; None if it has none."""
+        path = self.masks
+        if path and path.is_dir():
+            files = (path / f"{key}{suffix}" for key in keys for suffix in (".png", ".jpg", ".PNG", ".JPG"))
+            path = next(filter(is_file, files), None)
+        return read_mask(path, width, height) if path else None
+
+    def check_masked(self, unmasked: int, count: int) -> None:
+        """Reports frames without a mask. Raises InputError if the mask folder fits none of the `count` frames."""
+        if self.masks and unmasked == count:
+            raise InputError(
+                f"{self.masks}: no mask here is named like a frame; "
+                "call them 000012.png (frame of the film, from 0) or like the photo"
+            )
+        if self.masks and unmasked:
+            runtime.log_line(f"  {self.masks.name}: {unmasked} of {count} frames have no mask and are used whole")
+
+
+@dataclass(frozen=True)
+class KeptFrames:
+    """The kept frames of one source in order."""
+
+    info: SourceInfo
+    index: list[int]
+    times: list[float]
+    gps: list[tuple[float, float, float]]
+    metrics: dict[str, Any]
+    poses: list[Array]
+    """camera_to_world (4, 4) per frame; empty for a source without poses."""
+    intrinsics: list[Array]
+    """fx, fy, cx, cy [px] at the kept size per pose."""
+
+
+class FrameWriter:
+    """Encodes and writes a source's frames and masks in threads; errors are raised at the next frame or at the end."""
+
+    def __init__(self, out: Path, name: str) -> None:
+        self._images, self._masks = out / "images" / name, out / "masks" / name
+        self._waiting: list[Future[None]] = []
+        self.pool = ThreadPoolExecutor(2)
+
+    def put(self, index: int, image: Image, mask: Image | None) -> None:
+        """Queues one frame and its mask; blocks while the queue is full."""
+        while len(self._waiting) >= QUEUE_SIZE:
+            self._waiting.pop(0).result()
+        self._waiting.append(self.pool.submit(self._write, f"{index:06d}.png", image, mask))
+
+    def _write(self, file: str, image: Image, mask: Image | None) -> None:
+        gray = (image[..., 0] == image[..., 1]).all() and (image[..., 1] == image[..., 2]).all()
+        write_image(self._images / file, image[..., 0] if gray else image)
+        if mask is not None:
+            write_image(self._masks / file, mask)
+
+    def __enter__(self) -> "FrameWriter":
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self.pool.shutdown(wait=True, cancel_futures=error is not None)
+        if error is None:
+            for future in self._waiting:
+                future.result()

@@ -15,12 +15,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import pycolmap
 
 from twin.capture.camera_models import Lens, checked_lens
-from twin.capture.pycolmap_import import pycolmap
 from twin.config import CAMERA_MODELS
 from twin.errors import InputError, short_repr
-from twin.files import is_file, is_folder, read_bytes, read_json, wrap_read_errors
+from twin.files import is_file, read_bytes, read_json, wrap_read_errors
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.images import image_size
 from twin.geometry.poses import inverse_pose
@@ -192,24 +192,11 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
 
 
-def detect_kind(path: Path) -> str:
-    """The kind of a source by its files: video, images, colmap or transforms. Raises InputError for none of them."""
-    if not is_folder(path, "check path = in scene.toml (it is relative to the scene folder)"):
-        return "transforms" if path.suffix.lower() == ".json" else "video"
-    if find_model(path):
-        return "colmap"
-    if is_file(path / "transforms.json"):
-        return "transforms"
-    if _image_files(path):
-        return "images"
-    raise InputError(f"{path}: holds no images, no COLMAP model and no transforms.json; give a film or an image folder")
-
-
 def read_image_folder(folder: Path) -> ImageSet:
     """The images of a folder in natural order. Raises InputError if there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder}: not a folder; kind = 'images' needs a folder of images")
-    paths = _image_files(folder)
+    paths = image_files(folder)
     if not paths:
         raise InputError(f"{folder}: no image here (looked for {', '.join(IMAGE_SUFFIXES)}); put the photos in it")
     return ImageSet(tuple(paths))
@@ -313,24 +300,6 @@ def listed_files(path: Path, images: Path | None = None) -> list[Path]:
     return sorted(file for file in found if file is not None)
 
 
-def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path]:
-    """All files read for a source except masks of `scene.toml`; for a damaged set, those that can be determined.
-
-    `kind` may be auto; `images` is the separate image folder of a posed set. Raises InputError if `path` is no source.
-    """
-    kind = detect_kind(path) if kind == "auto" else kind
-    if kind == "transforms":
-        table = path / "transforms.json" if path.is_dir() else path
-        return [table, *listed_files(table, images)]
-    if kind == "colmap" and path.is_dir() and (model := find_model(path)) is not None:
-        files = [file for file in model.iterdir() if is_file(file)]
-        try:
-            return [*files, *read_colmap(path, images).paths]
-        except InputError:
-            return files  # reading the images will report the error
-    return _image_files(path) if kind == "images" and path.is_dir() else [path]
-
-
 def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
     """The lens of one frame; `table` is the file's top level updated with the frame's own entries.
 
@@ -380,7 +349,7 @@ def is_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and is_file(path)
 
 
-def _image_files(folder: Path) -> list[Path]:
+def image_files(folder: Path) -> list[Path]:
     return sorted(filter(is_image, folder.iterdir()), key=lambda p: natural_key(p.name))
 
 

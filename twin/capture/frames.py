@@ -1,8 +1,9 @@
 """Stage `capture`: converts films and image sets to kept frames of one size with masks, times and a held-out split.
 
-A *source* is one input under one lighting. A *kept* frame is upright and scaled to `capture.max_size`; it still has the
-lens's distortion. Its name is `<source>/<index>`, where the index is its position in the film or in the natural order
-of the image set: it does not depend on which other frames are kept. *Held-out* frames are never trained on.
+A *source* is one input under one lighting; its *kind* is video, images, colmap or transforms. A *kept* frame is upright
+and scaled to `capture.max_size`, and still has the lens's distortion. Its name is `<source>/<index>`, where the index
+is its position in the film or in the natural order of the image set: it does not depend on which other frames are kept.
+*Held-out* frames are never trained on.
 """
 
 from pathlib import Path
@@ -12,20 +13,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
-from twin.capture.capture_data import Capture
-from twin.capture.formats import detect_kind, read_colmap, read_image_folder, read_transforms
+from twin.capture.capture_data import NO_GPS, Capture, FrameWriter, KeptFrames, SourceTask
+from twin.capture.formats import (
+    find_model,
+    image_files,
+    listed_files,
+    read_colmap,
+    read_image_folder,
+    read_transforms,
+)
 from twin.capture.photos import read_photos
-from twin.capture.sources import NO_GPS, FrameWriter, KeptFrames, Masks, SourceTask, read_mask
 from twin.capture.video import FilmStatistics, damage_note, read_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
 from twin.config_file import MAX_NAME, check_lighting
 from twin.errors import InputError
-from twin.files import require_folder
+from twin.files import is_file, is_folder, require_folder
 from twin.scene import SceneDir
 from twin.types import Image
 
-# Generic path components, which do not identify a source.
-_GENERIC_NAMES = ("images", "image", "sparse", "colmap", "input", "0", "dense", "data")
+_GENERIC_NAMES = (
+    "images",
+    "image",
+    "sparse",
+    "colmap",
+    "input",
+    "0",
+    "dense",
+    "data",
+)  # path components that do not identify a source
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
@@ -57,6 +72,40 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         "with_gps": int(np.isfinite(capture.gps[:, :2]).all(1).sum()),
         "sources": {one.info.name: one.metrics for one in kept},
     }
+
+
+# ---- kinds and files of sources
+
+
+def detect_kind(path: Path) -> str:
+    """The kind of a source by its files: video, images, colmap or transforms. Raises InputError for none of them."""
+    if not is_folder(path, "check path = in scene.toml (it is relative to the scene folder)"):
+        return "transforms" if path.suffix.lower() == ".json" else "video"
+    if find_model(path):
+        return "colmap"
+    if is_file(path / "transforms.json"):
+        return "transforms"
+    if image_files(path):
+        return "images"
+    raise InputError(f"{path}: holds no images, no COLMAP model and no transforms.json; give a film or an image folder")
+
+
+def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path]:
+    """All files read for a source except masks of `scene.toml`; for a damaged set, those that can be determined.
+
+    `kind` may be auto; `images` is the separate image folder of a posed set. Raises InputError if `path` is no source.
+    """
+    kind = detect_kind(path) if kind == "auto" else kind
+    if kind == "transforms":
+        table = path / "transforms.json" if path.is_dir() else path
+        return [table, *listed_files(table, images)]
+    if kind == "colmap" and path.is_dir() and (model := find_model(path)) is not None:
+        files = [file for file in model.iterdir() if is_file(file)]
+        try:
+            return [*files, *read_colmap(path, images).paths]
+        except InputError:
+            return files  # reading the images will report the error
+    return image_files(path) if kind == "images" and path.is_dir() else [path]
 
 
 def source_names(paths: list[str]) -> list[str]:
@@ -95,7 +144,10 @@ def _read_source(
 ) -> KeptFrames:
     path = root / source.path
     kind = detect_kind(path) if source.kind == "auto" else source.kind
-    masks = Masks(root / source.mask) if source.mask else None
+    masks = root / source.mask if source.mask else None
+    cure = "give as mask an image or a folder of images, 0 = ignore"
+    if masks and is_folder(masks, cure) and not any(masks.iterdir()):
+        raise InputError(f"{masks}: this mask folder is empty; put one image per frame in it, 0 = ignore")
     task = SourceTask(path, name, lighting, kind, source, config, masks, writer)
     images = root / source.images if source.images else None
     if images:
@@ -108,33 +160,33 @@ def _read_source(
 
 
 def _read_video(task: SourceTask) -> KeptFrames:
-    def mask_of(index: int, width: int, height: int) -> Image | None:
-        found = task.masks.find((f"{index:06d}",)) if task.masks else None
-        return read_mask(found, width, height) if found else None
+    index: list[int] = []
+    times: list[float] = []
+    count, unmasked, size = FilmStatistics(), 0, (0, 0)
 
-    kept, count, unmasked = KeptFrames(task.info((0, 0), None, False)), FilmStatistics(), 0
-    size = (0, 0)
+    def mask_of(frame: int, width: int, height: int) -> Image | None:
+        return task.mask((f"{frame:06d}",), width, height)
+
     with runtime.bar(f"reading {task.name}", 0, "frame") as bar:
         for frame in read_film(task.path, task.config, count, mask_of, task.segments):
             size = (frame.image.shape[1], frame.image.shape[0])
             task.writer.put(frame.index, frame.image, frame.mask)
             unmasked += frame.mask is None
-            kept.index.append(frame.index)
-            kept.times.append(frame.time)
-            kept.gps.append(NO_GPS)
+            index.append(frame.index)
+            times.append(frame.time)
             bar.total = count.declared
             bar.update(count.decoded - bar.n)
     if note := damage_note(task.path, count):
         runtime.log_line(f"  {note}")
-    task.check_masked(unmasked, len(kept.index))
+    task.check_masked(unmasked, len(index))
     lens = task.given_lens(count.size)
-    kept.info = task.info(size, lens.scaled(*size) if lens else None, lens is not None)
-    kept.metrics = {
+    info = task.info(size, lens.scaled(*size) if lens else None, lens is not None)
+    metrics = {
         "kind": "video",
         "lighting": task.lighting,
         "decoded": count.decoded,
         "promised": count.declared,
-        "kept": len(kept.index),
+        "kept": len(index),
         "duplicates": count.duplicates,
         "damaged": count.damaged,
         "blank": count.blank,
@@ -143,7 +195,7 @@ def _read_video(task: SourceTask) -> KeptFrames:
         "height": size[1],
         "median_sharpness": round(float(np.median(count.sharpness)), 4),
     }
-    return kept
+    return KeptFrames(info, index, times, [NO_GPS] * len(index), metrics, [], [])
 
 
 def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:

@@ -2,25 +2,24 @@
 
 A *landmark* is a feature of a scene frame close to the projection of a sparse point, so its position is known. A
 *match* pairs a feature of the photo with a landmark; *inliers* are the matches that agree with one pose.
-`register_photo` and `register_film` run in the parent process and start a job, `solve_photo` and `solve_film` run it
-in the worker (`worker.py`).
+`register_photo` and `register_film` run `solve_photo` and `solve_film` in a worker process.
 """
 
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from twin.capture.camera_models import Lens, camera_to_world, same_aspect
+from twin.capture.camera_models import Lens, camera_to_world, lens_from_json, same_aspect
 from twin.capture.capture_data import Capture
 from twin.capture.photos import PhotoExif, evenly_spaced
-from twin.capture.pycolmap_import import pycolmap
 from twin.capture.video import fitted_size
 from twin.capture.worker import run_worker, send_message
 from twin.errors import InputError
@@ -31,12 +30,13 @@ from twin.scene import SceneDir
 from twin.types import Array, Image
 
 MIN_INLIERS = 25
-MAX_SIZE = 1280  # [px] longer side of the image from which features are extracted
-GUESSED_FOCAL = 1.2  # [longer sides]
+_MAX_SIZE = 1280  # [px] longer side of the image from which features are extracted
+_GUESSED_FOCAL = 1.2  # [longer sides]
 _FEATURES = 4000
 _FIRST_FRAMES = 48  # matched first, evenly spaced over all films
 _BEST_FRAMES = 4  # whose neighbors are matched next
 _NEIGHBOR_FRAMES = 8  # per best frame, under any lighting
+_TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
 _TRUSTED_FRAMES = 24  # with the most matches; matches in other frames are chance
 _RATIO = 0.8  # of the best to the second best distance, Lowe 2004
 _LANDMARK_RADIUS = 1.5  # [px] from the projection of a sparse point
@@ -44,7 +44,6 @@ _INLIER_TOLERANCE = 0.006  # [longer sides]
 _ESTIMATED = "estimated"
 _DISTORTION_INLIERS = 100  # needed to separate distortion from noise
 _LENS_SWITCH_RATIO = 1.25  # a later candidate lens must give this many times the inliers of an earlier one
-_TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
 _ROBUST_SCALE = 0.0015  # [longer sides] residual from which the robust loss reduces the weight of an inlier
 _MAX_FOCAL_ERROR = 0.02  # relative standard error
 _MAX_ITERATIONS = 12  # of the parabola fit
@@ -76,19 +75,16 @@ def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir, seed: int = 0
     Raises InputError: fewer than `MIN_INLIERS` inliers.
     """
     full = photo.shape[1], photo.shape[0]
-    size = fitted_size(*full, MAX_SIZE)
+    size = fitted_size(*full, _MAX_SIZE)
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         _write_gray(work / "photo.png", photo, size)
-        lenses = [
-            vars(lens) | {"held": fixed, "said": origin} for lens, fixed, origin in candidate_lenses(size, exif, scene)
-        ]
-        metric = str(scene.stage("metric").resolve())
-        run_worker({"task": "register", "metric": metric, "work": folder, "lenses": lenses, "seed": seed}, work)
+        lenses = [(vars(lens), held, origin) for lens, held, origin in candidate_lenses(size, exif, scene)]
+        run_worker(solve_photo, {"metric": str(scene.stage("metric")), "lenses": lenses, "seed": seed}, work)
         result = read_json(work / "result.json")
     return Registration(
         np.array(result["camera_to_world"]),
-        Lens(result["model"], tuple(result["params"]), *size).scaled(*full),
+        lens_from_json(result["lens"]).scaled(*full),
         result["lens_from"],
         result["matches"],
         result["inliers"],
@@ -118,9 +114,8 @@ def candidate_lenses(size: tuple[int, int], exif: PhotoExif, scene: SceneDir) ->
         if same_aspect(size, (width, height)):
             focal = float(np.median(cameras.intrinsics[frames, 0])) * size[0] / width
             candidates.append((simple(focal), False, f"the camera of {name!r}"))
-    candidates.append((simple(GUESSED_FOCAL * max(size)), False, _ESTIMATED))
-    # Of equal lenses the first is kept.
-    return list({repr(entry[0]): entry for entry in reversed(candidates)}.values())[::-1]
+    candidates.append((simple(_GUESSED_FOCAL * max(size)), False, _ESTIMATED))
+    return list(dict.fromkeys(candidates))
 
 
 def _write_gray(path: Path, image: Image, size: tuple[int, int]) -> None:
@@ -160,28 +155,103 @@ class LocalizationMap:
         return {int(i) for column in distance.T for i in np.argsort(column, kind="stable")[:count]}
 
 
-def solve_photo(job: dict[str, Any]) -> None:
-    """Runs a job of `register_photo`; writes `result.json` to its work folder.
+def solve_photo(job: dict[str, Any], work: Path) -> None:
+    """Runs a job of `register_photo`; writes `result.json` to `work`.
 
     Raises InputError: fewer than `MIN_INLIERS` inliers.
     """
-    scene_map, work = LocalizationMap(Path(job["metric"])), Path(job["work"])
+    scene_map = LocalizationMap(Path(job["metric"]))
     pixels, descriptors = scene_map.features(work / "photo.png")
-    pairs = _trusted_pairs(match_similar_frames(scene_map, descriptors, show_bars=True))
+    pairs = _trusted_pairs(_match_similar_frames(scene_map, descriptors, show_bars=True))
     image, points = pixels[pairs[:, 0]], scene_map.points.xyz[pairs[:, 1]]
-    poses = [_estimate_photo_pose(image, points, lens, job["seed"]) for lens in job["lenses"]]
-    most = max((pose["inliers"] for pose in poses if pose), default=0)
+    found: list[tuple[_LocalizedFrame, str]] = []
+    for entry, held, origin in job["lenses"]:
+        frame = _localize(
+            image, points, lens_from_json(entry), job["seed"], origin == _ESTIMATED, not held, distortion=not held
+        )
+        if frame:
+            found.append((frame, origin))
+    most = max((len(frame.image) for frame, _ in found), default=0)
     if most < MIN_INLIERS:
         raise InputError(
             f"only {most} of the photo's {len(pixels)} features agree with one camera pose (need {MIN_INLIERS}); "
             f"{len(pairs)} looked similar to features of the scene; take a sharp photo from near the filmed path, in "
             "lighting similar to one of the films: night and day have little texture in common"
         )
-    best = next(pose for pose in poses if pose and pose["inliers"] * _LENS_SWITCH_RATIO >= most)
-    write_json(work / "result.json", best | {"matches": len(pairs)})
+    frame, origin = next(pair for pair in found if len(pair[0].image) * _LENS_SWITCH_RATIO >= most)
+    write_json(
+        work / "result.json",
+        {
+            "camera_to_world": camera_to_world(frame.camera_from_world).tolist(),
+            "lens": vars(frame.lens),
+            "lens_from": origin,
+            "matches": len(pairs),
+            "inliers": len(frame.image),
+            "error": float(np.linalg.norm(frame.residuals(frame.lens), axis=1).mean()),
+        },
+    )
 
 
-def match_similar_frames(scene_map: LocalizationMap, descriptors: NDArray, show_bars: bool) -> list[NDArray[np.int64]]:
+@dataclass(frozen=True)
+class _LocalizedFrame:
+    """Inliers, pose and lens of a localized photo or film frame."""
+
+    image: Array
+    """Inliers in the image [px], shape (m, 2)."""
+    points: Array
+    """Inliers in the scene [m], shape (m, 3)."""
+    camera_from_world: pycolmap.Rigid3d
+    lens: Lens
+    """Estimated from this image alone, where it was free."""
+
+    def residuals(self, lens: Lens) -> Array:
+        """Reprojection errors of the inliers under a lens [px], shape (m, 2)."""
+        return np.asarray(lens.camera.img_from_cam(self.camera_from_world * self.points)) - self.image
+
+    def refined(self, lens: Lens) -> "_LocalizedFrame":
+        """The frame with its pose refined under a lens."""
+        every = np.ones(len(self.image), bool)
+        options = pycolmap.AbsolutePoseRefinementOptions()
+        options.refine_focal_length = options.refine_extra_params = False
+        found = pycolmap.refine_absolute_pose(
+            self.camera_from_world, self.image, self.points, every, lens.camera, options
+        )
+        return replace(self, camera_from_world=found["cam_from_world"], lens=lens) if found else self
+
+
+def _localize(
+    image: Array,
+    points: Array,
+    lens: Lens,
+    seed: int,
+    estimate_focal: bool,
+    refine_focal: bool,
+    distortion: bool = False,
+) -> _LocalizedFrame | None:
+    """The pose with the most inliers among matches (k, 2) and (k, 3), refined; None without a pose.
+
+    `estimate_focal` lets RANSAC vary the focal length; `distortion` refines the distortion if the inliers suffice.
+    """
+    if len(image) < MIN_INLIERS:
+        return None
+    camera = lens.camera
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.estimate_focal_length = estimate_focal
+    options.ransac.max_error = _INLIER_TOLERANCE * max(lens.width, lens.height)
+    options.ransac.min_inlier_ratio, options.ransac.random_seed = 0.02, seed
+    found = pycolmap.estimate_absolute_pose(image, points, camera, options)
+    if found is None:
+        return None
+    inlier = np.asarray(found["inlier_mask"], bool)
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    refinement.refine_focal_length = refine_focal
+    refinement.refine_extra_params = distortion and bool(inlier.sum() >= _DISTORTION_INLIERS)
+    refined = pycolmap.refine_absolute_pose(found["cam_from_world"], image, points, inlier, camera, refinement)
+    pose = (refined or found)["cam_from_world"]
+    return _LocalizedFrame(image[inlier], points[inlier], pose, replace(lens, params=tuple(map(float, camera.params))))
+
+
+def _match_similar_frames(scene_map: LocalizationMap, descriptors: NDArray, show_bars: bool) -> list[NDArray[np.int64]]:
     """Matches of a photo with each frame of a coarse-to-fine search, shapes (m, 2): photo feature, sparse point."""
     found: dict[int, NDArray[np.int64]] = {}
 
@@ -234,50 +304,6 @@ def _trusted_pairs(matches: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.unique(np.concatenate([np.zeros((0, 2), int), *most]), axis=0)
 
 
-def _estimate_photo_pose(image: Array, points: Array, lens: dict[str, Any], seed: int) -> dict[str, Any] | None:
-    """The pose with the most inliers under one candidate lens, as an entry of `result.json`, or None."""
-    if len(image) < MIN_INLIERS:
-        return None
-    camera, fixed = colmap_camera(lens), lens["held"]
-    options = pose_estimation_options(lens, seed, focal=lens["said"] == _ESTIMATED)
-    found = pycolmap.estimate_absolute_pose(image, points, camera, options)
-    if found is None:
-        return None
-    inlier = np.asarray(found["inlier_mask"], bool)
-    refinement = _refinement_options(not fixed, not fixed and bool(inlier.sum() >= _DISTORTION_INLIERS))
-    refined = pycolmap.refine_absolute_pose(found["cam_from_world"], image, points, inlier, camera, refinement)
-    pose = (refined or found)["cam_from_world"]
-    projected = np.asarray(camera.img_from_cam(pose * points[inlier]))
-    return {
-        "camera_to_world": camera_to_world(pose).tolist(),
-        "model": camera.model.name,
-        "params": [float(p) for p in camera.params],
-        "lens_from": lens["said"],
-        "inliers": int(inlier.sum()),
-        "error": float(np.linalg.norm(projected - image[inlier], axis=1).mean()),
-    }
-
-
-def colmap_camera(lens: dict[str, Any]) -> pycolmap.Camera:
-    """The COLMAP camera of a job's lens."""
-    return Lens(lens["model"], tuple(lens["params"]), lens["width"], lens["height"]).camera
-
-
-def pose_estimation_options(lens: dict[str, Any], seed: int, focal: bool) -> pycolmap.AbsolutePoseEstimationOptions:
-    """RANSAC options for a pose from matches; with `focal` the focal length is estimated too."""
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.estimate_focal_length = focal
-    options.ransac.max_error = _INLIER_TOLERANCE * max(lens["width"], lens["height"])
-    options.ransac.min_inlier_ratio, options.ransac.random_seed = 0.02, seed
-    return options
-
-
-def _refinement_options(focal: bool, distortion: bool = False) -> pycolmap.AbsolutePoseRefinementOptions:
-    options = pycolmap.AbsolutePoseRefinementOptions()
-    options.refine_focal_length, options.refine_extra_params = focal, distortion
-    return options
-
-
 # ---- films
 
 
@@ -308,24 +334,22 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
         InputError: no frame could be localized, or the focal length is not determined.
     """
     full = frames[0].shape[1], frames[0].shape[0]
-    size = fitted_size(*full, MAX_SIZE)
-    guess = Lens("SIMPLE_PINHOLE", (GUESSED_FOCAL * max(size), 0.5 * size[0], 0.5 * size[1]), *size)
+    size = fitted_size(*full, _MAX_SIZE)
+    guess = Lens("SIMPLE_PINHOLE", (_GUESSED_FOCAL * max(size), 0.5 * size[0], 0.5 * size[1]), *size)
     lens = given.scaled(*size) if given else guess
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         names = [f"{i:06d}.png" for i in range(len(frames))]
         for name, frame in zip(names, frames, strict=True):
             _write_gray(work / name, frame, size)
-        job = {"task": "register_film", "metric": str(scene.stage("metric").resolve()), "work": folder, "seed": seed}
-        run_worker(job | {"photos": names, "lens": vars(lens), "held": given is not None}, work)
+        job = {"metric": str(scene.stage("metric")), "photos": names, "seed": seed}
+        run_worker(solve_film, job | {"lens": vars(lens), "held": given is not None}, work)
         result = read_json(work / "result.json")
-    if given is None:
-        lens = Lens(lens.model, (result["focal"], *lens.params[1:]), *size)
     scale = full[0] / size[0]
     return FilmRegistration(
         np.array(result["frames"]),
         np.array(result["camera_to_world"]),
-        given or lens.scaled(*full),
+        given or lens_from_json(result["lens"]).scaled(*full),
         result["focal_error"] * scale,
         result["error"] * scale,
     )
@@ -334,39 +358,12 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
 # ---- films, in the worker
 
 
-@dataclass(frozen=True)
-class _LocalizedFrame:
-    """Inliers and pose of a localized frame."""
-
-    image: Array
-    """Inliers in the frame [px], shape (m, 2)."""
-    points: Array
-    """Inliers in the scene [m], shape (m, 3)."""
-    camera_from_world: Any
-    focal: float
-    """Focal length estimated from this frame alone [px]."""
-
-    @property
-    def position(self) -> Array:
-        """Camera center [m], shape (3,)."""
-        return camera_to_world(self.camera_from_world)[:3, 3]
-
-    def refined(self, lens: dict[str, Any]) -> tuple[Array, Array]:
-        """camera_to_world (4, 4) refined under a lens, and the inliers' residuals [px] (m, 2)."""
-        camera, every = colmap_camera(lens), np.ones(len(self.image), bool)
-        found = pycolmap.refine_absolute_pose(
-            self.camera_from_world, self.image, self.points, every, camera, _refinement_options(focal=False)
-        )
-        pose = found["cam_from_world"] if found else self.camera_from_world
-        return camera_to_world(pose), np.asarray(camera.img_from_cam(pose * self.points)) - self.image
-
-
-def solve_film(job: dict[str, Any]) -> None:
-    """Runs a job of `register_film`; writes `result.json` to its work folder.
+def solve_film(job: dict[str, Any], work: Path) -> None:
+    """Runs a job of `register_film`; writes `result.json` to `work`.
 
     Raises InputError: no frame could be localized, or the focal length is not determined.
     """
-    scene_map, work, lens, seed = LocalizationMap(Path(job["metric"])), Path(job["work"]), job["lens"], job["seed"]
+    scene_map, lens, seed = LocalizationMap(Path(job["metric"])), lens_from_json(job["lens"]), job["seed"]
     free_focal = not job["held"]
     matches: list[tuple[Array, Array]] = []
     localized: dict[int, _LocalizedFrame] = {}
@@ -389,20 +386,20 @@ def solve_film(job: dict[str, Any]) -> None:
         )
     focal_error = 0.0
     if free_focal:
-        lens = _with_focal(lens, float(np.median([frame.focal for frame in localized.values()])))
+        lens = _with_focal(lens, float(np.median([frame.lens.params[0] for frame in localized.values()])))
         again = {k: frame for k, pair in enumerate(matches) if (frame := _localize_frame(*pair, lens, seed, False))}
         localized = again or localized
         focal, focal_error = _shared_focal(list(localized.values()), lens)
         lens = _with_focal(lens, focal)
-    poses, residuals = zip(*(frame.refined(lens) for frame in localized.values()), strict=True)
+    final = [frame.refined(lens) for frame in localized.values()]
     write_json(
         work / "result.json",
         {
             "frames": list(localized),
-            "camera_to_world": [pose.tolist() for pose in poses],
-            "focal": lens["params"][0],
+            "camera_to_world": [camera_to_world(frame.camera_from_world).tolist() for frame in final],
+            "lens": vars(lens),
             "focal_error": focal_error,
-            "error": float(np.median([np.sqrt((e**2).sum(1)).mean() for e in residuals])),
+            "error": float(np.median([np.sqrt((frame.residuals(lens) ** 2).sum(1)).mean() for frame in final])),
         },
     )
 
@@ -412,31 +409,18 @@ def _film_matches(
 ) -> Iterator[list[NDArray[np.int64]]]:
     """Matches of a film's frame near the last localized frame, if there is one, then those of a search everywhere."""
     if last:
-        near = sorted(scene_map.nearest_frames(last.position[None], _TRACKING_FRAMES))
+        position = camera_to_world(last.camera_from_world)[None, :3, 3]
+        near = sorted(scene_map.nearest_frames(position, _TRACKING_FRAMES))
         yield [scene_map.matches(descriptors, i) for i in near]
-    yield match_similar_frames(scene_map, descriptors, show_bars=False)
+    yield _match_similar_frames(scene_map, descriptors, show_bars=False)
 
 
-def _localize_frame(
-    image: Array, points: Array, lens: dict[str, Any], seed: int, free_focal: bool
-) -> _LocalizedFrame | None:
-    """The pose of a frame from its matches, and its focal length if free; None with too few inliers."""
-    if len(image) < MIN_INLIERS:
-        return None
-    camera = colmap_camera(lens)
-    options = pose_estimation_options(lens, seed, focal=free_focal)
-    found = pycolmap.estimate_absolute_pose(image, points, camera, options)
-    if found is None or found["num_inliers"] < MIN_INLIERS:
-        return None
-    inlier = np.asarray(found["inlier_mask"], bool)
-    refined = pycolmap.refine_absolute_pose(
-        found["cam_from_world"], image, points, inlier, camera, _refinement_options(focal=free_focal)
-    )
-    pose = (refined or found)["cam_from_world"]
-    return _LocalizedFrame(image[inlier], points[inlier], pose, float(camera.params[0]))
+def _localize_frame(image: Array, points: Array, lens: Lens, seed: int, free_focal: bool) -> _LocalizedFrame | None:
+    frame = _localize(image, points, lens, seed, free_focal, free_focal)
+    return frame if frame and len(frame.image) >= MIN_INLIERS else None
 
 
-def _shared_focal(frames: Sequence[_LocalizedFrame], lens: dict[str, Any]) -> tuple[float, float]:
+def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float, float]:
     """The focal length that minimizes the robust cost over all frames, and its standard error [px].
 
     A parabola is fitted through the costs. Each frame counts as a single (x, y) measurement, because its inliers'
@@ -445,11 +429,12 @@ def _shared_focal(frames: Sequence[_LocalizedFrame], lens: dict[str, Any]) -> tu
     Raises:
         InputError: the frames do not determine the focal length.
     """
-    robust_scale, center = _ROBUST_SCALE * max(lens["width"], lens["height"]), float(lens["params"][0])
+    robust_scale, center = _ROBUST_SCALE * max(lens.width, lens.height), lens.params[0]
     for _ in range(_MAX_ITERATIONS):
         focals, costs = center * _FOCAL_STEPS, np.zeros(len(_FOCAL_STEPS))
         for i, focal in enumerate(focals):
-            residuals = [frame.refined(_with_focal(lens, float(focal)))[1] for frame in frames]
+            trial = _with_focal(lens, float(focal))
+            residuals = [frame.refined(trial).residuals(trial) for frame in frames]
             costs[i] = np.mean([robust_scale**2 * np.log1p((e**2).sum(1) / robust_scale**2).mean() for e in residuals])
         curve, lowest = np.polyfit(focals - center, costs, 2), int(costs.argmin())
         if lowest != len(_FOCAL_STEPS) // 2:  # far off the robust cost is nearly flat, so no parabola fits yet
@@ -464,6 +449,6 @@ def _shared_focal(frames: Sequence[_LocalizedFrame], lens: dict[str, Any]) -> tu
     raise InputError("the film does not show the camera's focal length; give camera_intrinsics in [robot]")
 
 
-def _with_focal(lens: dict[str, Any], focal: float) -> dict[str, Any]:
+def _with_focal(lens: Lens, focal: float) -> Lens:
     """A SIMPLE_PINHOLE lens with another focal length [px]."""
-    return lens | {"params": [focal, *lens["params"][1:]]}
+    return replace(lens, params=(focal, *lens.params[1:]))

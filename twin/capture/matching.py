@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from twin.capture.camera_models import Lens
 from twin.capture.capture_data import Capture, SourceInfo
-from twin.capture.pycolmap_import import pycolmap
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.images import write_image

@@ -1,4 +1,4 @@
-"""Reads image sets, posed or not, as kept frames, with focal length, GPS and time from the EXIF headers.
+"""Reads image sets as kept frames, with focal length, GPS and time from the EXIF headers.
 
 A *posed* set has a camera and a pose per image. A *stored* image is unrotated, as in the file; an *upright* image is
 rotated by its EXIF orientation. A focal length *prior* comes from the header; structure from motion refines it.
@@ -7,6 +7,8 @@ rotated by its EXIF orientation. A focal length *prior* comes from the header; s
 import hashlib
 import itertools
 import math
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -14,18 +16,18 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from PIL import ExifTags
 
 from twin import runtime
 from twin.capture.camera_models import Lens, same_aspect, undistorted
+from twin.capture.capture_data import QUEUE_SIZE, KeptFrames, SourceTask, read_mask
 from twin.capture.formats import ImageSet
-from twin.capture.pycolmap_import import pycolmap
-from twin.capture.sources import KeptFrames, SourceTask, prefetch, read_mask
 from twin.capture.video import BLANK_STD, fitted_size, in_segments
 from twin.errors import InputError
 from twin.geometry.images import DECODE_ERRORS, decode_image, open_header, resize
-from twin.types import Image
+from twin.types import Array, Image
 
 _FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
@@ -67,8 +69,8 @@ def read_exif(path: Path) -> PhotoExif:
     orientation = exif.get(ExifTags.Base.Orientation, 1)
     return PhotoExif(
         focal=focal_from_exif(photo, width, height) or _focal_from_model(path, width, height),
-        gps=gps_from_exif(gps),
-        time=time_from_exif(photo),
+        gps=_gps(gps),
+        time=_time(photo),
         orientation=orientation if orientation in range(1, 9) else 1,
     )
 
@@ -102,8 +104,7 @@ def _focal_from_model(path: Path, width: int, height: int) -> float | None:
     return camera.mean_focal_length() / max(width, height) if camera.has_prior_focal_length else None
 
 
-def gps_from_exif(gps: Any) -> tuple[float, float, float]:
-    """Latitude [°], longitude [°], altitude [m] from the GPS block; NaN where unknown."""
+def _gps(gps: Any) -> tuple[float, float, float]:
     tag = ExifTags.GPS
     latitude = _degrees(gps.get(tag.GPSLatitude), gps.get(tag.GPSLatitudeRef), "S")
     longitude = _degrees(gps.get(tag.GPSLongitude), gps.get(tag.GPSLongitudeRef), "W")
@@ -114,26 +115,24 @@ def gps_from_exif(gps: Any) -> tuple[float, float, float]:
     return latitude, longitude, -altitude if below else altitude
 
 
-def time_from_exif(photo: Any) -> float | None:
-    """Time of exposure [s since the epoch] with its fraction of a second, or None."""
-    text = photo.get(ExifTags.Base.DateTimeOriginal)
+def _degrees(angle: Any, reference: Any, negative: str) -> float:
+    """Degrees from (degrees, minutes, seconds), negative if `reference` is `negative`; NaN if malformed."""
     try:
-        taken = datetime.strptime(str(text).strip("\x00 "), "%Y:%m:%d %H:%M:%S")
+        total = sum(float(part) / 60.0**i for i, part in enumerate(angle))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return math.nan
+    return -total if str(reference).strip("\x00 ").upper() == negative else total
+
+
+def _time(photo: Any) -> float | None:
+    try:
+        text = str(photo.get(ExifTags.Base.DateTimeOriginal)).strip("\x00 ")
+        taken = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
     except ValueError:
         return None
     fraction = str(photo.get(ExifTags.Base.SubsecTimeOriginal) or "").strip("\x00 ")
     seconds = (taken - datetime(1970, 1, 1)).total_seconds()
     return seconds + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
-
-
-def _degrees(angle: Any, reference: Any, negative: str) -> float:
-    """Degrees from (degrees, minutes, seconds), negative if `reference` is `negative`; NaN if malformed."""
-    try:
-        values = [float(part) for part in angle]
-    except (TypeError, ValueError, ZeroDivisionError):
-        return math.nan
-    total = sum(value / 60.0**i for i, value in enumerate(values))
-    return -total if str(reference).strip("\x00 ").upper() == negative else total
 
 
 def _finite(value: Any, missing: float = 0.0) -> float:
@@ -159,29 +158,29 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     lenses = images.lenses
     if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):
         lenses = (given,) * len(lenses)
-    flatten = lenses is not None and _models_differ(lenses)
-    limit = min(task.config.frames or task.config.max_frames, task.config.max_frames)
+    # With several distortions no model of the source has them all, so each image is undistorted here.
+    several = lenses is not None and len({(lens.model, lens.distortion) for lens in lenses}) > 1
+    flatten = several and any(lens.is_distorted for lens in lenses or ())
     available = _in_kept_segments(task, images)
+    limit = min(task.config.frames or task.config.max_frames, task.config.max_frames)
     chosen = [int(available[i]) for i in evenly_spaced(len(available), limit)]
-
-    def load(i: int) -> tuple[int, Image, PhotoExif]:
-        return i, *load_photo(images.paths[i], lenses[i] if lenses else None)
-
-    kept = KeptFrames(task.info((0, 0), None, False))
-    seen: set[bytes] = set()
-    duplicates = blank = unmasked = 0
+    index: list[int] = []
+    gps: list[tuple[float, float, float]] = []
     clock: list[float | None] = []
     focals: list[float] = []
-    kept_lenses: list[Lens] = []
+    poses: list[Array] = []
+    posed_lenses: list[Lens] = []
+    seen: set[bytes] = set()
+    duplicates = blank = unmasked = 0
     native = size = (0, 0)
-    stream = prefetch(task.writer.pool, load, chosen)
-    for i, image, exif in runtime.track(stream, f"reading {task.name}", len(chosen), "image"):
-        shape = (image.shape[1], image.shape[0])
+    stream = _load_ahead(task.writer.pool, images.paths, lenses, chosen)
+    for i, (image, exif) in runtime.track(stream, f"reading {task.name}", len(chosen), "image"):
+        path, shape = images.paths[i], (image.shape[1], image.shape[0])
         if size == (0, 0):
             native, size = shape, fitted_size(*shape, task.config.max_size)
         if not same_aspect(shape, native):
             raise InputError(
-                f"{images.paths[i]}: {shape[0]}x{shape[1]}, but the images before it are {native[0]}x{native[1]}; "
+                f"{path}: {shape[0]}x{shape[1]}, but the images before it are {native[0]}x{native[1]}; "
                 "put images of another shape into a source of their own"
             )
         if shape != size:
@@ -194,46 +193,59 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
         if float(image[::4, ::4].std()) < BLANK_STD:
             blank += 1
             continue
-        mask = _mask(task, images, i, size)
+        own = images.masks[i] if images.masks and not task.masks else None
+        mask = read_mask(own, *size) if own else task.mask((path.stem, path.name), *size)
         unmasked += mask is None
         if lenses and images.camera_to_world is not None:
             lens = lenses[i].scaled(*size)
             if flatten:
                 mask = None if mask is None else undistorted(mask, lens, nearest=True)[0]
                 image, lens = undistorted(image, lens)
-            kept_lenses.append(lens)
-            kept.poses.append(images.camera_to_world[i])
-            kept.intrinsics.append(lens.intrinsics)
+            posed_lenses.append(lens)
+            poses.append(images.camera_to_world[i])
         task.writer.put(i, image, mask)
-        kept.index.append(i)
-        kept.gps.append(exif.gps)
+        index.append(i)
+        gps.append(exif.gps)
         clock.append(exif.time)
         focals += [exif.focal] if exif.focal else []
-    if not kept.index:
+    if not index:
         raise InputError(f"{task.path}: all {len(chosen)} images are blank (one color); give photos of the place")
-    task.check_masked(unmasked, len(kept.index))
-    kept.times = photo_times(clock, kept.index)
-    if kept_lenses:
-        median = np.median([lens.intrinsics for lens in kept_lenses], axis=0)
-        kept.info = task.info(size, kept_lenses[0].with_intrinsics(median), True)
+    task.check_masked(unmasked, len(index))
+    intrinsics = [lens.intrinsics for lens in posed_lenses]
+    if posed_lenses:
+        info = task.info(size, posed_lenses[0].with_intrinsics(np.median(intrinsics, axis=0)), True)
     elif known := task.given_lens(native):
-        kept.info = task.info(size, known.scaled(*size), True)
+        info = task.info(size, known.scaled(*size), True)
     else:
-        kept.info = task.info(size, focal_prior(focals, size, task.name), False)
-    kept.metrics = {
+        info = task.info(size, _focal_prior(focals, size, task.name), False)
+    metrics = {
         "kind": task.kind,
         "lighting": task.lighting,
         "decoded": len(chosen),
-        "kept": len(kept.index),
+        "kept": len(index),
         "missing": images.missing,
         "duplicates": duplicates,
         "blank": blank,
-        "with_gps": sum(math.isfinite(latitude) for latitude, _, _ in kept.gps),
-        "focal_prior_px": None if kept.info.calibrated or not focals else round(kept.info.camera_params[0], 1),
+        "with_gps": sum(math.isfinite(latitude) for latitude, _, _ in gps),
+        "focal_prior_px": None if info.calibrated or not focals else round(info.camera_params[0], 1),
         "width": size[0],
         "height": size[1],
     }
-    return kept
+    return KeptFrames(info, index, photo_times(clock, index), gps, metrics, poses, intrinsics)
+
+
+def _load_ahead(
+    pool: ThreadPoolExecutor, paths: tuple[Path, ...], lenses: tuple[Lens, ...] | None, chosen: list[int]
+) -> Iterator[tuple[int, tuple[Image, PhotoExif]]]:
+    """The chosen photos with their indices, in order, loaded in threads at most `QUEUE_SIZE` ahead of the consumer."""
+    waiting: list[tuple[int, Future[tuple[Image, PhotoExif]]]] = []
+    for i in chosen:
+        waiting.append((i, pool.submit(load_photo, paths[i], lenses[i] if lenses else None)))
+        if len(waiting) >= QUEUE_SIZE:
+            first, photo = waiting.pop(0)
+            yield first, photo.result()
+    for i, photo in waiting:
+        yield i, photo.result()
 
 
 def _in_kept_segments(task: SourceTask, images: ImageSet) -> NDArray[np.int64]:
@@ -245,7 +257,7 @@ def _in_kept_segments(task: SourceTask, images: ImageSet) -> NDArray[np.int64]:
     if not task.segments:
         return np.arange(count)
     clock = [read_exif(path).time for path in images.paths]
-    if not strictly_rising(clock):
+    if not _strictly_rising(clock):
         raise InputError(
             f"{task.path}: keep is in seconds, but these photos' EXIF times are missing or do not increase in "
             "file-name order; put the photos to be used into a folder of their own, and give keep to the films only"
@@ -282,41 +294,6 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoExif]:
     return image, exif
 
 
-def photo_times(clock: list[float | None], index: list[int]) -> list[float]:
-    """Times since the first photo [s] if all are known and rise strictly; else the indices."""
-    if strictly_rising(clock):
-        known = [t for t in clock if t is not None]
-        return [t - known[0] for t in known]
-    return [float(i) for i in index]
-
-
-def strictly_rising(clock: list[float | None]) -> bool:
-    """True if there are two or more times [s], all known and strictly increasing."""
-    known = [t for t in clock if t is not None]
-    return len(known) == len(clock) and len(known) > 1 and all(b > a for a, b in itertools.pairwise(known))
-
-
-def evenly_spaced(count: int, limit: int) -> NDArray[np.int64]:
-    """Indices of at most `limit` of `count` items, evenly spaced, ends included."""
-    return np.arange(count) if count <= limit else np.round(np.linspace(0, count - 1, limit)).astype(np.int64)
-
-
-def focal_prior(focals: list[float], size: tuple[int, int], name: str) -> Lens | None:
-    """A lens with the median of the photos' focal lengths [longer sides]; None without any."""
-    if not focals:
-        return None
-    median = float(np.median(focals))
-    if max(focals) - min(focals) > _MAX_FOCAL_SPREAD * median:
-        runtime.log_line(f"  {name}: the photos' focal lengths differ (zoomed); give each zoom a source of its own")
-    return Lens("SIMPLE_RADIAL", (median * max(size), 0.5 * size[0], 0.5 * size[1], 0.0), *size)
-
-
-def _models_differ(lenses: tuple[Lens, ...]) -> bool:
-    """True if the images' distortions differ; each image is then undistorted while it is read."""
-    several = len({(lens.model, lens.distortion) for lens in lenses}) > 1
-    return several and any(lens.is_distorted for lens in lenses)
-
-
 def _stored_size(path: Path) -> tuple[int, int] | None:
     """Width and height as stored [px]; None for a format unknown to Pillow.
 
@@ -327,18 +304,39 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
         return None
     with photo:
         stored = photo.size
-        if photo.format not in ("JPEG", "MPO"):
-            return stored
-        try:
-            photo.draft("L", (stored[0] // 8, stored[1] // 8))  # cheap, yet reads to the end
-            photo.load()
-        except DECODE_ERRORS:
-            count = path.stat().st_size
-            raise InputError(f"{path}: the image is cut off ({count} bytes); copy it again or remove it") from None
+        if photo.format in ("JPEG", "MPO"):
+            try:
+                photo.draft("L", (stored[0] // 8, stored[1] // 8))  # cheap, yet reads to the end
+                photo.load()
+            except DECODE_ERRORS:
+                count = path.stat().st_size
+                raise InputError(f"{path}: the image is cut off ({count} bytes); copy it again or remove it") from None
     return stored
 
 
-def _mask(task: SourceTask, images: ImageSet, i: int, size: tuple[int, int]) -> Image | None:
-    path, own = images.paths[i], images.masks[i] if images.masks else None
-    found = task.masks.find((path.stem, path.name)) if task.masks else own
-    return read_mask(found, *size) if found else None
+def photo_times(clock: list[float | None], index: list[int]) -> list[float]:
+    """Times since the first photo [s] if all are known and rise strictly; else the indices."""
+    if _strictly_rising(clock):
+        known = [t for t in clock if t is not None]
+        return [t - known[0] for t in known]
+    return [float(i) for i in index]
+
+
+def _strictly_rising(clock: list[float | None]) -> bool:
+    known = [t for t in clock if t is not None]
+    return len(known) == len(clock) and len(known) > 1 and all(b > a for a, b in itertools.pairwise(known))
+
+
+def evenly_spaced(count: int, limit: int) -> NDArray[np.int64]:
+    """Indices of at most `limit` of `count` items, evenly spaced, ends included."""
+    return np.arange(count) if count <= limit else np.round(np.linspace(0, count - 1, limit)).astype(np.int64)
+
+
+def _focal_prior(focals: list[float], size: tuple[int, int], name: str) -> Lens | None:
+    """A lens with the median of the photos' focal lengths [longer sides]; None without any."""
+    if not focals:
+        return None
+    median = float(np.median(focals))
+    if max(focals) - min(focals) > _MAX_FOCAL_SPREAD * median:
+        runtime.log_line(f"  {name}: the photos' focal lengths differ (zoomed); give each zoom a source of its own")
+    return Lens("SIMPLE_RADIAL", (median * max(size), 0.5 * size[0], 0.5 * size[1], 0.0), *size)

@@ -1,4 +1,4 @@
-"""Video files: decoding, rotation (display matrix) and frame selection, once from front to back in little memory.
+"""Video files: decoding, rotation (display matrix) and frame selection, in one pass with little memory.
 
 A *slot* is one of n equal time spans of a film; the sharpest frame of each slot is its *candidate*. A candidate that
 hardly moved since the last kept frame is a *duplicate* and is dropped. A frame's *index* is its position in the film,
@@ -23,7 +23,7 @@ from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.files import regular_file
 from twin.geometry.images import resize
-from twin.types import Image
+from twin.types import Array, Image
 
 FLOW_WIDTH = 320  # [px] image width at which motion is measured
 SHARPNESS_WIDTH = 640  # [px] image width at which sharpness is measured; at full size sensor noise counts as detail
@@ -99,7 +99,7 @@ def _contrast_stretched(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 class FilmTiming:
     """Frame times of a film from its packets, read without decoding."""
 
-    times: NDArray[np.float64]
+    times: Array
     """Presentation times since the first frame [s], sorted, shape (n,)."""
     start: float
     """Time stamp of the first frame in its stream [s]."""
@@ -115,6 +115,92 @@ class FilmTiming:
     def duration(self) -> float:
         """From the first frame to the end of the last [s]."""
         return float(self.times[-1] + self.interval)
+
+
+def probe(path: Path) -> FilmTiming:
+    """Reads the timing of a film from its packets.
+
+    Raises InputError: not a video, or too damaged to have a readable packet.
+    """
+    times: list[float] = []
+    regular_file(path)
+    try:
+        with av.open(str(path)) as container:
+            stream = _video_stream(container, path)
+            with contextlib.suppress(av.error.FFmpegError):  # a truncated file has packets up to its end
+                for packet in container.demux(stream):
+                    stamp = packet.pts if packet.pts is not None else packet.dts
+                    if stamp is not None and not packet.is_discard:
+                        times.append(float(stamp * packet.time_base))
+            declared = stream.frames
+            rate = float(stream.average_rate or 25)
+    except InputError:
+        raise
+    except (av.error.FFmpegError, ValueError, OSError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"{path}: not a readable film ({path.stat().st_size} bytes: {reason}); "
+            "copy it again from the camera or re-encode it"
+        ) from None
+    if not times:
+        raise InputError(f"{path}: the film has no readable frame; copy it again from the camera or re-encode it")
+    at = np.sort(np.array(times))
+    if len(at) > 1 and at[-1] == at[0]:  # a raw stream without time stamps
+        at = np.arange(len(at)) / rate
+    return FilmTiming(at - at[0], float(at[0]), declared or len(at))
+
+
+def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
+    """A decoded frame's index from its time [s], always above the `last` one; damaged frames leave gaps."""
+    if time is None:
+        return last + 1
+    right = min(int(np.searchsorted(timing.times, time)), len(timing.times) - 1)
+    left = max(right - 1, 0)
+    nearest = left if time - timing.times[left] < timing.times[right] - time else right
+    return max(nearest, last + 1)
+
+
+def slot_of(index: int, time: float, timing: FilmTiming, slots: int) -> int:
+    """The slot of a frame.
+
+    With as many slots as frames, each frame has its own. Otherwise slots have equal durations; half a frame interval is
+    added so that rounding of time stamps never moves a frame across the border of a slot.
+    """
+    if slots >= len(timing.times):
+        return index
+    return min(int((time + 0.5 * timing.interval) / timing.duration * slots), slots - 1)
+
+
+def in_segments(times: Array, segments: tuple[tuple[float, ...], ...]) -> NDArray[np.bool_]:
+    """Mask of the times (n,) [s] inside any of the segments [from, to]; all true without segments."""
+    if not segments:
+        return np.ones(len(times), bool)
+    # Matroska rounds its time stamps to milliseconds, an error of at most half of one.
+    return np.any([(times >= start - 5e-4) & (times <= end + 5e-4) for start, end in segments], axis=0)
+
+
+def _joined_segments(
+    timing: FilmTiming, segments: tuple[tuple[float, ...], ...], path: Path
+) -> tuple[FilmTiming, NDArray[np.int64]]:
+    """The timing of the kept segments joined, and each film frame's position in them (−1 if cut out).
+
+    Raises InputError: fewer than two frames are in the segments.
+    """
+    used = in_segments(timing.times, segments)
+    if segments and used.sum() < 2:
+        raise InputError(
+            f"{path}: keep = {[list(part) for part in segments]} leaves {used.sum()} of {len(used)} frames (need 2); "
+            f"the film runs from 0 to {timing.times[-1]:.2f} s"
+        )
+    position = np.where(used, np.cumsum(used) - 1, -1)
+    if used.all():
+        return timing, position
+    # The last frame of a segment lasts one frame interval.
+    step = np.where(np.diff(np.flatnonzero(used)) > 1, timing.interval, np.diff(timing.times[used]))
+    return FilmTiming(np.concatenate([[0.0], np.cumsum(step)]), timing.start, int(used.sum())), position
+
+
+# ---- reading a film
 
 
 @dataclass
@@ -144,31 +230,113 @@ class FilmFrame:
     """0 = ignore, shape (h, w); None without a mask."""
 
 
-def probe(path: Path) -> FilmTiming:
-    """Reads the timing of a film from its packets.
+@dataclass(frozen=True)
+class _Candidate:
+    slot: int
+    index: int
+    time: float
+    sharpness: float
+    frame: av.VideoFrame
 
-    Raises InputError: not a video, or too damaged to have a readable packet.
+
+def read_film(
+    path: Path,
+    config: CaptureConfig,
+    count: FilmStatistics,
+    mask_of: Callable[[int, int, int], Image | None],
+    segments: tuple[tuple[float, ...], ...] = (),
+) -> Iterator[FilmFrame]:
+    """Yields a film's kept frames in order: the sharpest of each slot, without duplicates of a standing camera.
+
+    `count` is filled while reading. `mask_of` maps a frame's index, kept width and kept height to its mask or None.
+    `segments` are [from, to] each [s]; empty for the whole film.
+
+    Raises InputError: unreadable, fewer than two frames, or only blank frames.
     """
-    times: list[float] = []
-    regular_file(path)
-    try:
-        with av.open(str(path)) as container:
-            stream = _video_stream(container, path)
-            with contextlib.suppress(av.error.FFmpegError):  # of a truncated file the packets before the end are used
-                for packet in container.demux(stream):
-                    stamp = packet.pts if packet.pts is not None else packet.dts
-                    if stamp is not None and not packet.is_discard:
-                        times.append(float(stamp * packet.time_base))
-            declared = stream.frames
-            rate = float(stream.average_rate or 25)
-    except (av.error.FFmpegError, ValueError, OSError) as error:
-        raise _unreadable(path, error) from None
-    if not times:
-        raise InputError(f"{path}: the film has no readable frame; copy it again from the camera or re-encode it")
-    at = np.sort(np.array(times))
-    if len(at) > 1 and at[-1] == at[0]:  # a raw stream without time stamps
-        at = np.arange(len(at)) / rate
-    return FilmTiming(at - at[0], float(at[0]), declared or len(at))
+    last_small: Image | None = None
+    for candidate in _sharpest_per_slot(path, config, count, segments):
+        image = upright(candidate.frame)
+        count.size = (image.shape[1], image.shape[0])
+        size = fitted_size(*count.size, config.max_size)
+        if size != count.size:
+            image = np.asarray(resize(image, *size), np.uint8)
+        height = max(1, round(size[1] * FLOW_WIDTH / size[0]))
+        small = cv2.cvtColor(np.asarray(resize(image, FLOW_WIDTH, height), np.uint8), cv2.COLOR_RGB2GRAY)
+        small = np.asarray(small, np.uint8)
+        mask = mask_of(candidate.index, *size)
+        small_mask = None
+        if mask is not None:
+            small_mask = np.asarray(cv2.resize(mask, small.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+        if last_small is not None and is_static(last_small, small, config.min_motion, small_mask):
+            count.duplicates += 1
+            continue
+        last_small = small
+        count.sharpness.append(candidate.sharpness)
+        yield FilmFrame(candidate.index, candidate.time, image, mask)
+    if count.decoded < 2:
+        raise InputError(
+            f"{path}: {count.decoded} of {count.declared} frames could be decoded (need 2); "
+            "copy it again from the camera or re-encode it"
+        )
+    if last_small is None:
+        raise InputError(
+            f"{path}: all {count.blank} frames are blank (one color); film with enough light and without a lens cap"
+        )
+
+
+def _sharpest_per_slot(
+    path: Path, config: CaptureConfig, count: FilmStatistics, segments: tuple[tuple[float, ...], ...]
+) -> Iterator[_Candidate]:
+    timing = probe(path)
+    kept_timing, position = _joined_segments(timing, segments, path)
+    last = int(np.flatnonzero(position >= 0)[-1])
+    slots = config.frames or max(2, round(kept_timing.duration * config.fps))
+    slots = min(slots, config.max_frames, len(kept_timing.times))
+    count.declared = max(timing.declared, len(timing.times)) if not segments else len(kept_timing.times)
+    count.duration = kept_timing.duration
+    best: _Candidate | None = None
+    index = -1
+    size: tuple[int, int] | None = None
+    for stamp, frame in decode(path, count):
+        index = frame_index(None if stamp is None else stamp - timing.start, timing, index)
+        if segments and index > last:
+            break
+        if segments and position[index] < 0:
+            continue
+        count.decoded += 1
+        if size is not None and size != (frame.width, frame.height):
+            raise InputError(
+                f"{path}: the picture changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} "
+                f"at frame {index}; cut the film there into two sources"
+            )
+        size = (frame.width, frame.height)
+        gray = _sharpness_image(frame)
+        if float(gray[::2, ::2].std()) < BLANK_STD:
+            count.blank += 1
+            continue
+        time = float(timing.times[index]) if index < len(timing.times) else index * timing.interval
+        order, at = (int(position[index]), float(kept_timing.times[position[index]])) if segments else (index, time)
+        candidate = _Candidate(slot_of(order, at, kept_timing, slots), index, time, sharpness(gray), frame)
+        if best is not None and candidate.slot != best.slot:
+            yield best
+            best = candidate
+        elif best is None or candidate.sharpness > best.sharpness:
+            best = candidate
+    if best is not None:
+        yield best
+
+
+def damage_note(path: Path, count: FilmStatistics) -> str | None:
+    """A note for the user if a film is truncated or partly damaged, else None."""
+    if count.decoded >= _MIN_DECODED_FRACTION * count.declared and not count.damaged:
+        return None
+    return (
+        f"{path.name}: damaged; {count.decoded} of {count.declared} frames could be decoded and only those are used. "
+        "Copy it again from the camera if more was filmed"
+    )
+
+
+# ---- decoding
 
 
 def decode(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
@@ -219,154 +387,13 @@ def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> 
         yield end
 
 
-def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
-    """A decoded frame's index from its time [s], always above the `last` one; damaged frames leave gaps."""
-    if time is None:
-        return last + 1
-    right = min(int(np.searchsorted(timing.times, time)), len(timing.times) - 1)
-    left = max(right - 1, 0)
-    nearest = left if time - timing.times[left] < timing.times[right] - time else right
-    return max(nearest, last + 1)
-
-
-def slot_of(index: int, time: float, timing: FilmTiming, slots: int) -> int:
-    """The slot of a frame.
-
-    With as many slots as frames, each frame has its own. Otherwise slots have equal durations; half a frame interval is
-    added so that rounding of time stamps never moves a frame across the border of a slot.
-    """
-    if slots >= len(timing.times):
-        return index
-    return min(int((time + 0.5 * timing.interval) / timing.duration * slots), slots - 1)
-
-
-def slot_count(timing: FilmTiming, config: CaptureConfig) -> int:
-    """Number of slots into which a film is divided."""
-    wanted = config.frames or max(2, round(timing.duration * config.fps))
-    return min(wanted, config.max_frames, len(timing.times))
-
-
-def in_segments(times: NDArray[np.float64], segments: tuple[tuple[float, ...], ...]) -> NDArray[np.bool_]:
-    """Mask of the times (n,) [s] inside any of the segments [from, to]; all true without segments."""
-    if not segments:
-        return np.ones(len(times), bool)
-    # Matroska rounds its time stamps to milliseconds, an error of at most half of one.
-    return np.any([(times >= start - 5e-4) & (times <= end + 5e-4) for start, end in segments], axis=0)
-
-
-def _keep_segments(
-    timing: FilmTiming, segments: tuple[tuple[float, ...], ...], path: Path
-) -> tuple[FilmTiming, NDArray[np.int64]]:
-    """The timing of the kept segments joined, and each film frame's position in them (−1 if cut out).
-
-    Raises InputError: fewer than two frames are in the segments.
-    """
-    used = in_segments(timing.times, segments)
-    if segments and used.sum() < 2:
-        raise InputError(
-            f"{path}: keep = {[list(part) for part in segments]} leaves {used.sum()} of {len(used)} frames (need 2); "
-            f"the film runs from 0 to {timing.times[-1]:.2f} s"
-        )
-    position = np.where(used, np.cumsum(used) - 1, -1)
-    if used.all():
-        return timing, position
-    # The last frame of a segment lasts one frame interval.
-    step = np.where(np.diff(np.flatnonzero(used)) > 1, timing.interval, np.diff(timing.times[used]))
-    return FilmTiming(np.concatenate([[0.0], np.cumsum(step)]), timing.start, int(used.sum())), position
-
-
-def read_film(
-    path: Path,
-    config: CaptureConfig,
-    count: FilmStatistics,
-    mask_of: Callable[[int, int, int], Image | None],
-    segments: tuple[tuple[float, ...], ...] = (),
-) -> Iterator[FilmFrame]:
-    """Yields a film's kept frames in order: the sharpest of each slot, without duplicates of a standing camera.
-
-    `count` is filled while reading. `mask_of` maps a frame's index, kept width and kept height to its mask or None.
-    `segments` are [from, to] each [s]; empty for the whole film.
-
-    Raises InputError: unreadable, fewer than two frames, or only blank frames.
-    """
-    timing = probe(path)
-    kept_timing, position = _keep_segments(timing, segments, path)
-    last = int(np.flatnonzero(position >= 0)[-1])
-    slots = slot_count(kept_timing, config)
-    count.declared = max(timing.declared, len(timing.times)) if not segments else len(kept_timing.times)
-    count.duration = kept_timing.duration
-    kept_small: Image | None = None
-    kept_any = False
-
-    def keep(candidate: "_Candidate") -> FilmFrame | None:
-        nonlocal kept_small, kept_any
-        full = upright(candidate.frame)
-        count.size = (full.shape[1], full.shape[0])
-        image = downscaled(full, config.max_size)
-        small = _flow_image(image)
-        mask = mask_of(candidate.index, image.shape[1], image.shape[0])
-        small_mask = None
-        if mask is not None:
-            small_mask = np.asarray(cv2.resize(mask, small.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
-        if kept_small is not None and is_static(kept_small, small, config.min_motion, small_mask):
-            count.duplicates += 1
-            return None
-        kept_small, kept_any = small, True
-        count.sharpness.append(candidate.sharpness)
-        return FilmFrame(candidate.index, candidate.time, image, mask)
-
-    best: _Candidate | None = None
-    index = -1
-    size: tuple[int, int] | None = None
-    for stamp, frame in decode(path, count):
-        index = frame_index(None if stamp is None else stamp - timing.start, timing, index)
-        if segments and index > last:
-            break
-        if segments and position[index] < 0:
-            continue
-        count.decoded += 1
-        time = float(timing.times[index]) if index < len(timing.times) else index * timing.interval
-        if size is not None and size != (frame.width, frame.height):
-            raise InputError(
-                f"{path}: the picture changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} "
-                f"at frame {index}; cut the film there into two sources"
-            )
-        size = (frame.width, frame.height)
-        gray = _sharpness_image(frame)
-        if float(gray[::2, ::2].std()) < BLANK_STD:
-            count.blank += 1
-            continue
-        order, at = (int(position[index]), float(kept_timing.times[position[index]])) if segments else (index, time)
-        candidate = _Candidate(slot_of(order, at, kept_timing, slots), index, time, sharpness(gray), frame)
-        if best is not None and candidate.slot != best.slot:
-            if (kept := keep(best)) is not None:
-                yield kept
-            best = candidate
-        elif best is None or candidate.sharpness > best.sharpness:
-            best = candidate
-    if best is not None and (kept := keep(best)) is not None:
-        yield kept
-    _check_usable(path, count, kept_any)
-
-
-def damage_note(path: Path, count: FilmStatistics) -> str | None:
-    """A note for the user if a film is truncated or partly damaged, else None."""
-    if count.decoded >= _MIN_DECODED_FRACTION * count.declared and not count.damaged:
-        return None
-    return (
-        f"{path.name}: damaged; {count.decoded} of {count.declared} frames could be decoded and only those are used. "
-        "Copy it again from the camera if more was filmed"
-    )
+def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
+    if not container.streams.video:
+        raise InputError(f"{path}: no video stream in this file; give a film, an image folder or a posed image set")
+    return container.streams.video[0]
 
 
 # ---- size and orientation
-
-
-def downscaled(image: Image, max_size: int) -> Image:
-    """Scales an image down to a longer side of at most `max_size` [px]."""
-    height, width = image.shape[:2]
-    new = fitted_size(width, height, max_size)
-    return image if new == (width, height) else np.asarray(resize(image, *new), np.uint8)
 
 
 def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
@@ -378,20 +405,14 @@ def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
 def upright(frame: av.VideoFrame) -> Image:
     """A frame as RGB, rotated and mirrored by its display matrix in multiples of 90°."""
     image = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-    matrix = display_matrix(frame)
-    return image if matrix is None else apply_display_matrix(image, matrix)
-
-
-def display_matrix(frame: av.VideoFrame) -> NDArray[np.float64] | None:
-    """The 2×2 part of a frame's display matrix (pixel row vector × matrix = displayed position), or None."""
     side = frame.side_data.get(SideData.DISPLAYMATRIX)  # type: ignore[call-overload]
     if side is None:
-        return None
+        return image
     matrix = np.frombuffer(bytes(side), np.int32, 9).reshape(3, 3)[:2, :2] / 65536.0
-    return matrix if np.abs(np.linalg.det(matrix)) > 1e-3 else None
+    return apply_display_matrix(image, matrix) if np.abs(np.linalg.det(matrix)) > 1e-3 else image
 
 
-def apply_display_matrix(image: Image, matrix: NDArray[np.float64]) -> Image:
+def apply_display_matrix(image: Image, matrix: Array) -> Image:
     """Applies a display matrix [[a, b], [c, d]] to an image: x' = a x + c y, y' = b x + d y."""
     (a, b), (c, d) = matrix
     if abs(a) < abs(c):  # x' depends on y: a quarter turn
@@ -403,15 +424,6 @@ def apply_display_matrix(image: Image, matrix: NDArray[np.float64]) -> Image:
     return np.ascontiguousarray(image)
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    slot: int
-    index: int
-    time: float
-    sharpness: float
-    frame: av.VideoFrame
-
-
 def _sharpness_image(frame: av.VideoFrame) -> Image:
     width = min(SHARPNESS_WIDTH, frame.width)
     height = max(1, round(frame.height * width / frame.width))
@@ -420,37 +432,3 @@ def _sharpness_image(frame: av.VideoFrame) -> Image:
         luma = np.frombuffer(bytes(plane), np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
         return np.asarray(resize(luma, width, height), np.uint8)
     return np.asarray(frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray(), np.uint8)
-
-
-def _flow_image(image: Image) -> Image:
-    height, width = image.shape[:2]
-    small = np.asarray(resize(image, FLOW_WIDTH, max(1, round(height * FLOW_WIDTH / width))), np.uint8)
-    return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
-def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    if not container.streams.video:
-        raise InputError(f"{path}: no video stream in this file; give a film, an image folder or a posed image set")
-    return container.streams.video[0]
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    if isinstance(error, InputError):
-        return error
-    size = path.stat().st_size if path.exists() else 0
-    reason = getattr(error, "strerror", None) or str(error)
-    return InputError(
-        f"{path}: not a readable film ({size} bytes: {reason}); copy it again from the camera or re-encode it"
-    )
-
-
-def _check_usable(path: Path, count: FilmStatistics, kept_any: bool) -> None:
-    if count.decoded < 2:
-        raise InputError(
-            f"{path}: {count.decoded} of {count.declared} frames could be decoded (need 2); "
-            "copy it again from the camera or re-encode it"
-        )
-    if not kept_any:
-        raise InputError(
-            f"{path}: all {count.blank} frames are blank (one color); film with enough light and without a lens cap"
-        )

@@ -1,29 +1,32 @@
 """Runs structure from motion in a separate process, because some failures inside COLMAP abort the whole process.
 
-The parent (a stage) starts the *worker*, reads its messages line by line, shows their progress and turns an abort into
-an error with a cure. A message is one line of JSON on the worker's standard output: {"bar": name, "total": n} starts a
-progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports bad input. COLMAP's own log
-comes on standard error and goes to a file.
+The parent starts the *worker*, `python -m twin.capture.worker MODULE:FUNCTION JOB`, which calls the function with the
+*job*, a dictionary in the file JOB, and the folder of that file. The parent shows the worker's progress and turns an
+abort into an error with a cure. A *message* is one line of JSON on the worker's standard output: {"bar": name,
+"total": n} starts a progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports bad
+input. COLMAP's own log comes on standard error and goes to a file.
 """
 
 import contextlib
 import errno
+import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
+import traceback
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
 from twin import runtime
 from twin.errors import InputError
-from twin.runtime import child_environment
+from twin.runtime import child_environment, die_with_parent
 
-_LOG = "colmap.log"
-BAD_INPUT = 2
+_BAD_INPUT = 2  # exit status
 _CURES = {
     "SIGABRT": "film slower and with more texture in view, check the calibration, or set cameras.mapper = "
     '"incremental"',
@@ -44,13 +47,11 @@ _MAPPING_LOG_STEPS = (
 """Parts of COLMAP's log lines that advance the mapping bar."""
 
 
-def send_message(**message: Any) -> None:
-    """Sends a message from the worker to its parent."""
-    print(json.dumps(message), flush=True)
+# ---- in the parent
 
 
-def run_worker(job: dict[str, Any], folder: Path) -> None:
-    """Runs one job with progress bars. The worker writes its result to `folder`.
+def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any], folder: Path) -> None:
+    """Runs `solve(job, folder)` in a worker with progress bars; the folder also gets the job and COLMAP's log.
 
     Raises:
         InputError: the worker reported bad input or died of a signal inside COLMAP.
@@ -59,9 +60,8 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     """
     job_file = folder / "job.json"
     job_file.write_text(json.dumps(job), encoding="utf-8")
-    log_file = folder / _LOG
     process = subprocess.Popen(
-        [sys.executable, "-m", "twin.capture.solver", str(job_file)],
+        [sys.executable, "-m", "twin.capture.worker", f"{solve.__module__}:{solve.__qualname__}", str(job_file)],
         stdin=subprocess.PIPE,  # closes when this process dies, whatever the cause; the worker then ends, too
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -73,7 +73,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     assert process.stdout and process.stderr
     bars = _ProgressBars()
     recent: deque[str] = deque(maxlen=30)
-    reader = threading.Thread(target=_keep_log, args=(process.stderr, log_file, bars, recent), daemon=True)
+    reader = threading.Thread(target=_keep_log, args=(process.stderr, folder / "colmap.log", bars, recent), daemon=True)
     reader.start()
     error: str | None = None
     try:
@@ -89,7 +89,7 @@ def run_worker(job: dict[str, Any], folder: Path) -> None:
     if code == 0:
         return
     tail = " | ".join(recent)[-1500:]
-    if code == BAD_INPUT and error:
+    if code == _BAD_INPUT and error:
         raise InputError(error)
     if any(words in tail.lower() for words in _DISK_FULL):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
@@ -117,9 +117,10 @@ class _ProgressBars:
             return {}
         if not isinstance(message, dict):
             return {}
+        if "bar" in message:
+            self.close()
         with self._lock:
             if "bar" in message:
-                self._end()
                 self._mapping = message["bar"] == "mapping"
                 self._bar = runtime.bar(message["bar"], message["total"] or len(_MAPPING_LOG_STEPS))
             if "step" in message and self._bar is not None:
@@ -129,21 +130,17 @@ class _ProgressBars:
         return message
 
     def log(self, line: str) -> None:
+        """Advances the mapping bar if a line of COLMAP's log ends one of its steps."""
+        finished = "fixed-rotation" not in line and any(part in line for part in _MAPPING_LOG_STEPS)
         with self._lock:
-            finished = (
-                self._mapping and "fixed-rotation" not in line and any(part in line for part in _MAPPING_LOG_STEPS)
-            )
-            if finished and self._bar is not None and self._bar.n < self._bar.total:
+            if finished and self._mapping and self._bar is not None and self._bar.n < self._bar.total:
                 self._bar.update(1)
 
     def close(self) -> None:
         with self._lock:
-            self._end()
-
-    def _end(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
+            if self._bar is not None:
+                self._bar.close()
+                self._bar = None
 
 
 def _keep_log(stream: IO[str], path: Path, bars: _ProgressBars, recent: deque[str]) -> None:
@@ -153,3 +150,43 @@ def _keep_log(stream: IO[str], path: Path, bars: _ProgressBars, recent: deque[st
             bars.log(line)
             with contextlib.suppress(OSError):  # on a full disk the worker fails by itself
                 log.write(line.encode())
+
+
+# ---- in the worker
+
+
+def send_message(**message: Any) -> None:
+    """Sends a message from the worker to its parent."""
+    print(json.dumps(message), flush=True)
+
+
+def main(function: str, job_file: str) -> int:
+    """Calls MODULE:FUNCTION with a job. Exit status: 0 done, 2 bad input (sent as a message), 1 any other error."""
+    die_with_parent()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    try:
+        module, _, name = function.partition(":")
+        path = Path(job_file)
+        getattr(importlib.import_module(module), name)(json.loads(path.read_text(encoding="utf-8")), path.parent)
+    except InputError as error:
+        send_message(error=str(error))
+        return _BAD_INPUT
+    except Exception:  # printed here because os._exit below skips the interpreter's own report
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+def _exit_with_parent() -> None:
+    """Ends this process when its standard input closes, as it does when the parent dies, even by kill -9."""
+    with contextlib.suppress(OSError, ValueError):
+        while os.read(0, 1024):
+            pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    code = main(*sys.argv[1:])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # skips COLMAP's destructors, which may abort; all results are on disk already

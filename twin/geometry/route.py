@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 from scipy.ndimage import gaussian_filter1d, median_filter
+from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras
+from twin.geometry.poses import rotation_angle
 from twin.types import Array
 
 SPACING = 0.25  # [m]
@@ -26,6 +28,11 @@ _JUMP_RATIO = 8.0  # times the typical step; uneven frame intervals and sudden s
 _MIN_JUMP = 5.0  # [m]
 _JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
 _MAX_MISSING = 20.0  # frames in a row; longer gaps in time do not raise the allowed step further
+_MIN_PATH_FRAMES = 6
+_MAX_OUTLIER_FRACTION = 0.25  # if more frames of a source look wrong, its path is not smooth and no frame is removed
+_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is a set of unordered photos, not a film
+_OUTLIER_SIGMAS = 8.0  # an outlier's residual exceeds this many robust standard deviations of all residuals
+_MAX_TURN = np.radians(5.0)  # [rad] smallest allowed deviation from the predicted direction
 
 
 def filmed_route(cameras: Cameras) -> Array:
@@ -185,3 +192,88 @@ def _smooth(xy: Array, sigma: float) -> Array:
     before = 2 * xy[0] - xy[reach:0:-1]
     after = 2 * xy[-1] - xy[-2 : -reach - 2 : -1]
     return gaussian_filter1d(np.concatenate([before, xy, after]), sigma, axis=0)[reach : reach + len(xy)]
+
+
+# ---- poses off the path
+
+
+def path_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
+    """Mask (n,) of the frames off the path of their neighbors, found one by one, the worst first.
+
+    All false for fewer than 6 frames or a path that is not smooth. `limit` is the allowed position residual [median
+    steps between frames]; more is allowed if the whole path is rough.
+    """
+    n = len(camera_to_world)
+    out = np.zeros(n, bool)
+    if n < _MIN_PATH_FRAMES:
+        return out
+    step = float(np.median(np.linalg.norm(np.diff(camera_to_world[:, :3, 3], axis=0), axis=1)))
+    position, turn = _path_residuals(camera_to_world)
+    if np.median(position) > _MAX_ROUGHNESS * step:
+        return out
+    max_offset = max(limit * step, _OUTLIER_SIGMAS * (1.4826 * float(np.median(position))), 1e-12)
+    max_turn = max(_MAX_TURN, _OUTLIER_SIGMAS * (1.4826 * float(np.median(turn))))
+    while True:
+        kept = np.flatnonzero(~out)
+        if len(kept) < _MIN_PATH_FRAMES:
+            return np.zeros(n, bool)
+        position, turn = _path_residuals(camera_to_world[kept])
+        score = np.maximum(position / max_offset, turn / max_turn)
+        worst = int(np.argmax(score))
+        if score[worst] <= 1.0:
+            return out
+        # An outlier also spoils its neighbors' predictions: the frame is removed without which the others agree best.
+        candidates = [k for k in range(max(worst - 2, 0), min(worst + 3, len(kept))) if score[k] > 0.5]
+        out[kept[min(candidates, key=lambda k: _score_without(camera_to_world[kept], k, max_offset, max_turn))]] = True
+        if out.sum() > _MAX_OUTLIER_FRACTION * n:
+            return np.zeros(n, bool)
+
+
+def _path_residuals(camera_to_world: Array) -> tuple[Array, Array]:
+    """Deviation of each frame from the pose predicted from its neighbors, for poses in order of time (n, 4, 4), n ≥ 5.
+
+    The smaller of two predictions' residuals counts, since either alone fails on correct frames: the chord between
+    neighbors is independent of the speed but cuts corners; the cubic through them follows turns but needs even steps.
+    Returns residuals of position (unit of the poses) and direction [rad], shapes (n,).
+    """
+    n = len(camera_to_world)
+    centers = camera_to_world[:, :3, 3]
+    rotations = Rotation.from_matrix(camera_to_world[:, :3, :3])
+    position, turn = np.zeros(n), np.zeros(n)
+    for i in range(n):
+        left, right = [k for k in (i - 1, i - 2) if k >= 0], [k for k in (i + 1, i + 2) if k < n]
+        if left and right:
+            chords = [_segment_distance(centers[i], centers[a], centers[b]) for a in left for b in right]
+            position[i] = float(np.median(chords))
+            if len(left) == len(right) == 2:  # Lagrange's cubic at the middle of five equidistant frames
+                a2, a1, b1, b2 = centers[left[1]], centers[left[0]], centers[right[0]], centers[right[1]]
+                cubic = (4.0 * (a1 + b1) - (a2 + b2)) / 6.0
+                position[i] = min(position[i], float(np.linalg.norm(centers[i] - cubic)))
+            middle = [Slerp([a, b], Rotation.concatenate([rotations[a], rotations[b]]))(i) for a in left for b in right]
+            turn[i] = min(_angle(m, rotations[i]) for m in middle)
+        else:  # an end of the path: extrapolate the next two frames
+            near, far = (right or left)[0], (right or left)[1]
+            step = centers[near] - centers[far]
+            position[i] = _segment_distance(centers[i], centers[near], centers[near] + 2.5 * step)
+            extrapolated = rotations[near] * rotations[far].inv() * rotations[near]
+            turn[i] = min(_angle(extrapolated, rotations[i]), _angle(rotations[near], rotations[i]))
+    return position, turn
+
+
+def _angle(a: Rotation, b: Rotation) -> float:
+    return float(rotation_angle((a.inv() * b).as_matrix()))
+
+
+def _segment_distance(point: Array, start: Array, end: Array) -> float:
+    along = end - start
+    fraction = np.clip((point - start) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
+    return float(np.linalg.norm(point - start - fraction * along))
+
+
+def _score_without(poses: Array, k: int, max_offset: float, max_turn: float) -> float:
+    lo, hi = max(k - 5, 0), min(k + 6, len(poses))
+    local = np.delete(poses[lo:hi], k - lo, axis=0)
+    if len(local) < 3:
+        return np.inf
+    position, turn = _path_residuals(local)
+    return float(np.sum(np.maximum(position / max_offset, turn / max_turn)))

@@ -1,8 +1,0 @@
-"""Imports `pycolmap` and keeps our SIGTERM handler: COLMAP's log library would print a C++ stack trace instead."""
-
-from twin.cli import signals_kept
-
-with signals_kept():
-    import pycolmap
-
-__all__ = ["pycolmap"]
