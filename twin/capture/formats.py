@@ -10,6 +10,7 @@ sources posed by one reconstruction share its world.
 import math
 import re
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -36,20 +37,20 @@ _MAX_COORDINATE = 1e9  # of a camera center in `transforms.json`
 _RIGID_TOLERANCE = 1e-2  # on the entries of RᵀR − 1; files with rounded numbers stay below
 
 
-# ---- COLMAP models, text or binary; parsed here, not by COLMAP, so that a damaged file gives a clear error
+# ---- COLMAP models
+#
+# Parsed here, because pycolmap's reader also demands the files of points and loads them, accepts cameras.bin cut off,
+# gives no file and line of a damaged text, and may abort the process.
 
 
 def find_model(folder: Path) -> Path | None:
     """The COLMAP model in a folder or at the usual places below it, or None."""
-    for name in _MODEL_FOLDERS:
-        model = folder / name
-        if any(_is_model(model, kind) for kind in (".bin", ".txt")):
-            return model
-    return None
+    models = (folder / name for name in _MODEL_FOLDERS)
+    return next((model for model in models if _has_model(model, ".bin") or _has_model(model, ".txt")), None)
 
 
-def _is_model(model: Path, kind: str) -> bool:
-    return is_file(model / f"cameras{kind}") and is_file(model / f"images{kind}")
+def _has_model(folder: Path, suffix: str) -> bool:
+    return is_file(folder / f"cameras{suffix}") and is_file(folder / f"images{suffix}")
 
 
 def read_model(model: Path) -> list[tuple[str, Lens, Array]]:
@@ -57,13 +58,12 @@ def read_model(model: Path) -> list[tuple[str, Lens, Array]]:
 
     Raises InputError: damaged or inconsistent files, or a pose that is not finite.
     """
-    kind = ".bin" if _is_model(model, ".bin") else ".txt"
-    read_cameras, read_images = (_cameras_bin, _images_bin) if kind == ".bin" else (_cameras_txt, _images_txt)
-    cameras_path, images_path = model / f"cameras{kind}", model / f"images{kind}"
+    binary = _has_model(model, ".bin")
+    cameras_path, images_path = (model / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images"))
     with wrap_read_errors(cameras_path, _CURE):
-        lenses = read_cameras(cameras_path)
+        lenses = (_cameras_bin if binary else _cameras_txt)(cameras_path)
     with wrap_read_errors(images_path, _CURE):
-        images = read_images(images_path)
+        images = (_images_bin if binary else _images_txt)(images_path)
     posed = []
     for name, camera_id, values in images:
         if camera_id not in lenses:
@@ -89,11 +89,10 @@ def rotation_from_quaternion(q: Array) -> Array:
 
 def _cameras_txt(path: Path) -> dict[int, Lens]:
     lenses = {}
-    for number, line in enumerate(_text_lines(path), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+    for number, line in _numbered_lines(path):
+        if not line.strip() or line.lstrip().startswith("#"):
             continue
-        where = f"{path}: line {number}"
+        words, where = line.split(), f"{path}: line {number}"
         try:
             key, width, height, params = int(words[0]), int(words[2]), int(words[3]), tuple(map(float, words[4:]))
         except (ValueError, IndexError):
@@ -104,7 +103,7 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 def _images_txt(path: Path) -> list[tuple[str, int, Array]]:
     images = []
-    lines = iter(enumerate(_text_lines(path), 1))
+    lines = _numbered_lines(path)
     for number, line in lines:
         if not line.strip() or line.startswith("#"):
             continue
@@ -119,9 +118,9 @@ def _images_txt(path: Path) -> list[tuple[str, int, Array]]:
     return images
 
 
-def _text_lines(path: Path) -> list[str]:
+def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
-        return read_bytes(path).decode("utf-8").splitlines()
+        return iter(enumerate(read_bytes(path).decode("utf-8").splitlines(), 1))
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; {_CURE}") from None
 
@@ -133,19 +132,14 @@ class _BinaryReader:
         self.data, self.offset = read_bytes(path), 0
 
     def take(self, layout: str) -> tuple:
-        values = struct.unpack_from("<" + layout, self.data, self.offset)
+        start = self.offset
         self.offset += struct.calcsize("<" + layout)
-        return values
+        return struct.unpack_from("<" + layout, self.data, start)
 
     def text(self) -> str:
-        end = self.data.index(b"\0", self.offset)
-        text, self.offset = self.data[self.offset : end].decode("utf-8"), end + 1
-        return text
-
-    def skip(self, count: int) -> None:
-        if self.offset + count > len(self.data):
-            raise ValueError(f"ends after {len(self.data)} bytes")
-        self.offset += count
+        start, end = self.offset, self.data.index(b"\0", self.offset)
+        self.offset = end + 1
+        return self.data[start:end].decode("utf-8")
 
 
 def _cameras_bin(path: Path) -> dict[int, Lens]:
@@ -165,7 +159,10 @@ def _images_bin(path: Path) -> list[tuple[str, int, Array]]:
     for _ in range(reader.take("Q")[0]):
         values = reader.take("I7dI")
         images.append((reader.text(), int(values[8]), np.array(values[1:8])))
-        reader.skip(24 * reader.take("Q")[0])
+        (points,) = reader.take("Q")
+        reader.offset += 24 * points
+        if reader.offset > len(reader.data):
+            raise ValueError(f"ends after {len(reader.data)} bytes")
     return images
 
 
@@ -293,11 +290,11 @@ def listed_files(path: Path, images: Path | None = None) -> list[Path]:
     found = set()
     for frame in frames if isinstance(frames, list) else ():
         if isinstance(frame, dict):
-            if isinstance(frame.get("file_path"), str):
-                found.add(_find_image(path.parent, images, frame["file_path"]))
-            if isinstance(frame.get("mask_path"), str) and is_file(path.parent / frame["mask_path"]):
-                found.add(path.parent / frame["mask_path"])
-    return sorted(file for file in found if file is not None)
+            if isinstance(name := frame.get("file_path"), str):
+                found.add(_find_image(path.parent, images, name))
+            if isinstance(name := frame.get("mask_path"), str) and is_file(path.parent / name):
+                found.add(path.parent / name)
+    return sorted(filter(None, found))
 
 
 def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
@@ -306,28 +303,24 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
     Raises InputError: neither focal length nor angle of view, or an unsupported camera model.
     """
 
-    def number(key: str, default: float | None = None) -> float | None:
+    def number(key: str, default: float = 0.0) -> float:
         value = table.get(key, default)
-        numeric = isinstance(value, int | float) and not isinstance(value, bool)
-        if value is not None and not (numeric and abs(value) < _MAX_CAMERA_VALUE):
+        if value is not None and not _is_number(value, _MAX_CAMERA_VALUE):
             raise InputError(f"{where}: {key} = {short_repr(value)}; expected a finite number")
-        return value
+        return value or 0.0
 
-    if "w" in table and "h" in table:
-        width, height = round(number("w") or 0), round(number("h") or 0)
-    else:
-        width, height = image_size(file)
+    width, height = (round(number("w")), round(number("h"))) if "w" in table and "h" in table else image_size(file)
     fx, fy = number("fl_x"), number("fl_y")
     angle_x, angle_y = number("camera_angle_x"), number("camera_angle_y")
-    if fx is None and angle_x:
+    if table.get("fl_x") is None and angle_x:
         fx = 0.5 * width / math.tan(0.5 * angle_x)
-    if fy is None and angle_y and "fl_x" not in table:
+    if table.get("fl_y") is None and angle_y and "fl_x" not in table:
         fy = 0.5 * height / math.tan(0.5 * angle_y)
     fx, fy = fx or fy, fy or fx
     if not fx or not fy:
         raise InputError(f"{where}: neither fl_x nor camera_angle_x; add the focal length [px]")
-    core = (fx, fy, number("cx", 0.5 * width) or 0.0, number("cy", 0.5 * height) or 0.0)
-    k1, k2, k3, k4, p1, p2 = (number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    core = (fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height))
+    k1, k2, k3, k4, p1, p2 = map(number, ("k1", "k2", "k3", "k4", "p1", "p2"))
     name = table.get("camera_model") or ""
     if not isinstance(name, str):
         raise InputError(f"{where}: camera_model = {short_repr(name)}; expected OPENCV, OPENCV_FISHEYE or PINHOLE")
@@ -391,26 +384,24 @@ def _undo_world_transform(table: dict[str, Any], path: Path) -> tuple[Array, flo
     if "applied_transform" in table:
         to_original = inverse_pose(_rigid_pose(table["applied_transform"], f"{path}: applied_transform"))
     scale = table.get("applied_scale", 1.0)
-    if (
-        not isinstance(scale, int | float)
-        or isinstance(scale, bool)
-        or not 1 / _MAX_CAMERA_VALUE < scale < _MAX_CAMERA_VALUE
-    ):
+    if not _is_number(scale, _MAX_CAMERA_VALUE) or scale <= 1 / _MAX_CAMERA_VALUE:
         raise InputError(f"{path}: applied_scale = {short_repr(scale)}; expected a positive number")
     # nerfstudio scales after it moves, x' = s (R x + t), so the translation of the inverse is scaled too.
     to_original[:3, 3] *= scale
     return to_original, float(scale)
 
 
+def _is_number(value: Any, limit: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < limit
+
+
 def _find_image(base: Path, images: Path | None, name: str) -> Path | None:
     name = name.replace("\\", "/")
     for path in [images / name, images / Path(name).name] if images else [base / name]:
-        if is_file(path):
-            return path
-        # instant-ngp writes names without a suffix.
-        if path.name and path.suffix.lower() not in IMAGE_SUFFIXES:
-            for suffix in IMAGE_SUFFIXES:
-                for candidate in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
-                    if is_file(candidate):
-                        return candidate
+        suffixes = [""]
+        if path.name and path.suffix.lower() not in IMAGE_SUFFIXES:  # instant-ngp writes names without a suffix
+            suffixes += [case for suffix in IMAGE_SUFFIXES for case in (suffix, suffix.upper())]
+        for suffix in suffixes:
+            if is_file(candidate := path.parent / (path.name + suffix)):
+                return candidate
     return None

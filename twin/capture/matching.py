@@ -7,6 +7,7 @@ enough of its matches satisfy one two-view geometry. Each source has one databas
 image. A camera is *known* (a given, fixed calibration), has a focal length *prior*, or is *unknown*.
 """
 
+import itertools
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,6 @@ _BLIND_OFFSETS = (-3, -2, -1, 0, 1, 2, 3)
 _CHUNK_FRAMES = 16
 _CHUNK_PAIRS = 100
 _MIN_FEATURES = 50
-_UNKNOWN_MODEL = "SIMPLE_RADIAL"
 _UNKNOWN_FOCAL = 1.2  # [longer side], COLMAP's default
 
 
@@ -51,12 +51,13 @@ def frames_by_source(source_index: NDArray[np.int64]) -> list[NDArray[np.int64]]
 
 
 def sequence_pairs(source_index: NDArray[np.int64]) -> set[Pair]:
-    """Neighbours in time within each source."""
-    pairs: set[Pair] = set()
-    for frames in frames_by_source(source_index):
-        for step in SEQUENCE_STEPS:
-            pairs.update(zip(frames[:-step].tolist(), frames[step:].tolist(), strict=True))
-    return pairs
+    """Neighbors in time within each source."""
+    return {
+        pair
+        for frames in frames_by_source(source_index)
+        for step in SEQUENCE_STEPS
+        for pair in zip(frames[:-step].tolist(), frames[step:].tolist(), strict=True)
+    }
 
 
 def frame_signatures(
@@ -131,35 +132,31 @@ def expanded_pairs(
     """
     groups = frames_by_source(source_index)
     position = np.concatenate([np.arange(len(frames)) for frames in groups])
-    verified = {pair: inliers.get(pair, 0) for pair in probes if inliers.get(pair, 0) >= min_inliers}
+    verified = {pair: inliers[pair] for pair in probes if inliers.get(pair, 0) >= min_inliers}
     pairs: set[Pair] = set()
-    for a, first in enumerate(groups):
-        for i, j in verified:
-            if source_index[i] == source_index[j] == a:
-                for di in _CROSS_OFFSETS:
-                    for dj in _CROSS_OFFSETS:
-                        p, q = position[i] + di, position[j] + dj
-                        if 0 <= p < len(first) and 0 <= q < len(first) and p != q:
-                            pairs.add(ordered_pair(int(first[p]), int(first[q])))
-        for b in range(a + 1, len(groups)):
-            second = groups[b]
-            best: dict[int, tuple[int, int]] = {}
-            for (i, j), count in verified.items():
-                if source_index[i] == a and source_index[j] == b:
-                    best[int(position[i])] = max(best.get(int(position[i]), (0, 0)), (count, int(position[j])))
-            if len(best) >= 2:
-                anchors = sorted(best)
-                counterpart = np.interp(np.arange(len(first)), anchors, [best[p][1] for p in anchors])
-                # np.interp is constant beyond the outermost anchors; there the mean ratio of the sources is used.
-                pace = (len(second) - 1) / max(len(first) - 1, 1)
-                k = np.arange(len(first))
-                counterpart += pace * (np.minimum(k - anchors[0], 0) + np.maximum(k - anchors[-1], 0))
-                offsets: tuple[int, ...] = _CROSS_OFFSETS
-            else:
-                counterpart = np.arange(len(first)) * (len(second) - 1) / max(len(first) - 1, 1)
-                offsets = _BLIND_OFFSETS
-            for i, center in zip(first.tolist(), np.rint(counterpart).astype(int), strict=True):
-                pairs.update(ordered_pair(i, int(second[center + d])) for d in offsets if 0 <= center + d < len(second))
+    for i, j in verified:
+        frames = groups[source_index[i]]
+        if source_index[i] == source_index[j]:
+            for di, dj in itertools.product(_CROSS_OFFSETS, _CROSS_OFFSETS):
+                p, q = position[i] + di, position[j] + dj
+                if 0 <= p < len(frames) and 0 <= q < len(frames) and p != q:
+                    pairs.add(ordered_pair(int(frames[p]), int(frames[q])))
+    for a, b in itertools.combinations(range(len(groups)), 2):
+        first, second = groups[a], groups[b]
+        best: dict[int, tuple[int, int]] = {}
+        for (i, j), count in verified.items():
+            if source_index[i] == a and source_index[j] == b:
+                best[int(position[i])] = max(best.get(int(position[i]), (0, 0)), (count, int(position[j])))
+        k, pace = np.arange(len(first)), (len(second) - 1) / max(len(first) - 1, 1)
+        if len(best) >= 2:
+            anchors, offsets = sorted(best), _CROSS_OFFSETS
+            counterpart = np.interp(k, anchors, [best[p][1] for p in anchors])
+            # np.interp is constant beyond the outermost anchors; there the mean ratio of the sources is used.
+            counterpart += pace * (np.minimum(k - anchors[0], 0) + np.maximum(k - anchors[-1], 0))
+        else:
+            counterpart, offsets = k * (len(second) - 1) / max(len(first) - 1, 1), _BLIND_OFFSETS
+        for i, center in zip(first.tolist(), np.rint(counterpart).astype(int), strict=True):
+            pairs.update(ordered_pair(i, int(second[center + d])) for d in offsets if 0 <= center + d < len(second))
     return pairs
 
 
@@ -172,27 +169,16 @@ def near_pairs(
     frames off at both ends.
     """
     centers, forward = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
-    linked = {
-        ordered_pair(i + di, j + dj)
-        for i, j in tried
-        for di in _CROSS_OFFSETS
-        for dj in _CROSS_OFFSETS
-        if i + di != j + dj
-    }
+    offsets = list(itertools.product(_CROSS_OFFSETS, _CROSS_OFFSETS))
+    linked = {ordered_pair(i + di, j + dj) for i, j in tried for di, dj in offsets if i + di != j + dj}
     pairs: set[Pair] = set()
     for k in range(len(frames)):
         distance = np.linalg.norm(centers - centers[k], axis=1)
         usable = (distance <= reach) & (forward @ forward[k] > 0.5)
         usable[k] = False
-        fresh = 0
-        for other in np.argsort(distance):
-            pair = ordered_pair(int(frames[k]), int(frames[other]))
-            if not usable[other] or pair in linked:
-                continue
-            pairs.add(pair)
-            fresh += 1
-            if fresh == most:
-                break
+        order = np.argsort(distance)
+        near = (ordered_pair(int(frames[k]), int(frames[other])) for other in order[usable[order]])
+        pairs.update(itertools.islice((pair for pair in near if pair not in linked), most))
     return pairs
 
 
@@ -288,10 +274,10 @@ def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, t
     path.unlink(missing_ok=True)
     pycolmap.Database.open(path).close()
     image_ids = np.zeros(len(capture.names), np.int64)
+    given = capture.intrinsics if capture.camera_to_world is not None else None
     for s, source in enumerate(capture.sources):
         frames = np.flatnonzero(capture.source_index == s)
-        posed = capture.camera_to_world is not None and capture.intrinsics is not None
-        camera_per_image = posed and bool(np.ptp(capture.intrinsics[frames], axis=0).max() > 1e-9)  # type: ignore[index]
+        camera_per_image = given is not None and bool(np.ptp(given[frames], axis=0).max() > 1e-9)
         mode = pycolmap.CameraMode.PER_IMAGE if camera_per_image else pycolmap.CameraMode.SINGLE
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "PINHOLE"
@@ -306,47 +292,39 @@ def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, t
                 image_ids[i] = image.image_id
                 if image.camera_id not in done:
                     done.add(image.camera_id)
-                    intrinsics = capture.intrinsics[i] if capture.intrinsics is not None and posed else None
-                    database.update_camera(_camera(source, image.camera_id, free_focal and not posed, intrinsics))
+                    intrinsics = None if given is None else given[i]
+                    database.update_camera(_camera(source, image.camera_id, free_focal, intrinsics))
     return Matcher(path, images, _mask_folder(capture, stage, work), capture, image_ids, threads, seed, set())
 
 
-def _camera(source: SourceInfo, camera_id: int, ignore_prior: bool, intrinsics: NDArray | None) -> pycolmap.Camera:
-    model, params = source.camera_model, source.camera_params
+def _camera(source: SourceInfo, camera_id: int, free_focal: bool, intrinsics: Array | None) -> pycolmap.Camera:
+    """A source's camera, or that of a posed image with given intrinsics (4,)."""
+    width, height = source.width, source.height
+    lens = Lens(source.camera_model, source.camera_params, width, height)
     if intrinsics is not None:
-        if params:
-            params = Lens(model, params, source.width, source.height).with_intrinsics(np.asarray(intrinsics)).params
-        else:
-            model, params = "PINHOLE", tuple(float(v) for v in intrinsics)
-        ignore_prior = False
-    if not params or ignore_prior:
-        guess = _UNKNOWN_FOCAL * max(source.width, source.height)
-        camera = pycolmap.Camera.create_from_model_name(
-            camera_id, model or _UNKNOWN_MODEL, guess, source.width, source.height
-        )
+        lens = lens if lens.params else Lens("PINHOLE", (0.0,) * 4, width, height)
+        lens = lens.with_intrinsics(intrinsics)
+    elif free_focal or not lens.params:
+        model, guess = source.camera_model or "SIMPLE_RADIAL", _UNKNOWN_FOCAL * max(width, height)
+        camera = pycolmap.Camera.create_from_model_name(camera_id, model, guess, width, height)
         camera.has_prior_focal_length = False
         return camera
-    return pycolmap.Camera(
-        camera_id=camera_id,
-        model=model,
-        width=source.width,
-        height=source.height,
-        params=list(params),
-        has_prior_focal_length=True,
-    )
+    camera = lens.camera
+    camera.camera_id, camera.has_prior_focal_length = camera_id, True
+    return camera
 
 
 def _mask_folder(capture: Capture, stage: Path, work: Path) -> Path | None:
     """Copies the masks to a folder under COLMAP's names (`a.png.png` for `a.png`); None if no frame has a mask."""
-    masked = {name for name in capture.names if (stage / "masks" / f"{name}.png").exists()}
-    if not masked:
+    masks = [stage / "masks" / f"{name}.png" for name in capture.names]
+    if not any(mask.exists() for mask in masks):
         return None
     folder = work / "masks"
-    for name, s in zip(capture.names, capture.source_index, strict=True):
+    for name, mask, s in zip(capture.names, masks, capture.source_index, strict=True):
         target = folder / f"{name}.png.png"
         target.parent.mkdir(parents=True, exist_ok=True)
-        if name in masked:
-            shutil.copyfile(stage / "masks" / f"{name}.png", target)
+        if mask.exists():
+            shutil.copyfile(mask, target)
         else:  # COLMAP extracts no features from an image whose mask is missing
             source = capture.sources[int(s)]
             write_image(target, np.full((source.height, source.width), 255, np.uint8))

@@ -70,7 +70,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     elif scale_source == "gps":
         row = {name: i for i, name in enumerate(capture.names)}
         gps = capture.gps[[row[name] for name in cameras.names]]
-        scale, (east, _) = scale_from_gps(cameras.positions, up.direction, gps, np.random.default_rng(config.seed))
+        scale, east = scale_from_gps(cameras.positions, up.direction, gps, np.random.default_rng(config.seed))
     elif scale_source == "marker":
         assert config.metric.marker is not None
         scale = scale_from_marker(cameras, config.metric.marker)

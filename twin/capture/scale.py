@@ -1,14 +1,11 @@
-"""Estimates the metric scale of a reconstruction from camera height, a known distance, GPS or a printed marker.
-
-Each estimator returns a `Scale`. *Relative* means divided by the scale.
-"""
+"""Metric scale of a reconstruction from the camera height, a known distance, GPS or a printed marker."""
 
 from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+import pycolmap
 
 from twin import runtime
 from twin.capture.gravity import Road, heights_above_road
@@ -25,7 +22,6 @@ _SCALE_OPTIONS = (
     "metric.poses_are_metric = true"
 )
 _PIXEL_ERROR = 1.0  # [px] of a point marked by hand
-_EARTH_A, _EARTH_E2 = 6378137.0, 6.69437999014e-3  # WGS 84: semi-major axis [m], squared eccentricity
 _GPS_TRIALS = 400
 _MIN_ANGLE = np.radians(2.0)  # [rad] between the rays of two frames to a marker
 
@@ -47,17 +43,19 @@ def select_scale_source(metric: MetricConfig, source_heights: dict[str, float]) 
     `source_heights` holds the sources' own camera heights [m], 0 for none. Raises InputError unless exactly one is
     configured, or for a negative height.
     """
-    given = []
-    if metric.camera_height < 0 or any(h < 0 for h in source_heights.values()):
+    heights = (metric.camera_height, *source_heights.values())
+    if any(height < 0 for height in heights):
         raise InputError(
             f"metric.camera_height = {metric.camera_height}; expected metres above the ground, such as 0.5"
         )
-    if metric.camera_height > 0 or any(h > 0 for h in source_heights.values()):
-        given.append("camera_height")
-    given += ["distance"] * (metric.distance is not None)
-    given += ["gps"] * metric.gps
-    given += ["marker"] * (metric.marker is not None)
-    given += ["poses_are_metric"] * metric.poses_are_metric
+    options = {
+        "camera_height": any(height > 0 for height in heights),
+        "distance": metric.distance is not None,
+        "gps": metric.gps,
+        "marker": metric.marker is not None,
+        "poses_are_metric": metric.poses_are_metric,
+    }
+    given = [name for name, set_ in options.items() if set_]
     if not given:
         raise InputError(f"no scale given; give one of: {_SCALE_OPTIONS}")
     if len(given) > 1:
@@ -101,19 +99,14 @@ def scale_from_height(
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
-    # With few points, or points of the verge only (a kerb is a tenth of the usual height), no better than 5 %.
+    # Few points, or only points of the verge, give at best 5 %: a kerb is a tenth of the usual height.
     few = 0.0 if road.reliable else 0.05
     sigma = float(np.sqrt(np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2))
-    return Scale(
-        value,
-        sigma,
-        {
-            "road_points": len(road.points),
-            "road_reliable": bool(road.reliable),
-            "scale_per_source_relative": [round(s / value, 4) for s in scales],
-            "local_height_spread_m": float(np.average(spreads, weights=weights)),
-        },
-    )
+    notes = {
+        "scale_per_source_relative": [round(s / value, 4) for s in scales],
+        "local_height_spread_m": float(np.average(spreads, weights=weights)),
+    }
+    return Scale(value, sigma, notes)
 
 
 def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distance: DistanceConfig) -> Scale:
@@ -125,25 +118,23 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
     """
     if not distance.metres > 0:
         raise InputError(f"metric.distance.metres = {distance.metres}; expected the metres between the points a and b")
-    marks = [
-        _marked_pixel(cameras, "a", distance.frame_a, distance.a),
-        _marked_pixel(cameras, "b", distance.frame_a, distance.b),
-    ]
+    frames = [_marked_frame(cameras, "a", distance.frame_a, distance.a)]
+    frames.append(_marked_frame(cameras, "b", distance.frame_a, distance.b))
+    pixels = np.array([distance.a, distance.b], np.float64)
     if distance.frame_b:
-        marks.append(_marked_pixel(cameras, "a2", distance.frame_b, distance.a2))
-        marks.append(_marked_pixel(cameras, "b2", distance.frame_b, distance.b2))
+        frames.append(_marked_frame(cameras, "a2", distance.frame_b, distance.a2))
+        frames.append(_marked_frame(cameras, "b2", distance.frame_b, distance.b2))
+        pixels = np.concatenate([pixels, np.array([distance.a2, distance.b2], np.float64)])
         if distance.frame_a == distance.frame_b:
             raise InputError(f"metric.distance: frame_a and frame_b are both {distance.frame_a!r}; mark two frames")
-    frames = [frame for frame, _ in marks]
-    pixels = np.array([pixel for _, pixel in marks])
 
     def length(offset: Array) -> float:
         rays = [_ray(cameras, f, p) for f, p in zip(frames, pixels + offset, strict=True)]
-        if len(rays) == 2:
-            ends = [_on_ground(origin, direction, up, ground_level) for origin, direction in rays]
+        if distance.frame_b:
+            a, b = _meeting_point(rays[0], rays[2]), _meeting_point(rays[1], rays[3])
         else:
-            ends = [_meeting_point(rays[0], rays[2]), _meeting_point(rays[1], rays[3])]
-        return float(np.linalg.norm(ends[0] - ends[1]))
+            a, b = (_on_ground(*ray, up, ground_level) for ray in rays)
+        return float(np.linalg.norm(a - b))
 
     measured = length(np.zeros_like(pixels))
     if not np.isfinite(measured) or measured < 1e-9:
@@ -161,7 +152,7 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
     return Scale(distance.metres / measured, sigma, {"distance_units": measured})
 
 
-def _marked_pixel(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ...]) -> tuple[int, Array]:
+def _marked_frame(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ...]) -> int:
     if frame not in cameras.names:
         raise InputError(
             f"metric.distance: no registered frame {frame!r}; expected a name such as {cameras.names[0]!r} "
@@ -171,7 +162,7 @@ def _marked_pixel(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ..
     width, height = (int(v) for v in cameras.sizes[index])
     if len(pixel) != 2 or not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
         raise InputError(f"metric.distance.{key} = {list(pixel)}; expected [u, v] within {width}×{height} px")
-    return index, np.array(pixel, np.float64)
+    return index
 
 
 def _ray(cameras: Cameras, frame: int, pixel: Array) -> tuple[Array, Array]:
@@ -190,8 +181,7 @@ def _on_ground(origin: Array, direction: Array, up: Array, level: float) -> Arra
 def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
     """The point nearest to two rays, shape (3,); NaN if they are parallel or it lies behind a camera."""
     (o1, d1), (o2, d2) = first, second
-    matrix = np.stack([d1, -d2], 1)
-    along, _, rank, _ = np.linalg.lstsq(matrix, o2 - o1, rcond=1e-9)
+    along, _, rank, _ = np.linalg.lstsq(np.stack([d1, -d2], 1), o2 - o1, rcond=1e-9)
     if rank < 2 or np.any(along <= 0):
         return np.full(3, np.nan)
     return 0.5 * (o1 + along[0] * d1 + o2 + along[1] * d2)
@@ -199,38 +189,16 @@ def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> A
 
 def local_east_north_up(gps: Array) -> Array:
     """East, north, up [m] relative to the first row from latitude [°], longitude [°], altitude [m] (WGS 84), (n, 3)."""
-    lat, lon = np.radians(gps[:, 0]), np.radians(gps[:, 1])
-    normal = _EARTH_A / np.sqrt(1.0 - _EARTH_E2 * np.sin(lat) ** 2)
-    ecef = np.stack(
-        [
-            (normal + gps[:, 2]) * np.cos(lat) * np.cos(lon),
-            (normal + gps[:, 2]) * np.cos(lat) * np.sin(lon),
-            (normal * (1.0 - _EARTH_E2) + gps[:, 2]) * np.sin(lat),
-        ],
-        1,
-    )
-    a, b = lat[0], lon[0]
-    rows = [
-        [-np.sin(b), np.cos(b), 0.0],
-        [-np.sin(a) * np.cos(b), -np.sin(a) * np.sin(b), np.cos(a)],
-        [np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)],
-    ]
-    return (ecef - ecef[0]) @ np.array(rows).T
+    return np.asarray(pycolmap.GPSTransform().ellipsoid_to_enu(gps, *gps[0]))
 
 
-def scale_from_gps(
-    centers: Array, up: Array, gps: Array, rng: np.random.Generator
-) -> tuple[Scale, tuple[Array, NDArray[np.bool_]]]:
-    """Scale and heading from GPS positions by a robust similarity fit in the horizontal plane.
+def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generator) -> tuple[Scale, Array]:
+    """Scale and horizontal east axis (3,) from GPS positions by a robust similarity fit in the horizontal plane.
 
     Altitudes are not used: they are several times less accurate than positions, and up is known already. `gps` (n, 3)
     holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown; `rng` samples the trials.
 
-    Returns:
-        The scale; and the horizontal east axis in the reconstruction, shape (3,), with the mask of inliers, shape (n,).
-
-    Raises:
-        InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
+    Raises InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
     """
     known = np.all(np.isfinite(gps[:, :2]), axis=1)
     if known.sum() < 3:
@@ -245,9 +213,8 @@ def scale_from_gps(
     source = centers[known] @ first + 1j * (centers[known] @ second)
     # In complex numbers a similarity of the plane is target = factor · source + offset.
     best = np.inf
-    n = len(source)
     for _ in range(_GPS_TRIALS):
-        i, j = rng.choice(n, 2, replace=False)
+        i, j = rng.choice(len(source), 2, replace=False)
         if abs(source[j] - source[i]) < 1e-9 * np.ptp(np.abs(source - source[0])):
             continue
         factor = (target[j] - target[i]) / (source[j] - source[i])
@@ -278,14 +245,12 @@ def scale_from_gps(
     # The fit rotates the plane's first axis to a direction in east-north; east in the plane is the conjugate.
     rotation = fit / abs(fit)
     east = first * rotation.real - second * rotation.imag
-    used = np.zeros(len(gps), bool)
-    used[np.flatnonzero(known)[inliers]] = True
     notes = {
         "gps_frames": int(known.sum()),
         "gps_inliers": int(inliers.sum()),
         "gps_residual_median_m": float(np.median(residual)),
     }
-    return Scale(float(abs(fit)), sigma, notes), (east, used)
+    return Scale(float(abs(fit)), sigma, notes), east
 
 
 def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
@@ -340,22 +305,16 @@ def _triangulate(pixels: Array, camera_to_world: Array, intrinsics: Array) -> Ar
     Linear (Hartley & Zisserman 2004, sec. 12.2), then Gauss-Newton on the reprojection error.
     """
     world_to_camera = inverse_pose(camera_to_world)
+    rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
     fx, fy, cx, cy = intrinsics.T
     u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
-    rows = np.concatenate(
-        [
-            u[:, None] * world_to_camera[:, 2] - world_to_camera[:, 0],
-            v[:, None] * world_to_camera[:, 2] - world_to_camera[:, 1],
-        ]
-    )
-    homogeneous = np.linalg.svd(rows)[2][-1]
+    rows = [c[:, None] * world_to_camera[:, 2] - world_to_camera[:, k] for k, c in enumerate((u, v))]
+    homogeneous = np.linalg.svd(np.concatenate(rows))[2][-1]
     point = homogeneous[:3] / homogeneous[3]
     for _ in range(10):
-        local = np.einsum("nij,j->ni", world_to_camera[:, :3, :3], point) + world_to_camera[:, :3, 3]
-        z = local[:, 2]
-        residual = np.concatenate([(local[:, 0] / z - u) * fx, (local[:, 1] / z - v) * fy])
-        rotation = world_to_camera[:, :3, :3]
-        du = (rotation[:, 0] - (local[:, 0] / z)[:, None] * rotation[:, 2]) / z[:, None] * fx[:, None]
-        dv = (rotation[:, 1] - (local[:, 1] / z)[:, None] * rotation[:, 2]) / z[:, None] * fy[:, None]
+        x, y, z = (np.einsum("nij,j->ni", rotation, point) + translation).T
+        residual = np.concatenate([(x / z - u) * fx, (y / z - v) * fy])
+        du = (rotation[:, 0] - (x / z)[:, None] * rotation[:, 2]) / z[:, None] * fx[:, None]
+        dv = (rotation[:, 1] - (y / z)[:, None] * rotation[:, 2]) / z[:, None] * fy[:, None]
         point = point - np.linalg.lstsq(np.concatenate([du, dv]), residual, rcond=None)[0]
     return point
