@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, opencv_to_mujoco, pixel_grid, project, scaled_intrinsics, unproject
 from twin.geometry.images import psnr, read_image, ssim, write_image
-from twin.geometry.poses import Similarity, inverse_pose, look_at, rotation_angle, rotation_between, umeyama
+from twin.geometry.poses import Similarity, inverse_pose, look_at, rotation_angle, umeyama
 
 
 def _rotation(rng):
@@ -17,10 +18,9 @@ def _similarity(rng):
     return Similarity(float(rng.uniform(0.2, 5)), _rotation(rng), rng.normal(size=3))
 
 
-def test_similarity_group_laws():
+def test_a_similarity_and_its_inverse_cancel():
     rng = np.random.default_rng(0)
-    a, b, x = _similarity(rng), _similarity(rng), rng.normal(size=(7, 3))
-    np.testing.assert_allclose(a.compose(b).points(x), a.points(b.points(x)), atol=1e-12)
+    a, x = _similarity(rng), rng.normal(size=(7, 3))
     np.testing.assert_allclose(a.inverse().points(a.points(x)), x, atol=1e-12)
 
 
@@ -47,15 +47,10 @@ def test_similarity_moves_poses_with_their_points():
     )
 
 
-def test_rotation_between_and_angle():
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        a, b = rng.normal(size=(2, 3))
-        a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-        r = rotation_between(a, b)
-        np.testing.assert_allclose(r @ a, b, atol=1e-12)
-        assert rotation_angle(r) == pytest.approx(np.arccos(a @ b), abs=1e-9)
-    np.testing.assert_allclose(rotation_between(a, -a) @ a, -a, atol=1e-12)
+def test_rotation_angle():
+    vectors = np.random.default_rng(3).normal(size=(20, 3))
+    angles = rotation_angle(Rotation.from_rotvec(vectors).as_matrix())
+    np.testing.assert_allclose(np.cos(angles), np.cos(np.linalg.norm(vectors, axis=1)), atol=1e-9)
     tiny = np.array([[1, -1e-9, 0], [1e-9, 1, 0], [0, 0, 1.0]])
     assert rotation_angle(tiny) == pytest.approx(1e-9, rel=1e-6)
 

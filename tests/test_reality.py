@@ -22,6 +22,8 @@ from twin.scene import SceneDir
 
 DEMO = Path(__file__).parent.parent / "scenes" / "demo"
 
+_IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+
 
 @pytest.fixture(scope="module")
 def campus():
@@ -192,7 +194,7 @@ def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) ->
 
 
 def test_a_perfect_build_has_no_error(truth, tmp_path):
-    found = measure(fake_build(truth, tmp_path, Similarity.identity()))["figures"]
+    found = measure(fake_build(truth, tmp_path, _IDENTITY))["figures"]
     assert found["ate_m"] < 1e-9
     assert abs(found["scale_error"]) < 1e-9
     assert found["tilt_deg"] < 1e-5
@@ -203,7 +205,7 @@ def test_a_perfect_build_has_no_error(truth, tmp_path):
 
 
 def test_errors_are_measured(truth, tmp_path):
-    found = measure(fake_build(truth, tmp_path / "lift", Similarity.identity(), lift=0.07))["figures"]
+    found = measure(fake_build(truth, tmp_path / "lift", _IDENTITY, lift=0.07))["figures"]
     assert found["ground_median_m"] == pytest.approx(0.07, abs=0.002)
     assert found["ground_bias_m"] == pytest.approx(0.07, abs=0.002)
     tilt = np.deg2rad(2.0)
@@ -234,7 +236,7 @@ def test_a_shifted_mesh_is_as_far_off_as_it_was_shifted(off):
 def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(truth, tmp_path):
     found = []
     for name, kinds in (("all", {"ground", "obstacle", "foliage"}), ("flat", {"ground"})):
-        scene = fake_build(truth, tmp_path / name, Similarity.identity())
+        scene = fake_build(truth, tmp_path / name, _IDENTITY)
         parts = [t.part for t in truth.place.objects if t.kind in kinds]
         starts = np.cumsum([0] + [len(p.vertices) for p in parts])
         np.savez(

@@ -32,6 +32,15 @@ from twin.types import Array, Image
 QUEUE_SIZE = 4  # images decoded or encoded in the background; bounds the memory
 NO_GPS = (math.nan, math.nan, math.nan)
 _LOSSY_THRESHOLD = 63  # compression changes the zeros of a JPEG mask
+_ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
+    "source_index": ((), "i"),
+    "times": ((), "f"),
+    "held_out": ((), "b"),
+    "gps": ((3,), "f"),
+    "camera_to_world": ((4, 4), "f"),
+    "intrinsics": ((4,), "f"),
+}
+"""Stored arrays of `Capture`: shape per frame and `dtype.kind`."""
 
 
 # ---- the stored capture
@@ -81,10 +90,8 @@ class Capture:
 
     def save(self, folder: Path) -> None:
         """Writes `capture.json` and `capture.npz`."""
-        arrays = {"source_index": self.source_index, "times": self.times, "held_out": self.held_out, "gps": self.gps}
-        if self.camera_to_world is not None and self.intrinsics is not None:
-            arrays |= {"camera_to_world": self.camera_to_world, "intrinsics": self.intrinsics}
-        np.savez(folder / "capture.npz", **arrays)  # type: ignore[arg-type]
+        arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+        np.savez(folder / "capture.npz", **arrays)
         write_json(folder / "capture.json", {"sources": [vars(s) for s in self.sources], "names": self.names})
 
     @staticmethod
@@ -96,16 +103,7 @@ class Capture:
             names = tuple(map(require_text, head["names"]))
         with wrap_read_errors(folder / "capture.npz", "build the scene again"):
             capture, n = Capture(sources, names, **data), len(names)
-            shapes: dict[str, tuple[NDArray, tuple[int, ...], str]] = {
-                "source_index": (capture.source_index, (n,), "i"),
-                "times": (capture.times, (n,), "f"),
-                "held_out": (capture.held_out, (n,), "b"),
-                "gps": (capture.gps, (n, 3), "f"),
-            }
-            if capture.camera_to_world is not None and capture.intrinsics is not None:
-                shapes["camera_to_world"] = capture.camera_to_world, (n, 4, 4), "f"
-                shapes["intrinsics"] = capture.intrinsics, (n, 4), "f"
-            check_shapes(shapes)
+            check_shapes({name: (array, (n, *_ARRAYS[name][0]), _ARRAYS[name][1]) for name, array in data.items()})
             if n and not (capture.source_index.min() >= 0 and capture.source_index.max() < len(sources)):
                 raise ValueError(f"frames refer to a source index outside 0 to {len(sources) - 1}")
         return capture

@@ -19,6 +19,14 @@ from twin.geometry.poses import Similarity, inverse_pose
 from twin.types import Array
 
 _CV_TO_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+_CAMERA_ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
+    "camera_to_world": ((4, 4), "f"),
+    "intrinsics": ((4,), "f"),
+    "sizes": ((2,), "i"),
+    "times": ((), "f"),
+    "held_out": ((), "b"),
+}
+"""Stored arrays of `Cameras`: shape per frame and `dtype.kind`."""
 
 
 def opencv_to_mujoco(camera_to_world: Array) -> Array:
@@ -70,80 +78,42 @@ class Cameras:
     def select(self, index: NDArray) -> "Cameras":
         """The frames selected by an index array or boolean mask."""
         i = np.arange(len(self))[index]
-        return replace(
-            self,
-            names=tuple(self.names[k] for k in i),
-            camera_to_world=self.camera_to_world[i],
-            intrinsics=self.intrinsics[i],
-            sizes=self.sizes[i],
-            lightings=tuple(self.lightings[k] for k in i),
-            sources=tuple(self.sources[k] for k in i),
-            times=self.times[i],
-            held_out=self.held_out[i],
-        )
+        texts = {name: tuple(getattr(self, name)[k] for k in i) for name in ("names", "lightings", "sources")}
+        return replace(self, **texts, **{name: getattr(self, name)[i] for name in _CAMERA_ARRAYS})  # type: ignore[arg-type]
 
     def transformed(self, similarity: Similarity) -> "Cameras":
         return replace(self, camera_to_world=similarity.poses(self.camera_to_world))
 
     def save(self, folder: Path) -> None:
         """Writes `cameras.json` and `cameras.npz`; image folders are stored as relative paths."""
-        np.savez(
-            folder / "cameras.npz",
-            camera_to_world=self.camera_to_world,
-            intrinsics=self.intrinsics,
-            sizes=self.sizes,
-            times=self.times,
-            held_out=self.held_out,
-        )
+        np.savez(folder / "cameras.npz", **{name: getattr(self, name) for name in _CAMERA_ARRAYS})
         # A stage folder is written as `<name>.partial` and renamed, so paths are relative to its parent, `build/`.
         base = folder.resolve().parent
-        final = {p: Path(os.path.relpath(p.resolve(), base)).as_posix() for p in (self.images, self.masks) if p}
-        write_json(
-            folder / "cameras.json",
-            {
-                "names": self.names,
-                "lightings": self.lightings,
-                "sources": self.sources,
-                "images": final[self.images].replace(".partial/", "/"),
-                "masks": final[self.masks].replace(".partial/", "/") if self.masks else None,
-            },
+        images, masks = (
+            Path(os.path.relpath(path.resolve(), base)).as_posix().replace(".partial/", "/") if path else None
+            for path in (self.images, self.masks)
         )
+        head = {"names": self.names, "lightings": self.lightings, "sources": self.sources}
+        write_json(folder / "cameras.json", head | {"images": images, "masks": masks})
 
     @staticmethod
     def load(folder: Path) -> "Cameras":
         """Reads the files that `save` wrote. Raises InputError if they are missing or damaged."""
         head, data = read_json(folder / "cameras.json"), load_arrays(folder / "cameras.npz")
         base = folder.resolve().parent
-        missing = {"camera_to_world", "intrinsics", "sizes", "times", "held_out"} - data.keys()
-        if missing:
-            raise InputError(f"{folder / 'cameras.npz'}: no {', '.join(sorted(missing))}; build the scene again")
         with wrap_read_errors(folder / "cameras.json", "build the scene again"):
-            cameras = Cameras(
-                names=tuple(map(require_text, head["names"])),
-                camera_to_world=data["camera_to_world"],
-                intrinsics=data["intrinsics"],
-                sizes=data["sizes"],
-                lightings=tuple(map(require_text, head["lightings"])),
-                sources=tuple(map(require_text, head["sources"])),
-                times=data["times"],
-                held_out=data["held_out"],
-                images=base / head["images"],
-                masks=base / head["masks"] if head["masks"] else None,
+            texts = {name: tuple(map(require_text, head[name])) for name in ("names", "lightings", "sources")}
+            images, masks, n = (
+                base / head["images"],
+                base / head["masks"] if head["masks"] else None,
+                len(texts["names"]),
             )
-            n = len(cameras.names)
-            if not len(cameras.lightings) == len(cameras.sources) == n:
-                raise ValueError(f"{n} names, {len(cameras.lightings)} lightings, {len(cameras.sources)} sources")
+            if any(len(values) != n for values in texts.values()):
+                raise ValueError(", ".join(f"{len(values)} {name}" for name, values in texts.items()))
         with wrap_read_errors(folder / "cameras.npz", "build the scene again"):
-            check_shapes(
-                {
-                    "camera_to_world": (cameras.camera_to_world, (n, 4, 4), "f"),
-                    "intrinsics": (cameras.intrinsics, (n, 4), "f"),
-                    "sizes": (cameras.sizes, (n, 2), "i"),
-                    "times": (cameras.times, (n,), "f"),
-                    "held_out": (cameras.held_out, (n,), "b"),
-                }
-            )
-        return cameras
+            arrays = {name: data[name] for name in _CAMERA_ARRAYS}
+            check_shapes({name: (arrays[name], (n, *one), kind) for name, (one, kind) in _CAMERA_ARRAYS.items()})
+        return Cameras(**texts, **arrays, images=images, masks=masks)  # type: ignore[arg-type]
 
 
 def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
@@ -217,7 +187,8 @@ def unproject(pixels: Array, intrinsics: Array) -> Array:
 
 def project(points: Array, camera_to_world: Array, intrinsics: Array) -> tuple[Array, Array]:
     """Projects world points (..., 3) into one camera: pixels (..., 2) and depth (...), negative behind the camera."""
-    local = points @ inverse_pose(camera_to_world)[:3, :3].T + inverse_pose(camera_to_world)[:3, 3]
+    world_to_camera = inverse_pose(camera_to_world)
+    local = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     depth = local[..., 2]
     fx, fy, cx, cy = intrinsics
     safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
@@ -226,8 +197,7 @@ def project(points: Array, camera_to_world: Array, intrinsics: Array) -> tuple[A
 
 def scaled_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
     """Intrinsics after resizing an image from `size` to `new_size` (width, height)."""
-    sx, sy = new_size[0] / size[0], new_size[1] / size[1]
-    return np.asarray(intrinsics) * np.array([sx, sy, sx, sy])
+    return np.asarray(intrinsics) * np.tile(np.array(new_size) / size, 2)
 
 
 # ---- sparse points of structure from motion
@@ -275,15 +245,9 @@ class SparsePoints:
         with wrap_read_errors(path, "build the scene again"):
             points = SparsePoints(**load_arrays(path))
             m, k = len(points.xyz), len(points.point)
-            check_shapes(
-                {
-                    "xyz": (points.xyz, (m, 3), "f"),
-                    "rgb": (points.rgb, (m, 3), "u"),
-                    "error": (points.error, (m,), "f"),
-                    "point": (points.point, (k,), "i"),
-                    "frame": (points.frame, (k,), "i"),
-                }
-            )
+            shapes = {"xyz": ((m, 3), "f"), "rgb": ((m, 3), "u"), "error": ((m,), "f"), "point": ((k,), "i")}
+            shapes |= {"frame": ((k,), "i")}
+            check_shapes({name: (getattr(points, name), *shape) for name, shape in shapes.items()})
             if k and not (points.point.min() >= 0 and points.point.max() < m and points.frame.min() >= 0):
                 raise ValueError(f"an observation has a point index outside 0 to {m - 1}, or a negative frame index")
         return points

@@ -19,10 +19,6 @@ class Similarity:
     rotation: Array
     translation: Array
 
-    @staticmethod
-    def identity() -> "Similarity":
-        return Similarity(1.0, np.eye(3), np.zeros(3))
-
     def points(self, x: Array) -> Array:
         """Maps points, shape (..., 3)."""
         return self.scale * x @ self.rotation.T + self.translation
@@ -37,10 +33,6 @@ class Similarity:
     def inverse(self) -> "Similarity":
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
-
-    def compose(self, first: "Similarity") -> "Similarity":
-        """The similarity that applies `first`, then this one."""
-        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
 
 
 def umeyama(source: Array, target: Array, with_scale: bool = True) -> Similarity:
@@ -65,17 +57,6 @@ def inverse_pose(pose: Array) -> Array:
     out[..., :3, 3] = -(rotation_t @ pose[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1.0
     return out
-
-
-def rotation_between(a: Array, b: Array) -> Array:
-    """The smallest rotation from unit vector a to unit vector b, shape (3, 3)."""
-    v, c = np.cross(a, b), float(a @ b)
-    if c < -1 + 1e-12:  # opposite: half a turn about any axis perpendicular to a
-        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        axis /= np.linalg.norm(axis)
-        return 2.0 * np.outer(axis, axis) - np.eye(3)
-    k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + k + k @ k / (1.0 + c)
 
 
 def rotation_angle(rotation: Array) -> Array:
