@@ -126,6 +126,7 @@ def draw_filming(number: int) -> Filming:
         films = [("a", "day", [line]), ("b", "night", [shifted(line, 1.0)[::-1]])]
     elif kind == "jump_ahead":
         k, gap = len(line) // 2, round(rng.uniform(6.0, 20.0) / _DENSE)
+        gap = min(gap, len(line) - k - round(3.0 / _DENSE))
         films = [("a", "day", [line[:k], line[k + gap :]])]
         bridges, longest = [line[k : k + gap]], max(k, len(line) - k - gap) * _DENSE
     else:
