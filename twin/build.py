@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from twin import commands, runtime
-from twin.config import SceneConfig
+from twin.config import RouteConfig, SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError
 from twin.files import digest_file, is_link, remove, write_json
@@ -54,9 +54,9 @@ _MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")
 PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
-    Stage("metric", "twin.capture.metric", 1, ("metric", "mjcf.route"), ("capture", "cameras")),
+    Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 3, ("nerf", "mjcf.route"), ("cameras", "metric")),
-    Stage("mesh", "twin.assets.mesh", 2, ("mesh", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
+    Stage("mesh", "twin.assets.mesh", 2, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 3, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",
@@ -218,8 +218,8 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for one in (settings.get("capture", {}), *settings.get("source", ())):
         if "keep" in one and not one["keep"]:
             del one["keep"]
-    if stage.name == "metric" and settings["mjcf.route"]:  # only rejects a path with jumps; does not change results
-        del settings["mjcf.route"]
+    if settings.get("route") == dataclasses.asdict(RouteConfig()):
+        del settings["route"]
     if not settings.get("nerf", {}).get("refine_cameras", True):
         del settings["nerf"]["refine_cameras"]
     return {

@@ -99,8 +99,7 @@ class CaptureConfig:
     """Every n-th frame of each source is held out from training."""
     keep: tuple[tuple[float, ...], ...] = ()
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
-    and disjoint; empty = all. If the film drives the route twice, keep only one of the passes. Photos need
-    timestamps."""
+    and disjoint; empty = all. Photos need timestamps."""
     min_motion: float = 1.0
     """Frames with less motion since the last kept one [px, median optical flow at 320 px width] are dropped."""
 
@@ -229,6 +228,20 @@ class MeshConfig:
 
 
 @dataclass(frozen=True)
+class RouteConfig:
+    """The choice of the route among the filmed passes; by default the longest line of one lighting."""
+
+    passes: tuple[str, ...] = ()
+    """Passes in driving order, such as "noon:2", or "noon" for the longest one of that source; see the report."""
+    points: tuple[tuple[float, ...], ...] = ()
+    """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m off what was filmed."""
+    reverse: bool = False
+    """Drive against the filmed direction. The camera then looks where nobody filmed."""
+    max_gap: float = 5.0
+    """Longest unfilmed way between two passes that are joined [m]."""
+
+
+@dataclass(frozen=True)
 class MjcfConfig:
     """The MJCF scene."""
 
@@ -312,6 +325,7 @@ class SceneConfig:
     metric: MetricConfig = field(default_factory=MetricConfig)
     nerf: NerfConfig = field(default_factory=NerfConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
+    route: RouteConfig = field(default_factory=RouteConfig)
     mjcf: MjcfConfig = field(default_factory=MjcfConfig)
     robot: HuskyParams = field(default_factory=HuskyParams)
     """Values of `scene.toml` override those of `robot.toml` beside it, which override the defaults."""

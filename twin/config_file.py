@@ -10,6 +10,7 @@ import math
 import types
 import typing
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from twin.config import (
     UPS,
     MetricConfig,
     ObstacleConfig,
+    RouteConfig,
     SceneConfig,
     SourceConfig,
     TaskConfig,
@@ -243,6 +245,7 @@ def _check(config: SceneConfig, path: Path) -> None:
         _check_range(source.camera_height, 0, _INF, f"{path}: camera_height of [[source]] {source.path!r}")
         _check_segments(source.keep, f"{path}: keep of [[source]] {source.path!r}")
     _check_segments(config.capture.keep, f"{path}: capture.keep")
+    _check_route(config.route, path)
     _check_obstacles(config.obstacle, path)
     _check_metric(config.metric, path)
     given = _scale_sources(config.metric)
@@ -306,6 +309,19 @@ def _check_tasks(tasks: tuple[TaskConfig, ...], path: Path) -> None:
             )
         _check_name(task.name, f"{path}: [[task]] name")
     _check_unique([task.name for task in tasks], "[[task]]", path)
+
+
+def _check_route(route: RouteConfig, path: Path) -> None:
+    if route.passes and route.points:
+        raise InputError(f"{path}: [route] gives passes and points; give one of them")
+    if len(route.points) == 1 or any(len(point) != 2 for point in route.points):
+        raise InputError(
+            f"{path}: route.points = {short_repr([list(point) for point in route.points])}; expected two or more "
+            "[x, y] [m], such as [[0, 0], [12.5, 1.0]]"
+        )
+    if any(a == b for a, b in pairwise(route.points)):
+        raise InputError(f"{path}: route.points names a point twice in a row; give each once")
+    _check_range(route.max_gap, 0, 50, f"{path}: route.max_gap")
 
 
 def _check_metric(metric: MetricConfig, path: Path) -> None:

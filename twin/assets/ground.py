@@ -19,7 +19,7 @@ from twin.assets.views import Views
 from twin.config import MeshConfig
 from twin.files import check_shapes, load_arrays, wrap_read_errors
 from twin.geometry.cameras import Cameras, SparsePoints
-from twin.geometry.route import path_inliers, source_frames
+from twin.geometry.passes import path_inliers, source_frames
 from twin.types import Array
 
 

@@ -20,7 +20,8 @@ from twin.assets.tsdf import FREE_SPACE_REACH, color_points
 from twin.assets.views import ColorField, Views, render_views
 from twin.config import SceneConfig
 from twin.geometry.cameras import Cameras, SparsePoints
-from twin.geometry.route import distance_to_route, filmed_route, route_length
+from twin.geometry.passes import path_length
+from twin.geometry.route import distance_to_route, filmed_route, route_metrics
 from twin.scene import SceneDir
 from twin.types import Array
 
@@ -47,7 +48,8 @@ def build_assets(
     """Writes all files of the stage from any field; returns the metrics."""
     stopwatch = _Stopwatch()
     settings = config.mesh
-    route = filmed_route(cameras) if config.mjcf.route else None
+    filmed = filmed_route(cameras, config.route) if config.mjcf.route else None
+    route = filmed.line if filmed else None
     path = route if route is not None else cameras.positions[:, :2]
     low, high = path.min(0) - settings.margin, path.max(0) + settings.margin
     if route is None:
@@ -89,7 +91,8 @@ def build_assets(
         },
         "standing": left_out["standing"],
         "bounds_m": box.tolist(),
-        "route_length_m": route_length(route) if route is not None else None,
+        "route_length_m": path_length(route) if route is not None else None,
+        "route": route_metrics(filmed) if filmed else None,
         "seconds_of": stopwatch.laps,
     }
 
@@ -213,7 +216,7 @@ def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
     metrics: dict[str, float | None] = {"slope_rms": float(np.sqrt(np.mean(slope**2))) if len(slope) else None}
     if route is not None and len(route) > 2:
         height = ground.at(route)
-        step = route_length(route) / (len(route) - 1)
+        step = path_length(route) / (len(route) - 1)
         metrics["route_slope_rms"] = float(np.sqrt(np.mean((np.diff(height) / step) ** 2)))
         metrics["route_bend_rms_per_m"] = float(np.sqrt(np.mean((np.diff(height, 2) / step**2) ** 2)))
         xy = ground.origin + ground.cell * np.stack(np.meshgrid(*map(np.arange, ground.height.shape[::-1])), -1)

@@ -17,7 +17,8 @@ from twin.assets.ground import Ground
 from twin.assets.tsdf import Volume, zero_level
 from twin.config import MeshConfig
 from twin.geometry.cameras import Cameras
-from twin.geometry.route import SPACING, distance_to_route
+from twin.geometry.passes import SPACING
+from twin.geometry.route import distance_to_route
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground

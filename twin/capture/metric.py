@@ -25,7 +25,6 @@ from twin.errors import InputError
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.poses import Similarity
-from twin.geometry.route import check_no_jumps
 from twin.scene import SceneDir
 from twin.types import Array
 
@@ -45,7 +44,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         similarity from the reconstruction, and the notes of the `Scale`.
 
     Raises:
-        InputError: no scale or several given, the data lack the evidence for it, or the path jumps.
+        InputError: no scale or several given, or the data lack the evidence for it.
     """
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
@@ -78,8 +77,6 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         scale = Scale(1.0, 0.0)
     similarity = _level_frame(cameras, up.direction, level, scale.value, east, keep=config.metric.up == "poses")
     cameras, points = cameras.transformed(similarity), points.transformed(similarity)
-    if config.mjcf.route:
-        check_no_jumps(cameras)
     cameras.save(out)
     points.save(out)
     metrics = _metrics(cameras, points, scale_source, scale, up, road, floor_source, similarity)

@@ -1,167 +1,190 @@
-"""The filmed path and the route derived from it.
+"""The route: the line that the robot drives, chosen from the filmed passes.
 
-The *path* is the sequence of camera centers (x, y, z) in driving order. The *route* is the path seen from above (x, y),
-without outliers, stops and rocking, smoothed, with points every `SPACING` meters. *Station* [m] is the arc length along
-it. The *corridor* is the area within a half width of the route; it is free, since the camera passed through it.
+By default it is the longest pass, continued where another pass of the same lighting takes up its line; `[route]` in
+scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along it. The *corridor* is
+the area within a half width of the route; it is free, since the camera passed through it.
 """
 
-import math
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import Akima1DInterpolator
-from scipy.ndimage import gaussian_filter1d, median_filter
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial import cKDTree
 
-from twin.errors import InputError
+from twin.config import RouteConfig
+from twin.errors import InputError, short_repr
 from twin.geometry.cameras import Cameras
-from twin.geometry.poses import rotation_angle
+from twin.geometry.passes import SPACING, FilmedPass, find_passes, path_directions, path_length, resample, smooth_line
 from twin.types import Array
 
-SPACING = 0.25  # [m]
-_SMOOTHING = 0.5  # [m] standard deviation; moves a 5 m turn by 0.5²/(2·5) = 2.5 cm
-_STATIONARY_RADIUS = 0.4  # [m] motion within this is standing or rocking
-_DEPARTURE_RADIUS = 1.6  # [m] beyond this the camera has left: a later return is a second pass, as in a round trip
 _MIN_LENGTH = 2.0  # [m]
-_JUMP_RATIO = 8.0  # times the typical step; uneven frame intervals and sudden starts stay below 4
-_MIN_JUMP = 5.0  # [m]
-_JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
-_MAX_MISSING = 20.0  # frames in a row; longer gaps in time do not raise the allowed step further
-_MIN_PATH_FRAMES = 6
-_MAX_OUTLIER_FRACTION = 0.25  # if more frames of a source look wrong, its path is not smooth and no frame is removed
-_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is a set of unordered photos, not a film
-_OUTLIER_SIGMAS = 8.0  # an outlier's residual exceeds this many robust standard deviations of all residuals
-_MAX_TURN = np.radians(5.0)  # [rad] smallest allowed deviation from the predicted direction
+_AS_LONG = 0.98  # the first line this close to the longest is chosen, so that noise does not decide
+_ASIDE = 0.6  # [m] lateral offset at which one pass continues another; half of it is off both
+_BEYOND = 3.0  # [m] of new way that a continuation must bring
+_AGREE = np.cos(np.deg2rad(40.0))  # of headings where passes are joined
+_BLEND = 3.0  # [m] before and after a join over which the line goes from one pass to the other
+_MAX_FOLD = np.cos(np.deg2rad(120.0))  # of the change of heading over `_FOLD_CHORD`
+_FOLD_CHORD = 2.0  # [m]
+_OFF_FILM = 1.0  # [m] that a line through way points may leave the filmed paths
 
 
-def filmed_route(cameras: Cameras) -> Array:
-    """The route of the longest source (the first of those within 2 % of it), shape (m, 2) [m].
+@dataclass(frozen=True)
+class Route:
+    """A drivable line and the passes that it was chosen from."""
 
-    Raises InputError: the route is shorter than 2 m, or its path jumps.
+    line: Array
+    """Points about 0.25 m apart in driving order, shape (m, 2) [m]."""
+    chosen: tuple[str, ...]
+    """Names of its passes in driving order; empty if way points were given."""
+    passes: tuple[FilmedPass, ...]
+    """All passes."""
+
+
+def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:
+    """The route of a place.
+
+    Raises:
+        InputError: the route is shorter than 2 m or folds back on itself, passes that are to be joined lie apart, a
+            pass has an unknown name, or way points leave what was filmed.
     """
-    route, length, index = _longest_route(cameras)
+    config = config or RouteConfig()
+    passes = find_passes(cameras)
+    if config.points:
+        line, chosen = _through_points(config.points, passes), tuple[str, ...]()
+    elif config.passes:
+        picked = [_named(name, passes) for name in config.passes]
+        line = picked[0].path
+        for one in picked[1:]:
+            line = _joined(line, one, config.max_gap)
+        chosen = tuple(one.name for one in picked)
+    else:
+        line, chosen = _longest_line(passes, config.max_gap)
+    length = path_length(line)
     if length < _MIN_LENGTH:
         raise InputError(
             f"the filmed path is {length:.2f} m long, expected at least {_MIN_LENGTH:g} m; "
             "film a drive, correct [metric], or set mjcf.route = false"
         )
-    _check_source_jumps(cameras, index)
-    return route
+    _check_no_fold(line)
+    return Route(line[::-1] if config.reverse else line, chosen[::-1] if config.reverse else chosen, tuple(passes))
 
 
-def check_no_jumps(cameras: Cameras) -> None:
-    """Rejects a film of several passes as soon as its cameras are metric; a path too short for a route passes.
-
-    Raises InputError: the path of the route jumps, see `path_jumps`; the message names the frames.
-    """
-    _, length, index = _longest_route(cameras)
-    if length >= _MIN_LENGTH:
-        _check_source_jumps(cameras, index)
-
-
-def _longest_route(cameras: Cameras) -> tuple[Array, float, NDArray[np.int64]]:
-    """The first route within 2 % of the longest, the longest length [m], and the route's frames in order of time."""
-    frames = source_frames(cameras)
-    routes = [smooth_route(cameras.positions[index]) for index in frames]
-    if not routes:
-        return np.zeros((0, 2)), 0.0, np.zeros(0, np.int64)
-    lengths = np.array([route_length(route) for route in routes])
-    chosen = int(np.argmax(lengths >= 0.98 * lengths.max()))
-    return routes[chosen], float(lengths.max()), frames[chosen]
+def route_metrics(route: Route) -> dict[str, object]:
+    """The passes and the choice as JSON."""
+    return {
+        "chosen": list(route.chosen),
+        "passes": [
+            {"name": one.name, "length_m": one.length, "frames": len(one.frames), "ends_with": one.ends_with}
+            for one in route.passes
+        ],
+    }
 
 
-def path_jumps(positions: Array, times: Array) -> NDArray[np.int64]:
-    """Finds steps much longer than the typical step of a path, as between two passes filmed one after the other.
-
-    A jump is longer than 5 m and than 8 typical steps of its neighborhood, allowing for missing frames. Takes camera
-    centers (n, 3) [m] in order of time, with times [s] or indices (n,); returns the indices i of jumps from i to i + 1.
-    """
-    if len(positions) < 3:
-        return np.zeros(0, np.int64)
-    step = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
-    gap = np.diff(times)
-    intervals = np.clip(gap / max(float(np.median(gap)), 1e-9), 1.0, _MAX_MISSING)  # frame intervals per step
-    pace = step / intervals
-    typical = np.full(len(step), np.median(pace))
-    for i in range(len(step)):
-        neighbors = np.concatenate([pace[max(i - _JUMP_WINDOW, 0) : i], pace[i + 1 : i + 1 + _JUMP_WINDOW]])
-        # The upper quartile, since a film may start, stop and speed up at any frame.
-        typical[i] = max(typical[i], float(np.quantile(neighbors, 0.75)))
-    return np.flatnonzero((step > _MIN_JUMP) & (step > typical * np.maximum(_JUMP_RATIO, 2.0 * intervals)))
+def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
+    """A pass by its name, or the longest one of a source."""
+    fitting = [one for one in passes if name in (one.name, one.source)]
+    if not fitting:
+        known = ", ".join(f"{one.name} ({one.length:.1f} m)" for one in passes) or "none"
+        raise InputError(f"route.passes: no pass {short_repr(name)}; expected one of {known}")
+    return max(fitting, key=lambda one: one.length)
 
 
-def _check_source_jumps(cameras: Cameras, index: NDArray[np.int64]) -> None:
-    """Raises InputError if the path of a source jumps; `index` has its frames in order of time."""
-    index = index[path_inliers(cameras.positions[index])]
-    xy, times = cameras.positions[index, :2], cameras.times[index]
-    jumps = path_jumps(cameras.positions[index], times)
-    if not len(jumps):
-        return
-    first = int(jumps[0])
-    length = float(np.linalg.norm(xy[first + 1] - xy[first]))
-    starts, ends = [0, *(int(k) + 1 for k in jumps)], [*(int(k) for k in jumps), len(index) - 1]
-    passes = list(zip(starts, ends, strict=True))
-    a, b = max(passes, key=lambda ends: route_length(xy[ends[0] : ends[1] + 1]))
-    keep = f"[[{math.floor(100 * times[a]) / 100:g}, {math.ceil(100 * times[b]) / 100:g}]]"
-    raise InputError(
-        f"the filmed path jumps {length:.1f} m from frame {cameras.names[index[first]]} to "
-        f"{cameras.names[index[first + 1]]}: a route is one pass without cuts; choose a pass, for the longest write "
-        f"keep = {keep} [s] under [capture], or under its [[source]] where there are several; put photos of one pass "
-        "into a folder of their own; or set mjcf.route = false"
+def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tuple[str, ...]]:
+    """The first line within 2 % of the longest, each pass continued by others of its lighting, and its passes."""
+    lines = []
+    for start in passes:
+        line, names = start.path, [start.name]
+        while True:
+            further = []
+            for other in passes:
+                if other.lighting == start.lighting and other.name not in names:
+                    joined = _continued(line, other.path, max_gap)
+                    if joined is not None and _new_length(line, joined) >= _BEYOND:
+                        further.append((joined, other.name))
+            if not further:
+                break
+            line, name = max(further, key=lambda one: path_length(one[0]))
+            names.append(name)
+        lines.append((line, tuple(names)))
+    if not lines:
+        return np.zeros((0, 2)), ()
+    longest = max(path_length(line) for line, _ in lines)
+    # Of lines that are as long, one pass is better than a joined one.
+    fitting = [one for one in lines if path_length(one[0]) >= _AS_LONG * longest]
+    return min(fitting, key=lambda one: len(one[1]))
+
+
+def _continued(line: Array, path: Array, max_gap: float) -> Array | None:
+    """A line that goes on along a path which runs over or starts ahead of its end; None if the path does neither."""
+    if len(line) < 3 or len(path) < 3:
+        return None
+    end, ahead = line[-1], path_directions(line)[-1]
+    directions = path_directions(path)
+    distance = np.linalg.norm(path - end, axis=1)
+    distance[directions @ ahead < _AGREE] = np.inf
+    k = int(np.argmin(distance))
+    offset = path[k] - end
+    along, aside = float(offset @ ahead), abs(float(ahead[0] * offset[1] - ahead[1] * offset[0]))
+    starts_ahead = k == 0 and 0.0 < along <= max_gap and aside <= max(_ASIDE, 0.25 * along)
+    if not (np.isfinite(distance[k]) and (distance[k] <= _ASIDE or starts_ahead)):
+        return None
+    return _blended(line, path[k:])
+
+
+def _new_length(line: Array, joined: Array) -> float:
+    """Length [m] of a continued line beside which the line itself has not run, as in a second lap."""
+    distance, _ = cKDTree(line).query(joined)
+    return float((distance > _ASIDE).sum()) * SPACING
+
+
+def _joined(line: Array, one: FilmedPass, max_gap: float) -> Array:
+    """A line that goes on along a pass, as the user wants it."""
+    distance = np.linalg.norm(one.path - line[-1], axis=1)
+    k = int(np.argmin(distance))
+    if distance[k] > max_gap:
+        raise InputError(
+            f"route.passes: {one.name} is {distance[k]:.1f} m from the end of the pass before it, expected at most "
+            f"{max_gap:g} m; choose passes that meet, or raise route.max_gap where the way between them is free"
+        )
+    return _blended(line, one.path[k:])
+
+
+def _blended(line: Array, rest: Array) -> Array:
+    """A line and its continuation; side by side they are joined gradually, across a gap by a straight piece."""
+    offset = rest[0] - line[-1]
+    if np.linalg.norm(offset) > _ASIDE:
+        return resample(np.concatenate([line, rest]), curved=False)
+    before, after = (min(round(_BLEND / SPACING), len(one)) for one in (line, rest))
+    first = line[-before:] + np.linspace(0.0, 0.5, before)[:, None] * offset
+    second = rest[:after] - np.linspace(0.5, 0.0, after)[:, None] * offset
+    return resample(np.concatenate([line[:-before], first, second[1:], rest[after:]]), curved=False)
+
+
+def _through_points(points: tuple[tuple[float, ...], ...], passes: list[FilmedPass]) -> Array:
+    line = smooth_line(np.array(points, float))
+    off = (
+        np.min([distance_to_route(one.path, line) for one in passes], axis=0) if passes else np.full(len(line), np.inf)
     )
+    worst = int(np.argmax(off))
+    if off[worst] > _OFF_FILM:
+        x, y = line[worst]
+        raise InputError(
+            f"route.points: at ({x:.1f}, {y:.1f}) the route is {off[worst]:.1f} m from the nearest filmed path, "
+            f"expected at most {_OFF_FILM:g} m; set the points along what was filmed (the report has a map)"
+        )
+    return line
 
 
-def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:
-    """Frame indices of each source in order of time, sources in order of appearance."""
-    sources = np.array(cameras.sources)
-    frames = []
-    for name in dict.fromkeys(cameras.sources):
-        index = np.flatnonzero(sources == name)
-        frames.append(index[np.argsort(cameras.times[index], kind="stable")])
-    return frames
-
-
-def smooth_route(positions: Array) -> Array:
-    """Route (m, 2) with points `SPACING` apart from camera centers in order of time (n, 3); (1, 2) if standing."""
-    xy = remove_stationary(positions[path_inliers(positions)][:, :2])
-    if len(xy) < 2:
-        return xy[:1]
-    dense = _resample(xy, SPACING, curved=len(xy) > 4)
-    return _resample(_smooth(dense, _SMOOTHING / SPACING), SPACING, curved=False)
-
-
-def path_inliers(positions: Array) -> NDArray[np.bool_]:
-    """Mask (n,) of the camera centers (n, 3) that agree with their neighbors in time; false for single outliers."""
-    n = len(positions)
-    if n < 5:
-        return np.ones(n, bool)
-    step = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
-    typical = np.stack([median_filter(positions[:, k], size=5, mode="nearest") for k in range(3)], -1)
-    # A component-wise median lags by up to two steps along the path, also in a turn; 2.5 steps allow for that.
-    return np.linalg.norm(positions - typical, axis=1) <= 2.5 * step + 0.3
-
-
-def remove_stationary(xy: Array) -> Array:
-    """Removes stops and rocking from a path in order of time, (n, 2) → (k, 2).
-
-    The point kept after each kept point is the first one past the path's last exit from a disc of radius
-    `_STATIONARY_RADIUS` around it. Returns after the path was `_DEPARTURE_RADIUS` away are another pass and are kept.
-    """
-    kept, i = [0], 0
-    while True:
-        distance = np.linalg.norm(xy[i:] - xy[i], axis=1)
-        departed = np.flatnonzero(distance > _DEPARTURE_RADIUS)
-        visit = distance[: departed[0] if len(departed) else len(distance)]
-        i += int(np.flatnonzero(visit <= _STATIONARY_RADIUS)[-1]) + 1
-        if i >= len(xy):
-            return xy[kept]
-        kept.append(i)
-
-
-def route_length(route: Array) -> float:
-    """Length of a polyline (m, 2) [m]."""
-    return float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
+def _check_no_fold(line: Array) -> None:
+    """Raises InputError: the line turns back on the spot, which no robot drives in one go."""
+    directions, reach = path_directions(line), round(_FOLD_CHORD / SPACING)
+    cosine = (directions[reach:] * directions[:-reach]).sum(1)
+    if len(cosine) and cosine.min() < _MAX_FOLD:
+        x, y = line[int(np.argmin(cosine)) + reach // 2]
+        raise InputError(
+            f"the route turns back at ({x:.1f}, {y:.1f}) within {_FOLD_CHORD:g} m; choose one pass under [route], such "
+            "as passes = ['film:1']"
+        )
 
 
 def distance_to_route(route: Array, xy: Array) -> Array:
@@ -174,106 +197,3 @@ def distance_to_route(route: Array, xy: Array) -> Array:
         fraction = np.clip((xy - start) @ along / (along @ along), 0.0, 1.0)
         best = np.minimum(best, np.linalg.norm(xy - start - fraction[..., None] * along, axis=-1))
     return best
-
-
-def _resample(xy: Array, spacing: float, curved: bool) -> Array:
-    station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
-    # Equal steps close to the spacing, so that the last point is the end of the path.
-    count = max(round(float(station[-1]) / spacing), 1)
-    at = np.linspace(0.0, station[-1], count + 1)
-    if curved:
-        return Akima1DInterpolator(station, xy, axis=0)(at)
-    return np.stack([np.interp(at, station, xy[:, k]) for k in range(2)], -1)
-
-
-def _smooth(xy: Array, sigma: float) -> Array:
-    """Gaussian smoothing along a polyline; odd extension keeps straight ends straight and end points in place."""
-    reach = min(int(4 * sigma) + 1, len(xy) - 1)
-    before = 2 * xy[0] - xy[reach:0:-1]
-    after = 2 * xy[-1] - xy[-2 : -reach - 2 : -1]
-    return gaussian_filter1d(np.concatenate([before, xy, after]), sigma, axis=0)[reach : reach + len(xy)]
-
-
-# ---- poses off the path
-
-
-def path_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
-    """Mask (n,) of the frames off the path of their neighbors, found one by one, the worst first.
-
-    All false for fewer than 6 frames or a path that is not smooth. `limit` is the allowed position residual [median
-    steps between frames]; more is allowed if the whole path is rough.
-    """
-    n = len(camera_to_world)
-    out = np.zeros(n, bool)
-    if n < _MIN_PATH_FRAMES:
-        return out
-    step = float(np.median(np.linalg.norm(np.diff(camera_to_world[:, :3, 3], axis=0), axis=1)))
-    position, turn = _path_residuals(camera_to_world)
-    if np.median(position) > _MAX_ROUGHNESS * step:
-        return out
-    max_offset = max(limit * step, _OUTLIER_SIGMAS * (1.4826 * float(np.median(position))), 1e-12)
-    max_turn = max(_MAX_TURN, _OUTLIER_SIGMAS * (1.4826 * float(np.median(turn))))
-    while True:
-        kept = np.flatnonzero(~out)
-        if len(kept) < _MIN_PATH_FRAMES:
-            return np.zeros(n, bool)
-        position, turn = _path_residuals(camera_to_world[kept])
-        score = np.maximum(position / max_offset, turn / max_turn)
-        worst = int(np.argmax(score))
-        if score[worst] <= 1.0:
-            return out
-        # An outlier also spoils its neighbors' predictions: the frame is removed without which the others agree best.
-        candidates = [k for k in range(max(worst - 2, 0), min(worst + 3, len(kept))) if score[k] > 0.5]
-        out[kept[min(candidates, key=lambda k: _score_without(camera_to_world[kept], k, max_offset, max_turn))]] = True
-        if out.sum() > _MAX_OUTLIER_FRACTION * n:
-            return np.zeros(n, bool)
-
-
-def _path_residuals(camera_to_world: Array) -> tuple[Array, Array]:
-    """Deviation of each frame from the pose predicted from its neighbors, for poses in order of time (n, 4, 4), n ≥ 5.
-
-    The smaller of two predictions' residuals counts, since either alone fails on correct frames: the chord between
-    neighbors is independent of the speed but cuts corners; the cubic through them follows turns but needs even steps.
-    Returns residuals of position (unit of the poses) and direction [rad], shapes (n,).
-    """
-    n = len(camera_to_world)
-    centers = camera_to_world[:, :3, 3]
-    rotations = Rotation.from_matrix(camera_to_world[:, :3, :3])
-    position, turn = np.zeros(n), np.zeros(n)
-    for i in range(n):
-        left, right = [k for k in (i - 1, i - 2) if k >= 0], [k for k in (i + 1, i + 2) if k < n]
-        if left and right:
-            chords = [_segment_distance(centers[i], centers[a], centers[b]) for a in left for b in right]
-            position[i] = float(np.median(chords))
-            if len(left) == len(right) == 2:  # Lagrange's cubic at the middle of five equidistant frames
-                a2, a1, b1, b2 = centers[left[1]], centers[left[0]], centers[right[0]], centers[right[1]]
-                cubic = (4.0 * (a1 + b1) - (a2 + b2)) / 6.0
-                position[i] = min(position[i], float(np.linalg.norm(centers[i] - cubic)))
-            middle = [Slerp([a, b], Rotation.concatenate([rotations[a], rotations[b]]))(i) for a in left for b in right]
-            turn[i] = min(_angle(m, rotations[i]) for m in middle)
-        else:  # an end of the path: extrapolate the next two frames
-            near, far = (right or left)[0], (right or left)[1]
-            step = centers[near] - centers[far]
-            position[i] = _segment_distance(centers[i], centers[near], centers[near] + 2.5 * step)
-            extrapolated = rotations[near] * rotations[far].inv() * rotations[near]
-            turn[i] = min(_angle(extrapolated, rotations[i]), _angle(rotations[near], rotations[i]))
-    return position, turn
-
-
-def _angle(a: Rotation, b: Rotation) -> float:
-    return float(rotation_angle((a.inv() * b).as_matrix()))
-
-
-def _segment_distance(point: Array, start: Array, end: Array) -> float:
-    along = end - start
-    fraction = np.clip((point - start) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
-    return float(np.linalg.norm(point - start - fraction * along))
-
-
-def _score_without(poses: Array, k: int, max_offset: float, max_turn: float) -> float:
-    lo, hi = max(k - 5, 0), min(k + 6, len(poses))
-    local = np.delete(poses[lo:hi], k - lo, axis=0)
-    if len(local) < 3:
-        return np.inf
-    position, turn = _path_residuals(local)
-    return float(np.sum(np.maximum(position / max_offset, turn / max_turn)))

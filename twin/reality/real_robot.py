@@ -21,7 +21,7 @@ from twin.env.options import Options
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.task import DriveTask
 from twin.geometry.cameras import pixel_grid, unproject
-from twin.geometry.route import route_length, smooth_route
+from twin.geometry.passes import path_length, smooth_path
 from twin.mjcf import husky
 from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World, heading_at, point_at
@@ -94,8 +94,8 @@ def true_route(plan: FilmingPlan | None = None, line: RoadLine | None = None) ->
     As in a build, the first film within 2 % of the longest gives the path.
     """
     plan, line = plan or FilmingPlan(), line or RoadLine()
-    paths = [smooth_route(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
-    lengths = np.array([route_length(path) for path in paths])
+    paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
+    lengths = np.array([path_length(path) for path in paths])
     xy = paths[int(np.argmax(lengths >= _LENGTH_TOLERANCE * lengths.max()))]
     return np.column_stack([xy, ground_height(line, xy)])
 

@@ -14,6 +14,7 @@ from twin.assets.ground import Ground
 from twin.env.route_segments import scene_tasks
 from twin.files import read_json, wrap_read_errors, write_text
 from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.passes import find_passes
 from twin.mjcf.world import World
 from twin.report import figures
 from twin.report.build_sections import SECTIONS, costs_section, headline_sections, sections
@@ -51,7 +52,10 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     route = _load_route(mesh / "route.npz")
     half_width = pick(report, "mjcf.half_width_m")
     wide = float(half_width) if isinstance(half_width, int | float) else 0.0
-    drawn = figures.place_map(cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide)
+    passes = find_passes(cameras) if route is not None else []
+    drawn = figures.place_map(
+        cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide, passes=passes
+    )
     out = [Chart("Map of points, cameras and route", figures.svg(drawn), "metric")]
     if ground is not None:
         path = cameras.positions[:, :2] if route is None else route

@@ -478,6 +478,18 @@ def mesh_section(report: dict[str, Any]) -> Section:
     )
 
 
+def _route_choice(report: dict[str, Any]) -> str:
+    """The passes that the route follows, and how many there are."""
+    route = pick(report, "mesh.route")
+    if not isinstance(route, dict) or not route.get("passes"):
+        return "the filmed path"
+    if not route.get("chosen"):
+        return "through the way points of [route]"
+    count = len(route["passes"])
+    chosen = ", then ".join(map(str, route["chosen"]))
+    return f"along {chosen}, of {count} filmed passes; [route] chooses others" if count > 1 else "the filmed path"
+
+
 def mjcf_section(report: dict[str, Any]) -> Section:
     mjcf = pick(report, "mjcf") or {}
     routeless = mjcf.get("has_route") is False
@@ -487,7 +499,7 @@ def mjcf_section(report: dict[str, Any]) -> Section:
     size = mjcf.get("assets_bytes")
     megabytes = size / 1e6 if isinstance(size, int | float) else None
     facts = [
-        Fact("route", "none" if routeless else number(mjcf.get("route_length_m"), "{:.1f} m"), "the filmed path"),
+        Fact("route", "none" if routeless else number(mjcf.get("route_length_m"), "{:.1f} m"), _route_choice(report)),
         Fact("turn", number(mjcf.get("turn_deg"), "{:+.0f}°"), "from the first heading to the last; right is negative"),
         Fact("corridor", number(mjcf.get("half_width_m"), "± {:.2f} m"), "kept free of solid parts"),
         Fact("free at the start", number(mjcf.get("spawn_clearance_m"), "{:.2f} m"), "robot to the nearest part"),

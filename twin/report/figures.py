@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from twin.assets.ground import Ground
+from twin.geometry.passes import FilmedPass
 from twin.types import Array
 
 # Placeholder colors, used by nothing else; `svg` replaces them by the page's CSS variables.
@@ -149,10 +150,12 @@ def place_map(
     route: Array | None = None,
     half_width: float = 0.0,
     parts: Sequence[Array] = (),
+    passes: Sequence[FilmedPass] = (),
 ) -> Figure:
     """Map of sparse points, cameras by source (held-out ones hollow), route with corridor, and solid parts [m].
 
     Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (uint8) (m, 3), `route` and each part (k, 2).
+    Several passes of one source are drawn as lines with their names.
     """
     low, high = map_bounds(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
     figure, axes = _map_axes(low, high)
@@ -165,6 +168,7 @@ def place_map(
         axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colors, linewidths=0, rasterized=True)
         _draw_route(axes, route, half_width)
         _draw_parts(axes, parts)
+        _draw_passes(axes, passes)
         for i, source in enumerate(dict.fromkeys(sources)):
             mine = np.array([name == source for name in sources])
             color = SERIES[i % len(SERIES)]
@@ -208,6 +212,22 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
     if route is not None or len(parts):
         _legend(axes, 3)
     return figure
+
+
+def _draw_passes(axes: Axes, passes: Sequence[FilmedPass]) -> None:
+    """Lines and names of passes, if some source has several; a cross marks where a film jumps or turns."""
+    if len(passes) == len({one.source for one in passes}):
+        return
+    for k, one in enumerate(passes):
+        color = SERIES[k % len(SERIES)]
+        axes.plot(*one.path.T, color=color, lw=0.9, ls=(0, (4, 2)), zorder=3)
+        middle = one.path[len(one.path) // 2]
+        box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
+        axes.annotate(
+            one.name, middle, xytext=(4, -9), textcoords="offset points", fontsize=7, color=color, bbox=box, zorder=6
+        )
+        if one.ends_with != "end":
+            axes.plot(*one.path[-1], "x", color=color, ms=6, zorder=5)
 
 
 def _draw_route(axes: Axes, route: Array | None, half_width: float) -> None:

@@ -1,0 +1,271 @@
+"""Passes: the stretches of a filmed path that a robot can drive in one go.
+
+A film may go down a road twice, come back in the other lane, drive laps, stop, back up, or be cut. Its path is divided
+at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at *laps* (it
+goes the same way again). What remains between them is a *pass*, named `<source>:<number>`. `twin/geometry/route.py`
+chooses the route from the passes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
+from scipy.ndimage import gaussian_filter1d, median_filter
+from scipy.spatial import cKDTree
+
+from twin.geometry.cameras import Cameras
+from twin.types import Array
+
+SPACING = 0.25  # [m] between the points of a path
+_SMOOTHING = 0.5  # [m] standard deviation; moves a 5 m turn by 0.5²/(2·5) = 2.5 cm
+_STATIONARY_RADIUS = 0.4  # [m] motion within this is standing or rocking
+_DEPARTURE_RADIUS = 1.6  # [m] beyond this the camera has left: a later return is another pass
+_JUMP_RATIO = 8.0  # times the typical step; uneven frame intervals and sudden starts stay below 4
+_MIN_JUMP = 5.0  # [m]
+_LONG_JUMP, _LONG_RATIO = 12.0, 3.0  # [m], times the typical step
+_JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
+_MAX_MISSING = 20.0  # frames in a row; longer gaps in time do not raise the allowed step further
+_BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; a 6 m bend is 12 m wide
+_ALONGSIDE = 0.5  # [m]
+_PARALLEL = np.cos(np.deg2rad(40.0))  # of the angle between a path and the part that it retraces
+_MIN_RETRACE = 1.5  # [m] shorter retraces are noise
+_MIN_LAP = 12.0  # [m] a path that goes the same way again has driven at least this far
+_MAX_TURN = 25.0  # [m] a longer way round is a loop at the end of the road and stays in the pass
+_MIN_PASS = 1.0  # [m]
+_CHORD = 1.0  # [m] over which headings are measured
+
+
+@dataclass(frozen=True)
+class FilmedPass:
+    """One pass of one source."""
+
+    name: str
+    """`<source>:<number>`, numbered from 1 in order of time."""
+    source: str
+    lighting: str
+    frames: NDArray[np.int64]
+    """Indices into the cameras, in order of time."""
+    path: Array
+    """Points `SPACING` apart in the direction in which the camera looks, shape (m, 2) [m]."""
+    ends_with: str
+    """`end` of the film, `jump`, `turn` or `lap`."""
+
+    @property
+    def length(self) -> float:
+        return path_length(self.path)
+
+
+def find_passes(cameras: Cameras) -> list[FilmedPass]:
+    """All passes, by source in order of appearance and then in order of time."""
+    found = []
+    for index in source_frames(cameras):
+        number = 0
+        for piece, ending in _between_jumps(cameras, index):
+            for frames, path, ends_with in _between_retraces(cameras.positions, piece, ending):
+                if path_length(path) < _MIN_PASS:
+                    continue
+                number += 1
+                first = int(frames[0])
+                if _looks_back(cameras.camera_to_world[frames], path):
+                    path = path[::-1]
+                source = cameras.sources[first]
+                found.append(
+                    FilmedPass(f"{source}:{number}", source, cameras.lightings[first], frames, path, ends_with)
+                )
+    return found
+
+
+def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:
+    """Frame indices of each source in order of time, sources in order of appearance."""
+    sources = np.array(cameras.sources)
+    frames = []
+    for name in dict.fromkeys(cameras.sources):
+        index = np.flatnonzero(sources == name)
+        frames.append(index[np.argsort(cameras.times[index], kind="stable")])
+    return frames
+
+
+# ---- division
+
+
+def path_jumps(positions: Array, times: Array) -> NDArray[np.int64]:
+    """Finds steps much longer than the typical step of a path, as between two passes filmed one after the other.
+
+    A jump is longer than 5 m and than 8 typical steps of its neighborhood, allowing for missing frames; or longer than
+    12 m and 3 typical steps, whatever is missing. Takes camera centers (n, 3) [m] in order of time, with times [s] or
+    indices (n,); returns the indices i of jumps from i to i + 1.
+    """
+    if len(positions) < 3:
+        return np.zeros(0, np.int64)
+    step = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    gap = np.diff(times)
+    intervals = np.clip(gap / max(float(np.median(gap)), 1e-9), 1.0, _MAX_MISSING)  # frame intervals per step
+    pace = step / intervals
+    typical = np.full(len(step), np.median(pace))
+    for i in range(len(step)):
+        neighbors = np.concatenate([pace[max(i - _JUMP_WINDOW, 0) : i], pace[i + 1 : i + 1 + _JUMP_WINDOW]])
+        # The upper quartile, since a film may start, stop and speed up at any frame.
+        typical[i] = max(typical[i], float(np.quantile(neighbors, 0.75)))
+    relative = (step > _MIN_JUMP) & (step > typical * np.maximum(_JUMP_RATIO, 2.0 * intervals))
+    return np.flatnonzero(relative | ((step > _LONG_JUMP) & (step > _LONG_RATIO * typical)))
+
+
+def _between_jumps(cameras: Cameras, index: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], str]]:
+    """The frames of a source between its jumps, each with how the piece ends."""
+    inliers = index[path_inliers(cameras.positions[index])]
+    jumps = path_jumps(cameras.positions[inliers], cameras.times[inliers])
+    # An outlier at the edge of a piece has no neighbors on both sides to be found by, so pieces are made without it.
+    pieces = np.split(inliers, jumps + 1) if len(jumps) else [index]
+    return [(piece, "jump" if k < len(jumps) else "end") for k, piece in enumerate(pieces)]
+
+
+def _between_retraces(
+    positions: Array, frames: NDArray[np.int64], ending: str
+) -> list[tuple[NDArray[np.int64], Array, str]]:
+    """Frames, path and ending of each pass between the turns and laps of a piece without jumps."""
+    path = smooth_path(positions[frames])
+    cuts = _retraces(path)
+    if not cuts:
+        return [(frames, path, ending)]
+    # Frames follow their station; frames of a turn belong to no pass.
+    station = _frame_stations(positions[frames, :2], path)
+    spacing = path_length(path) / (len(path) - 1)
+    starts = [0, *(start for _, start, _ in cuts)]
+    ends = [*(end for end, _, _ in cuts), len(path) - 1]
+    out = []
+    for start, end, kind in zip(starts, ends, [*(kind for *_, kind in cuts), ending], strict=True):
+        mine = frames[(station >= (start - 0.5) * spacing) & (station <= (end + 0.5) * spacing)]
+        if end > start and len(mine):
+            out.append((mine, path[start : end + 1], kind))
+    return out
+
+
+def _retraces(path: Array) -> list[tuple[int, int, str]]:
+    """Where a path retraces itself: the last point before, the first point after, and `turn` or `lap`."""
+    if len(path) < 3:
+        return []
+    direction = path_directions(path)
+    near = cKDTree(path).query_ball_point(path, _BESIDE)
+    need = round(_MIN_RETRACE / SPACING)
+    cuts: list[tuple[int, int, str]] = []
+    begin, run = 0, list[tuple[int, int, str]]()
+    for i in range(len(path)):
+        earlier = np.array([j for j in near[i] if begin <= j < i], int)
+        # Beside the point, neither ahead nor behind.
+        earlier = earlier[np.abs((path[earlier] - path[i]) @ direction[i]) <= _ALONGSIDE]
+        cosine = direction[earlier] @ direction[i]
+        back = earlier[cosine < -_PARALLEL]
+        again = earlier[(cosine > _PARALLEL) & ((i - earlier) * SPACING > _MIN_LAP)]
+        if not len(back) and not len(again):
+            run = []
+            continue
+        kind = "turn" if len(back) else "lap"
+        partners = back if len(back) else again
+        j = int(partners[np.argmin(np.linalg.norm(path[partners] - path[i], axis=1))])
+        run = [*run, (j, i, kind)] if not run or run[-1][2] == kind else [(j, i, kind)]
+        if len(run) < need:
+            continue
+        j, first, kind = run[0]
+        short_turn = kind == "turn" and (first - j) * SPACING <= _MAX_TURN
+        cuts.append((j if short_turn else first, first, kind))
+        begin, run = first, []
+    return cuts
+
+
+def _frame_stations(xy: Array, path: Array) -> Array:
+    """Station [m] of frames (n, 2) along their own path; it never falls, also where the path meets itself."""
+    total = path_length(path)
+    kept = _moving(xy)
+    raw = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy[kept], axis=0), axis=1))])
+    return np.interp(np.arange(len(xy)), kept, raw * (total / max(float(raw[-1]), 1e-9)))
+
+
+def _looks_back(camera_to_world: Array, path: Array) -> bool:
+    """Whether cameras (n, 4, 4) look against the direction in which they moved."""
+    direction = path_directions(path)
+    _, nearest = cKDTree(path).query(camera_to_world[:, :2, 3])
+    return float(np.mean((camera_to_world[:, :2, 2] * direction[nearest]).sum(1))) < -0.5
+
+
+# ---- paths
+
+
+def smooth_path(positions: Array) -> Array:
+    """Path (m, 2) with points `SPACING` apart from camera centers in order of time (n, 3); (1, 2) if standing."""
+    xy = remove_stationary(positions[path_inliers(positions)][:, :2])
+    if len(xy) < 2:
+        return xy[:1]
+    dense = resample(xy, curved=len(xy) > 4)
+    return resample(_smooth(dense, _SMOOTHING / SPACING), curved=False)
+
+
+def path_inliers(positions: Array) -> NDArray[np.bool_]:
+    """Mask (n,) of the camera centers (n, 3) that agree with their neighbors in time; false for single outliers."""
+    n = len(positions)
+    if n < 5:
+        return np.ones(n, bool)
+    step = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    typical = np.stack([median_filter(positions[:, k], size=5, mode="nearest") for k in range(3)], -1)
+    # A component-wise median lags by up to two steps along the path, also in a turn; 2.5 steps allow for that.
+    return np.linalg.norm(positions - typical, axis=1) <= 2.5 * step + 0.3
+
+
+def remove_stationary(xy: Array) -> Array:
+    """Removes stops and rocking from a path in order of time, (n, 2) → (k, 2).
+
+    The point kept after each kept point is the first one past the path's last exit from a disc of radius
+    `_STATIONARY_RADIUS` around it. Returns after the path was `_DEPARTURE_RADIUS` away are another pass and are kept.
+    """
+    return xy[_moving(xy)]
+
+
+def _moving(xy: Array) -> list[int]:
+    """Indices of the points that `remove_stationary` keeps."""
+    kept, i = [0], 0
+    while True:
+        distance = np.linalg.norm(xy[i:] - xy[i], axis=1)
+        departed = np.flatnonzero(distance > _DEPARTURE_RADIUS)
+        visit = distance[: departed[0] if len(departed) else len(distance)]
+        i += int(np.flatnonzero(visit <= _STATIONARY_RADIUS)[-1]) + 1
+        if i >= len(xy):
+            return kept
+        kept.append(i)
+
+
+def path_length(path: Array) -> float:
+    """Length of a polyline (m, 2) [m]."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+
+def path_directions(path: Array, chord: float = _CHORD) -> Array:
+    """Unit directions at the points of a path, of the chord around each, shape (m, 2)."""
+    reach = max(round(chord / 2 / SPACING), 1)
+    at = np.arange(len(path))
+    along = path[np.minimum(at + reach, len(path) - 1)] - path[np.maximum(at - reach, 0)]
+    return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+
+
+def smooth_line(corners: Sequence[Array] | Array) -> Array:
+    """A path (m, 2) along a polyline (n ≥ 2, 2), its corners rounded as those of a filmed path."""
+    return resample(_smooth(resample(np.asarray(corners, float), curved=False), _SMOOTHING / SPACING), curved=False)
+
+
+def resample(xy: Array, curved: bool) -> Array:
+    """Points about `SPACING` apart along a polyline (n ≥ 2, 2), or along a curve through its points."""
+    station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    # Equal steps close to the spacing, so that the last point is the end of the path.
+    count = max(round(float(station[-1]) / SPACING), 1)
+    at = np.linspace(0.0, station[-1], count + 1)
+    if curved:
+        return Akima1DInterpolator(station, xy, axis=0)(at)
+    return np.stack([np.interp(at, station, xy[:, k]) for k in range(2)], -1)
+
+
+def _smooth(xy: Array, sigma: float) -> Array:
+    """Gaussian smoothing along a polyline; odd extension keeps straight ends straight and end points in place."""
+    reach = min(int(4 * sigma) + 1, len(xy) - 1)
+    before = 2 * xy[0] - xy[reach:0:-1]
+    after = 2 * xy[-1] - xy[-2 : -reach - 2 : -1]
+    return gaussian_filter1d(np.concatenate([before, xy, after]), sigma, axis=0)[reach : reach + len(xy)]
