@@ -245,6 +245,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("cameras", "cameras.outliers", ["day/000001"], "day/000001"),
     ("cameras", "cameras.note", "the given poses did not fit", "The given poses did not fit."),
     ("metric", "metric.scale_uncertainty", 0.1, "10.0%"),
+    ("metric", "metric.scale_disagreement", 4.2, "4.2 standard deviations"),
     ("metric", "metric.gravity_uncertainty_deg", 3.0, "3.0°"),
     ("metric", "metric.road_reliable", False, "Too few points"),
     ("field", "field.psnr", {"day": 12.0}, "12.0 dB"),

@@ -10,7 +10,7 @@ import pytest
 from twin.capture import metric
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.gravity import find_road, up_from_ground
-from twin.capture.scale import local_east_north_up
+from twin.capture.scale import Scale, combine_scales, local_east_north_up
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json
@@ -354,6 +354,42 @@ def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:
     assert metrics["scale"] == 1.0 and metrics["gravity_source"] == "poses"
 
 
+def test_two_scales_are_combined_by_their_uncertainties() -> None:
+    a, b = Scale(2.0, 0.01), Scale(2.02, 0.03, {"gps_frames": 7})
+    both = combine_scales({"camera_height": a, "gps": b})
+    assert both.value == pytest.approx(2.0 * 1.01 ** (0.01**2 / (0.01**2 + 0.03**2)), rel=1e-6)
+    assert both.uncertainty == pytest.approx(1 / np.hypot(1 / 0.01, 1 / 0.03), rel=1e-9)
+    assert both.notes["gps_frames"] == 7 and both.notes["scale_disagreement"] < 1.0
+    # Scales that contradict each other make the result less certain, not more.
+    apart = combine_scales({"camera_height": a, "gps": Scale(2.4, 0.01)})
+    assert apart.uncertainty > 0.05 and apart.notes["scale_disagreement"] > 10.0
+    assert combine_scales({"gps": b}) == b
+    exact = combine_scales({"poses_are_metric": Scale(1.0, 0.0), "camera_height": Scale(1.1, 0.02)})
+    assert (exact.value, exact.uncertainty) == (1.0, 0.0)
+    assert exact.notes["scale_disagreement"] == pytest.approx(np.log(1.1) / 0.02)
+
+
+def test_an_error_of_the_measured_height_is_in_the_uncertainty(tmp_path: Path) -> None:
+    film = _path()
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(2))
+    sure = world.run(tmp_path / "a", camera_height=HEIGHT, camera_height_tolerance=0.0)
+    unsure = world.run(tmp_path / "b", camera_height=HEIGHT, camera_height_tolerance=0.05)
+    assert sure["scale"] == unsure["scale"]
+    added = unsure["scale_uncertainty"] ** 2 - sure["scale_uncertainty"] ** 2
+    assert added == pytest.approx((0.05 / HEIGHT) ** 2, rel=1e-6)
+
+
+def test_a_cross_slope_makes_the_scale_less_certain(tmp_path: Path) -> None:
+    film = _path(turn=False)
+    points = _points(film, np.random.default_rng(0))
+    level = _world(tmp_path / "level", [film], points, _similarity(2)).run(tmp_path / "a", camera_height=HEIGHT)
+    kerb = points.copy()
+    kerb[:300, 2] += 0.06 * (points[:300, 1] > 0.0)
+    raised = _world(tmp_path / "kerb", [film], kerb, _similarity(2)).run(tmp_path / "b", camera_height=HEIGHT)
+    assert raised["scale_uncertainty_of"]["left_against_right"] > 0.01
+    assert level["scale_uncertainty_of"]["left_against_right"] < 0.005
+
+
 def test_up_from_cameras(tmp_path: Path) -> None:
     film = _path(pitch=0.0)
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(6))
@@ -370,7 +406,6 @@ def test_wrong_choices_are_one_line_with_a_cure(tmp_path: Path) -> None:
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(0))
     cases: list[tuple[dict, str]] = [
         ({}, "no scale given; give one of: metric.camera_height .*distance.*gps.*marker.*poses_are_metric"),
-        ({"camera_height": 1.0, "gps": True}, r"2 scales given \(metric.camera_height, metric.gps\); keep exactly one"),
         ({"camera_height": -1.0}, "metric.camera_height = -1.0; expected metres"),
         ({"poses_are_metric": True}, "the input brought no poses"),
         ({"camera_height": 1.0, "up": "poses"}, "the input brought no poses"),

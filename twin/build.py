@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from twin import commands, runtime
-from twin.config import RouteConfig, SceneConfig
+from twin.config import MetricConfig, RouteConfig, SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError
 from twin.files import digest_file, is_link, remove, write_json
@@ -218,6 +218,8 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for one in (settings.get("capture", {}), *settings.get("source", ())):
         if "keep" in one and not one["keep"]:
             del one["keep"]
+    if settings.get("metric", {}).get("camera_height_tolerance") == MetricConfig.camera_height_tolerance:
+        del settings["metric"]["camera_height_tolerance"]
     if settings.get("route") == dataclasses.asdict(RouteConfig()):
         del settings["route"]
     if not settings.get("nerf", {}).get("refine_cameras", True):

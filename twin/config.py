@@ -152,10 +152,12 @@ class MarkerConfig:
 
 @dataclass(frozen=True)
 class MetricConfig:
-    """Source of the metric scale; exactly one must be given."""
+    """Sources of the metric scale: one, or several to be compared and combined."""
 
     camera_height: float = 0.0
     """Lens above the ground [m], for a camera carried at constant height. 0 = not given."""
+    camera_height_tolerance: float = 0.01
+    """Standard deviation of the error with which it was measured [m]."""
     distance: DistanceConfig | None = None
     marker: MarkerConfig | None = None
     gps: bool = False

@@ -57,7 +57,7 @@ _RANGES: dict[str, dict[str, tuple[float, float]]] = {
         "min_registered": (0, 1),
         "max_outlier": (1e-3, _INF),
     },
-    "metric": {"camera_height": (0, _INF)},
+    "metric": {"camera_height": (0, _INF), "camera_height_tolerance": (0, 1)},
     "nerf": {
         "steps": (1, _INF),
         "rays": (1, 2**20),
@@ -249,10 +249,10 @@ def _check(config: SceneConfig, path: Path) -> None:
     _check_obstacles(config.obstacle, path)
     _check_metric(config.metric, path)
     given = _scale_sources(config.metric)
-    if len(given) != 1 and not (not given and any(source.camera_height > 0.0 for source in config.source)):
+    if not given and not any(source.camera_height > 0.0 for source in config.source):
         # Checked here, not minutes into the build.
         raise InputError(
-            f"{path}: [metric] gives {'no scale' if not given else ' and '.join(given)}; give exactly one of "
+            f"{path}: [metric] gives no scale; give one or more of "
             "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
             "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true"
         )

@@ -48,7 +48,7 @@ fps = 2.0                      # frames kept per second of film, the sharpest of
 # frames = 80                  # or: so many per film
 # keep = [[0, 62.5]]           # use only these time ranges [s], such as one pass; under a [[source]]: for it only
 
-[metric]                       # source of the metric scale; exactly one
+[metric]                       # sources of the metric scale; several are compared
 {camera_height}
 # gps = true                   # EXIF positions of the photos
 # poses_are_metric = true      # the given poses are in metres

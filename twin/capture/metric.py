@@ -14,11 +14,12 @@ from twin.capture.capture_data import Capture
 from twin.capture.gravity import Gravity, Road, camera_up, find_road, heights_above_road, up_from_ground
 from twin.capture.scale import (
     Scale,
+    combine_scales,
     scale_from_distance,
     scale_from_gps,
     scale_from_height,
     scale_from_marker,
-    select_scale_source,
+    select_scale_sources,
 )
 from twin.config import SceneConfig
 from twin.errors import InputError
@@ -44,42 +45,45 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         similarity from the reconstruction, and the notes of the `Scale`.
 
     Raises:
-        InputError: no scale or several given, or the data lack the evidence for it.
+        InputError: no scale given, or the data lack the evidence for it.
     """
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
     heights = {source.name: source.camera_height for source in capture.sources}
-    scale_source = select_scale_source(config.metric, heights)
-    if scale_source == "poses_are_metric" and capture.camera_to_world is None:
+    sources = select_scale_sources(config.metric, heights)
+    if "poses_are_metric" in sources and capture.camera_to_world is None:
         raise InputError(
             "metric.poses_are_metric: the input brought no poses; give metric.camera_height or another scale"
         )
     up, road = _find_up(cameras, points.xyz, config.metric.up, capture)
     level, floor_source = _ground_level(cameras, points.xyz, up.direction, road)
     east: Array | None = None
-    if scale_source == "camera_height":
-        scale = scale_from_height(cameras, up.direction, points.xyz, road, config.metric.camera_height, heights)
-    elif scale_source == "distance":
+    scales: dict[str, Scale] = {}
+    if "camera_height" in sources:
+        scales["camera_height"] = scale_from_height(cameras, up, points.xyz, road, config.metric, heights)
+    if "distance" in sources:
         assert config.metric.distance is not None
         if road is None and not config.metric.distance.frame_b:
             raise InputError(
                 "metric.distance: no ground was reconstructed to lay the points on; give frame_b, a2 and b2"
             )
-        scale = scale_from_distance(cameras, up.direction, level, config.metric.distance)
-    elif scale_source == "gps":
+        scales["distance"] = scale_from_distance(cameras, up.direction, level, config.metric.distance)
+    if "gps" in sources:
         row = {name: i for i, name in enumerate(capture.names)}
         gps = capture.gps[[row[name] for name in cameras.names]]
-        scale, east = scale_from_gps(cameras.positions, up.direction, gps, np.random.default_rng(config.seed))
-    elif scale_source == "marker":
+        rng = np.random.default_rng(config.seed)
+        scales["gps"], east = scale_from_gps(cameras.positions, up.direction, gps, rng)
+    if "marker" in sources:
         assert config.metric.marker is not None
-        scale = scale_from_marker(cameras, config.metric.marker)
-    else:
-        scale = Scale(1.0, 0.0)
+        scales["marker"] = scale_from_marker(cameras, config.metric.marker)
+    if "poses_are_metric" in sources:
+        scales["poses_are_metric"] = Scale(1.0, 0.0)
+    scale = combine_scales(scales)
     similarity = _level_frame(cameras, up.direction, level, scale.value, east, keep=config.metric.up == "poses")
     cameras, points = cameras.transformed(similarity), points.transformed(similarity)
     cameras.save(out)
     points.save(out)
-    metrics = _metrics(cameras, points, scale_source, scale, up, road, floor_source, similarity)
+    metrics = _metrics(cameras, points, " + ".join(sources), scale, up, road, floor_source, similarity)
     write_json(out / "metric.json", metrics)
     return metrics
 

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from twin import runtime
-from twin.capture.gravity import Road, heights_above_road
+from twin.capture.gravity import Gravity, Road, below_path, heights_above_road
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, unproject
@@ -23,6 +23,7 @@ _SCALE_OPTIONS = (
 )
 _PIXEL_ERROR = 1.0  # [px] of a point marked by hand
 _GPS_TRIALS = 400
+_MIN_SIDE = 10  # road points on either side of the path for a comparison of the two
 _MIN_ANGLE = np.radians(2.0)  # [rad] between the rays of two frames to a marker
 
 
@@ -37,11 +38,11 @@ class Scale:
     """Further entries of `metric.json`."""
 
 
-def select_scale_source(metric: MetricConfig, source_heights: dict[str, float]) -> str:
-    """The one scale source that is configured: camera_height, distance, gps, marker or poses_are_metric.
+def select_scale_sources(metric: MetricConfig, source_heights: dict[str, float]) -> list[str]:
+    """The scale sources that are configured: camera_height, distance, gps, marker, poses_are_metric.
 
-    `source_heights` holds the sources' own camera heights [m], 0 for none. Raises InputError unless exactly one is
-    configured, or for a negative height.
+    `source_heights` holds the sources' own camera heights [m], 0 for none. Raises InputError if none is configured, or
+    for a negative height.
     """
     heights = (metric.camera_height, *source_heights.values())
     if any(height < 0 for height in heights):
@@ -58,17 +59,50 @@ def select_scale_source(metric: MetricConfig, source_heights: dict[str, float]) 
     given = [name for name, set_ in options.items() if set_]
     if not given:
         raise InputError(f"no scale given; give one of: {_SCALE_OPTIONS}")
-    if len(given) > 1:
-        raise InputError(f"{len(given)} scales given ({', '.join('metric.' + g for g in given)}); keep exactly one")
-    return given[0]
+    return given
+
+
+def combine_scales(scales: dict[str, Scale]) -> Scale:
+    """The mean of independent scales in the logarithm, weighted by their variances.
+
+    Where they differ by more than their uncertainties explain, the combined uncertainty grows by the Birge ratio
+    (Birge 1932). A scale without uncertainty, of poses that are given as metric, is taken as it is. The notes of the
+    sources are merged; for several sources, `scales` holds each one relative to the result, and
+    `scale_disagreement` the largest difference of two in standard deviations.
+    """
+    names = list(scales)
+    notes: dict[str, Any] = {}
+    for one in scales.values():
+        notes |= one.notes
+    if len(names) == 1:
+        return Scale(scales[names[0]].value, scales[names[0]].uncertainty, notes)
+    logs = np.log([one.value for one in scales.values()])
+    sigmas = np.array([one.uncertainty for one in scales.values()])
+    exact = np.flatnonzero(sigmas == 0.0)
+    if len(exact):
+        mean, sigma = float(logs[exact[0]]), 0.0
+    else:
+        weights = 1.0 / sigmas**2
+        mean = float(np.average(logs, weights=weights))
+        birge = float(np.sqrt(np.sum(weights * (logs - mean) ** 2) / (len(logs) - 1)))
+        sigma = max(1.0, birge) / float(np.sqrt(weights.sum()))
+    apart = np.abs(logs[:, None] - logs) / np.maximum(np.hypot(sigmas[:, None], sigmas), 1e-9)
+    notes["scales"] = {
+        name: {"relative": float(np.exp(log - mean)), "uncertainty": float(one)}
+        for name, log, one in zip(names, logs, sigmas, strict=True)
+    }
+    notes["scale_disagreement"] = float(apart.max())
+    return Scale(float(np.exp(mean)), sigma, notes)
 
 
 def scale_from_height(
-    cameras: Cameras, up: Array, points: Array, road: Road | None, default: float, own: dict[str, float]
+    cameras: Cameras, up: Gravity, points: Array, road: Road | None, metric: MetricConfig, own: dict[str, float]
 ) -> Scale:
     """Scale from the known height of the cameras above the road; `points` (m, 3) are all sparse points.
 
-    `own` holds the height by source and `default` that of the others [m]; 0 = none. Raises InputError without a road.
+    `own` holds the height by source [m], 0 where that of `metric` holds. The uncertainty has the error of the height as
+    measured, how well it repeats along the path, the tilt, and how far the ground on the left differs from that on
+    the right. Raises InputError without a road.
     """
     if road is None:
         raise InputError(
@@ -77,13 +111,13 @@ def scale_from_height(
         )
     on_road = points[road.points]
     sources = np.array(cameras.sources)
-    scales, weights, sigmas, spreads = [], [], [], []
+    scales, weights, sigmas, spreads, measurement = [], [], [], [], []
     for name in dict.fromkeys(cameras.sources):
-        true_height = own.get(name, 0.0) or default
+        true_height = own.get(name, 0.0) or metric.camera_height
         if true_height <= 0:
             continue
         centers = cameras.positions[sources == name]
-        local = heights_above_road(on_road, centers, up, road.drop)
+        local = heights_above_road(on_road, centers, up.direction, road.drop)
         if local is not None:
             measured = local[np.isfinite(local)]
             height = float(np.median(measured))
@@ -92,6 +126,7 @@ def scale_from_height(
         else:  # too few points below this path: use the road as a whole
             height, spread, count = road.drop, road.spread, 1
         scales.append(true_height / height)
+        measurement.append(metric.camera_height_tolerance / true_height)
         weights.append(count)
         spreads.append(spread * true_height / height)
         # A road undulates smoothly, so the heights along it count as at most six independent ones.
@@ -101,12 +136,39 @@ def scale_from_height(
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
     # Few points, or only points of the verge, give at best 5 %: a kerb is a tenth of the usual height.
     few = 0.0 if road.reliable else 0.05
-    sigma = float(np.sqrt(np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2))
+    repeat = np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2
+    # One person measures all heights with one method, so their errors are common.
+    tape = float(np.average(measurement, weights=weights))
+    tilt, sides = _ground_errors(cameras, up, on_road, road.drop)
+    sigma = float(np.sqrt(repeat + tape**2 + tilt**2 + sides**2))
     notes = {
         "scale_per_source_relative": [round(s / value, 4) for s in scales],
         "local_height_spread_m": float(np.average(spreads, weights=weights)),
+        "scale_uncertainty_of": {
+            "height_as_measured": tape,
+            "repeatability": float(np.sqrt(repeat)),
+            "tilt": tilt,
+            "left_against_right": sides,
+        },
     }
     return Scale(value, sigma, notes)
+
+
+def _ground_errors(cameras: Cameras, up: Gravity, road: Array, drop: float) -> tuple[float, float]:
+    """Relative errors of the height of cameras above road points (k, 3): by the tilt, and by camber or a kerb.
+
+    The tilt moves the height by the mean horizontal offset of the points. Half the difference between the heights above
+    the points to the left and to the right of the path shows whether the ground is level across it.
+    """
+    nearest, height, _ = below_path(road, cameras.positions, up.direction)
+    away = road - cameras.positions[nearest]
+    away = away + height[:, None] * up.direction  # horizontal
+    tilt = up.uncertainty * float(np.linalg.norm(away.mean(0))) / drop
+    side = (away * cameras.camera_to_world[nearest, :3, 0]).sum(1)
+    left, right = height[side < 0.0], height[side > 0.0]
+    if min(len(left), len(right)) < _MIN_SIDE:
+        return tilt, 0.0
+    return tilt, abs(float(np.median(left) - np.median(right))) / 2.0 / drop
 
 
 def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distance: DistanceConfig) -> Scale:

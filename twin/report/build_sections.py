@@ -27,6 +27,7 @@ _FEW_FRAMES = 20
 _MIN_REGISTERED = 0.9  # share of frames
 _LARGE_REPROJECTION = 1.5  # [px]
 _LARGE_SCALE_UNCERTAINTY = 0.03  # relative
+_LARGE_DISAGREEMENT = 3.0  # standard deviations between two sources of scale
 _LARGE_TILT = 1.5  # [°]
 _FEW_HELD_OUT = 3  # frames per lighting
 _LOW_PSNR = 18.0  # [dB]
@@ -295,6 +296,22 @@ def _focal_text(value: Any) -> str:
     return number(value, "{:.0f} px")
 
 
+def _scale_facts(each: dict[str, Any]) -> list[Fact]:
+    """Each of several sources of scale, compared with the combined scale."""
+    facts = []
+    for name, one in each.items():
+        relative, sigma = (one.get(key) if isinstance(one, dict) else None for key in ("relative", "uncertainty"))
+        offset = relative - 1.0 if isinstance(relative, int | float) else None
+        facts.append(
+            Fact(
+                f"by {_SCALE_SOURCES.get(name, name)}",
+                f"{number(offset, '{:+.2%}')} ± {number(sigma, '{:.1%}')}",
+                "compared with the combined scale",
+            )
+        )
+    return facts
+
+
 def metric_section(report: dict[str, Any]) -> Section:
     metric = pick(report, "metric") or {}
     uncertainty = metric.get("scale_uncertainty")
@@ -324,15 +341,27 @@ def metric_section(report: dict[str, Any]) -> Section:
                 "film closer to the ground or at a higher resolution, or put textured objects on the road.",
             )
         )
+    each = metric.get("scales")
+    each = each if isinstance(each, dict) else {}
+    apart = metric.get("scale_disagreement")
+    if isinstance(apart, int | float) and apart > _LARGE_DISAGREEMENT:
+        cautions.append(
+            Caution(
+                f"The sources of scale contradict each other: they differ by {apart:.1f} standard deviations.",
+                "measure again what was given under [metric], and remove the source that is wrong.",
+            )
+        )
     source = metric.get("scale_source")
     sure = "" if uncertainty is None else f", with an uncertainty of about {uncertainty:.1%}"
-    source_text = NOT_MEASURED if not source else _SCALE_SOURCES.get(str(source), str(source))
+    named = " and ".join(_SCALE_SOURCES.get(one, one) for one in str(source).split(" + "))
+    source_text = named if source else NOT_MEASURED
     verdict = None
     if source is not None:
-        verdict = Verdict(f"Its scale comes from {_SCALE_SOURCES.get(str(source), str(source))}{sure}.", "good")
+        verdict = Verdict(f"Its scale comes from {named}{sure}.", "good")
     facts = [
         Fact("scale from", source_text, "as given in scene.toml"),
         Fact("scale uncertainty", number(uncertainty, "{:.1%}"), "one standard deviation, relative"),
+        *_scale_facts(each),
         Fact(
             "gravity from",
             str(_first_present(metric, "gravity_source", "gravity") or NOT_MEASURED),

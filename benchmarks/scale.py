@@ -1,0 +1,106 @@
+"""Coverage of the scale's uncertainty over simulated captures.
+
+    python benchmarks/scale.py [--first 1] [--count 200]
+
+A capture is a drive with known truth: its height is measured with an error, the road has slope, crossfall, a crown and
+a kerb, structure from motion bends the path and scatters points. Numbers 1 to 999 are for development, 1,000 upwards for
+reports, each once. Prints how often the truth lies within one and two standard deviations, and the median error. The
+errors of structure from motion are simulated, so this does not replace captures that are really reconstructed.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from twin.capture.gravity import up_from_ground
+from twin.capture.scale import Scale, scale_from_height
+from twin.config import MetricConfig
+from twin.geometry.cameras import Cameras
+from twin.geometry.poses import look_at
+from twin.types import Array
+
+_TOLERANCE = 0.01  # [m] standard deviation of the height as measured
+
+
+def draw_capture(number: int) -> tuple[Cameras, Array, float]:
+    """Cameras and sparse points (m, 3) whose true scale is 1, and the height that its user measured [m]."""
+    rng = np.random.default_rng([2027, number])
+    length, spacing, height = rng.uniform(20.0, 80.0), rng.uniform(0.4, 1.5), rng.uniform(0.4, 1.7)
+    s = np.arange(0.0, length, spacing)
+    radius = float(np.exp(rng.uniform(np.log(8.0), np.log(200.0)))) * rng.choice([-1.0, 1.0])
+    angle = np.clip(s - length / 3, 0.0, rng.uniform(0.1, 1.5) * abs(radius)) / radius
+    xy = np.cumsum(np.stack([np.cos(angle), np.sin(angle)], -1) * spacing, 0)
+    slope, camber, crown = rng.uniform(-0.08, 0.08), rng.normal(0.0, 0.012), rng.uniform(0.0, 0.02)
+    kerb_at, kerb = rng.uniform(1.2, 4.0), rng.choice([0.0, 0.06, 0.12])
+    waves = rng.uniform(0.0, 0.012), rng.uniform(3.0, 12.0), rng.uniform(0.0, 6.3)
+
+    def ground(along: Array, lateral: Array) -> Array:
+        out = slope * along + camber * lateral - crown * np.abs(lateral) + kerb * (lateral > kerb_at)
+        return out + waves[0] * np.sin(2 * np.pi * along / waves[1] + waves[2])
+
+    lift = height + 0.008 * np.sin(2 * np.pi * s / rng.uniform(2.0, 9.0)) + 0.003 * rng.standard_normal(len(s))
+    eyes = np.concatenate([xy, (ground(s, 0 * s) + lift)[:, None]], 1)
+    pitch, roll = rng.uniform(0.0, 0.3), rng.normal(0.0, np.radians(0.6))
+    ahead = np.stack([np.cos(angle), np.sin(angle), np.full(len(s), slope - np.tan(pitch))], 1)
+    poses = np.array([look_at(eye, eye + one) for eye, one in zip(eyes, ahead, strict=True)])
+    c, d = np.cos(roll), np.sin(roll)
+    poses[:, :3, :3] = poses[:, :3, :3] @ np.array([[c, -d, 0.0], [d, c, 0.0], [0.0, 0.0, 1.0]])
+    count = int(rng.integers(60, 1500))
+    k = rng.integers(0, len(s), count)
+    lateral = rng.normal(0.0, rng.uniform(0.6, 2.0), count)
+    normal = np.stack([-np.sin(angle[k]), np.cos(angle[k])], -1)
+    road = np.concatenate([xy[k] + lateral[:, None] * normal, ground(s[k], lateral)[:, None]], 1)
+    road[:, 2] += rng.uniform(0.005, 0.03) * rng.standard_normal(count)
+    other = eyes[rng.integers(0, len(s), 1200)] + rng.uniform(-15, 15, (1200, 3))
+    other[:, 2] = np.maximum(other[:, 2], ground(0.0, 0.0) + slope * other[:, 0]) + 0.4
+    points = np.concatenate([road, other])
+    # Structure from motion bends a drive: height and yaw grow by the square of the way.
+    bend = rng.normal(0.0, 0.1 / 40.0**2, 3) * [1.0, 1.0, 0.5]
+    for one in (points, poses[:, :3, 3]):
+        one += bend * ((one[:, :2] - xy[0]) ** 2).sum(1)[:, None]
+    n = len(s)
+    cameras = Cameras(
+        tuple(f"film/{i:06d}" for i in range(n)),
+        poses,
+        np.tile([300.0, 300.0, 320.0, 180.0], (n, 1)),
+        np.tile([640, 360], (n, 1)),
+        ("day",) * n,
+        ("film",) * n,
+        np.arange(float(n)),
+        np.zeros(n, bool),
+        Path("images"),
+    )
+    return cameras, points, height + _TOLERANCE * float(rng.standard_normal())
+
+
+def estimate(number: int) -> Scale:
+    """The scale of a drawn capture; its truth is 1."""
+    cameras, points, measured = draw_capture(number)
+    up, road = up_from_ground(cameras.camera_to_world, points)
+    return scale_from_height(cameras, up, points, road, MetricConfig(measured, _TOLERANCE), {})
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--first", type=int, default=1, help="number of the first capture (default %(default)s)")
+    parser.add_argument("--count", type=int, default=200, help="number of captures (default %(default)s)")
+    options = parser.parse_args()
+    scales = [estimate(number) for number in range(options.first, options.first + options.count)]
+    error = np.array([np.log(one.value) for one in scales])
+    sigma = np.array([one.uncertainty for one in scales])
+    parts = {
+        key: np.median([one.notes["scale_uncertainty_of"][key] for one in scales])
+        for key in ("height_as_measured", "repeatability", "tilt", "left_against_right")
+    }
+    print(f"within one standard deviation  {np.mean(np.abs(error) < sigma):6.1%}")
+    print(f"within two                     {np.mean(np.abs(error) < 2 * sigma):6.1%}")
+    print(f"median error                   {np.median(np.abs(error)):7.2%}, mean {error.mean():+.2%}")
+    print(f"median uncertainty             {np.median(sigma):7.2%}")
+    print("  of which " + ", ".join(f"{key} {value:.2%}" for key, value in parts.items()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
