@@ -4,8 +4,8 @@
 
 A capture is a drive with known truth: its height is measured with an error, the road has slope, crossfall, a crown and
 a kerb, structure from motion bends the path and scatters points. Numbers 1 to 999 are for development, 1,000 upwards
-for reports, each once. Prints how often the truth lies within one and two standard deviations, and the median error. The
-errors of structure from motion are simulated, so this does not replace captures that are really reconstructed.
+for reports, each once. Prints how often the truth lies within one and two standard deviations, and the median error.
+The errors of structure from motion are simulated, so this does not replace captures that are really reconstructed.
 """
 
 import argparse
