@@ -11,8 +11,8 @@ from twin.capture.matching import (
     probe_pairs,
     sequence_pairs,
 )
+from twin.geometry.passes import path_outliers
 from twin.geometry.poses import look_at
-from twin.geometry.route import path_outliers
 
 
 def test_sequence_stays_within_a_source() -> None:

@@ -11,6 +11,7 @@ from twin.geometry.passes import (
     path_inliers,
     path_jumps,
     path_length,
+    path_outliers,
     remove_stationary,
     smooth_path,
 )
@@ -119,11 +120,22 @@ def _driven(steps: list[float]) -> np.ndarray:
     ],
 )
 def test_turns_stops_and_changes_of_speed_are_no_jumps(xy):
-    assert len(path_jumps(_lifted(xy), 0.5 * np.arange(len(xy)))) == 0
+    assert len(path_jumps(xy, 0.5 * np.arange(len(xy)))) == 0
 
 
 def test_lost_frames_are_no_jump_unless_the_gap_in_time_is_too_short():
-    positions, times = _lifted(_driven([0.6] * 40 + [9.0] + [0.6] * 40)), 0.5 * np.arange(82)
-    assert list(path_jumps(positions, times)) == [40]
+    xy, times = _driven([0.6] * 40 + [9.0] + [0.6] * 40), 0.5 * np.arange(82)
+    assert list(path_jumps(xy, times)) == [40]
     times[41:] += 7.0  # 14 frames between them
-    assert len(path_jumps(positions, times)) == 0
+    assert len(path_jumps(xy, times)) == 0
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.04])
+def test_frames_beside_a_cut_are_no_outliers(unit):
+    cameras = draw_filming(KINDS.index("twice_with_cut")).cameras
+    pose = cameras.camera_to_world.copy()
+    pose[:, :3, 3] *= unit  # a reconstruction has no metres
+    true = np.zeros(len(cameras), bool)
+    true[[6, len(cameras) - 9]] = True
+    pose[true, 1, 3] += 4.0 * unit
+    assert np.array_equal(path_outliers(pose, 0.3), true)

@@ -33,8 +33,8 @@ from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json, write_json
 from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.passes import path_outliers
 from twin.geometry.poses import inverse_pose
-from twin.geometry.route import path_outliers
 from twin.scene import SceneDir
 from twin.types import Array
 

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
 
 from twin.geometry.cameras import Cameras
+from twin.geometry.poses import rotation_angle
 from twin.types import Array
 
 SPACING = 0.25  # [m] between the points of a path
@@ -32,9 +34,14 @@ _ALONGSIDE = 0.5  # [m]
 _PARALLEL = np.cos(np.deg2rad(40.0))  # of the angle between a path and the part that it retraces
 _MIN_RETRACE = 1.5  # [m] shorter retraces are noise
 _MIN_LAP = 12.0  # [m] a path that goes the same way again has driven at least this far
-_MAX_TURN = 25.0  # [m] a longer way round is a loop at the end of the road and stays in the pass
+_MAX_U_TURN = 25.0  # [m] a longer way round is a loop at the end of the road and stays in the pass
 _MIN_PASS = 1.0  # [m]
 _CHORD = 1.0  # [m] over which headings are measured
+_MIN_PATH_FRAMES = 6
+_MAX_OUTLIER_FRACTION = 0.25  # if more frames of a source look wrong, its path is not smooth and no frame is removed
+_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is a set of unordered photos, not a film
+_OUTLIER_SIGMAS = 8.0  # an outlier's residual exceeds this many robust standard deviations of all residuals
+_MAX_TURN = np.radians(5.0)  # [rad] smallest allowed deviation from the predicted direction
 
 
 @dataclass(frozen=True)
@@ -90,16 +97,16 @@ def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:
 # ---- division
 
 
-def path_jumps(positions: Array, times: Array) -> NDArray[np.int64]:
+def path_jumps(positions: Array, times: Array, min_jump: float = _MIN_JUMP) -> NDArray[np.int64]:
     """Finds steps much longer than the typical step of a path, as between two passes filmed one after the other.
 
     A jump is longer than 5 m and than 8 typical steps of its neighborhood, allowing for missing frames; or longer than
-    12 m and 3 typical steps, whatever is missing. Takes camera centers (n, 3) [m] in order of time, with times [s] or
-    indices (n,); returns the indices i of jumps from i to i + 1.
+    12 m and 3 typical steps, whatever is missing. Takes camera centers (n, d) [m] in order of time, with times [s] or
+    indices (n,); returns the indices i of jumps from i to i + 1. `min_jump` replaces the 5 m.
     """
     if len(positions) < 3:
         return np.zeros(0, np.int64)
-    step = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    step = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     gap = np.diff(times)
     intervals = np.clip(gap / max(float(np.median(gap)), 1e-9), 1.0, _MAX_MISSING)  # frame intervals per step
     pace = step / intervals
@@ -108,14 +115,14 @@ def path_jumps(positions: Array, times: Array) -> NDArray[np.int64]:
         neighbors = np.concatenate([pace[max(i - _JUMP_WINDOW, 0) : i], pace[i + 1 : i + 1 + _JUMP_WINDOW]])
         # The upper quartile, since a film may start, stop and speed up at any frame.
         typical[i] = max(typical[i], float(np.quantile(neighbors, 0.75)))
-    relative = (step > _MIN_JUMP) & (step > typical * np.maximum(_JUMP_RATIO, 2.0 * intervals))
+    relative = (step > min_jump) & (step > typical * np.maximum(_JUMP_RATIO, 2.0 * intervals))
     return np.flatnonzero(relative | ((step > _LONG_JUMP) & (step > _LONG_RATIO * typical)))
 
 
 def _between_jumps(cameras: Cameras, index: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], str]]:
     """The frames of a source between its jumps, each with how the piece ends."""
     inliers = index[path_inliers(cameras.positions[index])]
-    jumps = path_jumps(cameras.positions[inliers], cameras.times[inliers])
+    jumps = path_jumps(cameras.positions[inliers, :2], cameras.times[inliers])
     # An outlier at the edge of a piece has no neighbors on both sides to be found by, so pieces are made without it.
     pieces = np.split(inliers, jumps + 1) if len(jumps) else [index]
     return [(piece, "jump" if k < len(jumps) else "end") for k, piece in enumerate(pieces)]
@@ -168,7 +175,7 @@ def _retraces(path: Array) -> list[tuple[int, int, str]]:
         if len(run) < need:
             continue
         j, first, kind = run[0]
-        short_turn = kind == "turn" and (first - j) * SPACING <= _MAX_TURN
+        short_turn = kind == "turn" and (first - j) * SPACING <= _MAX_U_TURN
         cuts.append((j if short_turn else first, first, kind))
         begin, run = first, []
     return cuts
@@ -269,3 +276,103 @@ def _smooth(xy: Array, sigma: float) -> Array:
     before = 2 * xy[0] - xy[reach:0:-1]
     after = 2 * xy[-1] - xy[-2 : -reach - 2 : -1]
     return gaussian_filter1d(np.concatenate([before, xy, after]), sigma, axis=0)[reach : reach + len(xy)]
+
+
+# ---- poses off the path
+
+
+def path_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
+    """Mask (n,) of the frames off the path of their neighbors, in any unit of length.
+
+    `limit` is the allowed position residual [median steps between frames]; more is allowed if the whole path is rough.
+    A path is divided where the film jumps, since the frames before a cut predict nothing behind it.
+    """
+    n = len(camera_to_world)
+    if n < _MIN_PATH_FRAMES:
+        return np.zeros(n, bool)
+    step = float(np.median(np.linalg.norm(np.diff(camera_to_world[:, :3, 3], axis=0), axis=1)))
+    centers = camera_to_world[:, :3, 3] / max(step, 1e-12)
+    inliers = np.flatnonzero(path_inliers(centers))
+    cuts = inliers[path_jumps(centers[inliers], inliers.astype(float), min_jump=0.0)] + 1
+    return np.concatenate([_piece_outliers(piece, limit) for piece in np.split(camera_to_world, cuts)])
+
+
+def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
+    """Outliers of a path without jumps, found one by one, the worst first.
+
+    None for fewer than 6 frames or a path that is not smooth.
+    """
+    n = len(camera_to_world)
+    out = np.zeros(n, bool)
+    if n < _MIN_PATH_FRAMES:
+        return out
+    step = float(np.median(np.linalg.norm(np.diff(camera_to_world[:, :3, 3], axis=0), axis=1)))
+    position, turn = _path_residuals(camera_to_world)
+    if np.median(position) > _MAX_ROUGHNESS * step:
+        return out
+    max_offset = max(limit * step, _OUTLIER_SIGMAS * (1.4826 * float(np.median(position))), 1e-12)
+    max_turn = max(_MAX_TURN, _OUTLIER_SIGMAS * (1.4826 * float(np.median(turn))))
+    while True:
+        kept = np.flatnonzero(~out)
+        if len(kept) < _MIN_PATH_FRAMES:
+            return np.zeros(n, bool)
+        position, turn = _path_residuals(camera_to_world[kept])
+        score = np.maximum(position / max_offset, turn / max_turn)
+        worst = int(np.argmax(score))
+        if score[worst] <= 1.0:
+            return out
+        # An outlier also spoils its neighbors' predictions: the frame is removed without which the others agree best.
+        candidates = [k for k in range(max(worst - 2, 0), min(worst + 3, len(kept))) if score[k] > 0.5]
+        out[kept[min(candidates, key=lambda k: _score_without(camera_to_world[kept], k, max_offset, max_turn))]] = True
+        if out.sum() > _MAX_OUTLIER_FRACTION * n:
+            return np.zeros(n, bool)
+
+
+def _path_residuals(camera_to_world: Array) -> tuple[Array, Array]:
+    """Deviation of each frame from the pose predicted from its neighbors, for poses in order of time (n, 4, 4), n ≥ 5.
+
+    The smaller of two predictions' residuals counts, since either alone fails on correct frames: the chord between
+    neighbors is independent of the speed but cuts corners; the cubic through them follows turns but needs even steps.
+    Returns residuals of position (unit of the poses) and direction [rad], shapes (n,).
+    """
+    n = len(camera_to_world)
+    centers = camera_to_world[:, :3, 3]
+    rotations = Rotation.from_matrix(camera_to_world[:, :3, :3])
+    position, turn = np.zeros(n), np.zeros(n)
+    for i in range(n):
+        left, right = [k for k in (i - 1, i - 2) if k >= 0], [k for k in (i + 1, i + 2) if k < n]
+        if left and right:
+            chords = [_segment_distance(centers[i], centers[a], centers[b]) for a in left for b in right]
+            position[i] = float(np.median(chords))
+            if len(left) == len(right) == 2:  # Lagrange's cubic at the middle of five equidistant frames
+                a2, a1, b1, b2 = centers[left[1]], centers[left[0]], centers[right[0]], centers[right[1]]
+                cubic = (4.0 * (a1 + b1) - (a2 + b2)) / 6.0
+                position[i] = min(position[i], float(np.linalg.norm(centers[i] - cubic)))
+            middle = [Slerp([a, b], Rotation.concatenate([rotations[a], rotations[b]]))(i) for a in left for b in right]
+            turn[i] = min(_angle(m, rotations[i]) for m in middle)
+        else:  # an end of the path: extrapolate the next two frames
+            near, far = (right or left)[0], (right or left)[1]
+            step = centers[near] - centers[far]
+            position[i] = _segment_distance(centers[i], centers[near], centers[near] + 2.5 * step)
+            extrapolated = rotations[near] * rotations[far].inv() * rotations[near]
+            turn[i] = min(_angle(extrapolated, rotations[i]), _angle(rotations[near], rotations[i]))
+    return position, turn
+
+
+def _angle(a: Rotation, b: Rotation) -> float:
+    return float(rotation_angle((a.inv() * b).as_matrix()))
+
+
+def _segment_distance(point: Array, start: Array, end: Array) -> float:
+    along = end - start
+    fraction = np.clip((point - start) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
+    return float(np.linalg.norm(point - start - fraction * along))
+
+
+def _score_without(poses: Array, k: int, max_offset: float, max_turn: float) -> float:
+    lo, hi = max(k - 5, 0), min(k + 6, len(poses))
+    local = np.delete(poses[lo:hi], k - lo, axis=0)
+    if len(local) < 3:
+        return np.inf
+    position, turn = _path_residuals(local)
+    return float(np.sum(np.maximum(position / max_offset, turn / max_turn)))
