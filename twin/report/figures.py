@@ -221,10 +221,10 @@ def _draw_passes(axes: Axes, passes: Sequence[FilmedPass]) -> None:
     for k, one in enumerate(passes):
         color = SERIES[k % len(SERIES)]
         axes.plot(*one.path.T, color=color, lw=0.9, ls=(0, (4, 2)), zorder=3)
-        middle = one.path[len(one.path) // 2]
+        at = one.path[len(one.path) * (k + 1) // (len(passes) + 1)]  # passes may lie on each other, names may not
         box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
         axes.annotate(
-            one.name, middle, xytext=(4, -9), textcoords="offset points", fontsize=7, color=color, bbox=box, zorder=6
+            one.name, at, xytext=(4, -9), textcoords="offset points", fontsize=7, color=color, bbox=box, zorder=6
         )
         if one.ends_with != "end":
             axes.plot(*one.path[-1], "x", color=color, ms=6, zorder=5)
