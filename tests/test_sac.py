@@ -14,11 +14,10 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from twin.errors import InputError
-from twin.learn.checkpoint import load_state, save_state
 from twin.learn.policy import load_policy, save_policy
 from twin.learn.policy_network import Architecture, normalize_colors, preprocess
 from twin.learn.replay_buffer import FrameReplayBuffer
-from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
+from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights, load_state, save_state
 from twin.learn.train_config import TrainConfig
 
 SIZE = (32, 18)

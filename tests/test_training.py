@@ -25,10 +25,9 @@ from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
 from twin.learn.policy import load_policy
-from twin.learn.policy_evaluation import FRESH_EPISODES
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
+from twin.learn.training import FRESH_EPISODES, TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
 from twin.runtime import exclusive_lock
 
 

@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 
 CHOICE_FILE = "choice.json"
 """File of a run: evaluations of its last policies without exploration, and the chosen one; see
-`learn/policy_evaluation.py`."""
+`learn/training.py`."""
 _MAX_BINS = 25  # points of a curve
 _MIN_EPISODES = 5  # per point
 
