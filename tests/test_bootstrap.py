@@ -38,8 +38,12 @@ REAL = [
 ]
 
 
+def by_key(cells: list[Cell]) -> dict[tuple[str, str, str], Cell]:
+    return {cell.key: cell for cell in cells}
+
+
 def test_scores_are_means_over_real_cells_and_the_twins_cells_beside_them() -> None:
-    data = pair_cells(REAL, TWIN)
+    data = pair_cells(REAL, by_key(TWIN))
     assert (data.policies, data.cells) == (3, 5)
     assert [list(members) for members in data.strata] == [[0, 1], [2]]  # b and a on straight, a on the turn
     own = observed_rates(data)
@@ -51,7 +55,7 @@ def test_scores_are_means_over_real_cells_and_the_twins_cells_beside_them() -> N
 
 
 def test_policies_are_drawn_within_their_task() -> None:
-    rates = resample(pair_cells(REAL, [*TWIN]), np.random.default_rng(0), 500)
+    rates = resample(pair_cells(REAL, by_key(TWIN)), np.random.default_rng(0), 500)
     assert rates.twin.shape == rates.real.shape == (500, 3)
     # The turn has one policy, of 10 trials at about 0.4: no value of the others' 20 or 3-cell means need appear.
     assert np.allclose(rates.twin[:, 2] * 10, np.round(rates.twin[:, 2] * 10))
@@ -61,7 +65,7 @@ def test_policies_are_drawn_within_their_task() -> None:
 def test_trials_are_driven_anew() -> None:
     """One policy with one cell: what varies is binomial, at the rate shrunk by half a trial."""
     cells = [Cell("a", "t", "sun", 30, 6)]
-    rates = resample(pair_cells(cells, cells), np.random.default_rng(0), 20_000)
+    rates = resample(pair_cells(cells, by_key(cells)), np.random.default_rng(0), 20_000)
     rate = 6.5 / 31
     for drawn in (rates.twin, rates.real):
         assert drawn.mean() == pytest.approx(rate, abs=0.003)
@@ -73,7 +77,7 @@ def test_trials_are_driven_anew() -> None:
 def test_resampled_cells_agree_at_the_confidence_asked_for(confidence: float) -> None:
     """One policy with one cell: its successes are known from its rates, and so is the interval of their difference."""
     cells = [Cell("a", "t", "sun", 30, 12)]
-    data = pair_cells(cells, cells)
+    data = pair_cells(cells, by_key(cells))
     rates = resample(data, np.random.default_rng(0), 500, confidence)
     won = {"twin_successes": np.rint(30 * rates.twin[:, 0]), "real_successes": np.rint(30 * rates.real[:, 0])}
     _, low, high = rate_difference(**won, twin_trials=30, real_trials=30, confidence=confidence)
@@ -85,7 +89,7 @@ def test_resampled_cells_agree_at_the_confidence_asked_for(confidence: float) ->
 
 def test_the_same_seed_gives_the_same_and_certain_rates_are_not_certain() -> None:
     cells = [Cell(name, "t", "sun", 10, 10) for name in "abcde"]
-    one, two = (resample(pair_cells(cells, cells), np.random.default_rng(3), 50) for _ in range(2))
+    one, two = (resample(pair_cells(cells, by_key(cells)), np.random.default_rng(3), 50) for _ in range(2))
     assert np.array_equal(one.twin, two.twin) and np.array_equal(one.compatible, two.compatible)
     assert 0.9 < one.real.mean() < 1.0
 

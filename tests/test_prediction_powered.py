@@ -5,8 +5,12 @@ import pytest
 from scipy import stats
 from scipy.special import expit
 
-from twin.evaluation.prediction_powered import LinearCorrection, leave_one_group_out, prediction_powered_mean
-from twin.evaluation.statistics import UndefinedStatistic
+from twin.evaluation.statistics import (
+    LinearCorrection,
+    UndefinedStatistic,
+    leave_one_group_out,
+    prediction_powered_mean,
+)
 
 F = np.array([0.1, 0.3, 0.5, 0.6, 0.9, 0.95])
 Y = np.array([0.0, 0.3, 0.2, 0.5, 0.6, 0.9])

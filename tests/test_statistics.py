@@ -49,6 +49,14 @@ def test_wilson_known(successes: int, trials: int, low: float, high: float) -> N
     assert np.allclose(wilson(successes, trials, 0.95), (low, high), atol=6e-5)
 
 
+@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.999])
+def test_wilson_equals_scipy(confidence: float) -> None:
+    for trials in (1, 7, 200, 10_000):
+        for successes in {0, 1, trials // 3, trials}:
+            expected = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+            np.testing.assert_allclose(wilson(successes, trials, confidence), expected, rtol=0, atol=1e-12)
+
+
 def test_wilson_solves_the_score_equation() -> None:
     for successes, trials in itertools.product((1, 3, 7), (8, 20, 200)):
         for end in wilson(successes, trials):
