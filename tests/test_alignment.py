@@ -236,7 +236,7 @@ def test_a_log_that_shows_nothing_is_said_to():
 def test_a_scene_that_overrules_what_was_fitted_is_warned_of(tmp_path, monkeypatch, capsys):
     errors = {"friction": 0.01, "spin_friction": 0.01}
     monkeypatch.setattr("twin.align.identify", lambda *_: aligned(ground_errors=errors))
-    monkeypatch.setattr("twin.align.check", lambda *_: None)
+    monkeypatch.setattr("twin.align.check_log", lambda *_: None)
     monkeypatch.setattr("twin.sysid.plots.write_plots", lambda *_: None)
     scene, log = tmp_path / "x", tmp_path / "log.npz"
     scene.mkdir()
