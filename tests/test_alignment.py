@@ -12,7 +12,7 @@ from drive_logs import SOFT, columns, windows_of
 
 from twin.align import main, summary
 from twin.config_file import parse_table, read_robot
-from twin.env.controller import Controller
+from twin.env.controller import Controller, limit_command, wheel_speeds
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 from twin.sysid import drivetrain, kinematics, logs, rollout
 from twin.sysid.estimation import Fit
@@ -79,6 +79,23 @@ def test_commands_become_the_controllers_wheel_speeds():
     mean = np.mean(speeds, 0)
     assert np.abs(told[0, :200] - mean).max() < 0.3  # of 6 rad/s; the ramp's ends are rounder in the mean
     assert np.abs(told[0, 190:200] - mean[190:]).max() < 1e-6
+
+
+def test_the_drivetrain_is_the_controller_run_every_step():
+    """One law in two places: with whole delays and no lag, servo targets equal the controller's to the last digits."""
+    params = replace(SOFT, servo_lag=0.0, max_wheel_speed=0.8)
+    rng = np.random.default_rng(0)
+    requests = np.repeat(rng.uniform([-0.9, -2.0], [0.9, 2.0], (12, 4, 2)), logs.SAMPLES // 4, 1)
+    windows = windows_of(np.zeros((12, logs.SAMPLES, 2)), commands=requests, twist=True)
+    targets, _ = drivetrain.simulate_drivetrain(drivetrain.Drivetrain.from_robot(params, True), windows)
+    steps = round(params.command_latency / drivetrain.CONTROL_STEP)
+    arrived = np.pad(requests.repeat(round(logs.PERIOD / drivetrain.CONTROL_STEP), 1), ((0, 0), (steps, 0), (0, 0)))
+    limited, expected = np.zeros((12, 2)), []
+    for i in range(logs.SAMPLES * 5):
+        limited = limit_command(arrived[:, i], limited, params, drivetrain.CONTROL_STEP)
+        expected.append(wheel_speeds(limited, params))
+    assert (np.abs(expected).max(-1) > 0.999 * params.max_wheel_speed / WHEEL_RADIUS).any()
+    np.testing.assert_allclose(targets[:, : logs.SAMPLES * 5], np.stack(expected, 1), rtol=0, atol=1e-9)
 
 
 def test_a_ramp_goes_on_from_window_to_window():

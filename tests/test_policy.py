@@ -119,7 +119,7 @@ def test_neither_torch_nor_sb3_is_needed(folder, tmp_path):
         (tmp_path / "none" / name).mkdir(parents=True)
         (tmp_path / "none" / name / "__init__.py").write_text("raise ImportError('not here')")
     code = (
-        "import numpy as np; from twin.learn.policy import load_policy\n"
+        "import numpy as np, twin.validate; from twin.learn.policy import load_policy\n"
         f"print(load_policy({str(folder)!r})(np.zeros((12, 90, 160), np.uint8)))"
     )
     paths = os.pathsep.join([str(tmp_path / "none"), str(Path(__file__).parents[1])])
