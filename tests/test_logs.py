@@ -1,4 +1,4 @@
-"""Drive logs: alike from every kind of file, cut where they have gaps, refused in one line where they mislead."""
+"""Drive logs: equal from every kind of file, without windows that have gaps, refused in one line if implausible."""
 
 import re
 from pathlib import Path
@@ -122,7 +122,7 @@ def test_windows_without_poses_are_left_out(drive):
 
 
 def test_windows_in_which_the_robot_stands_are_left_out(drive):
-    """However long it is parked, told to stay: what is fitted and what is said would be of that. Stuck it is kept."""
+    """A robot parked for long would dominate fits and medians. One that is commanded but stuck is kept."""
     parked = {name: np.concatenate([column, np.repeat(column[-1:], 8000)]) for name, column in drive.items()}
     begins = len(drive["time"])
     parked["time"] = np.arange(len(parked["time"])) * 0.05

@@ -1,4 +1,4 @@
-"""Of a training's late policies the one that drives best is the run's, whatever it was that came last."""
+"""Selection of a run's policy: the best of a training's late ones, not the last."""
 
 import json
 import shutil
@@ -39,11 +39,11 @@ def run(scene, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def scripted(monkeypatch):
-    """Episodes that end as is said: by step of the policy, how many arrive and what each earns."""
+    """Episodes with scripted results: by step of the policy, the number of successes and the reward."""
     script: dict[int, tuple[int, float]] = {}
     asked: list[tuple[int, tuple[int, ...]]] = []
 
-    def pretend(policy, worlds, seeds, watch):
+    def pretend(policy, envs, seeds, watch):
         step = policy.trained["step"]
         asked.append((step, tuple(seeds)))
         won, reward = script.get(step, (0, 0.0))
@@ -56,7 +56,7 @@ def scripted(monkeypatch):
     return script, asked
 
 
-def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
+def test_the_policy_with_most_successes_is_selected(scene, run, scripted):
     script, asked = scripted
     (run / CHOICE_FILE).unlink(missing_ok=True)
     script |= {120: (2, 1.0), 140: (2, 1.5), 160: (1, 9.0), 40: (3, 9.0)}
@@ -76,7 +76,7 @@ def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
 
 
 @pytest.mark.slow
-def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, tmp_path, scripted):
+def test_selection_is_repeated_only_after_more_steps(scene, run, tmp_path, scripted):
     _, asked = scripted
     (run / CHOICE_FILE).unlink(missing_ok=True)
     first = training.select_checkpoint(scene, run, CONFIG)
@@ -92,7 +92,7 @@ def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, tmp_path, scrip
     assert again["steps"] == 200 and again["candidates"][-1]["step"] == 200
 
 
-def test_a_training_that_begins_anew_keeps_nothing_of_the_one_before(scene, run, tmp_path, scripted):
+def test_a_new_training_keeps_nothing_of_the_previous_one(scene, run, tmp_path, scripted):
     copy = shutil.copytree(run, tmp_path / "run")
     training.select_checkpoint(scene, copy, CONFIG)
     shutil.rmtree(copy / "state")
@@ -109,14 +109,14 @@ def test_candidates_are_few_and_the_last_is_one(tmp_path):
     assert found == [11000, 14000, 17000, 20000]
 
 
-def test_they_drive_as_the_training_had_it_but_from_the_start(scene, run, monkeypatch):
-    """Whole episodes, in the training's light, and driven as often as they are asked for with the same end."""
+def test_candidates_drive_whole_episodes_as_in_training(scene, run, monkeypatch):
+    """Whole episodes in the training's lighting, with the same result each time."""
     seen = []
 
-    def spy(policy, worlds, seeds, watch):
-        seen.append((worlds.options.start_along, worlds.options.lighting, worlds.options.randomise))
-        driven = run_episodes(policy, worlds, seeds[:2], watch)
-        assert driven == run_episodes(policy, worlds, seeds[:2], watch)
+    def spy(policy, envs, seeds, watch):
+        seen.append((envs.options.start_along, envs.options.lighting, envs.options.randomise))
+        driven = run_episodes(policy, envs, seeds[:2], watch)
+        assert driven == run_episodes(policy, envs, seeds[:2], watch)
         assert all(np.isfinite(one.reward) and one.steps > 0 for one in driven)
         return driven
 

@@ -442,7 +442,7 @@ def _mean_real(observed: Rates, candidates: list[Candidate]) -> Estimate:
         mean = prediction_powered_mean(twin=observed.twin, real=observed.real, twin_only=further)
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
-    return Estimate(mean.value, max(mean.low, 0.0), min(mean.high, 1.0), mean.labeled + mean.unlabeled)
+    return Estimate(mean.value, max(mean.low, 0.0), min(mean.high, 1.0), len(observed.twin) + len(further))
 
 
 def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLighting]:

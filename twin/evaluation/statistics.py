@@ -228,10 +228,6 @@ class PredictionPoweredMean:
     high: float
     power: float
     """λ: weight of the twin scores; 0: not used, 1: taken as they are."""
-    labeled: int
-    """Number of policies with both scores."""
-    unlabeled: int
-    """Number of policies with a twin score only."""
 
 
 def prediction_powered_mean(
@@ -269,7 +265,7 @@ def prediction_powered_mean(
     value = mean_power * further.mean() + float((y - powers * f).mean())
     error = np.var(y - powers * f, ddof=1) / n + mean_power**2 * np.var(further, ddof=1) / more
     half = float(student.ppf(0.5 + confidence / 2, n - 1) * np.sqrt(error))
-    return PredictionPoweredMean(float(value), float(value - half), float(value + half), mean_power, n, more)
+    return PredictionPoweredMean(float(value), float(value - half), float(value + half), mean_power)
 
 
 def _left_out_powers(f: Array, y: Array, ratio: float) -> Array:

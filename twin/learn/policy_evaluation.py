@@ -53,15 +53,14 @@ class EpisodeChunk:
 
 @dataclass(frozen=True)
 class EpisodeResult:
+    """An episode's result: progress [m], mean trust over its pictures, sum of its rewards."""
+
     seed: int
     cause: str
     progress: float
-    """[m]"""
     steps: int
     trust: float
-    """Mean over its pictures."""
     reward: float
-    """Sum over its steps."""
 
 
 def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:

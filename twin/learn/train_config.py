@@ -71,11 +71,9 @@ class TrainConfig:
     steps: int = 12_000
     worlds: int = 8
     action: str = STEERING
-    """steering (at `speed`) or twist."""
+    """This and the next two: see `Control`."""
     speed: float = 1.0
-    """[m/s]"""
     yaw_rate: float = 1.0
-    """[rad/s]"""
     centring: float = 1.0
     """Fraction of the step reward lost at the corridor's edge; none on the route."""
     steering: float = 0.5

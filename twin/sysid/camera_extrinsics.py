@@ -48,19 +48,15 @@ _AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True)
 class CameraExtrinsics:
-    """Values or standard errors of a camera's extrinsics.
+    """Values or standard errors of a camera's height [m] and angles [°].
 
     Yaw and pitch absorb an error of the principal point, as intended: both shift the image alike.
     """
 
     height: float
-    """[m]"""
     yaw: float
-    """[°]"""
     pitch: float
-    """[°]"""
     roll: float
-    """[°]"""
 
 
 def estimate_extrinsics(
@@ -97,9 +93,8 @@ def estimate_extrinsics(
         rest = inlier & (part != k)
         estimates.append((heights[rest].mean(), _yaw(bases, headings, rest), *angles[rest, 1:].mean(0)))
     spread = np.sqrt((_PARTS - 1) * np.var(estimates, axis=0))
-    value = CameraExtrinsics(
-        float(lens[2]) + BASE_HEIGHT, float(np.degrees(yaw)), *np.degrees(angles[inlier, 1:].mean(0)).tolist()
-    )
+    pitch, roll = np.degrees(angles[inlier, 1:].mean(0)).tolist()
+    value = CameraExtrinsics(float(lens[2]) + BASE_HEIGHT, float(np.degrees(yaw)), pitch, roll)
     return value, CameraExtrinsics(float(spread[0]), *np.degrees(spread[1:]).tolist())
 
 

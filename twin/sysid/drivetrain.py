@@ -28,22 +28,16 @@ _SIDES: Kinds = (0, 0)  # residuals of the left and the right wheels [rad/s]
 
 @dataclass(frozen=True)
 class Drivetrain:
-    """Parameters of the controller and the servos, in the units of wheel speeds."""
+    """Parameters of the controller and the servos: limits [rad/s], accelerations [rad/s²], latency and lag [s]."""
 
     mean_gain: float
     half_gain: float
     half_limit: float
-    """[rad/s]"""
     wheel_limit: float
-    """[rad/s]"""
     latency: float
-    """[s]"""
     mean_acceleration: float
-    """[rad/s²]"""
     half_acceleration: float
-    """[rad/s²]"""
     lag: float
-    """[s]"""
 
     @staticmethod
     def from_robot(params: HuskyParams, twist: bool) -> "Drivetrain":

@@ -27,16 +27,15 @@ _MIN_DIFFERENCE = 0.25  # [m/s] of the sides; below it the track ratio is noise
 
 @dataclass(frozen=True)
 class IcrModel:
-    """The ICR model; its defaults are nominal kinematics."""
+    """The ICR model: slip factors (speed of a side's tread over the ground / circumferential speed of its wheels), and
+    the centers' offsets [m]. The defaults are nominal kinematics.
+    """
 
     slip_left: float = 1.0
     slip_right: float = 1.0
-    """Speed of a side's tread over the ground / circumferential speed of its wheels."""
     y_left: float = TRACK / 2
     y_right: float = -TRACK / 2
-    """[m]"""
     x: float = 0.0
-    """[m]"""
 
     def motion(self, wheels: Array) -> Array:
         """vx, vy [m/s], yaw rate [rad/s], shape (..., 3), for wheel speeds [rad/s], shape (..., 2)."""
@@ -130,17 +129,14 @@ def steady_windows(windows: Windows) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Score:
-    """Errors over several windows; position and yaw are those of the pose at a window's end."""
+    """Median and 90th percentile of errors at the ends of several windows, and median error of wheel speeds."""
 
     windows: int
     position_m: float
-    """Median."""
     yaw_deg: float
-    """Median."""
     position_m_p90: float
     yaw_deg_p90: float
     wheels_rad_s: float
-    """Median over windows, samples and sides."""
 
     def rounded(self) -> dict[str, float]:
         """All numbers, rounded for JSON."""

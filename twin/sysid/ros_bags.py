@@ -13,7 +13,6 @@ import numpy as np
 
 from twin.errors import InputError
 from twin.robot import WHEELS
-from twin.sysid.logs import ACCELERATION, POSE, TWIST, WHEEL_SPEEDS
 from twin.types import Array
 
 _TYPES = {
@@ -101,7 +100,12 @@ def _imu(message: Any) -> tuple[float, ...]:
 
 
 _VALUES = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
-_NAMES = {"commands": TWIST, "wheels": WHEEL_SPEEDS, "poses": POSE, "imu": ACCELERATION}
+_NAMES = {
+    "commands": ("cmd_v", "cmd_yaw_rate"),
+    "wheels": ("left_wheel_vel", "right_wheel_vel"),
+    "poses": ("x", "y", "yaw"),
+    "imu": ("acceleration_x", "acceleration_y"),
+}
 
 
 def _columns(tables: dict[str, Array]) -> dict[str, Array]:
