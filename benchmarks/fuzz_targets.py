@@ -761,7 +761,7 @@ def _forecast(case: Case) -> None:
 def _noted(case: Case) -> None:
     """JSON beside runs and validations."""
     from twin.evaluation.training_curves import CHOICE_FILE, training_summaries, write_success_curve
-    from twin.learn import checkpoint, training
+    from twin.learn import sac, training
     from twin.scene import digest_file
 
     rng, root = case.rng, case.folder / "scene"
@@ -785,11 +785,11 @@ def _noted(case: Case) -> None:
         training._check_same(root, said)
     elif which < 0.9:
         (root / "state").mkdir(parents=True)
-        names = [name for name in vars(checkpoint).values() if isinstance(name, str) and name.endswith(".json")]
+        names = [name for name in vars(sac).values() if isinstance(name, str) and name.endswith(".json")]
         for name in names:
             told = {"steps": 100, "updates": 50, "resumed": 0}
             (root / "state" / name).write_bytes(mangled_text(rng, json_text(spoiled(rng, told))))
-        checkpoint.saved_steps(root / "state")
+        sac.saved_steps(root / "state")
     else:
         root.mkdir()
         (root / "episodes.csv").write_text(TRAINING_CSV)

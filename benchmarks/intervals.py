@@ -18,8 +18,15 @@ from scipy.special import expit
 
 from twin.config import RANDOMIZED
 from twin.evaluation.bootstrap import PairedCells, Rates, bootstrap_interval, observed_rates, resample
-from twin.evaluation.prediction_powered import LinearCorrection, leave_one_group_out, prediction_powered_mean
-from twin.evaluation.statistics import mmrv_batched, pearson_batched, spearman_batched, winner_batched
+from twin.evaluation.statistics import (
+    LinearCorrection,
+    leave_one_group_out,
+    mmrv_batched,
+    pearson_batched,
+    prediction_powered_mean,
+    spearman_batched,
+    winner_batched,
+)
 from twin.files import read_json
 
 _MEAN_OVER = 3000  # experiments, for what an interval aims at

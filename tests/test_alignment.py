@@ -1,4 +1,4 @@
-"""Alignment: logs in, what they show of a robot out. Truth is a simulated robot's own parameters."""
+"""System identification from logs of a simulated robot whose parameters are known."""
 
 import json
 from dataclasses import replace
@@ -12,7 +12,7 @@ from drive_logs import SOFT, columns, windows_of
 
 from twin.align import main, summary
 from twin.config_file import parse_table, read_robot
-from twin.env.controller import Controller
+from twin.env.controller import Controller, limit_command, wheel_speeds
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 from twin.sysid import drivetrain, kinematics, logs, rollout
 from twin.sysid.estimation import Fit
@@ -46,7 +46,7 @@ def test_icr_of_icr_motion_is_found():
         assert getattr(found, name) == pytest.approx(getattr(truth, name), abs=2e-3)
 
 
-def test_kinematics_begin_with_the_wheels_of_before():
+def test_kinematics_begin_with_the_preceding_wheel_speeds():
     """Poses of a slow sensor: a window's first one was measured while wheels did what they did in the one before."""
     n, age = 6, 10
     time = np.arange(n * logs.SAMPLES) * logs.PERIOD
@@ -66,19 +66,36 @@ def test_commands_become_the_controllers_wheel_speeds():
     request = (0.7, 0.9)
     speeds = []
     for phase in np.arange(10) * 0.01:
-        controller, told, rows = Controller(params), np.zeros(2), []
+        controller, speed, rows = Controller(params), np.zeros(2), []
         for i in range(200):
             if i % 10 == 0:
                 controller.command(i * 0.01, *request)
             if (i - round(phase * 100)) % 10 == 0 and i * 0.01 >= phase:
-                told = controller.update(i * 0.01)
-            rows.append(told)
+                speed = controller.update(i * 0.01)
+            rows.append(speed)
         speeds.append(rows)
     windows = windows_of(np.zeros((1, logs.SAMPLES, 2)), commands=np.full((1, logs.SAMPLES, 2), request), twist=True)
-    told, _ = drivetrain.simulate_drivetrain(drivetrain.Drivetrain.from_robot(params, True), windows)
+    targets, _ = drivetrain.simulate_drivetrain(drivetrain.Drivetrain.from_robot(params, True), windows)
     mean = np.mean(speeds, 0)
-    assert np.abs(told[0, :200] - mean).max() < 0.3  # of 6 rad/s; the ramp's ends are rounder in the mean
-    assert np.abs(told[0, 190:200] - mean[190:]).max() < 1e-6
+    assert np.abs(targets[0, :200] - mean).max() < 0.3  # of 6 rad/s; the ramp's ends are rounder in the mean
+    assert np.abs(targets[0, 190:200] - mean[190:]).max() < 1e-6
+
+
+def test_the_drivetrain_is_the_controller_run_every_step():
+    """One law in two places: with whole delays and no lag, servo targets equal the controller's to the last digits."""
+    params = replace(SOFT, servo_lag=0.0, max_wheel_speed=0.8)
+    rng = np.random.default_rng(0)
+    requests = np.repeat(rng.uniform([-0.9, -2.0], [0.9, 2.0], (12, 4, 2)), logs.SAMPLES // 4, 1)
+    windows = windows_of(np.zeros((12, logs.SAMPLES, 2)), commands=requests, twist=True)
+    targets, _ = drivetrain.simulate_drivetrain(drivetrain.Drivetrain.from_robot(params, True), windows)
+    steps = round(params.command_latency / drivetrain.CONTROL_STEP)
+    arrived = np.pad(requests.repeat(round(logs.PERIOD / drivetrain.CONTROL_STEP), 1), ((0, 0), (steps, 0), (0, 0)))
+    limited, expected = np.zeros((12, 2)), []
+    for i in range(logs.SAMPLES * 5):
+        limited = limit_command(arrived[:, i], limited, params, drivetrain.CONTROL_STEP)
+        expected.append(wheel_speeds(limited, params))
+    assert (np.abs(expected).max(-1) > 0.999 * params.max_wheel_speed / WHEEL_RADIUS).any()
+    np.testing.assert_allclose(targets[:, : logs.SAMPLES * 5], np.stack(expected, 1), rtol=0, atol=1e-9)
 
 
 def test_a_ramp_goes_on_from_window_to_window():
@@ -90,31 +107,31 @@ def test_a_ramp_goes_on_from_window_to_window():
     wheels = np.repeat(lagged[:, None], 2, 1).reshape(3, logs.SAMPLES, 2)
     asked = np.full((3, logs.SAMPLES, 2), 8.0)
     windows = replace(windows_of(wheels, commands=asked, twist=False), follows=np.arange(3) > 0)
-    told, turned = drivetrain.simulate_drivetrain(drive, windows)
+    targets, turned = drivetrain.simulate_drivetrain(drive, windows)
     step = drive.mean_acceleration * drivetrain.CONTROL_STEP
-    assert told[1:, :25] == pytest.approx(told[:-1, 200:])
-    assert told[:, 100, 0] == pytest.approx(drive.mean_acceleration * (2.0 * np.arange(3) + 0.8), abs=1.01 * step)
+    assert targets[1:, :25] == pytest.approx(targets[:-1, 200:])
+    assert targets[:, 100, 0] == pytest.approx(drive.mean_acceleration * (2.0 * np.arange(3) + 0.8), abs=1.01 * step)
     assert drivetrain.at_samples(turned) == pytest.approx(wheels, abs=step)
 
 
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])
-def test_late_poses_are_those_of_before(late):
+def test_late_poses_are_earlier_ones(late):
     """A robot that speeds up along a straight line, and one that goes on around a circle."""
     time = (
         np.arange(rollout.LEAD_SAMPLES + logs.SAMPLES + drivetrain.EXTRA_SAMPLES) - rollout.LEAD_SAMPLES
     ) * logs.PERIOD
     line = np.stack([(time + 1.0) ** 2, 0 * time, 0 * time], -1)
     circle = np.stack([np.sin(time), 1 - np.cos(time), time], -1)
-    told = logs.resample_poses(np.stack([line, circle]), np.array([late, late]), rollout.LEAD_SAMPLES)[
+    poses = logs.resample_poses(np.stack([line, circle]), np.array([late, late]), rollout.LEAD_SAMPLES)[
         :, : logs.SAMPLES + 2
     ]
-    t = np.arange(told.shape[1]) * logs.PERIOD
+    t = np.arange(poses.shape[1]) * logs.PERIOD
     assert len(t) == logs.SAMPLES + 2
-    np.testing.assert_allclose(told[0, :, 0], (t - late + 1) ** 2 - (1 - late) ** 2, atol=1e-3)
-    np.testing.assert_allclose(told[1], np.stack([np.sin(t), 1 - np.cos(t), t], -1), atol=1e-3)
+    np.testing.assert_allclose(poses[0, :, 0], (t - late + 1) ** 2 - (1 - late) ** 2, atol=1e-3)
+    np.testing.assert_allclose(poses[1], np.stack([np.sin(t), 1 - np.cos(t), t], -1), atol=1e-3)
 
 
-def test_tyres_in_grass_are_dragged_and_the_chassis_is_not():
+def test_viscosity_drags_tires_but_not_the_chassis():
     from twin.sysid.rollout import plane_model
 
     def drag(params: HuskyParams) -> np.ndarray:
@@ -173,11 +190,11 @@ def test_a_known_robot_is_recovered(drive, tmp_path):
     assert found["wheel_radius"][0] == pytest.approx((WHEEL_RADIUS, WHEEL_RADIUS), abs=0.004)
     held_out = ~windows.fitting
     ours, theirs = result.fitted.score(held_out), result.baseline.score(held_out)
-    # The ICR model knows what the wheels did, ours what they were told, by a controller whose clock is not the log's.
+    # The ICR model knows what the wheels did, ours only their commands, by a controller whose clock is not the log's.
     assert ours.position_m < min(0.02, 0.75 * theirs.position_m)
     assert ours.yaw_deg < min(2.0, 0.75 * theirs.yaw_deg)
     assert ours.wheels_rad_s < 0.15
-    # What is written is read back by the scene.
+    # The scene reads robot.toml back.
     path = tmp_path / "robot.toml"
     path.write_text(robot_toml(result, {"camera_pitch": 7.0, "friction": 0.1}, "log"), encoding="utf-8")
     robot = parse_table(HuskyParams, read_robot(path), "robot.toml")
@@ -187,7 +204,7 @@ def test_a_known_robot_is_recovered(drive, tmp_path):
 
 
 def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) -> Identification:
-    """An alignment that nothing was fitted for: a robot, and standard errors by parameter."""
+    """An identification without a fit, with given standard errors."""
     params = HuskyParams(**robot)
     wheels = np.random.default_rng(0).uniform(1, 5, (40, logs.SAMPLES, 2))
     gone = kinematics.predict(kinematics.IcrModel(y_left=0.6, y_right=-0.6), windows_of(wheels))[:, : logs.SAMPLES + 1]
@@ -202,7 +219,7 @@ def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) 
 
 
 @pytest.mark.parametrize("twist", [True, False])
-def test_errors_of_yaw_limits_go_by_the_multiplier(twist):
+def test_errors_of_yaw_limits_scale_with_the_multiplier(twist):
     """ω = half speed · 2 r / (multiplier · track), and so for its error; else errors are in the field's own unit."""
     errors = {"half_limit": 0.1, "half_acceleration": 0.4, "wheel_limit": 0.2, "latency": 0.03, "half_gain": 0.05}
     found = aligned(twist, errors, separation_multiplier=1.875, command_latency=0.2).identified
@@ -216,27 +233,27 @@ def test_errors_of_yaw_limits_go_by_the_multiplier(twist):
         assert found["separation_multiplier"] == (1.875, pytest.approx(0.05))
 
 
-def test_what_of_a_vector_was_not_fitted_is_said():
+def test_components_that_were_not_fitted_are_named():
     result = aligned(ground_errors={"center_of_mass_x": 0.003, "radius_left": 0.001, "radius_right": 0.002})
     assert result.identified["center_of_mass"][1] == (0.003, None, None)
     assert "# ± 0.003, not fitted, not fitted\n" in robot_toml(result, {}, "log")
     assert "± 0.003, not fitted, not fitted" in summary(result)
     assert "# ± 0.001, 0.002\n" in robot_toml(result, {}, "log")
-    told = json.loads(json.dumps(result.figures()))["robot"]
-    assert told["center_of_mass"]["standard_error"] == [0.003, None, None]
+    robot = json.loads(json.dumps(result.figures()))["robot"]
+    assert robot["center_of_mass"]["standard_error"] == [0.003, None, None]
 
 
-def test_a_log_that_shows_nothing_is_said_to():
+def test_a_log_that_identifies_nothing():
     result = aligned()
     assert "fitted: nothing" in summary(result)
     text = robot_toml(result, {"friction": 0.3}, "log")
     assert "nothing in it could be identified" in text and "friction = 0.3\n" in text
 
 
-def test_a_scene_that_overrules_what_was_fitted_is_warned_of(tmp_path, monkeypatch, capsys):
+def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monkeypatch, capsys):
     errors = {"friction": 0.01, "spin_friction": 0.01}
     monkeypatch.setattr("twin.align.identify", lambda *_: aligned(ground_errors=errors))
-    monkeypatch.setattr("twin.align.check", lambda *_: None)
+    monkeypatch.setattr("twin.align.check_log", lambda *_: None)
     monkeypatch.setattr("twin.sysid.plots.write_plots", lambda *_: None)
     scene, log = tmp_path / "x", tmp_path / "log.npz"
     scene.mkdir()
@@ -252,7 +269,7 @@ def test_a_scene_that_overrules_what_was_fitted_is_warned_of(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("out", ["file/out", "taken"])
-def test_a_folder_that_cannot_be_written_is_refused_before_the_fit(out, drive, tmp_path, monkeypatch, capsys):
+def test_an_unwritable_folder_is_refused_before_the_fit(out, drive, tmp_path, monkeypatch, capsys):
     def never(*_):
         raise AssertionError("fitted before the folder was made")
 
@@ -288,7 +305,7 @@ def test_effort_of_motors():
     assert (effort.outer, effort.inner, effort.total) == pytest.approx((3.0, 0.5, 1.75))
 
 
-def test_rolling_resistance_that_currents_show_is_found():
+def test_rolling_resistance_from_motor_currents():
     rng = np.random.default_rng(0)
     turning = rng.uniform(0.25, 0.4, (40, 1)) + np.array([[-0.06, 0.06]])
     speeds = np.concatenate([np.full((40, 2), 0.6), turning])

@@ -1,4 +1,4 @@
-"""Resampling of policies and trials: cells are paired rightly, and its intervals hold what they aim at."""
+"""The bootstrap over policies and trials: pairing of cells, resampling, coverage of intervals."""
 
 import numpy as np
 import pytest
@@ -38,8 +38,12 @@ REAL = [
 ]
 
 
-def test_scores_are_means_over_real_cells_and_the_twins_cells_beside_them() -> None:
-    data = pair_cells(REAL, TWIN)
+def by_key(cells: list[Cell]) -> dict[tuple[str, str, str], Cell]:
+    return {cell.key: cell for cell in cells}
+
+
+def test_scores_are_means_over_real_cells_and_their_twin_cells() -> None:
+    data = pair_cells(REAL, by_key(TWIN))
     assert (data.policies, data.cells) == (3, 5)
     assert [list(members) for members in data.strata] == [[0, 1], [2]]  # b and a on straight, a on the turn
     own = observed_rates(data)
@@ -50,22 +54,22 @@ def test_scores_are_means_over_real_cells_and_the_twins_cells_beside_them() -> N
     assert float(own.compatible) == 1.0
 
 
-def test_policies_are_drawn_within_their_task() -> None:
-    rates = resample(pair_cells(REAL, [*TWIN]), np.random.default_rng(0), 500)
+def test_policies_are_resampled_within_their_task() -> None:
+    rates = resample(pair_cells(REAL, by_key(TWIN)), np.random.default_rng(0), 500)
     assert rates.twin.shape == rates.real.shape == (500, 3)
     # The turn has one policy, of 10 trials at about 0.4: no value of the others' 20 or 3-cell means need appear.
     assert np.allclose(rates.twin[:, 2] * 10, np.round(rates.twin[:, 2] * 10))
     assert rates.twin[:, 2].mean() == pytest.approx(4.5 / 11, abs=0.03)
 
 
-def test_trials_are_driven_anew() -> None:
+def test_trials_are_resampled() -> None:
     """One policy with one cell: what varies is binomial, at the rate shrunk by half a trial."""
     cells = [Cell("a", "t", "sun", 30, 6)]
-    rates = resample(pair_cells(cells, cells), np.random.default_rng(0), 20_000)
+    rates = resample(pair_cells(cells, by_key(cells)), np.random.default_rng(0), 20_000)
     rate = 6.5 / 31
-    for drawn in (rates.twin, rates.real):
-        assert drawn.mean() == pytest.approx(rate, abs=0.003)
-        assert drawn.std() == pytest.approx(np.sqrt(rate * (1 - rate) / 30), rel=0.03)
+    for resampled in (rates.twin, rates.real):
+        assert resampled.mean() == pytest.approx(rate, abs=0.003)
+        assert resampled.std() == pytest.approx(np.sqrt(rate * (1 - rate) / 30), rel=0.03)
     assert abs(np.corrcoef(rates.twin[:, 0], rates.real[:, 0])[0, 1]) < 0.03
 
 
@@ -73,7 +77,7 @@ def test_trials_are_driven_anew() -> None:
 def test_resampled_cells_agree_at_the_confidence_asked_for(confidence: float) -> None:
     """One policy with one cell: its successes are known from its rates, and so is the interval of their difference."""
     cells = [Cell("a", "t", "sun", 30, 12)]
-    data = pair_cells(cells, cells)
+    data = pair_cells(cells, by_key(cells))
     rates = resample(data, np.random.default_rng(0), 500, confidence)
     won = {"twin_successes": np.rint(30 * rates.twin[:, 0]), "real_successes": np.rint(30 * rates.real[:, 0])}
     _, low, high = rate_difference(**won, twin_trials=30, real_trials=30, confidence=confidence)
@@ -85,12 +89,12 @@ def test_resampled_cells_agree_at_the_confidence_asked_for(confidence: float) ->
 
 def test_the_same_seed_gives_the_same_and_certain_rates_are_not_certain() -> None:
     cells = [Cell(name, "t", "sun", 10, 10) for name in "abcde"]
-    one, two = (resample(pair_cells(cells, cells), np.random.default_rng(3), 50) for _ in range(2))
+    one, two = (resample(pair_cells(cells, by_key(cells)), np.random.default_rng(3), 50) for _ in range(2))
     assert np.array_equal(one.twin, two.twin) and np.array_equal(one.compatible, two.compatible)
     assert 0.9 < one.real.mean() < 1.0
 
 
-def test_the_interval_holds_what_was_seen() -> None:
+def test_the_interval_contains_the_observed_value() -> None:
     again = np.linspace(0.0, 1.0, 101)
     assert bootstrap_interval(0.5, again) == pytest.approx((0.05, 0.95))
     assert bootstrap_interval(0.99, again) == pytest.approx((0.05, 0.99))
@@ -148,7 +152,7 @@ def statistics(rates: Rates) -> dict[str, np.ndarray]:
     [(12, 100, 50, 0.5, 1.5), (6, 100, 10, 0.7, 1.5), (12, 100, 20, 3.0, 1.5)],
     ids=["usual", "few", "a poor twin"],
 )
-def test_intervals_hold_the_mean_over_experiments(
+def test_intervals_cover_the_mean_over_experiments(
     n: int, twin_trials: int, real_trials: int, noise: float, spread: float
 ) -> None:
     rng = np.random.default_rng(n + real_trials)

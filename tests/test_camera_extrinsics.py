@@ -1,4 +1,4 @@
-"""How a robot's camera sits, by a film that it took on a known place."""
+"""Extrinsics of a robot's camera from a film that it took in a known place."""
 
 import json
 from dataclasses import replace
@@ -68,7 +68,7 @@ def shaken(poses: np.ndarray, metres: float, degrees: float, seed: int = 0) -> n
     return out
 
 
-def test_angles_turn_the_camera_as_they_say():
+def test_angles_turn_the_camera():
     """In the compiled robot: a yaw looks left, a pitch down, and a roll leans to the right."""
 
     def axes(**angles: float) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_angles_turn_the_camera_as_they_say():
     np.testing.assert_allclose(-both[2], [cosine, sine, 0.0], atol=1e-12)  # leaning does not turn where it looks
 
 
-def test_a_seated_camera_is_where_the_model_has_it(tmp_path):
+def test_the_camera_is_where_the_model_has_it(tmp_path):
     """At rest on the ground of a scene, of the robot as compiled into it."""
     world = tiny_world(tmp_path)
     model = world.model()
@@ -111,14 +111,14 @@ def test_a_seated_camera_is_where_the_model_has_it(tmp_path):
     np.testing.assert_allclose(pose[:3, :3] * [1, -1, -1], camera.xmat.reshape(3, 3), atol=1e-3)
 
 
-def test_the_seat_is_found():
+def test_extrinsics_are_found():
     seat, error = estimate_extrinsics(drive(ASKEW), hills, ASKEW.camera_offset)
     assert seat.height == pytest.approx(0.75, abs=0.002)
     assert (seat.yaw, seat.pitch, seat.roll) == pytest.approx((1.4, 7.0, -2.0), abs=0.05)
     assert max(vars(error).values()) < 0.05
 
 
-def test_errors_tell_how_far_it_may_be_off():
+def test_standard_errors_cover_the_truth():
     poses = shaken(drive(ASKEW), 0.01, 0.3)
     seat, error = estimate_extrinsics(poses, hills, ASKEW.camera_offset)
     for name in ("height", "yaw", "pitch", "roll"):
@@ -127,7 +127,7 @@ def test_errors_tell_how_far_it_may_be_off():
         assert abs(getattr(seat, name) - getattr(ASKEW, f"camera_{name}")) < 3.5 * sigma, name
 
 
-def test_driving_straight_or_backwards_tells_the_yaw_too():
+def test_yaw_from_driving_straight_or_backwards():
     for poses in (drive(ASKEW, weave=0.0), drive(ASKEW)[::-1]):
         assert estimate_extrinsics(poses, hills, ASKEW.camera_offset)[0].yaw == pytest.approx(1.4, abs=0.05)
 
@@ -146,7 +146,7 @@ def test_gaps_and_wrong_frames_do_no_harm():
 
 
 @pytest.mark.slow
-def test_errors_are_of_the_size_that_they_say():
+def test_standard_errors_are_the_scatter_of_estimates():
     """Over many films: neither a third nor three times of what the values scatter by."""
     off = []
     for seed in range(24):
@@ -208,7 +208,7 @@ def found_once(registered, monkeypatch):
     )
 
 
-def test_a_film_is_found_with_its_focal_length(registered, filmed):
+def test_a_film_is_registered_with_its_focal_length(registered, filmed):
     assert registered.frames.tolist() == list(range(len(filmed[0])))
     assert registered.lens.intrinsics == pytest.approx([K[0], K[0], K[2], K[3]], rel=0.01)
     assert 0.0 < registered.focal_error < 3.0
@@ -217,7 +217,7 @@ def test_a_film_is_found_with_its_focal_length(registered, filmed):
         assert np.degrees(rotation_angle(pose[:3, :3].T @ true[:3, :3])) < 0.4
 
 
-def test_frames_of_something_else_are_left_out(scene, filmed):
+def test_frames_of_another_place_are_left_out(scene, filmed):
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
     found = register_film([noise, filmed[0][4], noise, filmed[0][6]], GIVEN, scene)
     assert found.frames.tolist() == [1, 3] and found.lens == GIVEN and found.focal_error == 0.0
@@ -279,7 +279,7 @@ def by_hand(place, text: str) -> None:
         file.write("[robot]\n" + text)
 
 
-def test_the_verb_keeps_the_robot_and_shows_what_it_found(place, film, found_once, capsys):
+def test_the_verb_keeps_other_fields_and_prints_the_fit(place, film, found_once, capsys):
     """What robot.toml had stays, an earlier film's focal length is found anew; the pictures are of the same spots."""
     robot = place.root / "robot.toml"
     robot.write_text("friction = 0.6\ncamera_intrinsics = [400.0, 400.0, 160.0, 120.0]\ncamera_size = [320, 240]\n")
@@ -300,7 +300,7 @@ def test_the_verb_keeps_the_robot_and_shows_what_it_found(place, film, found_onc
     assert alike > 0.6 and alike > aside + 0.1  # a degree is 4.5 px
 
 
-def test_a_lens_by_hand_is_believed(place, film, found_once, capsys):
+def test_given_intrinsics_are_used(place, film, found_once, capsys):
     robot = place.root / "robot.toml"
     robot.write_text("camera_intrinsics = [400.0, 400.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
     by_hand(place, "camera_pitch = 5.0\ncamera_intrinsics = [520.0, 520.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
@@ -309,7 +309,7 @@ def test_a_lens_by_hand_is_believed(place, film, found_once, capsys):
     assert not {"camera_intrinsics", "camera_size"} & set(read_robot(robot))
 
 
-def test_what_cannot_be_used_is_refused_in_a_line(place, film, registered, tmp_path, capsys, monkeypatch):
+def test_unusable_films_are_refused_in_one_line(place, film, registered, tmp_path, capsys, monkeypatch):
     def refused(*arguments: str) -> str:
         assert main(list(arguments)) == 2
         return capsys.readouterr().err
@@ -346,7 +346,7 @@ def test_a_size_without_its_intrinsics_is_refused():
     assert merge_robot(fitted, own, "scene.toml") == {"friction": 0.6, **own}
 
 
-def test_a_name_that_toml_does_not_take_is_made_one(tmp_path):
+def test_unprintable_names_are_escaped(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text(toml_text("fitted to b\nc\x01\udcff.mp4", {"friction": 0.5}, {}), encoding="utf-8")
     assert read_robot(path) == {"friction": 0.5}
@@ -372,12 +372,12 @@ def test_the_focal_length_is_found_with_its_error(start):
     assert 0.0 < error < 1.5 and abs(focal - 260.0) < 3.5 * error
 
 
-def test_a_wall_in_front_does_not_tell_the_focal_length():
+def test_a_frontal_wall_does_not_determine_the_focal_length():
     with pytest.raises(InputError, match="does not show the camera's focal length; give camera_intrinsics"):
         _shared_focal(sights(6.0, 6.01), simple(260.0))
 
 
-def test_a_seat_that_stays_unknown_is_refused(scene, film, found_once, monkeypatch):
+def test_uncertain_extrinsics_are_refused(scene, film, found_once, monkeypatch):
     vague = CameraExtrinsics(0.001, 0.5, 0.1, 0.1)
     monkeypatch.setattr(
         "twin.sysid.camera_extrinsics.estimate_extrinsics", lambda *_: (CameraExtrinsics(1.0, 0.0, 5.0, 0.0), vague)
@@ -387,6 +387,6 @@ def test_a_seat_that_stays_unknown_is_refused(scene, film, found_once, monkeypat
         calibrate_camera(film, scene, known)
 
 
-def test_heading_is_the_way_the_base_looks():
+def test_heading_is_the_direction_of_the_base():
     poses = drive(ASKEW, weave=0.0, count=3)
     np.testing.assert_allclose(base_heading(poses, np.deg2rad(1.4)), 0.0, atol=2e-3)

@@ -1,4 +1,4 @@
-"""Least squares that says how sure it is: textbook cases, and how far fits scatter."""
+"""Maximum a posteriori estimation: textbook cases, and standard errors against the scatter of fits."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from twin.sysid.estimation import Fit, Parameter, fit_parameters, maximize_poste
 ONE = (0,)
 
 
-@pytest.mark.parametrize("guess", [None, 0.0])
-def test_identified_are_what_misses_move(guess):
-    """A line through noise: slope and offset come out with their textbook errors; what does nothing is refused.
+@pytest.mark.parametrize("prior_mean", [None, 0.0])
+def test_parameters_that_move_residuals_are_identified(prior_mean):
+    """A line through noise: slope and offset have their textbook errors; a parameter without effect is refused.
 
     A t distribution's fit to normal noise scatters 8 % more than the textbook's.
     """
@@ -19,29 +19,28 @@ def test_identified_are_what_misses_move(guess):
     x = np.linspace(-1, 1, 400)
     y = 2.0 * x + 0.5 + rng.normal(0, 0.1, 400)
     table = [
-        Parameter("slope", guess, 1.0, -10, 10, 1.0, ""),
-        Parameter("offset", guess, 1.0, -10, 10, 0.0, ""),
-        Parameter("nothing", guess, 1.0, -10, 10, 7.0, "m", "another log"),
+        Parameter("slope", prior_mean, 1.0, -10, 10, 1.0, ""),
+        Parameter("offset", prior_mean, 1.0, -10, 10, 0.0, ""),
+        Parameter("nothing", prior_mean, 1.0, -10, 10, 7.0, "m", "another log"),
     ]
 
-    def misses(v: dict[str, float]) -> np.ndarray:
+    def residuals(v: dict[str, float]) -> np.ndarray:
         return (v["slope"] * x + v["offset"] + 0 * v["nothing"] - y)[:, None, None]
 
-    found = fit_parameters(table, misses, ONE, np.arange(400), {p.name: 0.0 for p in table})
+    found = fit_parameters(table, residuals, ONE, np.arange(400), {p.name: 0.0 for p in table})
     assert found.values["slope"] == pytest.approx(2.0, abs=0.03)
-    for name, shown in {"slope": (x**2).sum(), "offset": 400}.items():
-        assert found.errors[name] == pytest.approx(1.08 * 0.1 / np.sqrt(shown), rel=0.1)
+    for name, slopes in {"slope": (x**2).sum(), "offset": 400}.items():
+        assert found.errors[name] == pytest.approx(1.08 * 0.1 / np.sqrt(slopes), rel=0.1)
     assert found.values["nothing"] == 7.0
     assert "nothing = 7 m" in found.refused["nothing"]
     assert "another log" in found.refused["nothing"]
 
 
 @pytest.mark.parametrize(("noise", "freedom"), [(0.02, np.inf), (1.0, np.inf), (50.0, np.inf), (1.0, 3), (1.0, 1)])
-def test_errors_are_how_far_fits_scatter(noise, freedom):
-    """However large misses are, and however heavy their tails; three windows in a row share some, and those of the last
-    component are of another size."""
+def test_standard_errors_are_the_scatter_of_fits(noise, freedom):
+    """For residuals of any size and tail; groups of three windows are correlated, the last component is larger."""
     table = [Parameter(name, None, 2.0 * noise, -50 * noise, 50 * noise, 0.0, "") for name in "ab"]
-    found, told = [], []
+    found, errors = [], []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         sizes = np.array([1.0, 1.0, 100.0])
@@ -51,38 +50,38 @@ def test_errors_are_how_far_fits_scatter(noise, freedom):
         if freedom < np.inf:
             off /= np.sqrt(rng.chisquare(freedom, (150, 1, 1)) / freedom)
 
-        def misses(values: dict[str, float], slopes=slopes, off=off) -> np.ndarray:
+        def residuals(values: dict[str, float], slopes=slopes, off=off) -> np.ndarray:
             return off + slopes @ np.array([values["a"], values["b"]])
 
-        one = fit_parameters(table, misses, (0, 0, 1), np.arange(150) // 3, {"a": 0.2 * noise, "b": 0.2 * noise})
+        one = fit_parameters(table, residuals, (0, 0, 1), np.arange(150) // 3, {"a": 0.2 * noise, "b": 0.2 * noise})
         found.append([one.values[name] for name in "ab"])
-        told.append([one.errors[name] for name in "ab"])
-    ratio = np.sqrt(np.square(found).mean() / np.square(told).mean())
+        errors.append([one.errors[name] for name in "ab"])
+    ratio = np.sqrt(np.square(found).mean() / np.square(errors).mean())
     assert 0.8 < ratio < 1.25
 
 
-def slope_through(y: np.ndarray, x: np.ndarray, groups: np.ndarray, looks: int = 1) -> Fit:
-    """A line's slope fitted to values that are looked at several times."""
+def slope_through(y: np.ndarray, x: np.ndarray, groups: np.ndarray, instants: int = 1) -> Fit:
+    """Slope of a line through values repeated at several instants."""
 
-    def misses(v: dict[str, float]) -> np.ndarray:
-        return np.repeat((v["slope"] * x - y)[:, None, None], looks, 1)
+    def residuals(v: dict[str, float]) -> np.ndarray:
+        return np.repeat((v["slope"] * x - y)[:, None, None], instants, 1)
 
-    return fit_parameters([Parameter("slope", None, 1.0, -10, 10, 1.0, "")], misses, ONE, groups, {"slope": 0.0})
+    return fit_parameters([Parameter("slope", None, 1.0, -10, 10, 1.0, "")], residuals, ONE, groups, {"slope": 0.0})
 
 
-@pytest.mark.parametrize("looks", [1, 40])
-def test_few_groups_do_not_make_sure(looks):
-    """Of two groups the scores may nearly cancel by chance; windows do scatter."""
+@pytest.mark.parametrize("instants", [1, 40])
+def test_few_groups_do_not_shrink_standard_errors(instants):
+    """The scores of two groups may cancel by chance; the scatter of windows remains."""
     x = np.linspace(-1, 1, 200)
     for seed in range(20):
         y = 2.0 * x + np.random.default_rng(seed).normal(0, 0.1, 200)
-        found = slope_through(y, x, np.arange(200) % 2, looks)
+        found = slope_through(y, x, np.arange(200) % 2, instants)
         assert found.errors["slope"] > 0.9 * 0.1 / np.linalg.norm(x)
 
 
-def test_of_few_groups_one_is_used_up_by_the_fit():
-    """Windows of a group miss alike, so groups count: the variance of a mean of G groups is Σ off² / (G (G − 1)). The
-    same groups eight times over have the same mean and scales, so errors tell what is divided by."""
+def test_few_groups_lose_one_degree_of_freedom():
+    """Windows of a group have equal residuals: the variance of a mean of G groups is Σ off² / (G (G − 1)). The same
+    groups eight times over have the same mean and scales, so the ratio of errors shows the denominator."""
     off = np.repeat([0.18, -0.22, 0.1, -0.06], 50)
     x = np.ones(len(off))
     few, many = (slope_through(2.0 + np.tile(off, k), np.tile(x, k), np.repeat(np.arange(4 * k), 50)) for k in (1, 8))
@@ -90,20 +89,20 @@ def test_of_few_groups_one_is_used_up_by_the_fit():
     assert few.errors["slope"] / many.errors["slope"] == pytest.approx(np.sqrt((4 * 8 - 1) / (4 - 1)), rel=0.02)
 
 
-def test_errors_hold_where_windows_that_tell_most_miss_most():
-    """A fifth of the windows is stuck, and would tell five times as much."""
-    found, told = [], []
+def test_standard_errors_with_large_residuals_at_high_leverage():
+    """A fifth of the windows is stuck, with five times the leverage."""
+    found, errors = [], []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         stuck = np.arange(300) % 5 == 0
         x = np.where(stuck, 5.0, 1.0) * rng.normal(size=300)
         one = slope_through(2.0 * x + np.where(stuck, 5.0, 0.5) * rng.normal(size=300), x, np.arange(300))
         found.append(one.values["slope"] - 2.0)
-        told.append(one.errors["slope"])
-    assert 0.75 < np.sqrt(np.square(found).mean() / np.square(told).mean()) < 1.25
+        errors.append(one.errors["slope"])
+    assert 0.75 < np.sqrt(np.square(found).mean() / np.square(errors).mean()) < 1.25
 
 
-def test_impossible_windows_do_not_decide_from_far_away():
+def test_outliers_do_not_decide_a_distant_start():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(200, 1, 1))
     noise = 0.01 * rng.normal(size=(200, 1, 1))
@@ -113,51 +112,53 @@ def test_impossible_windows_do_not_decide_from_far_away():
     assert found.values["a"] == pytest.approx(3.0, abs=0.005)
 
 
-def test_nothing_is_asked_twice():
+def test_no_values_are_evaluated_twice():
     rng = np.random.default_rng(0)
     x, noise = rng.normal(size=(2, 100)), rng.normal(size=100)
-    asked = []
+    evaluated = []
 
-    def misses(v: dict[str, float]) -> np.ndarray:
-        asked.append((v["a"], v["b"]))
+    def residuals(v: dict[str, float]) -> np.ndarray:
+        evaluated.append((v["a"], v["b"]))
         return (x[0] * v["a"] + x[1] * v["b"] - noise)[:, None, None]
 
     table = [Parameter(name, 0.0, 1.0, -10, 10, 0.0, "") for name in "ab"]
-    fit_parameters(table, misses, ONE, np.arange(100), {"a": 1.0, "b": 1.0})
-    assert len(set(asked)) == len(asked) > 6
+    fit_parameters(table, residuals, ONE, np.arange(100), {"a": 1.0, "b": 1.0})
+    assert len(set(evaluated)) == len(evaluated) > 6
 
 
 @pytest.mark.parametrize("reach", [0.01, 1.0])
 def test_reach_is_the_scale_of_the_first_step(reach):
     x = np.random.default_rng(0).normal(size=(100, 1, 1))
-    asked: list[float] = []
+    evaluated: list[float] = []
 
-    def misses(v: dict[str, float]) -> np.ndarray:
-        asked.append(v["a"])
+    def residuals(v: dict[str, float]) -> np.ndarray:
+        evaluated.append(v["a"])
         return (v["a"] - 500.0) * x + 0.1 * x**2
 
-    maximize_posterior([Parameter("a", None, 1.0, -1e3, 1e3, 0.0, "")], misses, ONE, {"a": 0.0}, reach)
-    assert asked[2] == pytest.approx(reach * np.sqrt(1e3 / reach), rel=0.1)  # after the beginning, and the slope there
+    maximize_posterior([Parameter("a", None, 1.0, -1e3, 1e3, 0.0, "")], residuals, ONE, {"a": 0.0}, reach)
+    assert evaluated[2] == pytest.approx(reach * np.sqrt(1e3 / reach), rel=0.1)  # after the start and its Jacobian
 
 
-def test_a_guess_weighs_as_much_as_a_log_that_is_as_unsure():
-    """One that says 1 and has eight times the weight of the guess that says 0."""
+def test_a_prior_weighs_as_much_as_data_of_its_variance():
+    """A prior of mean 0 and data of value 1 with eight times its weight."""
     table = [Parameter("a", 0.0, 1.0, -10, 10, 7.0, ""), Parameter("b", None, 1.0, -10, 10, 7.0, "")]
     count = 1000
     noise = np.tile(t(3).ppf((np.arange(count) + 0.5) / count), 2)
-    shown = np.sqrt(8 / (2 / 3 * count)) * np.repeat(np.eye(2), count, 0)  # of t with ν = 3, a look tells 2 / 3
+    slopes = np.sqrt(8 / (2 / 3 * count)) * np.repeat(
+        np.eye(2), count, 0
+    )  # information of t with ν = 3: 2 / 3 per value
 
-    def misses(v: dict[str, float]) -> np.ndarray:
-        return (shown @ [v["a"] - 1, v["b"] - 1] + noise)[:, None, None]
+    def residuals(v: dict[str, float]) -> np.ndarray:
+        return (slopes @ [v["a"] - 1, v["b"] - 1] + noise)[:, None, None]
 
-    found = fit_parameters(table, misses, ONE, np.arange(2 * count), {"a": 5.0, "b": 5.0})
+    found = fit_parameters(table, residuals, ONE, np.arange(2 * count), {"a": 5.0, "b": 5.0})
     assert found.values == pytest.approx({"a": 8 / 9, "b": 1.0}, abs=0.01)
     assert found.errors["a"] == pytest.approx(1 / 3, rel=0.05)
 
 
-@pytest.mark.parametrize("guess", [None, 3.0])
-def test_nothing_identified_is_a_fit_too(guess):
-    table = [Parameter(name, guess, 1.0, -10, 10, 7.0, "") for name in ("a", "b")]
+@pytest.mark.parametrize("prior_mean", [None, 3.0])
+def test_a_fit_without_identified_parameters(prior_mean):
+    table = [Parameter(name, prior_mean, 1.0, -10, 10, 7.0, "") for name in ("a", "b")]
     noise = np.random.default_rng(0).normal(size=(50, 1, 1))
     found = fit_parameters(table, lambda v: noise + 0 * (v["a"] + v["b"]), ONE, np.arange(50), {"a": 3.0, "b": 3.0})
     assert found.values == {"a": 7.0, "b": 7.0}
@@ -166,36 +167,36 @@ def test_nothing_identified_is_a_fit_too(guess):
 
 
 @pytest.mark.parametrize("kept", [0, 1])
-def test_parameters_may_go_one_by_one(kept):
-    """Each shows only as long as the next one is not at its usual value, and the last one hardly shows."""
+def test_parameters_are_dropped_one_by_one(kept):
+    """Each has an effect only while the next one is not at its default; the last one has nearly none."""
     rng = np.random.default_rng(1)
     names = list("abcdefg")
     x, noise = rng.normal(size=(7, 400)), 0.1 * rng.normal(size=400)
     table = [Parameter(name, 1.0, 1.0, -10, 10, 0.0, "") for name in names]
 
-    def misses(v: dict[str, float]) -> np.ndarray:
-        shown = [*(float(v[after] != 0.0) for after in names[1:]), 0.005]
-        shown[0] = shown[0] or float(kept)
-        off = (np.array([v[name] for name in names]) - 1.0) * shown
+    def residuals(v: dict[str, float]) -> np.ndarray:
+        slopes = [*(float(v[after] != 0.0) for after in names[1:]), 0.005]
+        slopes[0] = slopes[0] or float(kept)
+        off = (np.array([v[name] for name in names]) - 1.0) * slopes
         return (off @ x + noise)[:, None, None]
 
-    found = fit_parameters(table, misses, ONE, np.arange(400), dict.fromkeys(names, 1.0))
+    found = fit_parameters(table, residuals, ONE, np.arange(400), dict.fromkeys(names, 1.0))
     assert set(found.errors) == set(names[:kept]) and set(found.refused) == set(names[kept:])
     if kept:
         assert found.values["a"] == pytest.approx(1.0, abs=0.03)
         assert found.errors["a"] == pytest.approx(0.1 / np.linalg.norm(x[0]), rel=0.2)
 
 
-@pytest.mark.parametrize("guess", [None, 0.0])
-def test_two_that_do_the_same_are_not_both_identified(guess):
+@pytest.mark.parametrize("prior_mean", [None, 0.0])
+def test_of_two_parameters_of_equal_effect_one_is_identified(prior_mean):
     rng = np.random.default_rng(0)
     x, noise = rng.normal(size=200), 0.1 * rng.normal(size=200)
-    table = [Parameter(name, guess, 1.0, -10, 10, 0.0, "") for name in ("a", "b")]
+    table = [Parameter(name, prior_mean, 1.0, -10, 10, 0.0, "") for name in ("a", "b")]
     begin = {"a": 0.0, "b": 0.0}
 
-    def misses(v: dict[str, float]) -> np.ndarray:
+    def residuals(v: dict[str, float]) -> np.ndarray:
         return ((v["a"] + v["b"] - 1.0) * x + noise)[:, None, None]
 
-    found = fit_parameters(table, misses, ONE, np.arange(200), begin)
+    found = fit_parameters(table, residuals, ONE, np.arange(200), begin)
     assert len(found.errors) == 1
     assert sum(found.values.values()) == pytest.approx(1.0, abs=0.1)

@@ -1,4 +1,4 @@
-"""The forecast: what it says follows from the tables, what they do not allow is refused, and nothing is made up."""
+"""The forecast: its numbers follow from the tables, and statistics that the data do not determine are refused."""
 
 import json
 import re
@@ -181,7 +181,7 @@ def predicted(twin: np.ndarray, real: np.ndarray, at: float) -> tuple[float, flo
 
 
 def test_a_lighting_left_out_is_predicted_by_the_others_alone() -> None:
-    """Dusk is another world than the rest: a line that had seen it would come closer to it."""
+    """Dusk differs from the rest: a line fitted to it, too, would be closer."""
     twin, real = cells(n=9, driven=9)
     real = [replace(c, successes=c.trials - c.successes) if c.lighting == "dusk" else c for c in real]
     rates, lights = {c.key: c.rate for c in twin}, np.array([c.lighting for c in real])
@@ -194,7 +194,7 @@ def test_a_lighting_left_out_is_predicted_by_the_others_alone() -> None:
         assert out.coverage.value == pytest.approx(inside.mean())
 
 
-def test_policies_left_out_are_predicted_at_the_confidence_that_is_told() -> None:
+def test_policies_left_out_are_predicted_at_the_stated_confidence() -> None:
     """As many are within the interval as by the textbook; within the one of half the cases there are fewer."""
     twin, real = cells(n=12, driven=12)
     made = make_forecast("road", twin, real)
@@ -253,7 +253,7 @@ def test_rates_that_are_all_the_same_have_no_correlation_but_a_bias() -> None:
     assert "nan" not in forecast_page(made) + summary_text(made) + candidates_csv(made)
 
 
-def test_without_real_trials_it_says_what_it_cannot_know() -> None:
+def test_without_real_trials_statistics_are_missing() -> None:
     made = make_forecast("road", cells()[0], [])
     assert made.groups == made.pairs == made.left_out == ()
     text = Text(forecast_page(made)).text
@@ -278,7 +278,7 @@ def test_the_next_trials_are_of_policies_that_may_be_best_or_were_not_driven() -
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 
-def test_uneven_lightings_are_told() -> None:
+def test_uneven_lightings_are_named() -> None:
     twin, real = cells(n=8)
     twin = [c for c in twin if c.key != ("p7", "straight", "sun")]
     told = [caution.what for caution in limitations(make_forecast("road", twin, real[1:]))]

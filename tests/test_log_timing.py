@@ -1,4 +1,4 @@
-"""When poses were measured, told from when they got into the log; truth is a sensor that is made up."""
+"""Measurement times of poses, estimated from their times of appearance in logs of a simulated sensor."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def held(appeared: list[list[float]]) -> logs.Windows:
     return windows_of(np.zeros((len(appeared), logs.SAMPLES, 2)), poses)
 
 
-def test_stale_poses_were_measured_when_their_sensor_measured():
+def test_poses_have_the_period_of_their_sensor():
     """At 10 Hz: every second sample. In samples from the window's start; negative: before it."""
     regular, old = list(range(2, 41, 2)), list(range(1, 41, 2))
     late = [2, 4, 6, 11, 12, 13, *range(14, 41, 2)]  # two came late, none was lost
@@ -34,8 +34,8 @@ def test_stale_poses_were_measured_when_their_sensor_measured():
 
 
 def delivered(period: float) -> tuple[list[list[int]], np.ndarray, np.ndarray]:
-    """When measurements came into the log of 200 windows, and how long after its first one a window's last was made: in
-    truth, and by when they came. Each comes within a sample, one in twenty much later, one in a hundred never."""
+    """Samples at which measurements appear in 200 windows, and the time from each window's first to its last one: true,
+    and by appearance. Each appears within a sample, one in twenty much later, one in a hundred never."""
     rng = np.random.default_rng(0)
     appeared, truth, came = [], [], []
     for _ in range(200):
@@ -51,7 +51,7 @@ def delivered(period: float) -> tuple[list[list[int]], np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("period", [2.0, 8 / 3, 4.0, 10.0, 20.0])
-def test_measurements_are_told_from_their_delivery(period):
+def test_measurement_times_from_times_of_appearance(period):
     appeared, truth, came = delivered(period)
     off = np.abs(held(appeared).elapsed[:, -1] / logs.PERIOD - truth)
     naive = np.abs(came - truth)
@@ -59,7 +59,7 @@ def test_measurements_are_told_from_their_delivery(period):
     assert off.mean() < naive.mean()
 
 
-def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
+def test_aperiodic_sensors_use_times_of_appearance():
     """One that measures every 0.2 m, at several speeds, and one window of a 10 Hz sensor that came at 20 Hz."""
     by_distance = [list(range(each // 2, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
     steady = [list(range(2, 41, 2))] * 10 + [list(range(1, 41))]
@@ -70,7 +70,7 @@ def test_a_sensor_without_a_steady_rate_is_taken_at_its_word():
             assert window[0] == pytest.approx(min(0, 2 * each[0] - each[1]), abs=1e-9)
 
 
-def test_a_sensor_as_fast_as_the_log_is_taken_at_its_word():
+def test_fast_sensors_use_times_of_appearance():
     appeared, truth, _ = delivered(1.0)
     windows = held(appeared)
     assert windows.measurement_times[:, -1] / logs.PERIOD == pytest.approx([each[-1] for each in appeared])

@@ -1,4 +1,4 @@
-"""Drive logs: alike from every kind of file, cut where they have gaps, refused in one line where they mislead."""
+"""Drive logs: equal from every kind of file, without windows that have gaps, refused in one line if implausible."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,6 @@ from twin.align import main
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.sysid import kinematics, logs
-from twin.sysid.log_checks import check
 
 
 def _bad(table: dict[str, np.ndarray], **changes) -> dict[str, np.ndarray]:
@@ -82,7 +81,7 @@ def test_bad_logs_get_one_line(kind, drive, tmp_path, capsys):
 def test_too_few_turns(tmp_path):
     table = columns(HuskyParams(), 130.0, seed=2, strong=False)
     with pytest.raises(InputError, match=r"0 windows turn left and 0 right .*drive more turns"):
-        check(logs.cut_windows(table, "log"), "log")
+        logs.check_log(logs.cut_windows(table, "log"), "log")
 
 
 def test_csv_and_npz_are_the_same_log(drive, tmp_path):
@@ -123,7 +122,7 @@ def test_windows_without_poses_are_left_out(drive):
 
 
 def test_windows_in_which_the_robot_stands_are_left_out(drive):
-    """However long it is parked, told to stay: what is fitted and what is said would be of that. Stuck it is kept."""
+    """A robot parked for long would dominate fits and medians. One that is commanded but stuck is kept."""
     parked = {name: np.concatenate([column, np.repeat(column[-1:], 8000)]) for name, column in drive.items()}
     begins = len(drive["time"])
     parked["time"] = np.arange(len(parked["time"])) * 0.05
@@ -176,7 +175,7 @@ def test_published_windows_are_read(real_data: Path):
     windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
     assert len(windows) == 402
     assert set(windows.groups % 2) == {0, 1}
-    check(windows, "log")
+    logs.check_log(windows, "log")
     # The IMU's axes after reading: it is pushed forward when wheels speed up, and into the turn.
     motion = kinematics.fit_icr(windows).motion(windows.wheels)
     speeding = np.gradient(motion[..., 0], logs.PERIOD, axis=1).ravel()

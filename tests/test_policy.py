@@ -1,4 +1,4 @@
-"""Policy files: what is saved is what acts, and what is damaged or foreign is refused in one line."""
+"""Policy files: saved policies act as their networks; damaged and foreign files are refused in one line."""
 
 import json
 import os
@@ -64,7 +64,7 @@ def test_a_saved_policy_acts_as_the_network_written_out(tmp_path, pool):
     policy = load_policy(tmp_path)
     expected = np.array([naive(architecture, weights, stack) for stack in stacks])
     assert np.ptp(expected) > 1e-3
-    # Where levelling ends at a half, the last bit of a sum decides to which byte it goes.
+    # Where normalization ends at a half, the last bit of a sum decides to which byte it goes.
     np.testing.assert_allclose(policy.actions(stacks), expected, atol=3e-4)
     np.testing.assert_array_equal(policy(stacks[1]), policy(stacks[1]))
 
@@ -86,14 +86,14 @@ def test_what_actions_mean():
     assert twist.command(np.array([1.0, 0.0])) == (0.8, 0.0)
 
 
-def test_shrinking_is_the_mean_rounded_half_up():
+def test_pooling_is_the_mean_rounded_half_up():
     some = pictures(2)
     mean = some.reshape(2, 12, 45, 2, 80, 2).astype(float).mean((3, 5))
     np.testing.assert_array_equal(average_pool(some, 2), np.floor(mean + 0.5))
     assert average_pool(np.array([[[0, 0], [1, 1]]], np.uint8), 2).item() == 1
 
 
-def test_levelled_pictures_do_not_depend_on_exposure_contrast_or_white_balance():
+def test_normalized_pictures_do_not_depend_on_exposure_contrast_or_white_balance():
     rng = np.random.default_rng(3)
     road = np.clip(rng.normal(110.0, 30.0, (3, 40, 60)), 30, 220)
     other = np.array([0.55, 0.5, 0.35])[:, None, None] * road + np.array([20.0, 12.0, 30.0])[:, None, None]
@@ -105,11 +105,11 @@ def test_levelled_pictures_do_not_depend_on_exposure_contrast_or_white_balance()
     np.testing.assert_allclose(ground.mean(1), 128, atol=1)
     assert (ground.std(1) > 38).all() and (ground.std(1) < 48).all()
     assert (normalize_colors(np.full((3, 4, 4), 77, np.uint8)) == 128).all()
-    # Noise where there is nothing else is not made into a picture.
+    # Noise in a plain picture is not amplified.
     assert normalize_colors(rng.integers(9, 11, (3, 40, 60), np.uint8)).std() < 8
 
 
-def test_preparing_is_shrinking_and_then_levelling():
+def test_preprocessing_is_pooling_and_then_normalization():
     some = pictures(2)
     np.testing.assert_array_equal(preprocess(some, 2), normalize_colors(average_pool(some, 2)))
 
@@ -119,7 +119,7 @@ def test_neither_torch_nor_sb3_is_needed(folder, tmp_path):
         (tmp_path / "none" / name).mkdir(parents=True)
         (tmp_path / "none" / name / "__init__.py").write_text("raise ImportError('not here')")
     code = (
-        "import numpy as np; from twin.learn.policy import load_policy\n"
+        "import numpy as np, twin.validate; from twin.learn.policy import load_policy\n"
         f"print(load_policy({str(folder)!r})(np.zeros((12, 90, 160), np.uint8)))"
     )
     paths = os.pathsep.join([str(tmp_path / "none"), str(Path(__file__).parents[1])])
@@ -311,12 +311,12 @@ def test_a_callable_that_is_no_policy_is_refused_in_one_line(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("name", ["subprocess:run", "os:abort_", "..:..", "a b:c", ":x", "x:"])
-def test_what_names_no_policy_is_refused(name):
+def test_names_of_no_policy_are_refused(name):
     with pytest.raises(InputError):
         load_policy(name)
 
 
-def test_a_callable_that_raises_on_the_way_is_said_to(tmp_path, monkeypatch):
+def test_a_callable_that_raises_is_named(tmp_path, monkeypatch):
     code = "left = [1]\ndef act(pixels):\n    left.pop()\n    return [0.0]\n"
     (tmp_path / "tired_policy.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -1,4 +1,4 @@
-"""Of a training's late policies the one that drives best is the run's, whatever it was that came last."""
+"""Selection of a run's policy: the best of a training's late ones, not the last."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from tiny_twin import tiny_twin
 import twin
 from twin import runtime
 from twin.evaluation.training_curves import CHOICE_FILE, write_success_curve
-from twin.learn import policy_evaluation
+from twin.learn import training
 from twin.learn.policy import load_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.training import train
@@ -39,11 +39,11 @@ def run(scene, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def scripted(monkeypatch):
-    """Episodes that end as is said: by step of the policy, how many arrive and what each earns."""
+    """Episodes with scripted results: by step of the policy, the number of successes and the reward."""
     script: dict[int, tuple[int, float]] = {}
     asked: list[tuple[int, tuple[int, ...]]] = []
 
-    def pretend(policy, worlds, seeds, watch):
+    def pretend(policy, envs, seeds, watch):
         step = policy.trained["step"]
         asked.append((step, tuple(seeds)))
         won, reward = script.get(step, (0, 0.0))
@@ -52,18 +52,18 @@ def scripted(monkeypatch):
             for i, seed in enumerate(seeds)
         ]
 
-    monkeypatch.setattr(policy_evaluation, "run_episodes", pretend)
+    monkeypatch.setattr(training, "run_episodes", pretend)
     return script, asked
 
 
-def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
+def test_the_policy_with_most_successes_is_selected(scene, run, scripted):
     script, asked = scripted
     (run / CHOICE_FILE).unlink(missing_ok=True)
     script |= {120: (2, 1.0), 140: (2, 1.5), 160: (1, 9.0), 40: (3, 9.0)}
-    choice = policy_evaluation.select_checkpoint(scene, run, CONFIG)
+    choice = training.select_checkpoint(scene, run, CONFIG)
     assert [one["step"] for one in choice["candidates"]] == [100, 120, 140, 160]  # of the second half
     # Of those with most successes the one that earns most; its rate is that of the fresh episodes.
-    assert choice["chosen"] == {"step": 140, "trials": policy_evaluation.FRESH_EPISODES, "successes": 2, "reward": 1.5}
+    assert choice["chosen"] == {"step": 140, "trials": training.FRESH_EPISODES, "successes": 2, "reward": 1.5}
     assert [one["trials"] for one in choice["candidates"]] == [3, 3, 3, 3]
     for name in ("policy.json", "policy.safetensors", "policy.onnx"):
         assert (run / name).read_bytes() == (run / "checkpoints" / "000000140" / name).read_bytes()
@@ -71,30 +71,30 @@ def test_the_one_that_arrives_most_often_is_chosen(scene, run, scripted):
     shared = {seeds for _, seeds in asked[:-1]}
     assert len(shared) == 1 and len(next(iter(shared))) == CONFIG.trials  # all drive the same episodes
     step, fresh = asked[-1]
-    assert step == 140 and len(fresh) == policy_evaluation.FRESH_EPISODES and not set(fresh) & set(next(iter(shared)))
+    assert step == 140 and len(fresh) == training.FRESH_EPISODES and not set(fresh) & set(next(iter(shared)))
     assert write_success_curve(run).exists()
 
 
 @pytest.mark.slow
-def test_it_is_chosen_once_and_anew_after_more_steps(scene, run, tmp_path, scripted):
+def test_selection_is_repeated_only_after_more_steps(scene, run, tmp_path, scripted):
     _, asked = scripted
     (run / CHOICE_FILE).unlink(missing_ok=True)
-    first = policy_evaluation.select_checkpoint(scene, run, CONFIG)
+    first = training.select_checkpoint(scene, run, CONFIG)
     count = len(asked)
     for config in (CONFIG, replace(CONFIG, steps=80)):  # fewer steps than were trained change nothing
         train(scene, run, config)
-        assert policy_evaluation.select_checkpoint(scene, run, config) == first and len(asked) == count
+        assert training.select_checkpoint(scene, run, config) == first and len(asked) == count
     assert json.loads((run / CHOICE_FILE).read_text()) == first
     longer, copy = replace(CONFIG, steps=200), shutil.copytree(run, tmp_path / "run")
     train(scene, copy, longer)
     assert not (copy / CHOICE_FILE).exists()
-    again = policy_evaluation.select_checkpoint(scene, copy, longer)
+    again = training.select_checkpoint(scene, copy, longer)
     assert again["steps"] == 200 and again["candidates"][-1]["step"] == 200
 
 
-def test_a_training_that_begins_anew_keeps_nothing_of_the_one_before(scene, run, tmp_path, scripted):
+def test_a_new_training_keeps_nothing_of_the_previous_one(scene, run, tmp_path, scripted):
     copy = shutil.copytree(run, tmp_path / "run")
-    policy_evaluation.select_checkpoint(scene, copy, CONFIG)
+    training.select_checkpoint(scene, copy, CONFIG)
     shutil.rmtree(copy / "state")
     (copy / "state").mkdir()
     train(scene, copy, replace(CONFIG, steps=80))
@@ -105,22 +105,22 @@ def test_a_training_that_begins_anew_keeps_nothing_of_the_one_before(scene, run,
 def test_candidates_are_few_and_the_last_is_one(tmp_path):
     for step in range(1000, 21000, 1000):
         (tmp_path / f"{step:09d}").mkdir()
-    found = [int(path.name) for path in policy_evaluation._candidates(tmp_path, 20_000)]
+    found = [int(path.name) for path in training._candidates(tmp_path, 20_000)]
     assert found == [11000, 14000, 17000, 20000]
 
 
-def test_they_drive_as_the_training_had_it_but_from_the_start(scene, run, monkeypatch):
-    """Whole episodes, in the training's light, and driven as often as they are asked for with the same end."""
+def test_candidates_drive_whole_episodes_as_in_training(scene, run, monkeypatch):
+    """Whole episodes in the training's lighting, with the same result each time."""
     seen = []
 
-    def spy(policy, worlds, seeds, watch):
-        seen.append((worlds.options.start_along, worlds.options.lighting, worlds.options.randomise))
-        driven = run_episodes(policy, worlds, seeds[:2], watch)
-        assert driven == run_episodes(policy, worlds, seeds[:2], watch)
+    def spy(policy, envs, seeds, watch):
+        seen.append((envs.options.start_along, envs.options.lighting, envs.options.randomise))
+        driven = run_episodes(policy, envs, seeds[:2], watch)
+        assert driven == run_episodes(policy, envs, seeds[:2], watch)
         assert all(np.isfinite(one.reward) and one.steps > 0 for one in driven)
         return driven
 
     (run / CHOICE_FILE).unlink(missing_ok=True)
-    monkeypatch.setattr(policy_evaluation, "run_episodes", spy)
-    policy_evaluation.select_checkpoint(scene, run, CONFIG)
+    monkeypatch.setattr(training, "run_episodes", spy)
+    training.select_checkpoint(scene, run, CONFIG)
     assert set(map(str, seen)) == {str((0.0, "day", CONFIG.options()["randomise"]))}

@@ -1,12 +1,16 @@
-"""Corrected predictions: closed forms, no bias, intervals that hold, and refusals."""
+"""Prediction-powered estimates: closed forms, bias, coverage of intervals, refusals."""
 
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.special import expit
 
-from twin.evaluation.prediction_powered import LinearCorrection, leave_one_group_out, prediction_powered_mean
-from twin.evaluation.statistics import UndefinedStatistic
+from twin.evaluation.statistics import (
+    LinearCorrection,
+    UndefinedStatistic,
+    leave_one_group_out,
+    prediction_powered_mean,
+)
 
 F = np.array([0.1, 0.3, 0.5, 0.6, 0.9, 0.95])
 Y = np.array([0.0, 0.3, 0.2, 0.5, 0.6, 0.9])
@@ -49,7 +53,7 @@ def test_the_powered_mean_has_no_bias() -> None:
     assert abs(np.mean([tuned_on_the_same(f, y) for f, y in pairs]) - aim) > 3 * error
 
 
-def test_the_powered_interval_holds() -> None:
+def test_the_powered_interval_covers() -> None:
     """Rates of policies of varied quality, seven driven, ten not: 1500 experiments, Monte-Carlo error 0.008."""
     rng = np.random.default_rng(2)
     quality = rng.normal(0.0, 1.5, (1500, 17))
@@ -61,7 +65,7 @@ def test_the_powered_interval_holds() -> None:
     assert 0.88 <= held <= 0.95, held
 
 
-def test_power_saves_trials() -> None:
+def test_power_reduces_the_variance() -> None:
     rng = np.random.default_rng(2)
     tuned, classical = [], []
     for _ in range(300):
@@ -92,7 +96,7 @@ def test_predictions_are_rates_and_keep_their_width() -> None:
     assert flat.slope == 0.0 and float(flat.predict(0.9)[0]) == pytest.approx(Y.mean())
 
 
-def test_left_out_predictions_do_not_know_what_they_predict() -> None:
+def test_left_out_predictions_do_not_depend_on_their_target() -> None:
     value, _, _ = leave_one_group_out(twin=F, real=Y, groups=range(6))
     for i in range(6):
         fit = stats.linregress(np.delete(F, i), np.delete(Y, i))
@@ -116,8 +120,8 @@ def test_left_out_intervals_have_the_confidence_asked_for(confidence: float) -> 
 
 
 @pytest.mark.parametrize(("n", "real_trials", "noise"), [(12, 50, 0.5), (6, 20, 0.5), (12, 20, 3.0)])
-def test_predictions_hold_nine_times_in_ten(n: int, real_trials: int, noise: float) -> None:
-    """Rates of new policies, seen in as many real trials: 600 experiments, Monte-Carlo error 0.012."""
+def test_prediction_intervals_cover(n: int, real_trials: int, noise: float) -> None:
+    """Rates of new policies in as many real trials: 600 experiments, Monte-Carlo error 0.012."""
     rng = np.random.default_rng(n)
     held, held_out = [], []
     for _ in range(600):

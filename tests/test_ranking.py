@@ -1,4 +1,4 @@
-"""The ranking: probabilities are probabilities, agree with closed forms, and further trials are what they promise."""
+"""The ranking: probabilities against closed forms, coverage of intervals, numbers of further trials."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def of(*counts: tuple[int, int]) -> TrialCounts:
     return TrialCounts.from_rows([[one] for one in counts])
 
 
-def test_two_policies_as_by_integration() -> None:
+def test_two_policies_against_integration() -> None:
     chance = rank_probabilities(of((7, 10), (5, 10)), np.random.default_rng(0), 100_000)
     rate = (np.arange(200_000) + 0.5) / 200_000
     better = np.mean(stats.beta.pdf(rate, 7.5, 3.5) * stats.beta.cdf(rate, 5.5, 5.5))
@@ -31,7 +31,7 @@ def test_two_policies_as_by_integration() -> None:
     assert np.allclose(chance, chance.T)
 
 
-def test_every_policy_has_a_rank_and_every_rank_a_policy() -> None:
+def test_rows_and_columns_sum_to_one() -> None:
     chance = rank_probabilities(of((1, 10), (9, 10), (5, 10), (5, 10)), np.random.default_rng(1))
     assert np.allclose(chance.sum(0), 1.0) and np.allclose(chance.sum(1), 1.0)
     assert chance[1, 0] > 0.9 and chance[0, 3] > 0.9
@@ -44,7 +44,7 @@ def test_a_score_is_the_mean_over_cells_whatever_their_trials() -> None:
     assert rank_probabilities(tallies, np.random.default_rng(2))[1, 0] > 0.9
 
 
-def test_rank_interval_leaves_out_what_is_unlikely_at_either_end() -> None:
+def test_rank_interval_excludes_unlikely_ranks() -> None:
     expected, low, high = rank_interval(np.array([0.04, 0.5, 0.42, 0.04]))
     assert (low, high) == (2, 3) and expected == pytest.approx(2.46)
     assert rank_interval(np.array([0.06, 0.88, 0.06]))[1:] == (1, 3)
@@ -52,9 +52,9 @@ def test_rank_interval_leaves_out_what_is_unlikely_at_either_end() -> None:
     assert rank_interval(np.array([0.05, 0.9, 0.05]))[1:] == (2, 2)
 
 
-def test_rank_intervals_hold() -> None:
-    """True rates drawn evenly; 300 experiments of six policies, Monte-Carlo error 0.008. Ranks are whole numbers, so
-    that an interval holds at least as often as it says, nearly."""
+def test_rank_intervals_cover() -> None:
+    """Uniform true rates; 300 experiments of six policies, Monte-Carlo error 0.008. Ranks are whole numbers, so the
+    coverage is at least about the nominal one."""
     rng = np.random.default_rng(3)
     held = []
     for _ in range(300):
@@ -67,7 +67,7 @@ def test_rank_intervals_hold() -> None:
     assert 0.88 <= np.mean(held) <= 0.99, np.mean(held)
 
 
-def test_more_trials_make_surer() -> None:
+def test_confidence_grows_with_trials() -> None:
     tallies = of((8, 10), (6, 10), (3, 10))
     sure = [expected_confidence(tallies, more, 0) for more in (0, 20, 100, 500)]
     assert [s.winner for s in sure] == sorted(s.winner for s in sure)
@@ -75,7 +75,7 @@ def test_more_trials_make_surer() -> None:
     assert sure[-1].winner > 0.95 > sure[0].winner
 
 
-def test_now_is_what_the_posterior_says() -> None:
+def test_confidence_without_further_trials_is_the_posterior() -> None:
     """With no further trials the leader is fixed: it is within the margin of the best as often as in the posterior."""
     tallies = of((8, 10), (6, 10), (3, 10))
     draws = tallies.scores(tallies.sample_posterior(np.random.default_rng(9), 100_000))
@@ -91,7 +91,7 @@ def test_without_trials_so_far_nothing_is_known() -> None:
     assert expected_confidence(tallies, 0, 0).winner > 0.99
 
 
-def test_trials_to_settle_is_the_least_that_does() -> None:
+def test_trials_needed_is_the_least_sufficient_number() -> None:
     tallies = of((16, 20), (13, 20), (5, 20))
     more = trials_needed(tallies, "winner", 0)
     assert more is not None and more % 5 == 0 and more > 0
@@ -105,8 +105,8 @@ def test_trials_to_settle_is_the_least_that_does() -> None:
 
 
 @pytest.mark.parametrize("needed", [MAX_TRIALS - 5, MAX_TRIALS, MAX_TRIALS + 5, 1.5 * MAX_TRIALS, np.inf])
-def test_more_trials_than_the_most_are_never_asked_for(needed: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a ranking that settles at a known number of trials: that number, or none if nobody would drive so many."""
+def test_no_more_trials_than_the_maximum_are_needed(needed: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ranking that settles at a known number of trials: that number, or None above the maximum."""
 
     def confidence(counts: TrialCounts, more: int, seed: int, so_far: bool = True) -> RankingConfidence:
         assert more < 2 * MAX_TRIALS, "tried in vain"
@@ -116,7 +116,7 @@ def test_more_trials_than_the_most_are_never_asked_for(needed: float, monkeypatc
     assert trials_needed(of((5, 10), (6, 10)), "winner", 0) == (needed if needed <= MAX_TRIALS else None)
 
 
-def test_equals_need_no_order() -> None:
+def test_equal_policies_need_no_order() -> None:
     """Rates that differ by less than the margin are equally good: any may win."""
     same = of((5000, 10_000), (5020, 10_000))
     assert trials_needed(same, "winner", 0) == 0

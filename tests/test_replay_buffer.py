@@ -1,4 +1,4 @@
-"""The replay buffer of single pictures gives back the stacks that went in, also over episodes' borders and a wrap."""
+"""The replay buffer of single pictures returns the stacks that were added, also across episodes and the ring's end."""
 
 import numpy as np
 import pytest
@@ -10,37 +10,37 @@ from gymnasium import spaces
 from twin.errors import InputError
 from twin.learn.replay_buffer import FrameReplayBuffer
 
-WORLDS, STACK, SIZE, STATES = 3, 4, (5, 7), 2
+ENVS, STACK, SIZE, STATES = 3, 4, (5, 7), 2
 SPACE = spaces.Box(0, 255, (3 * STACK, *SIZE), np.uint8)
 ACTION = spaces.Box(-1, 1, (2,), np.float32)
 
 
-class NaiveWorlds:
-    """Worlds that show random pictures in episodes of random length, and remember every transition as whole stacks."""
+class NaiveEnvs:
+    """Environments with random pictures and episodes of random length, which store every transition as whole stacks."""
 
     def __init__(self, seed: int, longest: int) -> None:
         self.rng, self.longest = np.random.default_rng(seed), longest
-        self.observation = np.stack([self.first() for _ in range(WORLDS)])
-        self.left = self.rng.integers(1, longest + 1, WORLDS)
-        self.seen: list[list[tuple]] = [[] for _ in range(WORLDS)]
-        self.state = np.full((WORLDS, STATES), np.nan, np.float32)
+        self.observation = np.stack([self.first() for _ in range(ENVS)])
+        self.left = self.rng.integers(1, longest + 1, ENVS)
+        self.seen: list[list[tuple]] = [[] for _ in range(ENVS)]
+        self.state = np.full((ENVS, STATES), np.nan, np.float32)
 
     def first(self) -> np.ndarray:
         return np.tile(self.rng.integers(0, 256, (3, *SIZE), np.uint8), (STACK, 1, 1))
 
     def step(self, buffer: FrameReplayBuffer) -> None:
         before = self.observation.copy()
-        new = self.rng.integers(0, 256, (WORLDS, 3, *SIZE), np.uint8)
+        new = self.rng.integers(0, 256, (ENVS, 3, *SIZE), np.uint8)
         after = np.concatenate([before[:, 3:], new], 1)
-        action, reward = self.rng.uniform(-1, 1, (WORLDS, 2)).astype(np.float32), self.rng.normal(size=WORLDS)
+        action, reward = self.rng.uniform(-1, 1, (ENVS, 2)).astype(np.float32), self.rng.normal(size=ENVS)
         self.left -= 1
-        done, cut = self.left == 0, self.rng.random(WORLDS) < 0.5
+        done, cut = self.left == 0, self.rng.random(ENVS) < 0.5
         infos = [{"TimeLimit.truncated": bool(d and c)} for d, c in zip(done, cut, strict=True)]
-        states, firsts = self.rng.normal(size=(2, WORLDS, STATES)).astype(np.float32)
+        states, firsts = self.rng.normal(size=(2, ENVS, STATES)).astype(np.float32)
         for info, state, first in zip(infos, states, firsts, strict=True):
             info |= {"state": state, "first_state": first}
         buffer.add(before, after, action, reward, done, infos)
-        for i in range(WORLDS):
+        for i in range(ENVS):
             end = done[i] and not cut[i]
             told = self.state[i].copy(), states[i]
             self.seen[i].append((before[i], after[i], action[i], np.float32(reward[i]), end, told))
@@ -50,11 +50,11 @@ class NaiveWorlds:
             self.observation[i], self.left[i] = self.first(), self.rng.integers(1, self.longest + 1)
 
 
-def check(buffer: FrameReplayBuffer, worlds: NaiveWorlds) -> int:
+def check(buffer: FrameReplayBuffer, worlds: NaiveEnvs) -> int:
     """Compares every transition that is whole with what went in; how many there were."""
     filled = buffer.buffer_size if buffer.full else buffer.pos
     total, count = len(worlds.seen[0]), 0
-    for world in range(WORLDS):
+    for world in range(ENVS):
         for age in range(filled):  # 0: the newest
             row = np.array([(buffer.pos - 1 - age) % buffer.buffer_size])
             if not buffer.is_complete(row, np.array([world]))[0]:
@@ -73,19 +73,19 @@ def check(buffer: FrameReplayBuffer, worlds: NaiveWorlds) -> int:
 
 @pytest.mark.parametrize("longest", [1, 2, 6, 1000])
 @pytest.mark.parametrize("steps", [3, 40, 41, 137])
-def test_stacks_are_what_went_in(longest, steps):
-    buffer = FrameReplayBuffer(40 * WORLDS, SPACE, ACTION, "cpu", WORLDS, state_size=STATES)
-    worlds = NaiveWorlds(longest, longest)
+def test_stacks_are_those_added(longest, steps):
+    buffer = FrameReplayBuffer(40 * ENVS, SPACE, ACTION, "cpu", ENVS, state_size=STATES)
+    worlds = NaiveEnvs(longest, longest)
     for _ in range(steps):
         worlds.step(buffer)
     count = check(buffer, worlds)
     # Only episodes of less than 8 steps may cost room, and then half of it at most.
-    assert count == min(steps, 40) * WORLDS or (longest < 16 and count > min(steps, 40) * WORLDS // 2)
+    assert count == min(steps, 40) * ENVS or (longest < 16 and count > min(steps, 40) * ENVS // 2)
 
 
 def test_samples_are_transitions_and_each_comes(tmp_path):
-    buffer = FrameReplayBuffer(10 * WORLDS, SPACE, ACTION, "cpu", WORLDS, seed=5, state_size=STATES)
-    worlds = NaiveWorlds(0, 4)
+    buffer = FrameReplayBuffer(10 * ENVS, SPACE, ACTION, "cpu", ENVS, seed=5, state_size=STATES)
+    worlds = NaiveEnvs(0, 4)
     for _ in range(33):
         worlds.step(buffer)
     there = {}
@@ -105,7 +105,7 @@ def test_samples_are_transitions_and_each_comes(tmp_path):
 
 
 def test_shifted_samples_are_shifted_by_so_much_with_edges_repeated():
-    buffer = FrameReplayBuffer(40, SPACE, ACTION, "cpu", WORLDS, shift=2)
+    buffer = FrameReplayBuffer(40, SPACE, ACTION, "cpu", ENVS, shift=2)
     stacks = np.random.default_rng(0).integers(0, 256, (60, 12, *SIZE), np.uint8)
     shifts = set()
     for before, after in zip(stacks, buffer._shifted(stacks), strict=True):
@@ -120,11 +120,11 @@ def test_shifted_samples_are_shifted_by_so_much_with_edges_repeated():
     assert len(shifts) > 15
 
 
-def test_what_was_saved_is_there_after_more_was_written(tmp_path):
-    slack = 7 * WORLDS
-    settings = (20 * WORLDS, SPACE, ACTION, "cpu", WORLDS)
+def test_saved_transitions_survive_later_writes(tmp_path):
+    slack = 7 * ENVS
+    settings = (20 * ENVS, SPACE, ACTION, "cpu", ENVS)
     buffer = FrameReplayBuffer(*settings, file=tmp_path / "pictures.bin", slack=slack, state_size=STATES)
-    worlds = NaiveWorlds(3, 3)
+    worlds = NaiveEnvs(3, 3)
     for _ in range(50):
         worlds.step(buffer)
     arrays, rest = buffer.state()
@@ -138,7 +138,7 @@ def test_what_was_saved_is_there_after_more_was_written(tmp_path):
     worlds.seen = saved
     assert check(again, worlds) == count
     # It goes on with new episodes.
-    worlds.observation = np.stack([worlds.first() for _ in range(WORLDS)])
+    worlds.observation = np.stack([worlds.first() for _ in range(ENVS)])
     worlds.state[:] = np.nan
     for _ in range(30):
         worlds.step(again)
@@ -148,13 +148,13 @@ def test_what_was_saved_is_there_after_more_was_written(tmp_path):
 def test_pictures_of_another_size_are_refused(tmp_path):
     (tmp_path / "pictures.bin").write_bytes(b"123")
     with pytest.raises(InputError, match="3 bytes"):
-        FrameReplayBuffer(40, SPACE, ACTION, "cpu", WORLDS, file=tmp_path / "pictures.bin")
+        FrameReplayBuffer(40, SPACE, ACTION, "cpu", ENVS, file=tmp_path / "pictures.bin")
 
 
-def test_weather_is_laid_over_half_of_what_samples_begin_with_and_over_no_target():
+def test_half_of_the_stacks_but_no_target_are_augmented():
     def drawn(colours: float):
-        buffer = FrameReplayBuffer(60, SPACE, ACTION, "cpu", WORLDS, color_strength=colours, seed=4)
-        worlds = NaiveWorlds(2, 6)
+        buffer = FrameReplayBuffer(60, SPACE, ACTION, "cpu", ENVS, color_strength=colours, seed=4)
+        worlds = NaiveEnvs(2, 6)
         for _ in range(15):
             worlds.step(buffer)
         return buffer.sample(12)

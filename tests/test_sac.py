@@ -1,4 +1,4 @@
-"""SAC on a task of one picture: the update is SAC's, critics use what they are told, and what is saved goes on."""
+"""SAC on a task of one picture: the update, privileged critics, and resumption from saved states."""
 
 from pathlib import Path
 
@@ -14,11 +14,10 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from twin.errors import InputError
-from twin.learn.checkpoint import load_state, save_state
 from twin.learn.policy import load_policy, save_policy
 from twin.learn.policy_network import Architecture, normalize_colors, preprocess
 from twin.learn.replay_buffer import FrameReplayBuffer
-from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
+from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights, load_state, save_state
 from twin.learn.train_config import TrainConfig
 
 SIZE = (32, 18)
@@ -86,7 +85,7 @@ def spot_model(folder: Path | None = None, seed: int = 0, privileged: bool = Fal
 
 
 @pytest.mark.parametrize("privileged", [False, True])
-def test_it_learns_to_point_and_its_file_does_the_same(tmp_path, privileged):
+def test_the_policy_learns_and_its_file_acts_alike(tmp_path, privileged):
     model = spot_model(privileged=privileged)
     model.learn(1000)
     save_policy(tmp_path, TINY, TrainConfig().control, actor_weights(model, TINY), {})
@@ -106,7 +105,7 @@ def test_it_learns_to_point_and_its_file_does_the_same(tmp_path, privileged):
     assert np.mean(errors) < 0.5 * np.mean(untrained)
 
 
-def test_critics_are_told_the_state_and_the_encoder_learns_to_tell_it():
+def test_critics_receive_the_state_and_the_encoder_learns_to_predict_it():
     model = spot_model(privileged=True)
     inputs = [q[0].in_features for q in (*model.critic.q_networks, *model.critic_target.q_networks)]
     assert inputs == [TINY.features + 1 + 1] * 4 and model.actor.latent_pi[0].in_features == TINY.features
@@ -127,8 +126,8 @@ def test_critics_are_told_the_state_and_the_encoder_learns_to_tell_it():
     assert 0.15 < np.isnan(model.replay_buffer.states[:300]).mean() < 0.25  # the first of five, in these episodes
 
 
-def test_critics_use_what_they_are_told():
-    """Of pictures that are all alike, what is worth something can only be known from the state."""
+def test_critics_use_the_state():
+    """With equal pictures, values can only depend on the state."""
     model = spot_model(privileged=True)
     model.learn(120)
     pictures = torch.zeros((64, 6, 9, 16), dtype=torch.uint8)
@@ -139,7 +138,7 @@ def test_critics_use_what_they_are_told():
     told = [q[0].weight[:, TINY.features].clone() for q in model.critic.q_networks]
     model.learn(60, reset_num_timesteps=False)
     for before, q in zip(told, model.critic.q_networks, strict=True):
-        assert not torch.equal(before, q[0].weight[:, TINY.features])  # it has a gradient: the input is not nought
+        assert not torch.equal(before, q[0].weight[:, TINY.features])  # it has a gradient: the input is not zero
 
 
 def test_the_encoder_learns_from_the_critics_alone():
@@ -160,7 +159,7 @@ def test_the_encoder_learns_from_the_critics_alone():
     assert all(torch.equal(a, b) for a, b in zip(before, encoder, strict=True))
 
 
-def test_scaled_weights_are_scaled_pictures():
+def test_scaled_weights_equal_scaled_pictures():
     encoder = Encoder(SpotEnv.observation_space, TINY)
     pictures = torch.randint(0, 256, (3, 6, 9, 16))
     plain = encoder.further(encoder.first(pictures / 255.0 - 0.5))
@@ -169,7 +168,7 @@ def test_scaled_weights_are_scaled_pictures():
 
 
 @pytest.mark.parametrize("privileged", [False, True])
-def test_a_saved_training_goes_on_as_if_never_stopped(tmp_path, privileged):
+def test_a_saved_training_resumes_exactly(tmp_path, privileged):
     """Updates after loading are, number for number, those of the model that was saved."""
     (tmp_path / "a").mkdir()
     model = spot_model(tmp_path / "a", privileged=privileged)

@@ -1,4 +1,4 @@
-"""Rates and agreement: closed forms, ties, refusals, the order of arguments, and that intervals hold what they say."""
+"""Rates and agreement: closed forms, ties, refusals, the order of arguments, and the coverage of intervals."""
 
 import itertools
 
@@ -47,6 +47,14 @@ def slow_mmrv(twin: np.ndarray, real: np.ndarray) -> float:
 def test_wilson_known(successes: int, trials: int, low: float, high: float) -> None:
     # The last line is of Newcombe's paper on single proportions, Stat. in Medicine 17 (1998), table I.
     assert np.allclose(wilson(successes, trials, 0.95), (low, high), atol=6e-5)
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.999])
+def test_wilson_equals_scipy(confidence: float) -> None:
+    for trials in (1, 7, 200, 10_000):
+        for successes in {0, 1, trials // 3, trials}:
+            expected = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+            np.testing.assert_allclose(wilson(successes, trials, confidence), expected, rtol=0, atol=1e-12)
 
 
 def test_wilson_solves_the_score_equation() -> None:
@@ -129,7 +137,7 @@ def test_ties() -> None:
     assert mmrv(twin=np.array([1.0, 0.9]), real=np.array([0.8, 0.8])) == 0.0
 
 
-def test_rates_summed_up_differently_are_tied() -> None:
+def test_rates_equal_up_to_rounding_are_tied() -> None:
     twin = np.array([0.1 + 0.2, 0.3, 0.5])
     assert twin[0] != twin[1]
     assert mmrv(twin=twin, real=np.array([0.5, 0.5, 0.9])) == 0.0
@@ -139,7 +147,7 @@ def test_rates_summed_up_differently_are_tied() -> None:
 
 
 @pytest.mark.parametrize("statistic", [pearson, spearman])
-def test_what_is_not_defined_is_refused(statistic) -> None:
+def test_undefined_correlations_are_refused(statistic) -> None:
     for n in range(3):
         with pytest.raises(UndefinedStatistic, match=f"{n} policies; at least 3"):
             statistic(twin=np.arange(n), real=np.arange(n))
@@ -192,7 +200,7 @@ _NOISE = 3 * np.sqrt(0.09 / _RUNS)
 
 @pytest.mark.parametrize("trials", [10, 50, 100])
 def test_wilson_covers(trials: int) -> None:
-    """Over rates drawn evenly the mean coverage is the nominal one (Brown, Cai and DasGupta, section 4.1)."""
+    """Over uniformly distributed rates the mean coverage is the nominal one (Brown, Cai and DasGupta, section 4.1)."""
     rng = np.random.default_rng(trials)
     rate = rng.uniform(size=_RUNS)
     low, high = wilson(rng.binomial(trials, rate), trials)

@@ -1,4 +1,4 @@
-"""Training runs: one that was stopped goes on as if it had not been, and policies come out."""
+"""Training runs: resumption, refusals, and the tables and policies of a run."""
 
 import csv
 import json
@@ -25,10 +25,9 @@ from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
 from twin.learn.policy import load_policy
-from twin.learn.policy_evaluation import FRESH_EPISODES
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
+from twin.learn.training import FRESH_EPISODES, TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
 from twin.runtime import exclusive_lock
 
 
@@ -61,7 +60,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_a_run_killed_at_random_three_times_comes_to_its_end(scene, tmp_path):
+def test_a_run_killed_at_random_three_times_finishes(scene, tmp_path):
     """As a process, with SIGKILL: all steps are there, tables have no gap and nothing twice, and the policy drives."""
     folder = tmp_path / "run"
     code = (
@@ -132,7 +131,7 @@ def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
     assert not (scene / "runs/locked").exists()
 
 
-def test_a_finished_run_is_left_as_it_is(scene, tmp_path):
+def test_a_finished_run_is_unchanged(scene, tmp_path):
     from twin.learn.training import train as run
 
     built = twin.load_scene(scene)
@@ -145,7 +144,7 @@ def test_a_finished_run_is_left_as_it_is(scene, tmp_path):
     assert before == {path: path.read_bytes() for path in before}
 
 
-def test_nothing_is_noted_of_a_run_that_could_not_begin(scene, capsys):
+def test_a_run_that_cannot_begin_writes_no_config(scene, capsys):
     common = [str(scene), "--run", "typo", "--quiet", "--worlds", "2", "--steps", "4"]
     assert train.main([*common, "--task", "strait"]) == 2
     assert train.main([*common, "--task", "ahead", "--lighting", "dusk"]) == 2
@@ -162,7 +161,7 @@ def test_the_last_policy_is_a_checkpoint(scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_no_resumption_drives_what_validation_or_another_seed_drives(scene, tmp_path, monkeypatch):
+def test_resumptions_have_episodes_of_their_own(scene, tmp_path, monkeypatch):
     from twin.learn import training
 
     given, whole = [], training.PreprocessedVecEnv.seed
@@ -215,12 +214,12 @@ _WRONG: list[tuple[str, object]] = [
         {"lighting": "held-out"},
     ],
 )
-def test_what_no_training_can_be_is_refused(wrong):
+def test_impossible_configurations_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         TrainConfig(**wrong)
 
 
-def test_a_run_that_is_asked_to_stop_saves_and_goes_on(scene, tmp_path):
+def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     from twin.learn.training import train as run
 
     def interrupt(now) -> None:
@@ -236,7 +235,7 @@ def test_a_run_that_is_asked_to_stop_saves_and_goes_on(scene, tmp_path):
     assert seen[0] == 124 and seen[-1] == SHORT.steps
 
 
-def test_arriving_is_worth_what_surviving_for_ever_would_be():
+def test_the_goal_is_worth_surviving_for_ever():
     config = TrainConfig()
     rewards = config.options()["rewards"]
     for_ever = sum(rewards.step * config.gamma**k for k in range(2000))
@@ -244,7 +243,7 @@ def test_arriving_is_worth_what_surviving_for_ever_would_be():
     assert (rewards.collision, rewards.out_of_bounds) == (-4.0, -5.0)
 
 
-def test_episodes_that_began_on_the_way_do_not_count(tmp_path):
+def test_episodes_that_start_along_the_route_do_not_count(tmp_path):
     some = [("8", 1, "0.00"), ("16", 0, "7.50"), ("24", 0, "0.00"), ("32", 1, "0.10"), ("40", 1, "0.00")]
     rows = [[step, "1.0", "7", "training", str(won), "goal", "3.0", "8", "1.0", start] for step, won, start in some]
     (tmp_path / "episodes.csv").write_text(csv_text(TRAINING_EPISODE_COLUMNS, rows))
@@ -257,14 +256,14 @@ def test_episodes_that_began_on_the_way_do_not_count(tmp_path):
     assert read_episodes(tmp_path)[1].tolist() == [1, 0, 0, 1, 1]
 
 
-def test_a_run_of_an_earlier_version_is_told_to_be_one(tmp_path):
+def test_a_run_of_an_earlier_version_is_refused(tmp_path):
     write_json(tmp_path / "config.json", {"road": "x", "steps": 8})
     with pytest.raises(InputError, match="by an earlier version, which had no centring; give another --run"):
         _check_same(tmp_path, {"road": "x", "steps": 8, "centring": 1.0})
     _check_same(tmp_path, {"road": "x", "steps": 9})
 
 
-def test_setups_vary_what_they_say():
+def test_configurations_set_the_environment():
     varied, day = TrainConfig().options(), TrainConfig(lighting="day").options()
     assert varied["randomise"] == Ranges() and TrainConfig(randomise=False).options()["randomise"] is None
     nought = dict.fromkeys(("extinction", "sunlight", "shade"), (0.0, 0.0))
@@ -275,7 +274,7 @@ def test_setups_vary_what_they_say():
     assert len(TrainConfig().state_scales) == 7 and TrainConfig(privileged=False).state_scales == ()
 
 
-def test_states_are_what_the_world_tells(scene):
+def test_states_are_those_of_the_environment(scene):
     """Also of an episode's first picture, which comes with the last of the episode before."""
     env = DriveVecEnv(scene, "ahead", 2, seed=3, lighting="day", time_limit=0.5, action="steering")
     env.reset()

@@ -1,4 +1,4 @@
-"""Tables of trials: what is written is read again, and what is wrong is told in one line, with its line and a cure."""
+"""Tables of trials: written tables are read back, wrong ones refused with the line, the fault and a cure."""
 
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def test_cells_have_their_interval() -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "message"),
     [
         ("nerf,straight,sun,0,1,flew,1.0,5,", "line 3: cause = 'flew'; expected one of goal, collision"),
         ("nerf,straight,sun,0,1,collision,1.0,5,", "line 3: success = '1' with cause 'collision'"),
@@ -67,12 +67,12 @@ def test_cells_have_their_interval() -> None:
         ("nerf,straight,sun,7,1,goal,1.0,5,", "line 3: seed 7 of this policy, task and lighting is there twice"),
     ],
 )
-def test_a_spoilt_row_is_named(tmp_path: Path, line: str, told: str) -> None:
+def test_an_invalid_row_is_named(tmp_path: Path, line: str, message: str) -> None:
     good = "nerf,straight,sun,7,1,goal,29.0,300,0.9"
     path = write(tmp_path, ",".join(EPISODE_COLUMNS) + f"\n{good}\n{line}\n")
     with pytest.raises(InputError) as error:
         read_trials(path)
-    assert told in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_nothing_validated_says_what_to_run(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (HEADER + "nerf,sun,10,11\n", "line 2: successes = 11 of 10 trials; expected at most 10"),
         (HEADER + "nerf,sun,-3,0\n", "line 2: trials = '-3'; expected a whole number, 0 or more"),
@@ -119,13 +119,13 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         (HEADER + 'nerf,"sun\x00,10,5\n', "line 2"),
     ],
 )
-def test_wrong_results_are_told(tmp_path: Path, text: str, told: str) -> None:
+def test_wrong_results_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError) as error:
         read_results(write(tmp_path, text), TWIN)
-    assert told in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
-def test_what_is_no_text_is_told(tmp_path: Path) -> None:
+def test_binary_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "results.csv"
     path.write_bytes(b"policy,lighting\xff\xfe\n")
     with pytest.raises(InputError, match="no UTF-8"):

@@ -1,5 +1,5 @@
-"""Validation: episodes do not depend on who drives beside whom, a killed validation ends with the same table, and the
-summary says what the table holds."""
+"""Validation: episodes are independent of each other, a killed validation ends with the same table, and the summary
+agrees with the table."""
 
 import dataclasses
 import json
@@ -49,7 +49,7 @@ def chunk(scene: Path, seeds, lighting="day", name="ahead") -> EpisodeChunk:
     return EpisodeChunk(str(scene), "ahead", str(scene / "runs" / name), False, lighting, tuple(seeds))
 
 
-def test_an_episode_is_the_same_whoever_drives_beside(scene):
+def test_an_episode_does_not_depend_on_others(scene):
     together = run_chunk(chunk(scene, range(11)))
     assert [one.seed for one in together] == list(range(11))
     assert len({one.steps for one in together}) > 1  # they end at different times
@@ -57,7 +57,7 @@ def test_an_episode_is_the_same_whoever_drives_beside(scene):
     assert run_chunk(chunk(scene, (10, 3))) == [together[10], together[3]]
 
 
-def test_an_episode_is_that_of_the_environment_alone(scene):
+def test_an_episode_equals_that_of_a_single_environment(scene):
     import twin
     from twin.env.drivers import PolicyDriver
     from twin.env.episode import record_episode
@@ -67,16 +67,16 @@ def test_an_episode_is_that_of_the_environment_alone(scene):
     environment = twin.load(scene, "ahead", 5, lighting="day", **policy.options())
     episode = record_episode(environment, PolicyDriver(policy))
     assert (driven.cause, driven.steps) == (episode.cause, len(episode.times) - 1)
-    assert driven.progress == episode.progress[-1]  # to the last bit, which decides who meets the kerb
+    assert driven.progress == episode.progress[-1]  # to the last bit, which can decide whether a robot hits the kerb
     assert driven.trust == pytest.approx(episode.trust[:-1].mean(), abs=1e-9)
 
 
-def test_processes_give_what_one_gives(scene):
+def test_processes_give_the_same_results(scene):
     chunks = [chunk(scene, [0, 1]), chunk(scene, [2]), chunk(scene, [0], "night")]
     assert list(campaign(chunks, processes=2)) == list(campaign(chunks))
 
 
-def test_drawn_lights_do_not_depend_on_those_before(scene):
+def test_sampled_lightings_do_not_depend_on_earlier_ones(scene):
     def light(numbers):
         stage = EnvFactory.open(load_scene(scene), "ahead", {"size": (32, 18)})
         for number in numbers:
@@ -92,7 +92,7 @@ def run(scene: Path, *policies: str, lightings=("day", "night"), episodes=5) -> 
     return (scene / "validation" / "episodes.csv").read_text()
 
 
-def test_randomised_episodes_are_others_and_repeat(scene, monkeypatch):
+def test_randomized_episodes_differ_and_repeat(scene, monkeypatch):
     seeds = range(6)
     plain, drawn = run_chunk(chunk(scene, seeds)), run_chunk(chunk(scene, seeds, "day+randomised"))
     assert [one.seed for one in drawn] == list(seeds)
@@ -167,7 +167,7 @@ def test_more_policies_and_episodes_are_added(fresh):
     assert (fresh / "validation" / "failures_ahead.png").stat().st_size > 5_000
 
 
-def test_episodes_are_those_of_every_policy_but_of_one_lighting_alone(fresh):
+def test_policies_share_episodes_but_lightings_do_not(fresh):
     run(fresh, "ahead", "left", lightings=["day", "night"], episodes=2)
     trials = read_trials(fresh / "validation" / "episodes.csv")
     by = {name: {t.seed for t in trials if t.policy == name} for name in ("ahead", "left")}
@@ -189,13 +189,13 @@ def test_two_validations_do_not_mix(fresh):
     assert not (fresh / "validation" / "episodes.csv").exists()
 
 
-def test_what_is_named_twice_is_driven_once(fresh):
+def test_duplicate_names_are_driven_once(fresh):
     said = validate.validate(fresh, ["ahead", "ahead"], "ahead", ["day", "day"], 1)
     assert [c["trials"] for c in said["cells"]] == [1]
     assert len(read_trials(fresh / "validation" / "episodes.csv")) == 1
 
 
-def test_a_changed_road_is_not_mixed_with_what_was_driven(fresh):
+def test_a_changed_scene_is_refused(fresh):
     run(fresh, "ahead", lightings=["day"], episodes=1)
     toml = fresh / "scene.toml"
     text = toml.read_text()
@@ -210,7 +210,7 @@ def test_a_changed_road_is_not_mixed_with_what_was_driven(fresh):
         run(fresh, "left", lightings=["night"], episodes=2)
 
 
-def test_a_table_of_which_nothing_is_noted_is_not_added_to(fresh):
+def test_a_table_without_a_record_is_refused(fresh):
     """As one that an earlier version wrote, which noted no roads."""
     run(fresh, "ahead", lightings=["day"], episodes=1)
     path = fresh / "validation" / "validated.json"
@@ -219,7 +219,7 @@ def test_a_table_of_which_nothing_is_noted_is_not_added_to(fresh):
         run(fresh, "ahead", lightings=["day"], episodes=2)
 
 
-def test_the_worst_light_is_proved_on_fresh_episodes(fresh, monkeypatch):
+def test_the_worst_lighting_is_evaluated_on_fresh_episodes(fresh, monkeypatch):
     monkeypatch.setattr(validate, "_SEARCH_LIGHTINGS", 4)
     monkeypatch.setattr(validate, "_SEARCH_EPISODES", 1)
     monkeypatch.setattr(validate, "_SEARCH_KEPT", 2)
@@ -255,7 +255,7 @@ def trial(policy: str, seed: int, cause: str, trust: float | None = 1.0, progres
     return Trial(policy, "ahead", "day", seed, cause, progress, 10, trust)
 
 
-def test_paired_episodes_are_a_coin_tossed():
+def test_paired_episodes_are_a_sign_test():
     a = [trial("a", k, "goal" if k < 8 else "collision") for k in range(10)]
     b = [trial("b", k, "goal" if k < 1 else "timeout") for k in range(1, 12)]
     (pair,) = compare_pairs([*a, *b])

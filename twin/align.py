@@ -30,8 +30,7 @@ from twin.files import digest_file, read_toml, write_json, write_text
 from twin.robot import HuskyParams
 from twin.scene import SceneDir
 from twin.sysid.identification import Identification, format_error, identify, robot_toml, toml_text
-from twin.sysid.log_checks import check
-from twin.sysid.logs import read_log
+from twin.sysid.logs import check_log, read_log
 
 if TYPE_CHECKING:
     from twin.sysid.camera_extrinsics import CameraCalibration
@@ -65,7 +64,7 @@ def align_to_log(
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")
     windows = read_log(log)
     runtime.log_line(f"{log}: {len(windows)} windows, {int(windows.fitting.sum())} for fitting, the others for scoring")
-    check(windows, str(log))
+    check_log(windows, str(log))
     pictures = folder / RESULT_FOLDER
     _check_writable(pictures)
     _check_writable(folder)

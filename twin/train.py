@@ -10,6 +10,7 @@ The same command continues a stopped or killed run. The policy is in `runs/<name
 import argparse
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,24 +57,21 @@ def _train(twin: Twin, folder: Path, config: "TrainConfig", processes: int | Non
     """Trains with a progress bar; returns the evaluation of the selected checkpoint."""
     try:
         from twin.learn import training
-        from twin.learn.policy_evaluation import select_checkpoint
     except ImportError as error:
         raise InputError(f"training needs more: pip install .[learn] ({error})") from None
 
     with runtime.bar("train", config.steps, "step") as bar:
 
-        def watch(now: training.TrainingProgress) -> None:
+        def watch(steps: int, recent: Sequence[bool]) -> None:
             if not bar.n:  # steps of earlier calls do not count in the rate
-                bar.initial = bar.n = bar.last_print_n = now.steps
-            bar.update(now.steps - bar.n)
-            if now.recent:
-                low, high = wilson(sum(now.recent), len(now.recent))
-                bar.set_postfix_str(
-                    f"success {sum(now.recent)}/{len(now.recent)} ({low:.2f} to {high:.2f})", refresh=False
-                )
+                bar.initial = bar.n = bar.last_print_n = steps
+            bar.update(steps - bar.n)
+            if recent:
+                low, high = wilson(sum(recent), len(recent))
+                bar.set_postfix_str(f"success {sum(recent)}/{len(recent)} ({low:.2f} to {high:.2f})", refresh=False)
 
         training.train(twin, folder, config, watch, processes)
-    return select_checkpoint(twin, folder, config, processes)["chosen"]
+    return training.select_checkpoint(twin, folder, config, processes)["chosen"]
 
 
 if __name__ == "__main__":

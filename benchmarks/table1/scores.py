@@ -21,10 +21,10 @@ import numpy as np
 from plan import SETUPS, SHARES, STEPS, TASKS
 
 from twin.config import RANDOMIZED
-from twin.evaluation.prediction_powered import leave_one_group_out
 from twin.evaluation.statistics import (
     MIN_POLICIES,
     UndefinedStatistic,
+    leave_one_group_out,
     mmrv,
     pearson,
     rate_difference,

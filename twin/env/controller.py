@@ -33,15 +33,24 @@ def limit_command(command: Array, previous: Array, params: HuskyParams, period: 
     """
     limit = np.array([params.max_speed, params.max_yaw_rate])
     step = np.array([params.max_acceleration, params.max_yaw_acceleration]) * period
-    return np.clip(np.clip(command, -limit, limit), previous - step, previous + step)
+    return limit_change(np.clip(command, -limit, limit), previous, step)
+
+
+def limit_change(wanted: Array, previous: Array, step: Array) -> Array:
+    """Returns the values nearest to `wanted` that differ from the previous ones by at most `step`."""
+    return np.clip(wanted, previous - step, previous + step)
+
+
+def limit_sides(sides: Array, limit: float) -> Array:
+    """Returns the speeds of both sides, shape (..., 2), scaled down alike if one exceeds the limit."""
+    return sides / np.maximum(1.0, np.abs(sides).max(-1, keepdims=True) / limit)
 
 
 def wheel_speeds(command: Array, params: HuskyParams) -> Array:
     """Returns the speeds of the left and right wheels [rad/s] for v [m/s] and ω [rad/s], each shape (..., 2)."""
     half = command[..., 1:] * params.separation_multiplier * TRACK / 2
     sides = command[..., :1] + half * np.array([-1.0, 1.0])
-    excess = np.abs(sides).max(-1, keepdims=True) / params.max_wheel_speed
-    return sides / np.maximum(1.0, excess) / WHEEL_RADIUS
+    return limit_sides(sides, params.max_wheel_speed) / WHEEL_RADIUS
 
 
 def wheel_speeds_to_twist(speeds: Array, params: HuskyParams) -> Array:

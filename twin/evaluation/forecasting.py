@@ -1,9 +1,9 @@
-"""Forecast of real success rates from rates in the twin. Numbers only; `report/` makes pages and tables of it.
+"""Forecast of real success rates from rates in the twin: the numbers, of which `report/` makes pages and tables.
 
 A *candidate* is a policy on a task. Its twin score is the mean of its rates under the *compared lightings*: the twin's
 lightings that real cells of the task are compared with, or all of them without real trials. It is *driven* if it has
 real trials. A *group* is the driven candidates of one task, or of all tasks. Every number is an `Estimate` with its
-count and its interval, or with the data that are missing for it.
+count and interval, or with the reason for its absence.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from twin.config_file import parse_table
 from twin.errors import InputError, join_names
-from twin.evaluation import prediction_powered, ranking
+from twin.evaluation import ranking
 from twin.evaluation.bootstrap import (
     REPLICATES,
-    PairedCells,
     Rates,
     bootstrap_interval,
     mean_over_tasks,
@@ -33,12 +31,15 @@ from twin.evaluation.statistics import (
     CONFIDENCE,
     MIN_POLICIES,
     MIN_TRIALS,
+    LinearCorrection,
     UndefinedStatistic,
+    leave_one_group_out,
     mean_rate,
     mmrv,
     mmrv_batched,
     pearson,
     pearson_batched,
+    prediction_powered_mean,
     rate_difference,
     spearman,
     spearman_batched,
@@ -47,9 +48,13 @@ from twin.evaluation.statistics import (
 )
 from twin.evaluation.trials import Cell
 from twin.files import exists, read_json, wrap_read_errors, write_json
+from twin.types import Array
 
 ALL_TASKS = "all tasks"
 _FILE = "forecast.json"
+
+Cells = Mapping[tuple[str, str, str], Cell]
+"""The twin's cells by `Cell.key`."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +67,7 @@ class Estimate:
     n: int = 0
     """Number of trials for a rate, of policies or cells for a statistic."""
     missing: str = ""
-    """Data that are missing; empty if there is a value."""
-
-
-UNKNOWN_TRAINING = Estimate(missing="its training on this task is not known")
+    """The reason; empty if there is a value."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class CellPair:
 
     @property
     def within_chance(self) -> bool:
-        """True if the interval of the bias contains 0."""
+        """True if the interval of `bias` contains 0."""
         return (self.bias.low or 0.0) <= 0.0 <= (self.bias.high or 0.0)
 
 
@@ -94,7 +96,7 @@ class Candidate:
     policy: str
     task: str
     lightings: tuple[str, ...]
-    """The twin's lightings that its score is the mean over."""
+    """The twin's lightings of its score."""
     twin: Estimate
     """Twin score."""
     twin_rank: Estimate
@@ -104,11 +106,11 @@ class Candidate:
     real: Estimate
     """Mean over its real cells."""
     real_ranks: tuple[float, ...]
-    """Probability of each rank on the road among the driven candidates; empty if not driven, or the only one."""
+    """Probability of each rank on the road among the driven candidates; empty if it is not one of several."""
     corrected: Estimate
-    """Real rate predicted from its twin score and the other driven candidates, without its own real trials."""
-    trained: Estimate = UNKNOWN_TRAINING
-    """Success rate in training on this task before it was saved."""
+    """Real rate predicted from its twin score and the other driven candidates."""
+    trained: Estimate = Estimate(missing="its training on this task is not known")
+    """Success rate in training before it was saved."""
 
     @property
     def driven(self) -> bool:
@@ -117,13 +119,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of twin and road for the driven candidates of a task, or of all tasks."""
+    """Agreement of twin and road for a group."""
 
     task: str
     policies: int
     cells: int
     missing: tuple[str, ...]
-    """Data that are missing; the estimates below have no values until then."""
+    """Missing data, because of which the estimates below have no values."""
     pearson: Estimate
     spearman: Estimate
     mmrv: Estimate
@@ -132,16 +134,16 @@ class Agreement:
     bias: Estimate
     """Mean over cells of real minus twin rate."""
     coverage: Estimate
-    """Fraction of the cells whose `CellPair.bias` has an interval that contains 0."""
+    """Fraction of cells for which the interval of `CellPair.bias` contains 0."""
     corrected_coverage: Estimate
-    """Fraction of the candidates whose real rate lies in the interval predicted without them."""
+    """Fraction of candidates whose real rate lies in the interval predicted without them."""
     mean_real: Estimate
-    """Mean real rate of policies such as these, driven or not (prediction-powered estimate)."""
+    """Prediction-powered mean real rate of policies such as these, driven or not."""
 
 
 @dataclass(frozen=True)
 class LeftOutLighting:
-    """Prediction of one real lighting from all others of the task."""
+    """Prediction of one real lighting from the task's others."""
 
     task: str
     lighting: str
@@ -149,32 +151,31 @@ class LeftOutLighting:
     twin_error: Estimate
     """Mean absolute difference of twin and real rates."""
     corrected_error: Estimate
-    """The same after the correction fitted under the other lightings."""
+    """The same after a correction fitted under the other lightings."""
     coverage: Estimate
-    """Fraction of the cells within the predicted interval."""
+    """Fraction of cells within the predicted interval."""
 
 
 @dataclass(frozen=True)
 class TrialAllocation:
-    """Number of further real trials that would settle the ranking of a task's policies; see `ranking.py`."""
+    """Further real trials that would settle the ranking of a task's policies; see `ranking.py`."""
 
     task: str
     policies: int
     basis: str
-    """`road`: further trials are added to the real ones; `twin`: without real trials, the twin's rates are assumed."""
+    """`road`: trials are added to the real ones; `twin`: there are none, and the twin's rates are assumed."""
     winner_now: float | None = None
-    """Probability that the leading policy is the best, or within `ranking.MARGIN` of it."""
+    """See `RankingConfidence.winner`."""
     order_now: float | None = None
-    """Expected fraction of the pairs further apart than `ranking.MARGIN` that are in the right order."""
+    """See `RankingConfidence.order`."""
     more_for_winner: int | None = None
     """Real trials per policy until `winner_now` is expected to reach `sure`; None: more than `ranking.MAX_TRIALS`."""
     more_for_order: int | None = None
-    """The same for `order_now`."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """All numbers of a scene's forecast. Field names are the keys of `forecast.json`."""
+    """The forecast of a scene; field names are the keys of `forecast.json`."""
 
     scene: str
     twin_trials: int
@@ -214,7 +215,7 @@ class Forecast:
 
 
 def _without_nulls(value: Any) -> Any:
-    """A JSON value without its nulls, for which the dataclasses have defaults."""
+    """A JSON value without its nulls, whose fields have defaults."""
     if isinstance(value, dict):
         return {key: _without_nulls(item) for key, item in value.items() if item is not None}
     return [_without_nulls(item) for item in value] if isinstance(value, list) else value
@@ -236,33 +237,32 @@ def make_forecast(
         scene: Name of the scene.
         twin: Cells of the twin.
         real: Real cells, each with a twin cell to compare with; may be empty.
-        seed: Seed of the resampling.
+        seed: Of the resampling.
         trained: Success rates in training by (policy, task), where known.
     """
     tasks = tuple(dict.fromkeys(cell.task for cell in twin))
+    found = {cell.key: cell for cell in twin}
     candidates: list[Candidate] = []
     comparable: list[Candidate] = []
     groups, left_out, allocations = [], [], []
     for task in tasks:
-        task_real = [cell for cell in real if cell.task == task]
-        task_candidates, lightings = _candidates(task, [c for c in twin if c.task == task], task_real, seed)
+        task_twin, task_real = ([cell for cell in cells if cell.task == task] for cells in (twin, real))
+        task_candidates, lightings = _candidates(task, task_twin, task_real, seed)
         if task_real:
             task_comparable = [c for c in task_candidates if set(c.lightings) == set(lightings)]
-            groups.append(_agreement(task, task_real, twin, task_comparable, seed))
+            groups.append(_agreement(task, task_real, found, task_comparable, seed))
             comparable += task_comparable
-            left_out += _left_out(task, task_real, twin)
-        allocations.append(
-            _allocation(task, [c for c in twin if c.task == task and c.lighting in lightings], task_real, seed)
-        )
+            left_out += _left_out(task, task_real, found)
+        allocations.append(_allocation(task, [c for c in task_twin if c.lighting in lightings], task_real, seed))
         candidates += [replace(c, trained=(trained or {}).get((c.policy, task), c.trained)) for c in task_candidates]
     if len(groups) > 1:
-        groups.append(_agreement(ALL_TASKS, real, twin, comparable, seed))
+        groups.append(_agreement(ALL_TASKS, real, found, comparable, seed))
     return Forecast(
         scene=scene,
         twin_trials=sum(cell.trials for cell in twin),
         real_trials=sum(cell.trials for cell in real),
         candidates=tuple(candidates),
-        pairs=tuple(_pair(cell, twin) for cell in real),
+        pairs=tuple(_pair(cell, found[cell.twin_key]) for cell in real),
         groups=tuple(groups),
         left_out=tuple(left_out),
         plans=tuple(allocations),
@@ -271,40 +271,36 @@ def make_forecast(
     )
 
 
-# ---- candidates
-
-
 def _candidates(
     task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
 ) -> tuple[list[Candidate], tuple[str, ...]]:
-    """The candidates, best first, and the compared lightings; `twin` and `real` are the task's cells."""
+    """The candidates of a task, best in the twin first, and the compared lightings."""
     lightings = tuple(dict.fromkeys(cell.lighting for cell in twin))
     if real:
         compared = {cell.twin_key[2] for cell in real}
         lightings = tuple(name for name in lightings if name in compared)
     policies = list(dict.fromkeys(cell.policy for cell in twin))
     cells = [[c for c in twin if c.policy == p and c.lighting in lightings] for p in policies]
-    # A policy not validated under any compared lighting gets a score over its own lightings, which is not compared.
+    # A policy without any compared lighting gets a score over its own lightings, which is not compared.
     cells = [mine or [c for c in twin if c.policy == p] for p, mine in zip(policies, cells, strict=True)]
+    driven = [[c for c in real if c.policy == p] for p in policies]
     rng = np.random.default_rng([seed, 1])
     ranks = ranking.rank_probabilities(_trial_counts(cells), rng)
-    driven = [[c for c in real if c.policy == p] for p in policies]
     with_real = [i for i, mine in enumerate(driven) if mine]
-    real_ranks: dict[int, NDArray[np.float64]] = {}
+    real_ranks: dict[int, Array] = {}
     if len(with_real) > 1:
         each = ranking.rank_probabilities(_trial_counts([driven[i] for i in with_real]), rng)
         real_ranks = dict(zip(with_real, each, strict=True))
-    corrected = _corrected(cells, driven, lightings, twin)
+    corrected = _corrected(cells, driven, lightings, {cell.key: cell for cell in twin})
     out = []
     for i, policy in enumerate(policies):
-        expected, low, high = ranking.rank_interval(ranks[i])
         out.append(
             Candidate(
                 policy=policy,
                 task=task,
                 lightings=tuple(c.lighting for c in cells[i]),
                 twin=_mean_rate(cells[i]),
-                twin_rank=Estimate(expected, low, high, len(policies)),
+                twin_rank=Estimate(*ranking.rank_interval(ranks[i]), len(policies)),
                 twin_ranks=tuple(float(p) for p in ranks[i]),
                 real=_mean_rate(driven[i]) if driven[i] else Estimate(missing="not driven on the road"),
                 real_ranks=tuple(float(p) for p in real_ranks.get(i, ())),
@@ -315,64 +311,58 @@ def _candidates(
 
 
 def _corrected(
-    cells: list[list[Cell]], driven: list[list[Cell]], lightings: tuple[str, ...], twin: Sequence[Cell]
+    cells: list[list[Cell]], driven: list[list[Cell]], lightings: tuple[str, ...], twin: Cells
 ) -> list[Estimate]:
-    """Predicted real rate of each candidate, from the other driven ones."""
-    pairs = [(i, *_scores(mine, twin)) for i, mine in enumerate(driven) if mine]
-    missing = _missing_data([cell for mine in driven for cell in mine], twin)
+    """Real rate of each candidate, predicted from the other driven ones."""
+    scores = {i: _scores(mine, twin) for i, mine in enumerate(driven) if mine}
+    missing = "; ".join(_missing_data([cell for mine in driven for cell in mine], twin))
     out = []
     for i, mine in enumerate(cells):
-        others = [(f, y) for j, f, y in pairs if j != i]
+        others = [pair for j, pair in scores.items() if j != i]
         if missing or len(others) < MIN_POLICIES:
-            out.append(
-                Estimate(missing="; ".join(missing) or f"{len(others)} other policies driven, {MIN_POLICIES} needed")
-            )
-            continue
-        score = _scores(driven[i], twin)[0] if driven[i] else _mean_rate(mine).value
-        if {c.lighting for c in mine} != set(lightings):
+            too_few = f"{len(others)} other policies driven, {MIN_POLICIES} needed"
+            out.append(Estimate(missing=missing or too_few))
+        elif {c.lighting for c in mine} != set(lightings):
             out.append(Estimate(missing=f"not validated under {join_names(lightings)}, as the driven policies are"))
-            continue
-        line = prediction_powered.LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
-        value, low, high = (float(x) for x in line.predict(np.array(score)))
-        out.append(Estimate(value, low, high, line.n))
+        else:
+            line = LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
+            score = scores[i][0] if i in scores else _mean_rate(mine).value
+            out.append(Estimate(*(float(x) for x in line.predict(np.array(score))), line.n))
     return out
 
 
-def _scores(real: Sequence[Cell], twin: Sequence[Cell]) -> tuple[float, float]:
+def _scores(real: Sequence[Cell], twin: Cells) -> tuple[float, float]:
     """Mean twin and mean real rate of one policy's real cells."""
-    found = {cell.key: cell for cell in twin}
-    return float(np.mean([found[c.twin_key].rate for c in real])), float(np.mean([c.rate for c in real]))
-
-
-def _mean_rate(cells: Sequence[Cell]) -> Estimate:
-    mean, low, high = mean_rate([c.successes for c in cells], [c.trials for c in cells])
-    return Estimate(mean, low, high, sum(c.trials for c in cells))
+    return float(np.mean([twin[c.twin_key].rate for c in real])), float(np.mean([c.rate for c in real]))
 
 
 def _trial_counts(rows: Sequence[Sequence[Cell]]) -> TrialCounts:
     return TrialCounts.from_rows([[(c.successes, c.trials) for c in row] for row in rows])
 
 
-# ---- agreement
+def _mean_rate(cells: Sequence[Cell]) -> Estimate:
+    return Estimate(*mean_rate([c.successes for c in cells], [c.trials for c in cells]), sum(c.trials for c in cells))
 
 
-def _missing_data(real: Sequence[Cell], twin: Sequence[Cell]) -> list[str]:
+def _rate(successes: int, trials: int) -> Estimate:
+    low, high = wilson(successes, trials)
+    return Estimate(successes / trials, float(low), float(high), trials)
+
+
+def _missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
     """Data that are missing for a statistic over these real cells."""
-    found = {cell.key: cell for cell in twin}
     policies = len({cell.policy for cell in real})
     out = []
     if policies < MIN_POLICIES:
         more = MIN_POLICIES - policies
         out.append(f"{policies} policies driven on the road, {MIN_POLICIES} are needed: drive {more} more")
     short = [
-        f"{c.policy} under {c.lighting} has {c.trials} real trials ({MIN_TRIALS - c.trials} more)"
-        for c in real
-        if c.trials < MIN_TRIALS
-    ]
-    twins = dict.fromkeys(found[cell.twin_key] for cell in real)
-    short += [
-        f"{c.policy} under {c.lighting} has {c.trials} trials in the twin ({MIN_TRIALS - c.trials} more)"
-        for c in twins
+        f"{c.policy} under {c.lighting} has {c.trials} {kind} ({MIN_TRIALS - c.trials} more)"
+        for kind, cells in (
+            ("real trials", real),
+            ("trials in the twin", dict.fromkeys(twin[cell.twin_key] for cell in real)),
+        )
+        for c in cells
         if c.trials < MIN_TRIALS
     ]
     if short:
@@ -380,36 +370,33 @@ def _missing_data(real: Sequence[Cell], twin: Sequence[Cell]) -> list[str]:
     return out
 
 
-def _agreement(
-    task: str, real: Sequence[Cell], twin: Sequence[Cell], candidates: list[Candidate], seed: int
-) -> Agreement:
+# ---- agreement
+
+
+def _agreement(task: str, real: Sequence[Cell], twin: Cells, candidates: list[Candidate], seed: int) -> Agreement:
     missing = _missing_data(real, twin)
     data = pair_cells(real, twin)
     if missing:
         none = Estimate(n=data.policies, missing="; ".join(missing))
         return Agreement(task, data.policies, data.cells, tuple(missing), *(none,) * 9)
-    observed, replicates, n = observed_rates(data), resample(data, np.random.default_rng([seed, 2])), data.policies
+    observed, replicates = observed_rates(data), resample(data, np.random.default_rng([seed, 2]))
     return Agreement(
         task=task,
         policies=data.policies,
         cells=data.cells,
         missing=(),
-        pearson=_correlation(pearson, pearson_batched, observed, replicates),
-        spearman=_correlation(spearman, spearman_batched, observed, replicates),
-        mmrv=_bootstrapped(
-            mmrv(twin=observed.twin, real=observed.real), mmrv_batched(twin=replicates.twin, real=replicates.real), n
-        ),
-        **_winner(observed, replicates, data),
+        pearson=_statistic(pearson, pearson_batched, observed, replicates),
+        spearman=_statistic(spearman, spearman_batched, observed, replicates),
+        mmrv=_statistic(mmrv, mmrv_batched, observed, replicates),
+        **_winner(observed, replicates),
         bias=_bootstrapped(float(observed.difference), replicates.difference, data.cells),
         coverage=_bootstrapped(float(observed.compatible), replicates.compatible, data.cells),
-        corrected_coverage=_corrected_coverage(data, observed),
+        corrected_coverage=_corrected_coverage(observed),
         mean_real=_mean_real(observed, candidates),
     )
 
 
-def _correlation(
-    of: Callable[..., float], batched: Callable[..., NDArray[np.float64]], observed: Rates, replicates: Rates
-) -> Estimate:
+def _statistic(of: Callable[..., float], batched: Callable[..., Array], observed: Rates, replicates: Rates) -> Estimate:
     n = len(observed.twin)
     try:
         value = of(twin=observed.twin, real=observed.real)
@@ -418,116 +405,100 @@ def _correlation(
     return _bootstrapped(value, batched(twin=replicates.twin, real=replicates.real), n)
 
 
-def _bootstrapped(value: float, replicates: NDArray[np.float64], n: int) -> Estimate:
+def _bootstrapped(value: float, replicates: Array, n: int) -> Estimate:
     ends = bootstrap_interval(value, replicates)
     if ends is None:
         return Estimate(n=n, missing="most resampled experiments have rates that are all the same")
     return Estimate(value, *ends, n)
 
 
-def _winner(observed: Rates, replicates: Rates, data: PairedCells) -> dict[str, Estimate]:
+def _winner(observed: Rates, replicates: Rates) -> dict[str, Estimate]:
     """Agreement and regret of the winner, as means over tasks."""
-    if all(len(members) < 2 for members in data.strata):
-        none = Estimate(n=data.policies, missing="no task has two policies")
-        return {"winner_agreement": none, "winner_regret": none}
-    (agreement, regret), (agreements, regrets) = (
-        mean_over_tasks(winner_batched, observed),
-        mean_over_tasks(winner_batched, replicates),
-    )
-    return {
-        "winner_agreement": _bootstrapped(float(agreement), agreements, data.policies),
-        "winner_regret": _bootstrapped(float(regret), regrets, data.policies),
-    }
+    n, names = len(observed.twin), ("winner_agreement", "winner_regret")
+    if all(len(members) < 2 for members in observed.strata):
+        return dict.fromkeys(names, Estimate(n=n, missing="no task has two policies"))
+    values, resampled = (mean_over_tasks(winner_batched, rates) for rates in (observed, replicates))
+    return {k: _bootstrapped(float(v), r, n) for k, v, r in zip(names, values, resampled, strict=True)}
 
 
-def _corrected_coverage(data: PairedCells, observed: Rates) -> Estimate:
+def _corrected_coverage(observed: Rates) -> Estimate:
     """Coverage of leave-one-out predictions, task by task."""
     hits: list[bool] = []
-    for members in data.strata:
+    for members in observed.strata:
         twin, real = observed.twin[members], observed.real[members]
         try:
-            _, low, high = prediction_powered.leave_one_group_out(twin=twin, real=real, groups=range(len(members)))
+            _, low, high = leave_one_group_out(twin=twin, real=real, groups=range(len(members)))
         except UndefinedStatistic:
             continue
         hits += list((low <= real) & (real <= high))
     if not hits:
         return Estimate(missing=f"{MIN_POLICIES + 1} policies of a task driven on the road are needed")
-    low_, high_ = wilson(sum(hits), len(hits))
-    return Estimate(float(np.mean(hits)), float(low_), float(high_), len(hits))
+    return _rate(int(sum(hits)), len(hits))
 
 
 def _mean_real(observed: Rates, candidates: list[Candidate]) -> Estimate:
     further = [c.twin.value for c in candidates if not c.driven and c.twin.value is not None]
     try:
-        mean = prediction_powered.prediction_powered_mean(twin=observed.twin, real=observed.real, twin_only=further)
+        mean = prediction_powered_mean(twin=observed.twin, real=observed.real, twin_only=further)
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
-    return Estimate(mean.value, max(mean.low, 0.0), min(mean.high, 1.0), mean.labeled + mean.unlabeled)
+    return Estimate(mean.value, max(mean.low, 0.0), min(mean.high, 1.0), len(observed.twin) + len(further))
 
 
-def _left_out(task: str, real: Sequence[Cell], twin: Sequence[Cell]) -> list[LeftOutLighting]:
+def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLighting]:
+    """Each real lighting of a task predicted from the others."""
     lightings = [cell.lighting for cell in real]
     names = list(dict.fromkeys(lightings))
     twin_rate, real_rate = np.array([_scores([cell], twin) for cell in real]).T
-    missing = _missing_data(real, twin) or (["a second real lighting is needed"] if len(names) < 2 else [])
-    if missing:
-        none = Estimate(missing="; ".join(missing))
-        return [LeftOutLighting(task, name, lightings.count(name), none, none, none) for name in names]
+    missing = "; ".join(_missing_data(real, twin)) or ("a second real lighting is needed" if len(names) < 2 else "")
     out = []
     for name in names:
         mine = np.array([other == name for other in lightings])
         n = int(mine.sum())
-        try:
-            line = prediction_powered.LinearCorrection.fit(twin=twin_rate[~mine], real=real_rate[~mine])
-        except UndefinedStatistic:
-            none = Estimate(missing=f"the other lightings have fewer than {MIN_POLICIES} cells")
-            out.append(LeftOutLighting(task, name, n, none, none, none))
-            continue
-        value, low, high = line.predict(twin_rate[mine])
-        inside = (low <= real_rate[mine]) & (real_rate[mine] <= high)
-        ends = wilson(inside.sum(), n)
-        twin_error, error = np.abs(twin_rate - real_rate)[mine], np.abs(value - real_rate[mine])
-        covered = Estimate(float(inside.mean()), float(ends[0]), float(ends[1]), n)
-        out.append(LeftOutLighting(task, name, n, _mean(twin_error), _mean(error), covered))
+        estimates = (Estimate(missing=missing),) * 3
+        if not missing:
+            try:
+                line = LinearCorrection.fit(twin=twin_rate[~mine], real=real_rate[~mine])
+            except UndefinedStatistic:
+                none = Estimate(missing=f"the other lightings have fewer than {MIN_POLICIES} cells")
+                estimates = (none, none, none)
+            else:
+                value, low, high = line.predict(twin_rate[mine])
+                inside = (low <= real_rate[mine]) & (real_rate[mine] <= high)
+                twin_error, error = np.abs(twin_rate - real_rate)[mine], np.abs(value - real_rate[mine])
+                estimates = _mean(twin_error), _mean(error), _rate(int(inside.sum()), n)
+        out.append(LeftOutLighting(task, name, n, *estimates))
     return out
 
 
-def _mean(values: NDArray[np.float64]) -> Estimate:
+def _mean(values: Array) -> Estimate:
     """Mean of absolute differences, with Student's t interval, clipped at 0."""
-    n = len(values)
+    n, mean = len(values), float(values.mean())
     if n < 2:
-        return Estimate(float(values.mean()), None, None, n)
+        return Estimate(mean, n=n)
     half = float(student.ppf(0.5 + CONFIDENCE / 2, n - 1) * values.std(ddof=1) / np.sqrt(n))
-    mean = float(values.mean())
     return Estimate(mean, max(mean - half, 0.0), mean + half, n)
 
 
-def _pair(cell: Cell, twin: Sequence[Cell]) -> CellPair:
-    mate = next(c for c in twin if c.key == cell.twin_key)
-    difference = rate_difference(
+def _pair(cell: Cell, mate: Cell) -> CellPair:
+    value, low, high = rate_difference(
         twin_successes=mate.successes,
         twin_trials=mate.trials,
         real_successes=cell.successes,
         real_trials=cell.trials,
     )
-    value, low, high = (float(x) for x in difference)
-    bias = Estimate(value, low, high, cell.trials)
-    return CellPair(cell.policy, cell.task, cell.lighting, mate.lighting, _rate(mate), _rate(cell), bias)
-
-
-def _rate(cell: Cell) -> Estimate:
-    low, high = wilson(cell.successes, cell.trials)
-    return Estimate(cell.rate, float(low), float(high), cell.trials)
+    bias = Estimate(float(value), float(low), float(high), cell.trials)
+    rates = _rate(mate.successes, mate.trials), _rate(cell.successes, cell.trials)
+    return CellPair(cell.policy, cell.task, cell.lighting, mate.lighting, *rates, bias)
 
 
 def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int) -> TrialAllocation:
-    basis = "road" if len({cell.policy for cell in real}) > 1 else "twin"
-    cells = real if basis == "road" else twin
+    on_road = len({cell.policy for cell in real}) > 1
+    basis, cells = ("road", real) if on_road else ("twin", twin)
     policies = list(dict.fromkeys(cell.policy for cell in cells))
     if len(policies) < 2:
         return TrialAllocation(task, len(policies), basis, None, None, 0, 0)
     counts = _trial_counts([[c for c in cells if c.policy == policy] for policy in policies])
-    so_far = basis == "road"
-    now = ranking.expected_confidence(counts, 0, seed, so_far)
-    more = [ranking.trials_needed(counts, what, seed, so_far) for what in ("winner", "order")]
+    now = ranking.expected_confidence(counts, 0, seed, on_road)
+    more = [ranking.trials_needed(counts, what, seed, on_road) for what in ("winner", "order")]
     return TrialAllocation(task, len(policies), basis, now.winner, now.order, *more)

@@ -1,24 +1,20 @@
-"""Bayesian ranking of policies: probabilities of ranks, and the number of further trials that would settle the ranking.
+"""Bayesian ranking of policies: probabilities of ranks, and how many further trials would settle the ranking.
 
 The true rate of a cell is sampled from Jeffreys' posterior, Beta(successes + ½, trials − successes + ½); a policy's
-score is the mean over its cells. The probability of a rank is the fraction of samples in which a policy has it. All
-statements hold for the world in which the trials were driven: a ranking in the twin is no evidence of one on the road.
+score is the mean over its cells. A rank's probability is the fraction of samples in which a policy has it. All this
+holds for the world in which the trials were driven: a ranking in the twin is no evidence of one on the road.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.evaluation.statistics import CONFIDENCE
-from twin.types import Array
+from twin.types import Array, Indices
 
-SETTLED_PROBABILITY = 0.95
-"""Probability from which on a ranking counts as settled."""
-MARGIN = 0.05
-"""Policies whose true scores differ by less count as equally good."""
-MAX_TRIALS = 1000
-"""Largest number of further trials per policy that is considered."""
+SETTLED_PROBABILITY = 0.95  # from which on a ranking counts as settled
+MARGIN = 0.05  # policies whose true scores differ by less count as equally good
+MAX_TRIALS = 1000  # most further trials per policy that are considered
 
 _SAMPLES = 4000  # of the posterior
 _STEP = 5  # trials
@@ -26,14 +22,12 @@ _STEP = 5  # trials
 
 @dataclass(frozen=True)
 class TrialCounts:
-    """Trials of n policies on one task in up to k cells each; rows are padded with cells of weight 0."""
+    """Trials of n policies on one task in up to k cells each, shape (n, k); short rows are padded."""
 
-    successes: NDArray[np.int64]
-    """Shape (n, k)."""
-    trials: NDArray[np.int64]
-    """Shape (n, k)."""
+    successes: Indices
+    trials: Indices
     weight: Array
-    """1 for a cell, 0 for padding; shape (n, k)."""
+    """1 for a cell, 0 for padding."""
 
     @staticmethod
     def from_rows(rows: list[list[tuple[int, int]]]) -> "TrialCounts":
@@ -66,7 +60,7 @@ def rank_probabilities(counts: TrialCounts, rng: np.random.Generator, samples: i
 def rank_interval(probabilities: Array, confidence: float = CONFIDENCE) -> tuple[float, int, int]:
     """Expected rank of a policy (1 is best) from rank probabilities (n,), and the ends of its credible interval.
 
-    At either end, ranks are excluded as long as their total probability is at most (1 − confidence) / 2.
+    The ranks excluded at either end have a total probability of at most (1 − confidence) / 2.
     """
     ranks = np.arange(1, len(probabilities) + 1)
     tail = (1.0 - confidence) / 2 + 1e-12
@@ -82,7 +76,7 @@ class RankingConfidence:
     winner: float
     """Probability that the leading policy is within `MARGIN` of the truly best."""
     order: float
-    """Expected fraction of the pairs with true scores more than `MARGIN` apart that are ranked in the right order."""
+    """Expected fraction of pairs in the right order, among those with true scores more than `MARGIN` apart."""
 
 
 def expected_confidence(
@@ -90,13 +84,13 @@ def expected_confidence(
 ) -> RankingConfidence:
     """Expected confidence in the ranking after `more` trials per policy, spread evenly over its cells.
 
-    True rates are sampled from the posterior and trials from these rates; policies are ranked by the posterior mean.
+    True rates are sampled from the posterior, and trials at these rates; policies are ranked by the posterior mean.
 
     Args:
         counts: Trials so far.
         more: Further trials per policy.
-        seed: Use the same seed for different `more` to compare them on the same samples.
-        so_far: False: the trials so far are only the prior of the rates, and do not count for the ranking.
+        seed: With the same seed, different `more` are compared on the same samples.
+        so_far: False: the trials so far determine the true rates, but do not count for the ranking.
         samples: Number of samples of the true rates.
     """
     rng = np.random.default_rng(seed)
@@ -107,7 +101,7 @@ def expected_confidence(
     base_won, base = (counts.successes, counts.trials) if so_far else (0, 0)
     known = counts.scores((base_won + won + 0.5) / (base + extra + 1.0))
     score = counts.scores(true)
-    # Each of the policies tied in the posterior mean is equally likely to be chosen.
+    # Policies tied in the posterior mean are equally likely to be chosen.
     leading = np.isclose(known, known.max(-1, keepdims=True), rtol=0.0, atol=1e-12)
     good = score >= score.max(-1, keepdims=True) - MARGIN
     winner = ((leading & good).sum(-1) / leading.sum(-1)).mean()
@@ -121,8 +115,7 @@ def expected_confidence(
 def trials_needed(counts: TrialCounts, what: str, seed: int, so_far: bool = True) -> int | None:
     """Further trials per policy, a multiple of 5, until an expected confidence reaches `SETTLED_PROBABILITY`.
 
-    `what` is the field of `RankingConfidence`, "winner" or "order"; other arguments as of `expected_confidence`.
-    Returns None if `MAX_TRIALS` do not suffice.
+    `what` names a field of `RankingConfidence`. Returns None if `MAX_TRIALS` do not suffice.
     """
 
     def enough(more: int) -> bool:
@@ -135,7 +128,7 @@ def trials_needed(counts: TrialCounts, what: str, seed: int, so_far: bool = True
         low, high = high, 2 * high
         if low >= MAX_TRIALS:
             return None
-    while high - low > _STEP:  # bisection: the confidence is expected to grow with the trials
+    while high - low > _STEP:  # bisection, as the confidence grows with the trials
         middle = (low + high) // (2 * _STEP) * _STEP
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high if high <= MAX_TRIALS else None

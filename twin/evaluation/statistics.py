@@ -1,19 +1,22 @@
-"""Success rates with intervals; Spearman, Pearson, MMRV and regret of twin against real scores, in closed form.
+"""Statistics of success rates in closed form: intervals, agreement of twin and road, prediction of real rates.
 
 A *rate* is successes over trials; its interval contains the true rate with probability `CONFIDENCE`. *Twin scores* and
 *real scores* are rates of the same policies in the twin and on the road, in the same order, along the last axis;
 leading axes are separate experiments. Twin and real are keyword-only, as they are not interchangeable (regret and rank
 violations are differences of real rates).
 
-Functions raise `UndefinedStatistic` where the data do not determine the statistic. Those ending in `_batched` compute
-it over leading axes for resampling, and return nan there instead.
+Functions raise `UndefinedStatistic` if the data do not determine a statistic. Those ending in `_batched` work over
+leading axes, for resampling, and return nan instead.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import norm, rankdata
+from scipy.stats import t as student
 
 from twin.types import Array
 
@@ -24,8 +27,9 @@ MIN_POLICIES = 5
 MIN_TRIALS = 5
 """Number of trials per cell below which no correlation is given."""
 
-_MIN_POINTS = 3  # below it a correlation says nothing
-_DECIMALS = 12  # scores equal to so many decimals are tied, in whatever order they were summed
+_MIN_POINTS = 3  # of a correlation
+_DECIMALS = 12  # scores that agree to so many decimals are tied: sums differ in the last bits with their order
+_MIN_VARIANCE = 1e-12  # scores of less variance count as equal
 
 
 class UndefinedStatistic(ValueError):
@@ -36,9 +40,8 @@ class UndefinedStatistic(ValueError):
 
 
 def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
-    """Score interval of a rate: Wilson (1927); eq. 4 of Brown, Cai and DasGupta, Statistical Science 16 (2001).
-
-    Successes (any shape) need not be integers, see `mean_rate`; trials are positive. Returns lower and upper end.
+    """Lower and upper end of a rate's score interval (Wilson 1927); eq. 4 of Brown, Cai and DasGupta, Statistical
+    Science 16 (2001). Unlike SciPy's, it takes arrays, and successes that are not whole numbers (see `mean_rate`).
     """
     n = np.asarray(trials, float)
     p = np.asarray(successes, float) / n
@@ -49,11 +52,10 @@ def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDEN
 
 
 def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
-    """Unweighted mean of the rates of k cells (lightings), and its interval.
+    """Unweighted mean of the rates of k cells, shape (k,), and the ends of its interval.
 
-    The interval is Wilson's for the effective number of trials k² / Σ 1/nᵢ, at which a binomial rate has the mean's
-    variance if all rates are equal; unequal rates have less variance, so the interval errs to the wide side.
-    Successes and trials (positive) have shape (k,). Returns mean, lower and upper end.
+    The interval is Wilson's for k² / Σ 1/nᵢ trials, for which a binomial rate has the mean's variance if all rates are
+    equal. Unequal rates have less variance, so the interval errs to the wide side.
     """
     n = np.asarray(trials, float)
     mean = float(np.mean(np.asarray(successes, float) / n))
@@ -71,17 +73,13 @@ def rate_summary(won: int, trials: int) -> dict[str, Any]:
 
 
 def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
-    """Unweighted mean of the rates of k days, and its interval with the day as the unit.
+    """Unweighted mean of the rates of k days, shape (k,), and the ends of its interval with the day as the unit.
 
-    Trials of one day share its lighting and weather and tend to have the same outcome. The interval assumes that they
-    agree entirely: with an intra-class correlation of 1 the design effect 1 + (m − 1) ρ equals the m trials of a day
-    (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials, and the interval is Wilson's for these.
-    Rates between 0 and 1 have less variance than successes and failures of the same mean, so it errs to the wide side.
-    It holds for further days of the same policies, not for further policies. `rates` (k,) has one rate per day in
-    [0, 1], the mean over all its trials of all policies. Returns mean, lower and upper end.
-
-    Raises:
-        ValueError: `rates` is empty, or a rate is outside [0, 1].
+    Trials of one day share its lighting and weather. The interval assumes that their outcomes agree entirely: with an
+    intra-class correlation ρ of 1 the design effect 1 + (m − 1) ρ equals the m trials of a day (Kish, Survey Sampling,
+    1965, section 5.4), so k days count as k trials of Wilson's interval. Rates between 0 and 1 have less variance than
+    successes and failures of the same mean, so it errs to the wide side. It holds for further days of the same
+    policies, not for further policies. Raises ValueError: no rate, or one outside [0, 1].
     """
     days = np.asarray(rates, float)
     if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
@@ -98,10 +96,10 @@ def rate_difference(
     real_trials: ArrayLike,
     confidence: float = CONFIDENCE,
 ) -> tuple[Array, Array, Array]:
-    """Real rate minus twin rate, and its interval: Newcombe's hybrid score (method 10).
+    """Real minus twin rate in [−1, 1], and the ends of its interval: Newcombe's hybrid score, which SciPy lacks.
 
-    R. G. Newcombe, Interval estimation for the difference between independent proportions, Stat. in Medicine 17 (1998).
-    All counts have the same shape, trials are positive. Returns difference, lower and upper end, in [−1, 1].
+    Method 10 of R. G. Newcombe, Interval estimation for the difference between independent proportions, Statistics in
+    Medicine 17 (1998). All counts have the same shape.
     """
     twin = np.asarray(twin_successes, float) / np.asarray(twin_trials, float)
     real = np.asarray(real_successes, float) / np.asarray(real_trials, float)
@@ -133,10 +131,8 @@ def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
     The violation of a pair of policies that twin and road order differently is the difference of their real scores:
     |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]; MMRV is the mean over i of the largest over j. It is not symmetric in its
     arguments, and published code names them in both orders. Policies tied in the twin, but not on the road, count as a
-    violation of the worse of the two; code published with the paper compares by > and charges the better.
-
-    Raises:
-        UndefinedStatistic: fewer than two policies.
+    violation of the worse of the two; code published with the paper compares by > and charges the better. Raises
+    UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
     return float(mmrv_batched(twin=twin, real=real))
@@ -205,3 +201,140 @@ def _validated(twin: ArrayLike, real: ArrayLike, needed: int = _MIN_POINTS, vari
         if varied and np.ptp(_rounded(scores)) == 0:
             raise UndefinedStatistic(f"all rates {name} are {scores[0]:.3g}; a correlation needs rates that differ")
     return twin, real
+
+
+# ---- prediction of real scores
+#
+# Prediction-powered inference (PPI; Angelopoulos et al., arXiv 2301.09633) combines many twin scores with few pairs of
+# twin and real scores. With n paired scores fᵢ and Yᵢ, and N further twin scores f̃ⱼ, the mean real score of such
+# policies is estimated by
+#
+#     θ = λ · mean(f̃) + mean(Y − λ f)            eq. 4 of PPI++ (Angelopoulos, Duchi and Zrnic, arXiv 2311.01453)
+#
+# which is unbiased however inaccurate the twin is. Its variance is least at the *power* λ = Cov(Y, f) / ((1 + n/N)
+# Var f) (its example 6.1). A single further policy of twin score f̃ is predicted with the λ for N → ∞,
+#
+#     Ŷ = λ f̃ + mean(Y − λ f),  λ = Cov(Y, f) / Var f,
+#
+# the least-squares line through the paired scores; their residuals give the prediction interval.
+
+
+@dataclass(frozen=True)
+class PredictionPoweredMean:
+    """Estimate of the mean real score of policies like those driven."""
+
+    value: float
+    low: float
+    high: float
+    power: float
+    """λ: weight of the twin scores; 0: not used, 1: taken as they are."""
+
+
+def prediction_powered_mean(
+    *,
+    twin: ArrayLike,
+    real: ArrayLike,
+    twin_only: ArrayLike,
+    power: float | None = None,
+    confidence: float = CONFIDENCE,
+) -> PredictionPoweredMean:
+    """PPI++ for a mean.
+
+    λ is tuned without the policy it is applied to (leave one out), which keeps the estimate exactly unbiased; tuned on
+    the same few policies it would be biased (Mani et al., arXiv 2505.20178). The interval uses Student's t with n − 1
+    degrees of freedom and is not clipped to [0, 1]. In simulation it covers 0.91 to 0.93 for policies of varied
+    quality, but 0.8 for six policies most of which fail.
+
+    Args:
+        twin: fᵢ, shape (n,).
+        real: Yᵢ, shape (n,).
+        twin_only: f̃ⱼ, shape (N,).
+        power: λ; None: tuned.
+        confidence: Of the interval.
+
+    Raises:
+        UndefinedStatistic: n < 5, or N < 2.
+    """
+    f, y, further = (np.asarray(a, float) for a in (twin, real, twin_only))
+    n, more = len(y), len(further)
+    _check_count(n)
+    if more < 2:
+        raise UndefinedStatistic(f"{more} policies driven in the twin only; 2 are needed: validate further ones")
+    powers = _left_out_powers(f, y, n / more) if power is None else np.full(n, power)
+    mean_power = float(powers.mean())
+    value = mean_power * further.mean() + float((y - powers * f).mean())
+    error = np.var(y - powers * f, ddof=1) / n + mean_power**2 * np.var(further, ddof=1) / more
+    half = float(student.ppf(0.5 + confidence / 2, n - 1) * np.sqrt(error))
+    return PredictionPoweredMean(float(value), float(value - half), float(value + half), mean_power)
+
+
+def _left_out_powers(f: Array, y: Array, ratio: float) -> Array:
+    """λ tuned on all policies but the i-th, shape (n,); 0 where the others' twin scores are all equal."""
+    powers = np.zeros(len(y))
+    for i in range(len(y)):
+        others, labels = np.delete(f, i), np.delete(y, i)
+        if others.var() > _MIN_VARIANCE:
+            powers[i] = np.cov(labels, others)[0, 1] / ((1 + ratio) * others.var(ddof=1))
+    return powers
+
+
+@dataclass(frozen=True)
+class LinearCorrection:
+    """Least-squares line from twin to real scores."""
+
+    slope: float
+    """λ."""
+    twin_mean: float
+    real_mean: float
+    residual_std: float
+    """Standard deviation of real scores about the line."""
+    sum_of_squares: float
+    """Σ (f − mean f)²."""
+    n: int
+
+    @staticmethod
+    def fit(*, twin: ArrayLike, real: ArrayLike) -> "LinearCorrection":
+        """Fits scores (n,); the slope is 0 if all twin scores are equal. Raises UndefinedStatistic: n < 5."""
+        f, y = np.asarray(twin, float), np.asarray(real, float)
+        _check_count(len(y))
+        centered = f - f.mean()
+        squares = float(centered @ centered)
+        slope = float(centered @ (y - y.mean())) / squares if squares > _MIN_VARIANCE else 0.0
+        residual = y - y.mean() - slope * centered
+        residual_std = float(np.sqrt(residual @ residual / (len(y) - 2)))
+        return LinearCorrection(slope, float(f.mean()), float(y.mean()), residual_std, squares, len(y))
+
+    def predict(self, twin: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array, Array]:
+        """Real scores, in as many trials as the fitted policies had, predicted from twin scores.
+
+        Returns values and ends of their intervals, clipped to [0, 1], each of the shape of `twin`. The interval is that
+        of simple regression for a new observation (Draper and Smith, Applied Regression Analysis, section 3.1). It is
+        centered on the clipped value, so that it keeps its width where the line leaves the range of rates.
+        """
+        f = np.asarray(twin, float)
+        middle = np.clip(self.real_mean + self.slope * (f - self.twin_mean), 0, 1)
+        squares = self.sum_of_squares
+        lever = (f - self.twin_mean) ** 2 / squares if squares > _MIN_VARIANCE else np.zeros_like(f)
+        half = student.ppf(0.5 + confidence / 2, self.n - 2) * self.residual_std * np.sqrt(1.0 + 1.0 / self.n + lever)
+        return middle, np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
+
+
+def leave_one_group_out(
+    *, twin: ArrayLike, real: ArrayLike, groups: Sequence[object], confidence: float = CONFIDENCE
+) -> tuple[Array, Array, Array]:
+    """Each real score predicted by the line through all other groups: values and ends of intervals, shapes (n,).
+
+    `groups` names the group of each score, such as its policy or lighting. Raises UndefinedStatistic: fewer than 5
+    scores remain without a group.
+    """
+    f, y = np.asarray(twin, float), np.asarray(real, float)
+    out = np.empty((3, len(y)))
+    for group in dict.fromkeys(groups):
+        mine = np.array([other == group for other in groups])
+        out[:, mine] = LinearCorrection.fit(twin=f[~mine], real=y[~mine]).predict(f[mine], confidence)
+    return out[0], out[1], out[2]
+
+
+def _check_count(n: int) -> None:
+    if n < MIN_POLICIES:
+        raise UndefinedStatistic(f"{n} policies driven in both worlds; {MIN_POLICIES} are needed")

@@ -1,4 +1,4 @@
-"""Success during training, from a run's `episodes.csv`: the curve, and the rate before each saved policy."""
+"""Success during training, from a run's `episodes.csv`: curves, and the rate before each saved policy."""
 
 import csv
 import io
@@ -8,35 +8,34 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.evaluation.statistics import rate_summary, wilson
 from twin.evaluation.trials import RECENT_EPISODES
 from twin.files import digest_file, read_json, read_text, regular_file, wrap_read_errors
 from twin.scene import SceneDir
+from twin.types import Indices
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 CHOICE_FILE = "choice.json"
-"""File of a run: evaluations of its last policies without exploration, and the chosen one; see
-`learn/policy_evaluation.py`."""
+"""File of a run with the selection of its policy; see `learn/training.py`."""
 _MAX_BINS = 25  # points of a curve
 _MIN_EPISODES = 5  # per point
 
 
 def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Summaries of the trainings of validated policies, for those in `runs/` that are unchanged since validation.
+    """Summaries of the trainings of policies in `runs/` that are unchanged since their validation.
 
     Args:
         root: The scene folder.
-        policies: Their names in the tables, `run` or `run/checkpoint`.
+        policies: Names as in tables, `run` or `run/checkpoint`.
 
     Returns:
-        Summaries by policy, JSON-able: run, step at which it was saved, task, observe and lighting of the training,
-        and the `rate_summary` of the `RECENT_EPISODES` before that step.
+        By policy, JSON-able: run, step at which it was saved, task, observe and lighting of the training, and the
+        `rate_summary` of the `RECENT_EPISODES` before that step.
     """
     record = SceneDir(root).validation / "validated.json"
     digests: dict[str, Any] = {}
@@ -63,39 +62,35 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
 
 
 def _is_there(path: Path) -> bool:
-    """True if the file exists; False for a name that no file can have, since a table may contain any name."""
+    """True if the file exists; False also for impossible names, as a table may contain any."""
     try:
         return bool(regular_file(path))
     except InputError:
         return False
 
 
-def read_episodes(folder: Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Reads a run's episodes: steps at which they ended, ascending, and success, 0 or 1; both of shape (n,).
+def read_episodes(folder: Path) -> tuple[Indices, Indices]:
+    """Reads a run's episodes: steps at which they ended, ascending, and success, 0 or 1; shapes (n,).
 
-    Episodes that started along the route are left out, as they are easier.
-
-    Raises:
-        InputError: no such file, or not one that a training wrote.
+    Episodes that started along the route are left out, as they are easier. Raises InputError: no such file, or one that
+    no training wrote.
     """
     path = folder / "episodes.csv"
     text = read_text(path)
     with wrap_read_errors(path, "cut its last lines off, or train anew under another name"):
-        # Runs of before have no such column: all their episodes were whole.
+        # Older runs have no start_m: all their episodes were whole.
         whole = [row for row in csv.DictReader(io.StringIO(text)) if float(row.get("start_m") or 0.0) == 0.0]
         rows = [(int(row["step"]), int(row["success"])) for row in whole]
         steps, success = np.array(rows, np.int64).reshape(-1, 2).T
         if (np.diff(steps) < 0).any() or not np.isin(success, (0, 1)).all():
-            raise ValueError("steps that go back, or success that is neither 0 nor 1")
+            raise ValueError("steps decrease, or success is neither 0 nor 1")
     return steps, success
 
 
-def binned_rates(
-    steps: np.ndarray, success: np.ndarray, bins: int = _MAX_BINS
-) -> list[tuple[float, int, int, float, float]]:
+def binned_rates(steps: Indices, success: Indices, bins: int = _MAX_BINS) -> list[tuple[float, int, int, float, float]]:
     """Bins of about equally many episodes: mean step, successes, episodes, and the ends of the rate's interval.
 
-    `steps` and `success` are those of `read_episodes`. At most `bins` bins; each has at least 5 episodes, if possible.
+    At most `bins` bins of the episodes of `read_episodes`, each of at least 5 if possible.
     """
     out = []
     parts = max(1, min(bins, len(steps) // _MIN_EPISODES))
@@ -105,11 +100,9 @@ def binned_rates(
     return out
 
 
-def plot_success_curve(axes: Axes, steps: NDArray[np.int64], success: NDArray[np.int64], color: str) -> None:
-    """Plots the success rate over steps with its interval; arguments as of `binned_rates`, at least one episode."""
-    step, won, count, low, high = (
-        np.array(column, float) for column in zip(*binned_rates(steps, success), strict=True)
-    )
+def plot_success_curve(axes: Axes, steps: Indices, success: Indices, color: str) -> None:
+    """Plots the success rate of at least one episode over steps, with its interval; see `binned_rates`."""
+    step, won, count, low, high = np.array(binned_rates(steps, success), float).T
     axes.fill_between(step, low, high, color=color, alpha=0.2, linewidth=0, label="90 % interval")
     axes.plot(step, won / count, ".-", color=color, label=f"{len(steps)} episodes, {int(count[0])} a point")
 
@@ -127,7 +120,7 @@ def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
 
 
 def write_success_curve(folder: Path) -> Path:
-    """Writes `success.png` of a run: success over steps with 90 % intervals, and the evaluation that chose a policy."""
+    """Writes `success.png` of a run: success over steps with 90 % intervals, and the selection of its policy."""
     steps, success = read_episodes(folder)
     path = folder / "success.png"
     figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")

@@ -1,13 +1,13 @@
-"""Tables of trials: those that `twin.validate` writes, and the user's results from the road.
+"""Tables of trials in the twin, which `twin.validate` writes, and on the road, which the user writes.
 
-A *trial* is one drive of one policy, on a task, under a lighting; it succeeds or fails. A *cell* is the trials of one
+A *trial* is one drive of a policy, on a task, under a lighting; it succeeds or fails. A *cell* is all trials of one
 policy, task and lighting. In the twin every trial is a row of `validation/episodes.csv`; real trials are given as cells
 in `results.csv`:
 
     policy,lighting,trials,successes            optional columns: task, twin_lighting
 
-`task` is required only if a policy was validated on several. If the twin has no lighting of that name, `twin_lighting`
-names the twin's lighting to compare with: for `dusk_on_monday`, for example, `held-out+randomised`.
+`task` is required only for a policy validated on several. `twin_lighting` is required if the twin has no lighting of
+that name: it names the one to compare with, such as `held-out+randomised` for `dusk_on_monday`.
 """
 
 import csv
@@ -23,19 +23,15 @@ from twin.evaluation.statistics import wilson
 from twin.files import read_text
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
-"""Columns of `validation/episodes.csv`. `trust` is the mean estimated image reliability over the trial
-(see `twin.env.trust`); empty without images."""
+"""Columns of `validation/episodes.csv`; `trust` is the trial's mean image reliability (`twin.env.trust`), or empty."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
-RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
-"""Required columns of `results.csv`."""
-OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting")
-"""Optional columns of `results.csv`."""
+RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS = ("policy", "lighting", "trials", "successes"), ("task", "twin_lighting")
+"""Columns of `results.csv`."""
 RECENT_EPISODES = 20
-"""The training success rate is the mean over this many latest complete episodes; a training on a CPU has about 40 in
-total."""
+"""Number of latest complete episodes in a training's success rate, of about 40 in a training on a CPU."""
 
-_MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # of trials and steps in a cell; of a seed
+_MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # trials or steps in a cell; a seed
 _VALIDATE_COMMAND = "python -m twin.validate"
 
 
@@ -54,7 +50,7 @@ class Trial:
     steps: int
     """Control steps."""
     trust: float | None = None
-    """Mean over the pictures, in [0, 1]; None without pictures."""
+    """Mean over the pictures in [0, 1]; None without pictures."""
 
     @property
     def success(self) -> bool:
@@ -77,7 +73,7 @@ class Cell:
     trials: int
     successes: int
     twin_lighting: str = ""
-    """The twin's lighting that a real cell is compared with; empty for a cell of the twin."""
+    """For a real cell, the twin's lighting to compare with."""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -85,7 +81,7 @@ class Cell:
 
     @property
     def twin_key(self) -> tuple[str, str, str]:
-        """Key of the twin's cell that a real cell is compared with."""
+        """Key of the twin's cell to compare a real cell with."""
         return self.policy, self.task, self.twin_lighting or self.lighting
 
     @property
@@ -121,16 +117,12 @@ def cells_csv(cells: Iterable[Cell]) -> str:
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """Reads `validation/episodes.csv`.
-
-    Raises:
-        InputError: no such file, or an invalid row; names its line.
-    """
+    """Reads `validation/episodes.csv`. Raises InputError: no such file, or an invalid row, with its line."""
     if not path.exists():
         raise InputError(
             f"{path} does not exist; drive the policies in the twin first: {_VALIDATE_COMMAND} SCENE --policy RUN"
         )
-    trials, keys = [], set()
+    trials: dict[tuple[str, str, str, int], Trial] = {}
     for where, row in _rows(path, EPISODE_COLUMNS, ()):
         if row["cause"] not in CAUSES:
             raise InputError(f"{where}: cause = {row['cause']!r}; expected one of {', '.join(CAUSES)}")
@@ -140,30 +132,18 @@ def read_trials(path: Path) -> list[Trial]:
                 f"goal, else 0; run {_VALIDATE_COMMAND} anew"
             )
         trust = _parse_float(where, row, "trust") if row["trust"] else None
-        numbers = (
-            _parse_int(where, row, "seed"),
-            row["cause"],
-            _parse_float(where, row, "progress_m"),
-            _parse_int(where, row, "steps"),
-        )
-        trial = Trial(row["policy"], row["task"], row["lighting"], *numbers, trust)
-        key = (trial.policy, trial.task, trial.lighting, trial.seed)
-        if key in keys:
-            raise InputError(f"{where}: seed {trial.seed} of this policy, task and lighting is there twice; delete one")
-        keys.add(key)
-        trials.append(trial)
-    return trials
+        key = row["policy"], row["task"], row["lighting"], _parse_int(where, row, "seed")
+        progress, steps = _parse_float(where, row, "progress_m"), _parse_int(where, row, "steps")
+        if key in trials:
+            raise InputError(f"{where}: seed {key[3]} of this policy, task and lighting is there twice; delete one")
+        trials[key] = Trial(*key, row["cause"], progress, steps, trust)
+    return list(trials.values())
 
 
 def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
-    """Reads the user's real cells and checks that each has a twin cell to be compared with.
+    """Reads `results.csv` and checks that each real cell has one of the twin's cells to compare with.
 
-    Args:
-        path: Path of `results.csv`.
-        twin: Cells of the twin.
-
-    Raises:
-        InputError: no such file, wrong header, unknown names, impossible counts or duplicates; names the line.
+    Raises InputError: no such file, or a wrong header, unknown name, impossible count or duplicate, with its line.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
@@ -189,21 +169,17 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
 
 
 def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> tuple[str, str]:
+    policy, task = row["policy"], row.get("task", "")
     policies = list(dict.fromkeys(cell.policy for cell in twin))
-    if row["policy"] not in policies:
-        raise InputError(f"{where}: policy {row['policy']!r} was not validated; {name_hint(row['policy'], policies)}")
-    tasks = list(dict.fromkeys(cell.task for cell in twin if cell.policy == row["policy"]))
-    task = row.get("task", "")
+    if policy not in policies:
+        raise InputError(f"{where}: policy {policy!r} was not validated; {_name_hint(policy, policies)}")
+    tasks = list(dict.fromkeys(cell.task for cell in twin if cell.policy == policy))
     if not task and len(tasks) > 1:
-        raise InputError(
-            f"{where}: policy {row['policy']!r} was validated on {' and '.join(tasks)}; "
-            "add a column task that says which"
-        )
+        valid = " and ".join(tasks)
+        raise InputError(f"{where}: policy {policy!r} was validated on {valid}; add a column task that says which")
     if task and task not in tasks:
-        raise InputError(
-            f"{where}: policy {row['policy']!r} was not validated on task {task!r}; {name_hint(task, tasks)}"
-        )
-    return row["policy"], task or tasks[0]
+        raise InputError(f"{where}: policy {policy!r} was not validated on task {task!r}; {_name_hint(task, tasks)}")
+    return policy, task or tasks[0]
 
 
 def _unknown_lighting(cell: Cell, known: set[tuple[str, str, str]]) -> str:
@@ -214,12 +190,12 @@ def _unknown_lighting(cell: Cell, known: set[tuple[str, str, str]]) -> str:
             f"policy {cell.policy!r} was not validated under {name!r}; run {_VALIDATE_COMMAND} with --lightings {name}"
         )
     return (
-        f"lighting {name!r} is not in the twin; {name_hint(name, here)}; or add a column "
+        f"lighting {name!r} is not in the twin; {_name_hint(name, here)}; or add a column "
         "twin_lighting with the twin's lighting to compare with"
     )
 
 
-def name_hint(name: str, valid: Sequence[str]) -> str:
+def _name_hint(name: str, valid: Sequence[str]) -> str:
     """End of an error message: "did you mean ...?", or the valid names."""
     near = difflib.get_close_matches(name, valid, n=1)
     if near:
@@ -229,8 +205,7 @@ def name_hint(name: str, valid: Sequence[str]) -> str:
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
     """Yields the location of each row, and its fields by column name."""
-    text = read_text(path)
-    reader = csv.reader(io.StringIO(text))
+    reader = csv.reader(io.StringIO(read_text(path)))
     wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
     try:
         header = [name.strip() for name in next(reader, [])]
@@ -238,16 +213,14 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
             raise InputError(f"{path} is empty; its first line must be {wanted}")
         missing = [name for name in needed if name not in header]
         unknown = [name for name in header if name not in (*needed, *optional)]
-        if missing or unknown or len(set(header)) != len(header):
-            twice = [name for name in header if header.count(name) > 1]
-            fault = (
-                f"no column {missing[0]}"
-                if missing
-                else f"unknown column {unknown[0]!r}"
-                if unknown
-                else f"column {twice[0]!r} appears twice"
-            )
-            raise InputError(f"{path}: header {','.join(header)!r}: {fault}; expected {wanted}")
+        twice = [name for name in header if header.count(name) > 1]
+        faults = [
+            *(f"no column {name}" for name in missing),
+            *(f"unknown column {name!r}" for name in unknown),
+            *(f"column {name!r} appears twice" for name in twice),
+        ]
+        if faults:
+            raise InputError(f"{path}: header {','.join(header)!r}: {faults[0]}; expected {wanted}")
         count = 0
         for fields in reader:
             if not any(field.strip() for field in fields):

@@ -4,9 +4,9 @@
     action = policy(pixels)                 # uint8 (12, 90, 160), the newest picture last → numbers in [-1, 1]
     v, yaw_rate = policy.command(action)    # m/s, rad/s
 
-A *policy folder* holds `policy.json` (control, sizes of the network, how it was trained), `policy.safetensors`
-(weights) and `policy.onnx` (both in one file, for a robot with ONNX Runtime and without this package). Loading runs no
-code, except where the user trusts a file; see `load_policy` for other files.
+A *policy folder* contains `policy.json` (control, sizes of the network, its training), `policy.safetensors` (weights)
+and `policy.onnx` (both in one file, for a robot that has ONNX Runtime but not this package). Loading runs no code
+unless the user trusts a file; `load_policy` lists the other formats.
 """
 
 import contextlib
@@ -36,26 +36,26 @@ ActFunction = Callable[[Image], Array32]
 JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
 FORMAT, VERSION = "twin policy", 2
 
-_MAX_SIDE, _MAX_STACK = 4096, 64  # largest side of a picture [px], most pictures in a stack
-_MAX_BYTES = 256 << 20  # [bytes] of a file
+_MAX_SIDE, _MAX_STACK = 4096, 64  # side of a picture [px], pictures in a stack
+_MAX_BYTES = 256 << 20  # of a file
 _METADATA_KEY = "twin"  # in an ONNX file
 
 
 @dataclass(frozen=True)
 class Control:
-    """Meaning and timing of a policy's actions. A policy of unknown origin has the defaults."""
+    """Meaning and timing of a policy's actions. The defaults apply to policies of unknown origin."""
 
     action: str = STEERING
     """steering: one number, the yaw rate; twist: two, speed and yaw rate."""
     speed: float = 1.0
-    """Steering: the constant speed [m/s]. Twist: the maximum speed; action -1 means standstill."""
+    """[m/s]; steering: the constant speed; twist: the speed at action 1, with standstill at -1."""
     yaw_rate: float = 1.0
     """Yaw rate at action 1, to the left [rad/s]."""
     control_timestep: float = 0.1
     """Time between two actions, and between two pictures of a stack [s]."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a number out of range."""
+        """Raises ValueError: an unknown action, or a number out of range."""
         if self.action not in (STEERING, TWIST):
             raise ValueError(f"action = {self.action!r} is neither {STEERING!r} nor {TWIST!r}")
         for name, most in (("speed", 10.0), ("yaw_rate", 10.0), ("control_timestep", 1.0)):
@@ -75,13 +75,13 @@ class Policy:
 
     name: str
     act: ActFunction
-    """Stacks uint8 (n, 3 · stack, height, width) → actions float32 (n, actions), not yet checked."""
+    """Unchecked."""
     control: Control
     size: tuple[int, int] = (160, 90)
     """Width, height of the pictures [px]."""
     stack: int = 4
     trained: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Scene, task, run, step and so on; empty for other files."""
+    """Scene, task, run, step and so on of the training; empty if unknown."""
 
     def actions(self, stacks: Image) -> Array32:
         """Stacks uint8 (n, 3 · stack, height, width) → actions (n, actions), each number in [-1, 1].
@@ -114,54 +114,53 @@ class Policy:
         return v, float(action[-1]) * c.yaw_rate
 
     def options(self) -> dict[str, Any]:
-        """Keywords for `twin.load` of an environment that fits the policy."""
+        """Options of `twin.load` for an environment that fits the policy."""
         return {**dataclasses.asdict(self.control), "size": self.size, "stack": self.stack}
 
 
 def save_policy(
     folder: Path, architecture: Architecture, control: Control, weights: dict[str, Array32], trained: dict[str, Any]
 ) -> None:
-    """Writes a policy folder's files, policy.json last; a folder without it is not a policy.
+    """Writes a policy folder.
 
     Args:
         weights: See `Architecture.shapes`.
-        trained: How it was trained, JSON-able.
+        trained: Description of the training, JSON-able.
     """
     folder.mkdir(parents=True, exist_ok=True)
     weights = {name: np.ascontiguousarray(weights[name], np.float32) for name in architecture.shapes()}
-    head = {"control": dataclasses.asdict(control), "network": dataclasses.asdict(architecture)}
+    head: dict[str, Any] = {"format": FORMAT, "version": VERSION}
+    head |= {"control": dataclasses.asdict(control), "network": dataclasses.asdict(architecture)}
     blob = safetensors_save(weights)
-    metadata = json.dumps({"format": FORMAT, "version": VERSION, **head, "trained": trained})
-    sums = {"weights_sha256": hashlib.sha256(blob).hexdigest()}
-    table = {"format": FORMAT, "version": VERSION, **head, **sums, "trained": trained}
-    files = {WEIGHTS: blob, ONNX: onnx_bytes(architecture, weights, {_METADATA_KEY: metadata}), JSON: json_bytes(table)}
-    _replace_policy(folder, files)
+    onnx = onnx_bytes(architecture, weights, {_METADATA_KEY: json.dumps({**head, "trained": trained})})
+    table = {**head, "weights_sha256": hashlib.sha256(blob).hexdigest(), "trained": trained}
+    _replace_policy(folder, {WEIGHTS: blob, ONNX: onnx, JSON: json_bytes(table)})
 
 
 def copy_policy(source: Path, folder: Path) -> None:
-    """Replaces the files of a policy folder by another's, policy.json last."""
+    """Replaces the files of a policy folder by another's."""
     _replace_policy(folder, {name: read_bytes(source / name) for name in (WEIGHTS, ONNX, JSON)})
 
 
 def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
-    """Writes all files to temporary ones before it replaces the first: a full disk leaves the old policy whole."""
-    with contextlib.ExitStack() as asides:
-        written = {name: asides.enter_context(atomic_path(folder / name)) for name in reversed(files)}
+    """Replaces files, policy.json last; on a full disk the old policy remains complete."""
+    with contextlib.ExitStack() as stack:  # its exit renames the temporary files, the last entered first
+        temporary = {name: stack.enter_context(atomic_path(folder / name)) for name in reversed(files)}
         for name, content in files.items():
-            written[name].write_bytes(content)
-        (folder / JSON).unlink(missing_ok=True)  # otherwise it would describe other weights for a moment
+            temporary[name].write_bytes(content)
+        (folder / JSON).unlink(missing_ok=True)  # it must not describe other weights, even for a moment
 
 
 def find_policy(root: Path, source: str) -> str:
-    """Resolves a policy's name to a path for `load_policy`.
+    """The `source` for `load_policy`, with names as in tables (`run`, `run/checkpoint`) resolved to folders in `runs/`.
 
-    `run` and `run/checkpoint`, as in tables, become the folders under `runs/`; other names are returned unchanged.
+    Existing paths become absolute, since nodes of a cluster have other working folders; the rest is unchanged.
     """
     run, _, checkpoint = source.partition("/")
     folder = root / "runs" / run
     folder = folder / "checkpoints" / checkpoint if checkpoint else folder
     where = folder if not Path(source).exists() and (folder / JSON).exists() else Path(source)
-    return str(where.resolve()) if where.exists() else source  # absolute: nodes of a cluster have other working folders
+    return str(where.resolve()) if where.exists() else source
 
 
 def load_policy(source: str | Path, trust: bool = False) -> Policy:
@@ -170,14 +169,10 @@ def load_policy(source: str | Path, trust: bool = False) -> Policy:
     - a policy folder, such as a run or a checkpoint of one (or its policy.json);
     - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) of values 0 to 255, and one output
       (n, 1 or 2) in [-1, 1];
-    - `module:function`, a callable of one stack uint8 (3 · stack, height, width), the user's own code;
-    - a zip of stable-baselines3, which runs its code when it is loaded and needs `trust`.
+    - `module:function`, the user's own function of one stack uint8 (3 · stack, height, width);
+    - a zip of stable-baselines3, only with `trust`, since loading it runs its code.
 
-    Args:
-        trust: Files may run code.
-
-    Raises:
-        InputError: no such policy, or one that is damaged or of another format.
+    Raises InputError: no such policy, or one that is damaged or of another format.
     """
     path = Path(source)
     if path.name == JSON:
@@ -198,7 +193,9 @@ def load_policy(source: str | Path, trust: bool = False) -> Policy:
 
 
 def _from_folder(folder: Path) -> Policy:
-    head = _head(_json_of(folder / JSON), folder / JSON)
+    if not (folder / JSON).exists():
+        raise InputError(f"{folder} has no {JSON}: not a policy folder, or a run that has not saved a policy yet")
+    head = _head(read_json(folder / JSON), folder / JSON)
     architecture, control = _parts(head, folder / JSON)
     path = folder / WEIGHTS
     blob = _read(path)
@@ -214,7 +211,9 @@ def _from_folder(folder: Path) -> Policy:
             what = "missing" if found is None else f"{found.dtype} {found.shape}, or not finite"
             raise InputError(f"{path}: {name} is {what}; expected float32 {shape}, as {JSON} says")
     act = _session(onnx_bytes(architecture, weights, {}), path)
-    return Policy(_name(folder), act, control, architecture.size, architecture.stack, head.get("trained", {}))
+    full = folder.resolve()
+    name = f"{full.parent.parent.name}/{full.name}" if full.parent.name == "checkpoints" else full.name
+    return Policy(name, act, control, architecture.size, architecture.stack, head.get("trained", {}))
 
 
 def _from_onnx(path: Path) -> Policy:
@@ -222,19 +221,19 @@ def _from_onnx(path: Path) -> Policy:
 
     try:
         model = onnx.load_model_from_string(_read(path))
-        # Before the checker, which would open the files.
+        # Refused before the checker, which would open the files.
         if any(one.data_location == onnx.TensorProto.EXTERNAL for one in _tensors(model)):
             raise InputError(f"{path}: its weights are in other files; save it with its weights inside")
         onnx.checker.check_model(model)
     except InputError:
         raise
-    except Exception as error:  # errors of protobuf, of the checker, and Python's for deep nesting
+    except Exception as error:  # of protobuf, of the checker, or Python's for deep nesting
         raise InputError(f"{path}: not an ONNX file: {type(error).__name__}: {error}") from None
     names = {one.name for one in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in names]
     shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
     fits = len(inputs) == 1 and [len(shape) for shape in shapes] == [4, 2]
-    # A size of 0 means a dynamic axis.
+    # A dynamic axis has size 0.
     if not fits or shapes[0][1] % 3 or 0 in shapes[0][1:] or shapes[0][0] > 1 or shapes[1][1] not in (1, 2):
         raise InputError(
             f"{path}: inputs and outputs {shapes}; expected one input (n, 3 · stack, height, width) and one output "
@@ -259,7 +258,7 @@ def _from_onnx(path: Path) -> Policy:
 
 
 def _tensors(model: Any) -> Iterator[Any]:
-    """Every tensor of an ONNX model: initializers, sparse ones, attributes, functions, training info."""
+    """Every tensor of an ONNX model, wherever it is nested."""
     waiting = [model]
     while waiting:
         message = waiting.pop()
@@ -319,9 +318,8 @@ def _session(model: bytes, path: Path) -> ActFunction:
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
-    settings.intra_op_num_threads = settings.inter_op_num_threads = (
-        1  # environments run in parallel, and the order of sums is fixed
-    )
+    # One thread: environments run in parallel, and the order of sums is fixed.
+    settings.intra_op_num_threads = settings.inter_op_num_threads = 1
     settings.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
@@ -364,19 +362,7 @@ def _parts(head: dict[str, Any], path: Path) -> tuple[Architecture, Control]:
     return architecture, control
 
 
-def _json_of(path: Path) -> Any:
-    if not path.exists():
-        raise InputError(f"{path.parent} has no {JSON}: not a policy folder, or a run that has not saved a policy yet")
-    return read_json(path)
-
-
 def _read(path: Path) -> bytes:
     if not path.is_file():
         raise InputError(f"{path} is missing; copy the whole run")
     return read_bytes(path, _MAX_BYTES)
-
-
-def _name(folder: Path) -> str:
-    """Name of a policy folder: `run`, or `run/checkpoint`."""
-    folder = folder.resolve()
-    return f"{folder.parent.parent.name}/{folder.name}" if folder.parent.name == "checkpoints" else folder.name

@@ -1,11 +1,10 @@
 """The policy network, from a stack of pictures to an action, and its export as an ONNX graph.
 
-A *stack* is uint8, (3 · stack, height, width), the newest three channels last. Preprocessing averages blocks of `pool`
-× `pool` pixels and normalizes each color of each picture to a fixed mean and standard deviation in the lower half,
-where the ground is; that removes exposure, white balance and most of the lighting. Both steps return bytes, so that
-training and driving use the same values. Then follow convolutions with ReLU, a linear layer with layer normalization
-and tanh (the encoder of DrQ, Kostrikov et al. 2020, at another size), hidden layers with ReLU, and a tanh: an action
-with numbers in [-1, 1].
+A *stack* is uint8 (3 · stack, height, width), the newest picture last. Preprocessing averages blocks of `pool` × `pool`
+pixels and normalizes each color of each picture to a fixed mean and standard deviation in the lower half, where the
+ground is; this removes exposure, white balance and most of the lighting. Both steps return bytes, so that training and
+driving use the same values. Convolutions with ReLU follow, a linear layer with layer normalization and tanh (the
+encoder of DrQ, Kostrikov et al. 2020, at another size), hidden layers with ReLU, and a tanh for actions in [-1, 1].
 """
 
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ NORM_EPSILON = 1e-5
 GROUND_MEAN, GROUND_STD = 128.0, 48.0
 """Mean and standard deviation of a normalized color in the lower half of a picture."""
 NOISE_STD = 4.0
-"""Added to the standard deviation of a color, so that normalization does not amplify camera noise in plain pictures."""
+"""Added to the standard deviation of a color, so that normalization does not amplify noise in plain pictures."""
 _OPSET, _IR = 17, 8  # old enough for the ONNX Runtime on a robot
 
 
@@ -32,7 +31,7 @@ class Architecture:
     """Width, height of the pictures [px]."""
     stack: int = 4
     pool: int = 2
-    """Side of the averaged squares [px]: 1, 2 or 4, which are exact in floating point."""
+    """Side of the averaged blocks [px]: 1, 2 or 4, which are exact in floating point."""
     convolutions: tuple[tuple[int, int, int], ...] = ((32, 4, 4), (64, 3, 2))
     """Channels, kernel, stride of each."""
     features: int = 64
@@ -42,7 +41,7 @@ class Architecture:
     actions: int = 1
 
     def __post_init__(self) -> None:
-        """Raises ValueError: sizes that do not fit together, or are too large for a robot's computer."""
+        """Raises ValueError: sizes that do not fit together, or too large for a robot's computer."""
         if len(self.size) != 2:
             raise ValueError(f"size = {self.size}: expected (width, height)")
         numbers = [*self.size, self.stack, self.features, self.actions, *self.hidden, *sum(self.convolutions, ())]
@@ -115,11 +114,11 @@ def preprocess(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
 
 
 def onnx_bytes(architecture: Architecture, weights: dict[str, Array32], notes: dict[str, str]) -> bytes:
-    """The network with its preprocessing as an ONNX file: `pixels` uint8 (n, 3 · stack, height, width) → `action`
-    float32 (n, actions).
+    """Network and preprocessing as an ONNX file: `pixels` uint8 (n, 3 · stack, height, width) → `action` (n, actions).
 
     Args:
         weights: See `Architecture.shapes`.
+        notes: The file's metadata.
     """
     from onnx import TensorProto, helper, numpy_helper
 

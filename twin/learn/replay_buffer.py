@@ -1,9 +1,9 @@
 """A replay buffer of single pictures instead of stacks, and color augmentation of its samples.
 
-The pictures of each environment are written once, in order, to a ring in a file. A *transition* refers to its newest
-picture and stores its *age*, the steps since its episode began; its stack is that picture and those before it, back to
-the episode's first, which is repeated. The newest picture of the next stack follows on the ring, also at an episode's
-end, after which the next episode's first picture is written. This takes an eighth of the memory of two stacks of four.
+Each environment's pictures are written once, in order, to a ring in a file. A *transition* refers to its newest picture
+and stores its *age*, the steps since its episode began. Its stack is that picture and those before it, back to the
+episode's first, which is repeated; the next stack ends with the next picture of the ring. After an episode's last
+picture follows the next episode's first. This takes an eighth of the memory of two stacks of four.
 """
 
 from pathlib import Path
@@ -23,17 +23,16 @@ from twin.files import allocate
 # ---- color augmentation
 
 _GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of logarithms
-_SHADING = 0.4  # the same, at the knots
+_KNOTS, _SHADING = (3, 5), 0.4  # of the brightness pattern: knots down and across, standard deviation of the logarithm
 _MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # number of rectangles, exclusive; their sides as fractions of the picture's
-_KNOTS = (3, 5)  # of the brightness pattern, down and across
 _LEVELS = np.arange(256) / 255.0
 
 
 def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Randomizes the colors of stacks, for skies and shadows that no lighting of the field shows.
 
-    The policy's normalization removes brightness, contrast and tint of the whole ground; the rest is randomized here,
-    anew for every sample and alike for all pictures of a stack, so that motion is preserved:
+    The policy's normalization removes brightness, contrast and tint of the whole ground; this randomizes the rest.
+    Every stack is changed differently, but all its pictures alike, which preserves motion:
 
         tone     v → v^gamma, and contrast about the middle
         tint     a gain per color
@@ -42,7 +41,7 @@ def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Ge
 
     Args:
         stacks: Shape (k, 3 · stack, height, width), the colors of one picture next to each other.
-        strength: Factor of the constants above; 0 changes nothing.
+        strength: Factor of the standard deviations; 0 changes nothing.
     """
     count, channels, height, width = stacks.shape
     curves = _curves(count, strength, rng)
@@ -73,12 +72,12 @@ def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np
 
 # ---- the buffer
 
-_SHORT = 8  # mean steps of an episode; with shorter ones fewer transitions than the buffer's size remain complete
+_SHORT = 8  # mean steps of an episode; if they are shorter, fewer transitions than the buffer's size are complete
 _ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after")
 
 
 class ReplaySamples(NamedTuple):
-    """Samples of stable-baselines3, with privileged states."""
+    """The samples of stable-baselines3 with privileged states."""
 
     observations: torch.Tensor
     actions: torch.Tensor
@@ -92,8 +91,8 @@ class ReplaySamples(NamedTuple):
 class FrameReplayBuffer(ReplayBuffer):
     """Transitions of n environments whose observations are stacks (3 · stack, height, width), the newest picture last.
 
-    The ring of pictures is longer than the transitions need by `slack`: what is written after a save does not overwrite
-    what the saved transitions refer to, so a training that was killed resumes from its last save with all of them.
+    The ring has `slack` more pictures than the transitions need, so that pictures written after a save do not overwrite
+    those of the saved transitions: a killed training resumes with all of them.
     """
 
     def __init__(
@@ -115,11 +114,11 @@ class FrameReplayBuffer(ReplayBuffer):
         Args:
             buffer_size: Transitions of all environments together.
             observation_space: uint8 (3 · stack, height, width).
-            file: Of the pictures; None: in memory. An existing file is kept, see `set_state`.
-            slack: Transitions of all environments together that may be added between two saves.
-            shift: Samples are shifted by up to this many pixels each way, edges repeated: Kostrikov et al. 2020 (DrQ).
-            color_strength: Of `augment_colors`, applied to half of the stacks before transitions.
-            state_size: Numbers in the `state` of an `info`.
+            file: For the pictures; None: in memory. An existing file is kept, see `set_state`.
+            slack: Most transitions of all environments together between two saves.
+            shift: Largest random shift of samples each way [px], edges repeated (DrQ, Kostrikov et al. 2020).
+            color_strength: Strength of `augment_colors`, for half of the stacks before transitions.
+            state_size: Size of the `state` in an `info`.
 
         Raises:
             InputError: a file of another size.
@@ -129,35 +128,32 @@ class FrameReplayBuffer(ReplayBuffer):
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage, self.handle_timeout_termination = False, True
         channels, height, width = self.obs_shape
-        self.stack, self.shift, self.color_strength, self.rng = (
-            channels // 3,
-            shift,
-            color_strength,
-            np.random.default_rng(seed),
-        )
+        self.stack, self.shift, self.color_strength = channels // 3, shift, color_strength
+        self.rng = np.random.default_rng(seed)
         size = (self.buffer_size, n_envs)
         self.actions = np.zeros((*size, self.action_dim), np.float32)
         self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
         self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
         self.states = np.zeros((*size, state_size), np.float32)
-        """The robot's state before each transition; NaN in the first one of an environment in a process."""
+        """The robot's state before each transition; NaN in an environment's first one of this process."""
         self.states_after = np.zeros((*size, state_size), np.float32)
         self._state = np.full((n_envs, state_size), np.nan, np.float32)
-        self.length = self.buffer_size + self.buffer_size // _SHORT + -(-2 * slack // n_envs) + self.stack + 2
+        slack = -(-2 * slack // n_envs)
+        self._reach = self.buffer_size + self.buffer_size // _SHORT + self.stack + 2
+        self.length = self._reach + slack
         """Pictures in a ring."""
         shape = (n_envs, self.length, 3, height, width)
         if file is None:
             self.frames = np.zeros(shape, np.uint8)
         else:
-            there = file.exists()
-            if there and file.stat().st_size != int(np.prod(shape)):
-                raise InputError(f"{file} has {file.stat().st_size} bytes; expected {int(np.prod(shape))}: damaged")
-            allocate(file, int(np.prod(shape)))  # a full disk is an error now, not a SIGBUS hours later
+            bytes_needed = int(np.prod(shape))
+            if file.exists() and file.stat().st_size != bytes_needed:
+                raise InputError(f"{file} has {file.stat().st_size} bytes; expected {bytes_needed}: damaged")
+            allocate(file, bytes_needed)  # on a full disk an error now, not a SIGBUS hours later
             self.frames = np.memmap(file, np.uint8, "r+", shape=shape)
-        self._reach = self.length - -(-2 * slack // n_envs)
         self.written = np.zeros(n_envs, np.int64)
         """Pictures ever written to each ring."""
-        self._ages = np.full(n_envs, -1)  # of each environment's episode; -1: none
+        self._ages = np.full(n_envs, -1)  # steps of each environment's episode; -1: none
 
     def add(
         self,
@@ -201,7 +197,7 @@ class FrameReplayBuffer(ReplayBuffer):
         if self.shift:
             before, after = self._shifted(before), self._shifted(after)
         if self.color_strength:
-            # Half of them, and never the stacks that targets are computed from: Hansen et al. 2021 (SVEA).
+            # Half of the stacks, but not those that targets are computed from (SVEA, Hansen et al. 2021).
             half = batch_size // 2
             before[:half] = augment_colors(before[:half], self.color_strength, self.rng)
         rest = self.actions[row, env_index], after, self.ends[row, env_index, None], self.rewards[row, env_index, None]
@@ -225,14 +221,14 @@ class FrameReplayBuffer(ReplayBuffer):
         return out[0], out[1]
 
     def state(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
-        """The state apart from the pictures, as arrays and JSON-able values; flushes the pictures to their file."""
+        """The state without the pictures, as arrays and JSON-able values; flushes the pictures to their file."""
         if isinstance(self.frames, np.memmap):
             self.frames.flush()
         arrays = {name: getattr(self, name) for name in _ROWS} | {"written": self.written}
         return arrays, {"pos": self.pos, "full": self.full, "rng": self.rng.bit_generator.state}
 
     def set_state(self, arrays: dict[str, NDArray], rest: dict[str, Any]) -> None:
-        """Restores a state; pictures stay as they are in their file, and all environments begin new episodes."""
+        """Restores a state. Pictures are those in the file; all environments begin new episodes."""
         for name in (*_ROWS, "written"):
             getattr(self, name)[:] = arrays[name]
         self.pos, self.full = rest["pos"], rest["full"]

@@ -1,19 +1,23 @@
-"""SAC from pixels (Haarnoja et al. 2018) on stable-baselines3, with one encoder for actor and critics.
+"""SAC from pixels (Haarnoja et al. 2018) on stable-baselines3, and the saved states of a training.
 
-The encoder turns stacks into features. The actor's loss does not train it (Yarats et al. 2019; Kostrikov et al. 2020),
-and it has no target network (Yarats et al. 2021, DrQ-v2). An update runs it forward twice and backward once; in
-stable-baselines3, with separate encoders, it is five and three times.
+Actor and critics share one encoder, from stacks to features. Only the critics' loss trains it (Yarats et al. 2019;
+Kostrikov et al. 2020), and it has no target network (Yarats et al. 2021, DrQ-v2). An update runs it forward twice and
+backward once; with the separate encoders of stable-baselines3 it would be five and three times.
 
-The critics receive the robot's privileged *state* beside the features (Pinto et al. 2018, asymmetric actor-critic); the
-actor never does. A linear *state head* predicts the state from the features, as an auxiliary loss for the encoder.
+The critics also receive the robot's privileged *state* (Pinto et al. 2018, asymmetric actor-critic); the actor never
+does. A linear *state head* predicts the state from the features, as an auxiliary loss for the encoder.
 """
 
 import copy
+import shutil
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from safetensors.torch import load_file
+from safetensors.torch import save as tensor_bytes
 from stable_baselines3 import SAC
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -21,17 +25,28 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
+from twin.files import (
+    load_arrays,
+    read_json,
+    regular_file,
+    remove,
+    save_arrays,
+    wrap_read_errors,
+    write_bytes,
+    write_json,
+)
 from twin.learn.policy_network import NORM_EPSILON, Architecture
 from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.types import Array32
 
 _LOGGED = ("critic_loss", "actor_loss", "state_loss", "ent_coef", "value")
-_MAX_STATE = 3.0  # times its scale, at which a state is clamped
+_MAX_STATE = 3.0  # states are clamped at this multiple of their scale
 _AVERAGING_RATE = 1e-3  # of the averaged actor, per update
+_STATE, _TENSORS, _REPLAY = "state.json", "tensors.safetensors", "replay.npz"
 
 
 class Encoder(BaseFeaturesExtractor):
-    """The layers of `Architecture` from preprocessed stacks of values 0 to 255 to features."""
+    """Layers of `Architecture` from preprocessed stacks, values 0 to 255, to features."""
 
     def __init__(self, observation_space: spaces.Box, architecture: Architecture) -> None:
         super().__init__(observation_space, architecture.features)
@@ -47,7 +62,7 @@ class Encoder(BaseFeaturesExtractor):
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """Shapes (n, 3 · stack, h, w) → (n, features)."""
-        # Scaling the weights of the first convolution, instead of the pictures, saves a third of an update.
+        # Scaling the first convolution's weights instead of the pictures saves a third of an update.
         weight = self.first.weight
         bias = self.first.bias - 0.5 * weight.sum((1, 2, 3))  # type: ignore[operator]
         out = nn.functional.conv2d(pictures.float(), weight / 255.0, bias, self.first.stride)
@@ -80,16 +95,11 @@ class PixelSAC(SAC):
     """SAC with a shared encoder and privileged states."""
 
     averaged_actor: Actor
-    """Running mean of the actor and its encoder. It becomes the policy: single updates make the actor swing, and a
-    policy saved at the wrong moment leaves the road where the ones before and after do not."""
+    """Running mean of the actor and its encoder, which becomes the policy. The actor itself fluctuates between updates;
+    saved at a bad moment, it leaves the road."""
 
     def __init__(self, *arguments: Any, state_scales: tuple[float, ...] = (), **rest: Any) -> None:
-        """
-        Args:
-            arguments: Of `SAC`.
-            state_scales: Typical magnitudes of the numbers in the replay buffer's states; empty: no privileged states.
-            rest: Of `SAC`.
-        """
+        """`state_scales`: typical magnitudes of the privileged state's numbers; empty: none. The rest is `SAC`'s."""
         self._scales = state_scales
         super().__init__(*arguments, **rest)
 
@@ -103,7 +113,6 @@ class PixelSAC(SAC):
             self.critic.optimizer.add_param_group({"params": list(self.state_head.parameters())})
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Updates all networks `gradient_steps` times."""
         assert isinstance(self.replay_buffer, FrameReplayBuffer)
         assert self.ent_coef_optimizer is not None and self.log_ent_coef is not None
         assert isinstance(self.target_entropy, float)
@@ -151,8 +160,7 @@ class PixelSAC(SAC):
             polyak_update(
                 self.actor.parameters(), self.averaged_actor.parameters(), max(_AVERAGING_RATE, 1.0 / (done + 1))
             )
-            losses = critic_loss, actor_loss, state_loss
-            sums += [*(loss.item() for loss in losses), alpha.item(), best.mean().item()]
+            sums += [value.item() for value in (critic_loss, actor_loss, state_loss, alpha, best.mean())]
         self._n_updates += gradient_steps
         for name, value in zip(_LOGGED, sums / gradient_steps, strict=True):
             self.logger.record(f"train/{name}", value)
@@ -161,7 +169,7 @@ class PixelSAC(SAC):
         return (states / self._scale).clamp(-_MAX_STATE, _MAX_STATE)
 
     def _state_loss(self, features: torch.Tensor, states: torch.Tensor) -> torch.Tensor:
-        """Mean squared error of the state head, over the samples whose states are known."""
+        """Mean squared error of the state head over samples with a known state."""
         known = ~states.isnan().any(1)
         if not (self._scales and known.any()):
             return features.new_zeros(())
@@ -185,7 +193,110 @@ def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Arra
     modules: dict[str, Any] = {f"conv.{i}": m for i, m in enumerate(convolutions)}
     modules |= {"features": encoder.linear, "norm": encoder.norm}
     modules |= {f"hidden.{i}": m for i, m in enumerate(hidden)} | {"mean": actor.mu}
-    return {
-        name: getattr(modules[name.rsplit(".", 1)[0]], name.rsplit(".", 1)[1]).detach().cpu().numpy()
-        for name in architecture.shapes()
-    }
+    out = {}
+    for name in architecture.shapes():
+        module, parameter = name.rsplit(".", 1)
+        out[name] = getattr(modules[module], parameter).detach().cpu().numpy()
+    return out
+
+
+# ---- saved states
+#
+# A state contains the whole training, in files that run no code when they are loaded: tensors as safetensors, the
+# replay buffer without its pictures as npz, the rest as JSON. `state.json`, written last, names the complete folder
+# `state_<steps>`, so that a killed training leaves one complete state.
+
+
+def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
+    """Writes a state with JSON-able values `more`, then removes the previous state.
+
+    Raises OSError: the disk is full; the previous state is intact.
+    """
+    assert isinstance(model.replay_buffer, FrameReplayBuffer)
+    name = f"state_{model.num_timesteps:09d}"
+    remove(folder / name)
+    (folder / name).mkdir(parents=True)
+    try:
+        write_bytes(folder / name / _TENSORS, tensor_bytes(_tensors(model)))
+        arrays, replay = model.replay_buffer.state()
+        save_arrays(folder / name / _REPLAY, arrays)
+    except OSError:  # make room on the disk for the error's log
+        remove(folder / name)
+        raise
+    counts = {"steps": model.num_timesteps, "updates": model._n_updates, "episodes": model._episode_num}
+    rng = {"action_space": model.action_space.np_random.bit_generator.state}
+    write_json(folder / _STATE, {"folder": name, **counts, "replay": replay, "rng": rng, "more": more})
+    for old in folder.glob("state_*"):
+        if old.name != name:
+            shutil.rmtree(old)
+
+
+def has_state(folder: Path) -> bool:
+    """True if the folder contains a saved state."""
+    return (folder / _STATE).exists()
+
+
+def saved_steps(folder: Path) -> int:
+    """Control steps of the saved state."""
+    with wrap_read_errors(folder / _STATE, "train anew under another name"):
+        return int(read_json(folder / _STATE)["steps"])
+
+
+def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
+    """Restores the saved state in a new model and returns its `more`.
+
+    Raises InputError: files are missing, damaged, or of another network.
+    """
+    assert isinstance(model.replay_buffer, FrameReplayBuffer)
+    with wrap_read_errors(folder, "train anew under another name"):
+        head = read_json(folder / _STATE)
+        state = folder / Path(head["folder"]).name
+        tensors = load_file(regular_file(state / _TENSORS))
+        model.replay_buffer.set_state(load_arrays(state / _REPLAY), head["replay"])
+        _set_tensors(model, tensors)
+        int(head["steps"]), int(head["updates"]), int(head["episodes"]), dict(head["more"])
+        model.action_space.np_random.bit_generator.state = head["rng"]["action_space"]
+    model.num_timesteps, model._n_updates, model._episode_num = head["steps"], head["updates"], head["episodes"]
+    return head["more"]
+
+
+def _optimizers(model: PixelSAC) -> dict[str, torch.optim.Optimizer]:
+    assert model.ent_coef_optimizer is not None
+    return {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "entropy": model.ent_coef_optimizer}
+
+
+def _modules(model: PixelSAC) -> dict[str, torch.nn.Module]:
+    return {"policy": model.policy, "steady": model.averaged_actor, "teller": model.state_head}
+
+
+def _tensors(model: PixelSAC) -> dict[str, torch.Tensor]:
+    assert model.log_ent_coef is not None
+    out = {"log_ent_coef": model.log_ent_coef.detach(), "rng": torch.get_rng_state()}
+    for name, module in _modules(model).items():
+        out |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
+    for name, optimizer in _optimizers(model).items():
+        for i, values in optimizer.state_dict()["state"].items():
+            out |= {f"optimizer.{name}.{i}.{key}": value for key, value in values.items()}
+    if torch.cuda.is_available():
+        out["rng.cuda"] = torch.cuda.get_rng_state()
+    # Copies, since the shared encoder has several names and safetensors does not store shared tensors.
+    return {name: value.detach().cpu().clone().contiguous() for name, value in out.items()}
+
+
+def _set_tensors(model: PixelSAC, tensors: dict[str, torch.Tensor]) -> None:
+    assert model.log_ent_coef is not None
+    for name, module in _modules(model).items():
+        own = {n.removeprefix(f"{name}."): value for n, value in tensors.items() if n.startswith(f"{name}.")}
+        module.load_state_dict(own)
+    with torch.no_grad():
+        model.log_ent_coef.copy_(tensors["log_ent_coef"])
+    for name, optimizer in _optimizers(model).items():
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith(f"optimizer.{name}."):
+                i, field = key.removeprefix(f"optimizer.{name}.").split(".")
+                state.setdefault(int(i), {})[field] = value
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+    torch.set_rng_state(tensors["rng"])
+    if "rng.cuda" in tensors and torch.cuda.is_available():
+        torch.cuda.set_rng_state(tensors["rng.cuda"])

@@ -14,11 +14,10 @@ from twin.loading import Twin
 
 
 class DriveVecEnv(VecEnv):
-    """n environments; one whose episode ends is reset in the same step, with its last observation in
-    `terminal_observation`.
+    """n environments. An episode's last step resets its environment, with the last observation in the `info`.
 
-    Every `info` has the privileged `state`, and at an episode's end `first_state`, that of the next episode. Its
-    `lighting` is the lighting's name in tables; `sampled_lighting` is what Gymnasium's `info` has as `lighting`.
+    Every `info` has the privileged `state`, and at an episode's end `first_state`, that of the next episode. `lighting`
+    is the lighting's name in tables, `sampled_lighting` corresponds to `lighting` of Gymnasium's `info`.
     """
 
     def __init__(
@@ -30,14 +29,7 @@ class DriveVecEnv(VecEnv):
         processes: int | None = None,
         **options: Any,
     ) -> None:
-        """
-        Args:
-            scene: See `twin.load`.
-            task: See `twin.load`.
-            seed: Environment i has the episodes of seed + i; None: random.
-            processes: See `make_vector_env`.
-            options: See `twin.env.options.Options`.
-        """
+        """`seed`: environment i has the episodes of seed + i; None: random. For the rest see `make_vector_env`."""
         self.vector_env = make_vector_env(scene, task, options, [None] * n_envs, processes)
         super().__init__(n_envs, *make_spaces(self.vector_env))
         self._returns, self._lengths = np.zeros(n_envs), np.zeros(n_envs, int)

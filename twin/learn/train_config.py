@@ -1,6 +1,6 @@
-"""Configuration of a training, `TrainConfig`, with presets for a CPU and for a GPU.
+"""Configuration of a training, with presets for a CPU and for a GPU.
 
-*Steps* are control steps of all environments together. *Updates* are steps of the optimizers.
+*Steps* are control steps of all environments together, *updates* steps of the optimizers.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ from twin.learn.policy import Control
 from twin.learn.policy_network import Architecture
 
 _STATE_SCALES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
-"""Typical magnitudes of the privileged state: speed [m/s], yaw rate [rad/s], cross-track [m], heading
-error and turns 1, 2 and 4 m ahead [rad]."""
+"""Typical magnitudes of the privileged state: speed [m/s], yaw rate [rad/s], cross-track and heading error [m, rad],
+turns 1, 2 and 4 m ahead [rad]."""
 
 _LIMITS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**63 - 1),
@@ -45,11 +45,11 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "trials": (1, 10**6),
     "save_every": (1, 10**10),
 }
-"""Limits of each number. Beyond them a training fails in arithmetic, runs out of memory, or never ends."""
+"""Limits of each number, beyond which arithmetic fails, memory runs out or a training never ends."""
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
-_CLEAR = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
-"""Randomization of the robot alone; the place looks as filmed."""
+_ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
+"""Randomizes the robot; the place looks as filmed."""
 
 
 def _numbers(value: Any) -> list[Any]:
@@ -66,29 +66,27 @@ class TrainConfig:
     observe: str = NERF
     """nerf, or simulator: MuJoCo's rendering of the extracted mesh."""
     lighting: str = TRAINING
-    """See `env/episode_lighting.py`; the default varies between episodes."""
+    """See `env/episode_lighting.py`; the default is sampled for every episode."""
     seed: int = 0
     steps: int = 12_000
     worlds: int = 8
     action: str = STEERING
-    """steering (at `speed`) or twist."""
+    """This and the next two: see `Control`."""
     speed: float = 1.0
-    """[m/s]"""
     yaw_rate: float = 1.0
-    """[rad/s]"""
     centring: float = 1.0
-    """Fraction of the step reward lost at the corridor's edge; nothing is lost on the route."""
+    """Fraction of the step reward lost at the corridor's edge; none on the route."""
     steering: float = 0.5
     """Fraction of the step reward lost at full steering."""
     entropy: float = -0.5
     """Target entropy per number of an action [nat]; -0.5 is a standard deviation of 0.15 of the largest, -1 of 0.09."""
     start_along: float = 0.9
-    """Every second episode starts on the way, beside the route and at an angle, up to this fraction of the segment.
-    Without it a policy that has learned to stay in the middle never practices how to get back there."""
+    """Every second episode starts within this fraction of the segment, beside the route and at an angle, so that a
+    policy practices returning to the middle."""
     randomise: bool = True
     """Randomizes the robot in every episode and, where the lighting varies, weather and distractor objects."""
     privileged: bool = True
-    """The critics receive the robot's state, which the encoder learns to predict (`sac.py`); the policy never does."""
+    """The critics, but not the policy, receive the robot's state, which the encoder learns to predict (`sac.py`)."""
     pool: int = 2
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
     """Channels, kernel, stride."""
@@ -102,37 +100,34 @@ class TrainConfig:
     updates: float = 0.5
     """Per step."""
     gamma: float = 0.97
-    """Discount per step: a reward 33 steps (3 s) away counts a third."""
+    """Discount per step; a reward 33 steps (3 s) away counts a third."""
     learning_rate: float = 5e-4
     """In the first half of the training; see `training.py`."""
     tau: float = 0.01
-    """Rate at which the target critics follow, per update."""
+    """Averaging rate of the target critics, per update."""
     shift: int = 2
     """Random shift of preprocessed pictures in updates [px]."""
     colours: float = 1.0
-    """Strength of color augmentation in updates (`replay_buffer.py`), only where the lighting varies; a single lighting
-    and the simulator's pictures are not augmented."""
+    """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
     checkpoints: int = 20
     """Policies saved during the training."""
     trials: int = 8
-    """Episodes per candidate, without exploration, to select the best policy (`policy_evaluation.py`)."""
+    """Episodes per candidate in the selection of the best policy (`training.py`)."""
     save_every: int = 4_000
     """Steps between two saved states."""
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        """Raises InputError: a number out of range, or a lighting that is reserved for validation."""
+        """Raises InputError: a value out of range, or a lighting that is reserved for validation."""
         for name, (low, high) in _LIMITS.items():
-            for value in _numbers(getattr(self, name)):
+            given = getattr(self, name)
+            for value in _numbers(given):
                 if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-                    raise InputError(
-                        f"{name} = {short_repr(getattr(self, name))}; expected {low:,.10g} to {high:,.10g}"
-                    )
+                    raise InputError(f"{name} = {short_repr(given)}; expected {low:,.10g} to {high:,.10g}")
         for name, valid in _CHOICES.items():
             if getattr(self, name) not in valid:
-                raise InputError(
-                    f"{name} = {short_repr(getattr(self, name))}; expected {' or '.join(map(repr, valid))}"
-                )
+                choices = " or ".join(map(repr, valid))
+                raise InputError(f"{name} = {short_repr(getattr(self, name))}; expected {choices}")
         if self.lighting in (HELD_OUT, ANY):
             raise InputError(
                 f"lighting = {self.lighting!r}: held-out lightings are reserved for python -m twin.validate; "
@@ -155,24 +150,25 @@ class TrainConfig:
 
     @property
     def lighting_varies(self) -> bool:
-        """The lighting varies between episodes."""
+        """True if the lighting varies between episodes."""
         return self.observe == NERF and self.lighting == TRAINING
 
     def options(self) -> dict[str, Any]:
         """Options of the environment."""
-        # The goal is worth as much as surviving for ever. With less, a policy that is rewarded per step learns to
-        # linger before the goal, and leaves the road there rather than arrive. With a penalty only for leaving the
-        # road, it drives anywhere on it: next to the kerb a single surprise is enough.
+        # The goal is worth as much as surviving for ever: a policy that earned less would linger before it. The loss
+        # off the route keeps policies away from the kerb, where a single disturbance ends an episode.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
-        ranges = Ranges() if self.lighting_varies else _CLEAR
-        appearance = {
+        ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY
+        return {
+            **dataclasses.asdict(self.control),
             "lighting": self.lighting,
             "observe": self.observe,
             "randomise": ranges if self.randomise else None,
+            "rewards": rewards,
+            "start_along": self.start_along,
+            "device": self.device,
         }
-        rest = {"rewards": rewards, "start_along": self.start_along, "device": self.device}
-        return dataclasses.asdict(self.control) | appearance | rest
 
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -187,7 +183,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "batch": 256,
         "buffer": 100_000,
         "steps": 120_000,
-        "updates": 0.5,
         "shift": 4,
         "device": "cuda",
     },

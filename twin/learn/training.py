@@ -1,12 +1,12 @@
-"""A training run: SAC in many environments, in a folder that contains all its results.
+"""A training run: SAC in many environments, then selection of the best policy.
 
 runs/<name>/
   config.json                             the configuration
   policy.json .safetensors .onnx          the newest policy (`policy.py`); after the training the selected one
-  choice.json                             the selection (`policy_evaluation.py`)
+  choice.json                             the selection
   checkpoints/<steps>/                    policies saved during the training
   episodes.csv, log.csv, tensorboard/     episodes driven in training; speed, memory and losses at every save
-  state/                                  the saved state (`checkpoint.py`) and the replay buffer's pictures
+  state/                                  the saved state (`sac.py`) and the replay buffer's pictures
 """
 
 import csv
@@ -14,10 +14,9 @@ import dataclasses
 import json
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,40 +27,58 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from twin import runtime
 from twin.cli import StopNotice, Stopped, stop_noted
 from twin.config import RANDOMIZED
 from twin.env.suite import fingerprint
+from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.evaluation.trials import RECENT_EPISODES, csv_text
 from twin.files import read_json, wrap_read_errors, write_json, write_text
-from twin.learn.checkpoint import has_state, load_state, save_state
-from twin.learn.policy import save_policy
+from twin.learn.policy import copy_policy, load_policy, save_policy
+from twin.learn.policy_evaluation import run_episodes
 from twin.learn.policy_network import preprocess
 from twin.learn.replay_buffer import FrameReplayBuffer
-from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
+from twin.learn.sac import (
+    DrivePolicy,
+    Encoder,
+    PixelSAC,
+    actor_weights,
+    has_state,
+    load_state,
+    save_state,
+    saved_steps,
+)
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
-from twin.runtime import resident_memory
 
 TRAINING_EPISODE_COLUMNS = (
     *("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m"),
 )
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
+FRESH_EPISODES = 20
+"""Fresh episodes of the selected policy."""
+
+Watch = Callable[[int, Sequence[bool]], None]
+"""Receives the steps done, and the success of the last `RECENT_EPISODES` that started at the segment's beginning."""
+
 _FINAL_RATE = 0.1  # of the learning rate, at the end
-_SEED_STREAM = 6  # seeds of environments come from the run's seed, its resumptions and this; they never repeat
+_CANDIDATES = 4  # policies that the best one is selected from
+# Seeds derive from the run's seed, one of these and, in training, the number of resumptions: none repeats.
+_TRAINING_STREAM, _SELECTION_STREAM = 6, 7
 
 
 class PreprocessedVecEnv(VecEnvWrapper):
-    """Environments with the policy's preprocessing; the networks can learn while the environments are stepped."""
+    """Environments with the policy's preprocessing, in which networks can learn while the environments step."""
 
     def __init__(self, envs: DriveVecEnv, pool: int) -> None:
         channels, height, width = envs.observation_space.shape  # type: ignore[misc]
         super().__init__(envs, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
         self._pool, self._thread = pool, ThreadPoolExecutor(1)
         self.meanwhile: Callable[[], None] = lambda: None
-        """Called while the environments are stepped; the two are independent, so their order does not matter."""
+        """Called while the environments step; neither depends on the other."""
 
     def reset(self) -> NDArray:
         return preprocess(np.asarray(self.venv.reset()), self._pool)
@@ -79,55 +96,47 @@ class PreprocessedVecEnv(VecEnvWrapper):
         super().close()
 
 
-@dataclass(frozen=True)
-class TrainingProgress:
-    """Progress of a training."""
-
-    steps: int
-    recent: tuple[bool, ...]
-    """Success of the last episodes, at most `RECENT`, that started at the beginning of the segment."""
-
-
 def train(
     twin: Twin,
     folder: Path,
     config: TrainConfig,
-    watch: Callable[[TrainingProgress], None] | None = None,
+    watch: Watch | None = None,
     processes: int | None = None,
 ) -> None:
     """Trains a policy, or resumes a training that was stopped or killed.
 
-    SIGINT, SIGTERM and SIGHUP save the state and then raise `Stopped`, a KeyboardInterrupt. A folder that is not a run
-    is left alone; a run has a folder `state`, the first thing that a training creates.
+    SIGINT, SIGTERM and SIGHUP save the state and raise `Stopped`, a KeyboardInterrupt.
 
     Args:
-        config: Of the run; an existing run must have the same apart from `steps`.
+        config: Must equal that of an existing run, except for `steps`.
         processes: See `make_vector_env`; the number does not change the result.
 
     Raises:
-        InputError: an existing run has another configuration or is damaged, the folder is not a run, or an error of
-            `twin.load`.
+        InputError: an existing run has another configuration or is damaged, the folder is not empty and not a run, or
+            an error of `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
     road = fingerprint(twin, config.task, config.lighting + (RANDOMIZED if config.randomise else ""))
-    settings = json.loads(json.dumps({**dataclasses.asdict(config), "road": road}))  # as they are read again
+    settings = json.loads(json.dumps({**dataclasses.asdict(config), "road": road}))  # as read from a file
+    pictures = folder / "state" / "pictures.bin"
     resume = has_state(folder / "state")
     if resume:
         _check_same(folder, settings)
+        if not pictures.exists():
+            raise InputError(f"{pictures} is missing; train anew under another name")
     else:
         _check_run(folder)
         (folder / "state").mkdir(parents=True, exist_ok=True)
-        for stale in ("episodes.csv", "log.csv", "state/pictures.bin"):
-            (folder / stale).unlink(missing_ok=True)
+        for stale in (folder / "episodes.csv", folder / "log.csv", pictures):
+            stale.unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    if resume and not (folder / "state" / "pictures.bin").exists():
-        raise InputError(f"{folder}/state/pictures.bin is missing; train anew under another name")
     vec_env = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, **config.options())
     with closing(PreprocessedVecEnv(vec_env, config.pool)) as envs:
-        model = _model(envs, config, folder / "state" / "pictures.bin")
+        model = _model(envs, config, pictures)
         before: dict[str, Any] = load_state(folder / "state", model) if resume else {"wall": 0.0, "resumed": -1}
         resumed = before["resumed"] + 1
-        envs.seed(int(np.random.SeedSequence([config.seed, resumed, _SEED_STREAM]).generate_state(1, np.uint64)[0]))
+        seeds = np.random.SeedSequence([config.seed, resumed, _TRAINING_STREAM])
+        envs.seed(int(seeds.generate_state(1, np.uint64)[0]))
         updates = max(1, round(config.updates * config.worlds))
 
         def learn() -> None:
@@ -136,10 +145,11 @@ def train(
 
         envs.meanwhile = learn
         with stop_noted() as stop:
-            recorder = _RunRecorder(folder, config, settings, twin, before["wall"], resumed, watch, stop)
+            scene = twin.scene.root.resolve().name
+            recorder = _RunRecorder(folder, config, settings, scene, before["wall"], resumed, watch, stop)
             left = config.steps - model.num_timesteps
             if left > 0:
-                (folder / CHOICE_FILE).unlink(missing_ok=True)  # no longer valid after more steps
+                (folder / CHOICE_FILE).unlink(missing_ok=True)  # more steps invalidate the selection
                 model.learn(left, recorder, log_interval=10, reset_num_timesteps=False)
                 recorder.end()
                 if stop.number:
@@ -150,7 +160,7 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
     model = PixelSAC(
         DrivePolicy,
         envs,
-        # Decreases over the second half, so that the policy converges.
+        # Constant in the first half; decreases in the second, so that the policy converges.
         learning_rate=lambda left: config.learning_rate * (_FINAL_RATE + (1.0 - _FINAL_RATE) * min(1.0, 2.0 * left)),
         buffer_size=config.buffer,
         learning_starts=config.starts,
@@ -187,7 +197,10 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
 
 
 def _check_run(folder: Path) -> None:
-    """Raises InputError if a folder is not empty and not a run, since a training deletes and replaces files."""
+    """Raises InputError if a folder is neither empty nor a run, as a training deletes and replaces files.
+
+    A run has a folder `state`, which a training creates first.
+    """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise InputError(f"{folder} is not a folder; move it away, or give another --run")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "state").is_dir():
@@ -225,18 +238,17 @@ class _RunRecorder(BaseCallback):
         folder: Path,
         config: TrainConfig,
         settings: dict[str, Any],
-        twin: Twin,
+        scene: str,
         wall: float,
         resumed: int,
-        watch: Callable[[TrainingProgress], None] | None,
+        watch: Watch | None,
         stop: StopNotice,
     ) -> None:
         super().__init__()
         self.model: PixelSAC
-        self._folder, self._config, self._scene, self._watch = folder, config, twin.scene.root.resolve().name, watch
-        self._settings = settings
+        self._folder, self._config, self._settings, self._scene = folder, config, settings, scene
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
-        self._stop = stop
+        self._watch, self._stop = watch, stop
 
     @property
     def wall(self) -> float:
@@ -244,17 +256,16 @@ class _RunRecorder(BaseCallback):
         return self._wall + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        # Only now: the environments have started, so the configuration is valid.
+        # Not earlier: only a configuration with which the environments start is valid.
         write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self.model.num_timesteps
         self._first_updates = self.model._n_updates
-        self._recent: list[bool] = _keep_rows(self._folder / "episodes.csv", TRAINING_EPISODE_COLUMNS, self._saved)[
-            -RECENT_EPISODES:
-        ]
+        kept = _keep_rows(self._folder / "episodes.csv", TRAINING_EPISODE_COLUMNS, self._saved)
+        self._recent: list[bool] = kept[-RECENT_EPISODES:]
         _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
 
     def _on_rollout_start(self) -> None:
-        # Here, unlike in _on_step, the buffer has all that was collected.
+        # Unlike in _on_step, the buffer contains all collected transitions.
         if self._stop.number or self.model.num_timesteps - self._saved >= self._config.save_every:
             self.save()
         if self._stop.number:
@@ -266,25 +277,22 @@ class _RunRecorder(BaseCallback):
         for info in (one for one in self.locals["infos"] if "episode" in one):
             if not info["start"]:
                 self._recent = [*self._recent, info["is_success"]][-RECENT_EPISODES:]
-            rows.append(
-                (
-                    *(self.model.num_timesteps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"]),
-                    *(int(info["is_success"]), info["cause"], f"{info['progress']:.2f}"),
-                    *(info["episode"]["l"], f"{info['episode']['r']:.3f}", f"{info['start']:.2f}"),
-                )
-            )
+            episode = info["episode"]
+            head = (self.model.num_timesteps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
+            outcome = (int(info["is_success"]), info["cause"], f"{info['progress']:.2f}", episode["l"])
+            rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{info['start']:.2f}"))
         _append(self._folder / "episodes.csv", rows)
         if self._watch:
-            self._watch(TrainingProgress(self.model.num_timesteps, tuple(self._recent)))
+            self._watch(self.model.num_timesteps, self._recent)
         return True
 
     def end(self) -> None:
-        """Saves the last checkpoint and state when all steps are done."""
+        """Saves the last checkpoint and state."""
         self._checkpoint()
         self.save()
 
     def save(self) -> None:
-        """Saves the policy, the state and a row of the log, unless nothing was done since the last save."""
+        """Saves the policy, the state and a row of the log, unless no step was done since the last save."""
         if self.model.num_timesteps == self._saved:
             return
         model, elapsed = self.model, max(time.monotonic() - self._started, 1e-9)
@@ -293,7 +301,7 @@ class _RunRecorder(BaseCallback):
             *(model.num_timesteps, f"{self.wall:.1f}", model._n_updates),
             f"{(model.num_timesteps - self._first) / elapsed:.2f}",
             f"{(model._n_updates - self._first_updates) / elapsed:.2f}",
-            round(resident_memory() / 2**20),
+            round(runtime.resident_memory() / 2**20),
             *(f"{logged.get(f'train/{name}', float('nan')):.4g}" for name in ("ent_coef", "value")),
         )
         _append(self._folder / "log.csv", [row])
@@ -310,15 +318,9 @@ class _RunRecorder(BaseCallback):
 
     def _save_policy(self, folder: Path) -> None:
         c = self._config
-        trained = {
-            "scene": self._scene,
-            "run": self._folder.name,
-            "task": c.task,
-            "observe": c.observe,
-            "lighting": c.lighting,
-            "seed": c.seed,
-            "step": self.model.num_timesteps,
-        }
+        trained: dict[str, Any] = {"scene": self._scene, "run": self._folder.name}
+        trained |= {name: getattr(c, name) for name in ("task", "observe", "lighting", "seed")}
+        trained["step"] = self.model.num_timesteps
         save_policy(folder, c.architecture, c.control, actor_weights(self.model, c.architecture), trained)
 
 
@@ -329,14 +331,70 @@ def _append(path: Path, rows: list[tuple]) -> None:
 
 
 def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
-    """Creates a table, or drops its rows after `steps`; returns the successes of the kept episodes from the start."""
+    """Creates a table, or drops its rows after `steps`.
+
+    Returns the success of the kept episodes that started at the segment's beginning; empty for a table without success.
+    """
     rows: list[list[str]] = []
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
-            # The last line may be cut if the training was killed.
+            # A killed training may leave the last line incomplete.
             rows = [row for row in list(csv.reader(file))[1:] if len(row) == len(columns) and int(row[0]) <= steps]
     write_text(path, csv_text(columns, rows))
     if "success" not in columns:
         return []
     success, start = columns.index("success"), columns.index("start_m")
     return [row[success] == "1" for row in rows if float(row[start]) == 0.0]
+
+
+# ---- selection of a checkpoint
+
+
+def select_checkpoint(twin: Twin, folder: Path, config: TrainConfig, processes: int | None = None) -> dict[str, Any]:
+    """Selects the best policy of a finished training as the run's; keeps an earlier selection of the same training.
+
+    *Candidates* are policies saved in the second half of the training. All drive the same `config.trials` whole
+    episodes, with the training's lighting and randomization and without exploration. The one with most successes is
+    selected, among equals the one with the highest mean reward. The best of several is partly lucky, so its reported
+    rate comes from fresh episodes.
+
+    Returns:
+        The content of `choice.json`: steps of the training; step, trials, successes and mean reward of every candidate,
+        and of the selected one on fresh episodes.
+    """
+    trained = saved_steps(folder / "state")
+    if (folder / CHOICE_FILE).exists():
+        with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is selected again"):
+            before = read_json(folder / CHOICE_FILE)
+            if before["steps"] == trained:
+                _ = [before["chosen"][name] + 0 for name in ("step", "trials", "successes")]  # raises if damaged
+                return before
+    candidates = _candidates(folder / "checkpoints", trained)
+    samples = np.random.SeedSequence([config.seed, _SELECTION_STREAM]).generate_state(config.trials + FRESH_EPISODES)
+    seeds = tuple(int(seed) for seed in samples)
+    shared, fresh = seeds[: config.trials], seeds[config.trials :]
+    options = {**config.options(), "start_along": 0.0}
+    results = []
+    bar = runtime.bar("choose", len(candidates) * len(shared) + len(fresh), "episode")
+    with closing(make_vector_env(twin, config.task, options, [None] * config.worlds, processes)) as envs, bar:
+
+        def evaluate(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
+            driven = run_episodes(load_policy(path), envs, which, bar.update)
+            reward = round(float(np.mean([one.reward for one in driven])), 3)
+            won = sum(one.cause == "goal" for one in driven)
+            return {"step": int(path.name), "trials": len(driven), "successes": won, "reward": reward}
+
+        for path in candidates:
+            results.append(evaluate(path, shared))
+        best = max(range(len(results)), key=lambda i: (results[i]["successes"], results[i]["reward"]))
+        last = evaluate(candidates[best], fresh)
+    copy_policy(candidates[best], folder)
+    out = {"steps": trained, "candidates": results, "chosen": last}
+    write_json(folder / CHOICE_FILE, out)
+    return out
+
+
+def _candidates(folder: Path, steps: int) -> list[Path]:
+    """At most `_CANDIDATES` evenly spaced policies of the second half, including the last."""
+    late = sorted(path for path in folder.iterdir() if steps / 2 < int(path.name))
+    return late[:: -max(1, -(-len(late) // _CANDIDATES))][::-1]

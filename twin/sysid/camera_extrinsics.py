@@ -1,11 +1,10 @@
-"""Extrinsics and focal length of the robot's front camera, estimated from a film that it took on the built place.
+"""Extrinsics and focal length of the robot's front camera, estimated from a film that it took in the built place.
 
 `capture/localize.py` localizes the film's frames. The extrinsics are the camera's height above flat ground and its
 rotation from straight ahead: yaw to the left, pitch down, roll to the right. Height, pitch and roll follow from the
 frames' poses relative to a base at rest on the ground below. Yaw follows from the direction of travel: a base that does
-not slide sideways moves along its heading, so its sideways steps must not add up. The forward offset of the
-robot's turning point from the base's origin is estimated together with yaw, because a camera ahead of the turning point
-swings outwards in turns.
+not slide sideways moves along its heading, so its sideways steps must not add up. A camera ahead of the robot's turning
+point swings outwards in turns, so that point's forward offset from the base's origin is estimated together with yaw.
 """
 
 from collections.abc import Callable
@@ -39,7 +38,7 @@ from twin.types import Array, Image
 
 _MIN_FRAMES, _MIN_WAY = 16, 6.0  # frames, [m]
 _PARTS = 8  # consecutive parts of the film for the jackknife
-_NOISE, _OUTLYING = 0.01, 0.03  # [m] standard deviation of a sum of sideways steps; threshold of the robust loss
+_NOISE, _OUTLYING = 0.01, 0.03  # [m] a sum of sideways steps: standard deviation, threshold of the robust loss
 _PIVOT = 0.1  # [m] prior standard deviation of the turning point's forward offset from the base's origin
 _ROUNDS = 3  # alternations of base poses and extrinsics
 _FAR_OFF, _JUMP = 8.0, 3.0  # outliers: multiples of the median deviation, and of the median step
@@ -49,19 +48,15 @@ _AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True)
 class CameraExtrinsics:
-    """Values or standard errors of a camera's extrinsics.
+    """Values or standard errors of a camera's height [m] and angles [°].
 
-    Yaw and pitch absorb an error of the principal point. This is intended, because both shift the image alike.
+    Yaw and pitch absorb an error of the principal point, as intended: both shift the image alike.
     """
 
     height: float
-    """[m]"""
     yaw: float
-    """[°]"""
     pitch: float
-    """[°]"""
     roll: float
-    """[°]"""
 
 
 def estimate_extrinsics(
@@ -72,7 +67,7 @@ def estimate_extrinsics(
     Args:
         camera_to_world: OpenCV axes, in the order of the film [m], shape (n, 4, 4).
         ground_at: Returns the ground's height [m], shape (n,), at points (n, 2).
-        offset: Position of the lens relative to the base's origin, (forward, left) [m].
+        offset: Forward and left position of the lens relative to the base's origin [m].
 
     Raises:
         InputError: too few frames, or too short a path.
@@ -98,16 +93,15 @@ def estimate_extrinsics(
         rest = inlier & (part != k)
         estimates.append((heights[rest].mean(), _yaw(bases, headings, rest), *angles[rest, 1:].mean(0)))
     spread = np.sqrt((_PARTS - 1) * np.var(estimates, axis=0))
-    value = CameraExtrinsics(
-        float(lens[2]) + BASE_HEIGHT, float(np.degrees(yaw)), *np.degrees(angles[inlier, 1:].mean(0)).tolist()
-    )
+    pitch, roll = np.degrees(angles[inlier, 1:].mean(0)).tolist()
+    value = CameraExtrinsics(float(lens[2]) + BASE_HEIGHT, float(np.degrees(yaw)), pitch, roll)
     return value, CameraExtrinsics(float(spread[0]), *np.degrees(spread[1:]).tolist())
 
 
 def camera_pose_on_ground(
     params: HuskyParams, position: Array, heading: float, ground_at: Callable[[Array], Array]
 ) -> Array:
-    """camera_to_world (4, 4), OpenCV axes, of the camera of a robot at rest; camera at x, y (2,) [m], heading [rad]."""
+    """camera_to_world (4, 4), OpenCV axes, of a robot at rest with its camera at x, y (2,) [m] and a heading [rad]."""
     base, rotation = _base_pose(position, heading, ground_at, np.array(params.camera_position))
     pose = np.eye(4)
     pose[:3, :3] = rotation @ params.camera_rotation
@@ -137,8 +131,8 @@ def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
 
     Args:
         bases: x, y of the base [m], shape (n, 2).
-        headings: Of the base if the yaw were zero [rad], shape (n,).
-        use: Frames to use, shape (n,). Gaps and jumps split the path into segments whose steps are summed separately.
+        headings: Of the base for zero yaw [rad], shape (n,).
+        use: Frames to use, shape (n,). Gaps and jumps split the path into segments with separate sums of steps.
     """
     way = np.diff(bases, axis=0)
     length = np.linalg.norm(way, axis=1)
@@ -146,9 +140,9 @@ def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
     segments = [part for part in np.split(np.arange(len(bases)), np.flatnonzero(~connected) + 1) if len(part) > 2]
 
     def sideways(unknown: Array) -> Array:
-        """Sideways drift [m] of the point the robot turns about, `pivot` [m] ahead of the base's origin.
+        """Sideways drift [m] of the point that the robot turns about, `pivot` [m] ahead of the base's origin.
 
-        Summed up to each frame of a segment, minus the segment's mean; the last entry is the prior of `pivot`.
+        Sums of steps up to each frame of a segment, minus the segment's mean; then the prior of `pivot`.
         """
         yaw, pivot = unknown
         heads = headings - yaw
@@ -180,10 +174,7 @@ def _relative_to_base(
 def _base_pose(
     position: Array, heading: float, ground_at: Callable[[Array], Array], lens: Array
 ) -> tuple[Array, Array]:
-    """Pose (origin [m], axes (3, 3)) of a base at rest whose lens is above a world position (2,) [m].
-
-    `lens` (3,) [m] is the lens's position in the base.
-    """
+    """Origin [m] and axes (3, 3) of a base at rest whose lens, at `lens` (3,) [m] in the base, is above a position."""
     rotation = Rotation.from_euler("Z", heading).as_matrix()
     arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # from the ground
     for _ in range(2):  # a tilted base moves its lens sideways
@@ -210,11 +201,11 @@ class CameraCalibration:
     extrinsics: CameraExtrinsics
     standard_errors: CameraExtrinsics
     focal_given: bool
-    """The focal length was given, not estimated."""
+    """False: the focal length is estimated."""
 
     @property
     def summary(self) -> str:
-        """The film's registration in a line."""
+        """A line on the film's registration."""
         found = f"{len(self.registration.frames)} of {self.frames} frames found on the place"
         return f"{found}, median reprojection error {self.registration.error:.2f} px"
 
@@ -226,12 +217,9 @@ class CameraCalibration:
             for name, value in vars(self.extrinsics).items()
         }
         if not self.focal_given:
-            fx, fy, cx, cy = (float(value) for value in self.registration.lens.intrinsics)
-            out["camera_intrinsics"] = (
-                (fx, fy, cx, cy),
-                (self.registration.focal_error, self.registration.focal_error, None, None),
-            )
-            out["camera_size"] = (self.registration.lens.width, self.registration.lens.height), None
+            lens, error = self.registration.lens, self.registration.focal_error
+            out["camera_intrinsics"] = tuple(map(float, lens.intrinsics)), (error, error, None, None)
+            out["camera_size"] = (lens.width, lens.height), None
         return out
 
     def figures(self) -> dict[str, Any]:
@@ -250,11 +238,11 @@ def calibrate_camera(film: Path, scene: SceneDir, params: HuskyParams) -> tuple[
     """Estimates the camera's extrinsics, and its focal length unless given; also returns the film's frames.
 
     Args:
-        film: Undistorted film of the front camera while the robot drives through the scene, mostly straight ahead.
-        params: The robot; its intrinsics, if any, are used.
+        film: Undistorted film of the front camera, while the robot drives through the scene, mostly straight ahead.
+        params: The robot, with given intrinsics or none.
 
     Raises:
-        InputError: a scene that is not built, or a film that does not determine the extrinsics.
+        InputError: the scene is not built, or the film does not determine the extrinsics.
     """
     ground = _ground(scene)
     with runtime.bar("reading the film", 0, "frame") as bar:
@@ -286,17 +274,17 @@ def write_camera_comparison(
     """Writes `camera.png`: frames of the film on the left, renderings of the calibrated camera on the right."""
     field, ground = load_scene(scene.root).field(), _ground(scene)
     some = np.linspace(0, len(calibration.registration.frames) - 1, _PICTURES + 2).round().astype(int)[1:-1]
-    width, height = calibration.registration.lens.width, calibration.registration.lens.height
+    found = calibration.registration
+    width, height = found.lens.width, found.lens.height
     size = min(_WIDTH, width), round(height * min(1.0, _WIDTH / width))
-    lens = PixelCamera(tuple(calibration.registration.lens.intrinsics.tolist()), (width, height)).resized(size)
+    lens = PixelCamera(tuple(found.lens.intrinsics.tolist()), (width, height)).resized(size)
     rows = []
     for k in some:
-        pose = calibration.registration.camera_to_world[k]
+        pose = found.camera_to_world[k]
         heading = float(base_heading(pose, np.deg2rad(calibration.extrinsics.yaw)))
-        here = Viewpoints.of(
-            camera_pose_on_ground(robot, pose[:2, 3], heading, ground.at), np.array(lens.intrinsics), size
-        )
-        filmed = cv2.resize(frames[calibration.registration.frames[k]], size, interpolation=cv2.INTER_AREA)
+        on_ground = camera_pose_on_ground(robot, pose[:2, 3], heading, ground.at)
+        here = Viewpoints.of(on_ground, np.array(lens.intrinsics), size)
+        filmed = cv2.resize(frames[found.frames[k]], size, interpolation=cv2.INTER_AREA)
         rendered = [field.render(here, lighting).rgb[0] for lighting in field.lightings]
         best = max(rendered, key=lambda rgb: psnr(rgb, filmed / np.float32(255.0)))
         rows.append(np.hstack([filmed, (np.clip(best, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)]))
@@ -304,14 +292,14 @@ def write_camera_comparison(
 
 
 def _ground(scene: SceneDir) -> Ground:
-    """The ground of a scene. Raises InputError unless it is built up to the mesh."""
+    """The ground of a scene. Raises InputError: not built up to the mesh."""
     for stage in ("metric", "field", "mesh"):
         require_stage(scene, stage)
     return Ground.load(scene.stage("mesh"))
 
 
 def _given_lens(params: HuskyParams, size: tuple[int, int]) -> Lens | None:
-    """The lens of the robot, scaled to the film's size; None if its intrinsics are not given."""
+    """The robot's lens at the film's size; None without given intrinsics."""
     if not params.camera_intrinsics:
         return None
     if not same_aspect(size, params.camera().size):

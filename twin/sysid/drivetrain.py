@@ -1,63 +1,47 @@
 """Drivetrain model: wheel speeds that result from commands, by the robot's controller and servos, fitted to a log.
 
-The model follows the rules of `twin.env.controller`, for many windows at once and smooth in its parameters:
-acceleration limits act as ramps instead of steps every 0.1 s (on average the controller's delay to its next period and
-its step ahead cancel). *Mean* and *half* speed are the mean of the two sides and half their difference [rad/s at the
-wheels]. Wheel commands may be in units of another robot (DRIVE's assume wheels of 0.3 m under a Husky), so they have a
-gain for the mean and one for the half speed. With commands v and ω the first is 1 and the second is the controller's
-separation multiplier.
+The model applies the limits of `twin.env.controller` to many windows at once, every 0.01 s instead of every 0.1 s, so
+that it is smooth in its parameters. (On average the controller's wait for its next period and its step ahead cancel.)
+*Mean* and *half* speed are the mean of the two sides and half their difference [rad/s at the wheels]. Wheel commands
+may be in units of another robot (DRIVE's assume wheels of 0.3 m under a Husky), so they have a gain for the mean and
+one for the half speed. For commands v and ω the first is 1, the second the controller's separation multiplier.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from twin.env.controller import limit_change, limit_sides
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 from twin.sysid.estimation import Fit, Kinds, Parameter, fit_parameters, negative_log_likelihood
 from twin.sysid.logs import PERIOD, SAMPLES, Windows
 from twin.types import Array
 
 CONTROL_STEP = 0.01  # [s] of the simulation
-HISTORY_SAMPLES = 20  # samples of the previous window from which delayed commands are taken
 EXTRA_SAMPLES = 5  # samples beyond a window's end, for poses measured later than logged
 
+_HISTORY = 20  # samples of the previous window from which delayed commands are taken
 _CHAIN = 3  # previous windows over which a ramp is simulated: six seconds
 _PER_SAMPLE = round(PERIOD / CONTROL_STEP)
-_CURES = {
-    "mean_gain": "driving straight at several speeds",
-    "half_gain": "turns of several strengths",
-    "half_limit": "turns on the spot at full command",
-    "wheel_limit": "full speed and a turn at once",
-    "latency": "sudden changes of command",
-    "mean_acceleration": "sudden starts and stops",
-    "half_acceleration": "sudden turns at full command",
-    "lag": "sudden changes of command",
-}
 _SIDES: Kinds = (0, 0)  # residuals of the left and the right wheels [rad/s]
 
 
 @dataclass(frozen=True)
 class Drivetrain:
-    """Parameters of the controller and the servos, in the wheels' units."""
+    """Parameters of the controller and the servos: limits [rad/s], accelerations [rad/s²], latency and lag [s]."""
 
     mean_gain: float
     half_gain: float
     half_limit: float
-    """[rad/s]"""
     wheel_limit: float
-    """[rad/s]; above it both sides are scaled down alike."""
     latency: float
-    """[s]"""
     mean_acceleration: float
-    """[rad/s²]"""
     half_acceleration: float
-    """[rad/s²]"""
     lag: float
-    """[s]"""
 
     @staticmethod
     def from_robot(params: HuskyParams, twist: bool) -> "Drivetrain":
-        """The drivetrain of a robot; `twist`: its commands are v and ω, else wheel speeds."""
+        """The drivetrain of a robot; commands are v and ω if `twist`, else wheel speeds."""
         half = params.separation_multiplier * TRACK / 2 / WHEEL_RADIUS
         return Drivetrain(
             1.0,
@@ -71,7 +55,7 @@ class Drivetrain:
         )
 
     def robot_fields(self, params: HuskyParams, twist: bool) -> dict[str, float]:
-        """The same as fields of `HuskyParams`; with wheel commands, `params` gives the separation multiplier."""
+        """Its fields of `HuskyParams`; for wheel commands the separation multiplier is that of `params`."""
         multiplier = self.half_gain if twist else params.separation_multiplier
         half = multiplier * TRACK / 2 / WHEEL_RADIUS
         return {
@@ -85,41 +69,32 @@ class Drivetrain:
         }
 
 
-def commanded_speeds(windows: Windows) -> Array:
-    """Commanded mean and half speed before gains [rad/s], shape (n, k, 2)."""
-    a, b = windows.commands[..., 0], windows.commands[..., 1]
-    if windows.twist:
-        return np.stack([a, b * TRACK / 2], -1) / WHEEL_RADIUS
-    return np.stack([a + b, b - a], -1) / 2
-
-
 def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array, Array]:
-    """Servo targets and the wheel speeds that result from them, starting from each window's first wheel speeds.
+    """Servo targets and the resulting wheel speeds, starting from each window's first wheel speeds.
 
-    A window that follows others starts with their delayed commands and with the state of their acceleration ramps,
-    which lagging wheels do not show. In other windows the wheels keep their speed until the first command arrives.
+    A window that follows others starts with their delayed commands and the state of their acceleration ramps, which
+    lagging wheels do not show. In other windows the wheels keep their speed until the first command arrives.
 
     Returns:
         Targets and lagged wheel speeds, left and right [rad/s], each of shape (n, (k + EXTRA_SAMPLES) · 5, 2),
         `CONTROL_STEP` [s] apart.
     """
     gains = np.array([drivetrain.mean_gain, drivetrain.half_gain])
-    commanded = commanded_speeds(windows) * gains
+    commanded = windows.commanded_speeds * gains
     commanded[..., 1] = np.clip(commanded[..., 1], -drivetrain.half_limit, drivetrain.half_limit)
     speed = windows.wheels[:, 0]
     start = np.stack([speed.mean(1), (speed[:, 1] - speed[:, 0]) / 2], -1)
-    before = np.repeat(start[:, None], HISTORY_SAMPLES, 1)
+    before = np.repeat(start[:, None], _HISTORY, 1)
     follows = np.flatnonzero(windows.follows)
-    before[follows] = commanded[follows - 1, -HISTORY_SAMPLES:]
-    commanded = np.concatenate([before, commanded, np.repeat(commanded[:, -1:], EXTRA_SAMPLES, 1)], 1).repeat(
-        _PER_SAMPLE, 1
-    )
-    delay = min(drivetrain.latency / CONTROL_STEP, HISTORY_SAMPLES * _PER_SAMPLE - 1.0)
+    before[follows] = commanded[follows - 1, -_HISTORY:]
+    after = np.repeat(commanded[:, -1:], EXTRA_SAMPLES, 1)
+    commanded = np.concatenate([before, commanded, after], 1).repeat(_PER_SAMPLE, 1)
+    delay = min(drivetrain.latency / CONTROL_STEP, _HISTORY * _PER_SAMPLE - 1.0)
     whole = int(delay)
     share = delay - whole
 
     def delayed_by(steps: int) -> tuple[Array, Array]:
-        arrived = commanded[:, HISTORY_SAMPLES * _PER_SAMPLE - steps :]
+        arrived = commanded[:, _HISTORY * _PER_SAMPLE - steps :]
         begin = start
         for _ in range(_CHAIN):
             ended = _ramped(drivetrain, arrived, begin)[:, SAMPLES * _PER_SAMPLE - 1]
@@ -127,7 +102,7 @@ def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array
             begin[follows] = ended[follows - 1]
         return _wheel_speeds(drivetrain, _ramped(drivetrain, arrived, begin), speed)
 
-    # Ramps are not linear in their input, so the result is interpolated between two whole delays, not the commands.
+    # The results of two whole delays are interpolated, not the commands, as ramps are not linear in their input.
     one, other = delayed_by(whole), delayed_by(whole + 1)
     return (1 - share) * one[0] + share * other[0], (1 - share) * one[1] + share * other[1]
 
@@ -137,18 +112,17 @@ def _ramped(drivetrain: Drivetrain, commanded: Array, now: Array) -> Array:
     limit = np.array([drivetrain.mean_acceleration, drivetrain.half_acceleration]) * CONTROL_STEP
     out = np.empty((len(commanded), (SAMPLES + EXTRA_SAMPLES) * _PER_SAMPLE, 2))
     for i in range(out.shape[1]):
-        now = now + np.clip(commanded[:, i] - now, -limit, limit)
-        out[:, i] = now
+        out[:, i] = now = limit_change(commanded[:, i], now, limit)
     return out
 
 
 def _wheel_speeds(drivetrain: Drivetrain, ramped: Array, speed: Array) -> tuple[Array, Array]:
-    """Servo targets for these mean and half speeds, and the wheel speeds that lag behind them, starting from `speed`.
+    """Servo targets for mean and half speeds (n, steps, 2), and the wheel speeds that lag behind them from `speed` on.
 
-    Shapes (n, steps, 2), left and right [rad/s].
+    Both are left and right [rad/s], shape (n, steps, 2).
     """
-    targets = np.stack([ramped[..., 0] - ramped[..., 1], ramped[..., 0] + ramped[..., 1]], -1)
-    targets /= np.maximum(1.0, np.abs(targets).max(-1, keepdims=True) / drivetrain.wheel_limit)
+    sides = np.stack([ramped[..., 0] - ramped[..., 1], ramped[..., 0] + ramped[..., 1]], -1)
+    targets = limit_sides(sides, drivetrain.wheel_limit)
     decay = 1 - np.exp(-CONTROL_STEP / max(drivetrain.lag, 1e-6))
     lagged = np.empty_like(targets)
     for i in range(targets.shape[1]):
@@ -163,18 +137,13 @@ def at_samples(fine: Array) -> Array:
 
 
 def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, Fit]:
-    """Fits the drivetrain to a log's wheel speeds; parameters that are not identified keep the robot's values.
-
-    Args:
-        windows: All of a log; those for fitting are used.
-        params: The robot that gives the defaults.
-    """
+    """Fits the drivetrain to a log's wheel speeds; parameters that are not identified keep the values of `params`."""
     default = Drivetrain.from_robot(params, windows.twist)
     fitting = windows.fitting
     measured = windows.wheels[fitting]
-    commanded = np.abs(commanded_speeds(windows)[fitting, -1])
+    commanded = np.abs(windows.commanded_speeds[fitting, -1])
     half = np.abs(measured[..., 1] - measured[..., 0]) / 2
-    # Gains start from the wheels' final speeds, limits from their highest.
+    # Gains start from final wheel speeds, limits from the highest.
     start = {
         "mean_gain": 1.0 if windows.twist else _gain(commanded[:, 0], np.abs(measured[:, -1].mean(1))),
         "half_gain": _gain(commanded[:, 1], half[:, -1]),
@@ -187,31 +156,28 @@ def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, F
     }
 
     def residuals(values: dict[str, float]) -> Array:
-        drivetrain = Drivetrain(**(vars(default) | values))
-        return (at_samples(simulate_drivetrain(drivetrain, windows)[1]) - windows.wheels)[fitting]
+        lagged = simulate_drivetrain(replace(default, **values), windows)[1]
+        return (at_samples(lagged) - windows.wheels)[fitting]
 
-    # Accelerations hardly matter at a wrong latency, so the search starts at the best of several pairs.
+    # At a wrong latency accelerations hardly matter, so the search starts at the best of several pairs.
     tries = [start | {"latency": t, "half_acceleration": a} for t in (0.05, 0.15, 0.25, 0.4) for a in (3.0, 8.0, 30.0)]
     start = min(tries, key=lambda values: negative_log_likelihood(residuals(values), _SIDES))
-    priors = {  # standard deviation, lowest, highest value, unit
-        "mean_gain": (0.05 * start["mean_gain"], 0.05, 20.0, ""),
-        "half_gain": (0.1 * start["half_gain"], 0.02, 20.0, ""),
-        "half_limit": (0.3, 0.2, 40.0, "rad/s"),
-        "wheel_limit": (0.3, 0.5, 30.0, "rad/s"),
-        "latency": (0.05, 0.0, 0.9, "s"),
-        "mean_acceleration": (5.0, 0.5, 200.0, "rad/s²"),
-        "half_acceleration": (3.0, 0.5, 200.0, "rad/s²"),
-        "lag": (0.05, 0.0, 1.0, "s"),
-    }
-    if windows.twist:
-        del priors["mean_gain"]
-    defaults = vars(default)
     table = [
-        Parameter(name, None, std, low, high, defaults[name], unit, _CURES[name])
-        for name, (std, low, high, unit) in priors.items()
+        Parameter(name, None, std, low, high, getattr(default, name), unit, cure)
+        for name, std, low, high, unit, cure in (
+            ("mean_gain", 0.05 * start["mean_gain"], 0.05, 20.0, "", "driving straight at several speeds"),
+            ("half_gain", 0.1 * start["half_gain"], 0.02, 20.0, "", "turns of several strengths"),
+            ("half_limit", 0.3, 0.2, 40.0, "rad/s", "turns on the spot at full command"),
+            ("wheel_limit", 0.3, 0.5, 30.0, "rad/s", "full speed and a turn at once"),
+            ("latency", 0.05, 0.0, 0.9, "s", "sudden changes of command"),
+            ("mean_acceleration", 5.0, 0.5, 200.0, "rad/s²", "sudden starts and stops"),
+            ("half_acceleration", 3.0, 0.5, 200.0, "rad/s²", "sudden turns at full command"),
+            ("lag", 0.05, 0.0, 1.0, "s", "sudden changes of command"),
+        )
+        if not (windows.twist and name == "mean_gain")
     ]
     found = fit_parameters(table, residuals, _SIDES, windows.groups[fitting], start)
-    return Drivetrain(**(defaults | found.values)), found
+    return replace(default, **found.values), found
 
 
 def _gain(x: Array, y: Array) -> float:

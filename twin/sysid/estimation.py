@@ -1,9 +1,8 @@
 """Robust maximum a posteriori estimation with standard errors; unidentified parameters keep their defaults.
 
-A *parameter* has a prior: a normal distribution of mean `prior_mean` and standard deviation `prior_std`. The residuals
-of a window follow a multivariate Student's t distribution (below). A parameter is *identified* if, with all others
-free, its standard error is at most `MAX_ERROR_SHARE` of its prior's. As long as some are not, the least certain one is
-fixed at its default, and the rest is evaluated and fitted again.
+A *parameter* has a normal prior; the residuals of a window follow a multivariate Student's t distribution (below). A
+parameter is *identified* if, with all others free, its standard error is at most `_MAX_ERROR_SHARE` of its prior's
+standard deviation. While some are not, the least certain one is fixed at its default and the rest is fitted again.
 """
 
 from collections.abc import Callable
@@ -17,15 +16,15 @@ from twin.types import Array
 
 # ---- Student's t residuals
 #
-# Heavy tails, because a robot that is stuck for two seconds has residuals a hundred times as large as usual; with
-# squares such windows would decide a fit. The residuals (predicted minus measured) of a window follow a multivariate t
-# distribution (Lange, Little and Taylor 1989). For c components of scale σ its −2 log-likelihood is, up to a constant,
+# A robot that is stuck for two seconds has residuals a hundred times as large as usual, which would decide a fit by
+# squares. So the residuals (predicted minus measured) of a window follow a heavy-tailed multivariate t distribution
+# (Lange, Little and Taylor 1989). For c components of scale σ its −2 log-likelihood is, up to a constant,
 #
 #     2 Σ log σ + (ν + c) log(1 + s),    s = Σ (residual / σ)² / ν    (mean over the window's evaluated instants)
 #
-# with ν = `DEGREES_OF_FREEDOM`. Components of one *kind*, such as x and y, share their scale. Scales are estimated by
-# maximum likelihood from the residuals, in alternation with the model; both steps increase the likelihood. *Scaled*
-# residuals are in units of σ √ν.
+# with ν = `DEGREES_OF_FREEDOM`. Components of one *kind*, such as x and y, share their scale. Scales of maximum
+# likelihood are estimated in alternation with the model; both steps increase the likelihood. *Scaled* residuals are in
+# units of σ √ν.
 
 
 Kinds = tuple[int, ...]
@@ -35,18 +34,18 @@ DEGREES_OF_FREEDOM = 3.0  # fitted to a log (DRIVE's) it came to 2.6 to 3.2
 
 _MIN_SCALE = 1e-3  # in units of the residuals: no log resolves millimetres, milliradians, or as much per second
 _ROUNDS, _SETTLED = 10, 0.05  # most alternations of scales and model; relative change at which scales have converged
-_ITERATIONS, _CLOSE = 500, 1e-4  # the same of expectation maximisation
+_ITERATIONS, _CLOSE = 500, 1e-4  # the same for expectation maximization
 
 
 def residual_scale(residuals: Array, kinds: Kinds) -> Array:
     """Maximum-likelihood scales σ √ν, shape (c,), of residuals (n, instants, c); σ is at least `_MIN_SCALE`.
 
-    Where more than ν / (ν + c) of the windows have next to no residuals, those alone determine the scale.
+    If more than ν / (ν + c) of the windows have nearly no residuals, those alone determine the scale.
     """
     kind = np.asarray(kinds)
     of_kind = [residuals[..., kind == k] for k in range(kind.max() + 1)]
     scale = np.array([max(float(np.median(np.abs(r))), _MIN_SCALE) for r in of_kind])
-    for _ in range(_ITERATIONS):  # expectation maximisation with the step of Kent, Tyler and Vardi (1994)
+    for _ in range(_ITERATIONS):  # expectation maximization with the step of Kent, Tyler and Vardi (1994)
         weight = 1 / (1 + _squared_norm(residuals / (scale[kind] * np.sqrt(DEGREES_OF_FREEDOM))))
         square = [(weight * (r**2).mean((1, 2))).sum() / weight.sum() for r in of_kind]
         before, scale = scale, np.maximum(np.sqrt(square), _MIN_SCALE)
@@ -68,8 +67,8 @@ def fit_with_scales(
     """Fits a model and the scales of its residuals in alternation until the scales have converged.
 
     Args:
-        residuals: Of a model, shape (n, instants, c).
-        solve: Returns the best model, given a model to start from and the scales (c,).
+        residuals: Returns a model's, shape (n, instants, c).
+        solve: Returns the best model, from an initial one and the scales (c,).
     """
     scale = residual_scale(residuals(start), kinds)
     for _ in range(_ROUNDS):
@@ -86,20 +85,16 @@ def robust_loss(scaled: Array) -> Array:
 
 
 def robust_jacobian(scaled: Array, jacobian: Array) -> Array:
-    """Approximate Jacobian of `robust_loss(scaled)` for a least-squares solver; the gradient it gives is exact.
+    """Approximate Jacobian of `robust_loss(scaled)` for least squares, from that of `scaled` (n, instants, c, p).
 
-    It leaves out the part along the residuals, which Gauss-Newton does not need and finite differences get wrong.
-
-    Args:
-        scaled: Shape (n, instants, c).
-        jacobian: Of `scaled`, shape (n, instants, c, p).
+    The gradient is exact. The part along the residuals is left out: Gauss-Newton does not need it.
     """
     norm = _squared_norm(scaled)
     return jacobian * _per_window(1 / (1 + norm) / _loss_factor(norm) / np.sqrt(scaled.shape[1]), jacobian)
 
 
 def apply_weights(scaled: Array, values: Array) -> Array:
-    """Values (n, ...) times the root of their window's weight 1 / (1 + s) in iteratively reweighted least squares."""
+    """Values (n, ...) times the root of their window's weight in iteratively reweighted least squares, 1 / (1 + s)."""
     return values * _per_window(1 / np.sqrt((1 + _squared_norm(scaled)) * scaled.shape[1]), values)
 
 
@@ -119,13 +114,11 @@ def _per_window(factor: Array, like: Array) -> Array:
 
 # ---- maximum a posteriori estimation
 
-MAX_ERROR_SHARE = 0.5
-"""Largest standard error of an identified parameter, as a fraction of its prior's standard deviation."""
-
-_MIN_CURVATURE = 0.1  # fraction of the squares' curvature; where noise dominates, so does the difference of the two
+_MAX_ERROR_SHARE = 0.5  # largest standard error of an identified parameter, in prior standard deviations
+_MIN_CURVATURE = 0.1  # of the curvature of the squares, see `_inverse_curvature`
 _STEP = 0.05  # of finite differences, in prior standard deviations
-_NATS = 0.02  # of likelihood; a search ends where a step gains less: a fifth of a standard error in one direction
-_EVALUATIONS = 50  # most evaluations per round of the search, besides one per free parameter for every Jacobian
+_NATS = 0.02  # of likelihood; a search ends when a step gains less: a fifth of a standard error in one direction
+_EVALUATIONS = 50  # most evaluations per round of the search, without those of the Jacobians
 
 
 @dataclass(frozen=True)
@@ -136,11 +129,11 @@ class Parameter:
     prior_mean: float | None
     """None: no prior."""
     prior_std: float
-    """Without a prior, twice the standard error at which the parameter counts as identified."""
+    """Without a prior: twice the largest standard error with which the parameter counts as identified."""
     low: float
     high: float
     default: float
-    """Its value if the log does not identify it."""
+    """Value if it is not identified."""
     unit: str
     cure: str = "a log that uses the full range of speeds and turns"
     """The kind of log that would identify it."""
@@ -148,13 +141,13 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of `fit_parameters`; parameters without an entry in `errors` have their default values."""
+    """Result of `fit_parameters`."""
 
     values: dict[str, float]
     errors: dict[str, float]
-    """Standard errors of the identified parameters."""
+    """Standard errors of the identified parameters; the others have their defaults."""
     refused: dict[str, str]
-    """One line per parameter that is not identified: its default, its standard error and the cure."""
+    """A line per parameter that is not identified: its default, its standard error and the cure."""
     negative_log_likelihood: float
 
 
@@ -169,19 +162,17 @@ def maximize_posterior(
     """The most probable value of every parameter, identified or not.
 
     Args:
-        residuals: Of every window, given values by name, shape (n, instants, c).
+        residuals: Returns those of every window for values by name, shape (n, instants, c).
         reach: Scale of the first step in prior standard deviations; smaller near the solution. A step is at most
             √(reach · distance to the bound).
     """
-    # Solved in units of `reach` prior standard deviations from the start, so that SciPy's first step and its tolerances
-    # mean the same for every parameter.
-    low, high = (np.array([getattr(p, of) for p in table]) for of in ("low", "high"))
-    scales = reach * np.array([p.prior_std for p in table])
+    # In units of `reach` prior standard deviations from the start, SciPy's first step and tolerances have the same
+    # meaning for every parameter.
+    low, high, stds = (np.array([getattr(p, of) for p in table]) for of in ("low", "high", "prior_std"))
+    scales = reach * stds
     residuals = _cached(residuals)
     prior_mean = np.array([p.prior_mean or 0.0 for p in table])
-    prior_factor = np.array(
-        [0.0 if p.prior_mean is None else np.sqrt(_prior_weight(kinds)) / p.prior_std for p in table]
-    )
+    prior_factor = np.sqrt(_prior_weights(table, kinds)) / stds
     origin = np.clip([start[p.name] for p in table], low + 1e-6 * scales, high - 1e-6 * scales)
 
     def at(z: Array) -> dict[str, float]:
@@ -201,7 +192,7 @@ def maximize_posterior(
 
         bounds = (low - origin) / scales - begin, (high - origin) / scales - begin
         z = np.zeros(len(table))  # SciPy's first step is as long as its starting point is far from zero
-        cost = float((losses(z) ** 2).sum()) / 2  # which SciPy minimises
+        cost = float((losses(z) ** 2).sum()) / 2  # as SciPy defines it
         tolerance = min(1e-3, _NATS / ((DEGREES_OF_FREEDOM + len(kinds)) * max(cost, 1e-9)))
         return begin + least_squares(losses, z, jacobian, bounds, ftol=tolerance, xtol=1e-3, max_nfev=_EVALUATIONS).x
 
@@ -217,10 +208,9 @@ def fit_parameters(
     reach: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
-    """Fits the parameters that the data identify; the others keep their defaults.
+    """Fits the parameters that the data identify; the others keep their defaults. Arguments as `maximize_posterior`.
 
-    Args:
-        groups: Of the windows, shape (n,). Residuals of one group may depend on each other.
+    `groups` (n,) are those of the windows; residuals within one may be correlated.
     """
     free = list(table)
     values = {p.name: start[p.name] for p in table}
@@ -230,7 +220,7 @@ def fit_parameters(
     def at(some: dict[str, float]) -> Array:
         return residuals(values | some)
 
-    while True:  # terminates: each round has fewer free parameters
+    while True:  # each round has fewer free parameters
         if free:
             progress(f"fitting {', '.join(p.name for p in free)}")
             values |= maximize_posterior(free, at, kinds, values, reach, progress)
@@ -240,17 +230,18 @@ def fit_parameters(
         count = len(free)
         while True:  # drop the least certain parameter until all are identified
             stds = np.array([p.prior_std for p in free])
-            weights = np.array([0.0 if p.prior_mean is None else _prior_weight(kinds) for p in free])
-            errors = _standard_errors(slopes, now / scale, groups, stds, weights)
+            errors = _standard_errors(slopes, now / scale, groups, stds, _prior_weights(free, kinds))
             worst = int(np.argmax(errors / stds)) if free else -1
-            if worst < 0 or errors[worst] <= MAX_ERROR_SHARE * stds[worst]:
+            if worst < 0 or errors[worst] <= _MAX_ERROR_SHARE * stds[worst]:
                 break
             p = free.pop(worst)
             values[p.name] = p.default
+            error = (
+                f"{errors[worst]:.3g}" if np.isfinite(errors[worst]) else "unbounded (the log does not depend on it)"
+            )
             refused[p.name] = (
                 f"{p.name} = {p.default:.4g} {p.unit}".rstrip()
-                + f": standard error {_error_text(errors[worst])}, expected at most "
-                + f"{MAX_ERROR_SHARE * p.prior_std:.3g}; needs {p.cure}"
+                + f": standard error {error}, expected at most {_MAX_ERROR_SHARE * p.prior_std:.3g}; needs {p.cure}"
             )
             slopes = np.delete(slopes, worst, -1)
         if len(free) == count:
@@ -258,16 +249,13 @@ def fit_parameters(
             return Fit(values, found, refused, negative_log_likelihood(now, kinds))
 
 
-def _prior_weight(kinds: Kinds) -> float:
-    """Weight of (value − mean)² / std² of a prior against log(1 + s) of a window."""
-    return 1 / (DEGREES_OF_FREEDOM + len(kinds))
+def _prior_weights(table: list[Parameter], kinds: Kinds) -> Array:
+    """Weights (p,) of the priors' (value − mean)² / std² relative to log(1 + s) of a window; 0 without a prior."""
+    return np.array([0.0 if p.prior_mean is None else 1 / (DEGREES_OF_FREEDOM + len(kinds)) for p in table])
 
 
 def _cached(residuals: Callable[[dict[str, float]], Array]) -> Callable[[dict[str, float]], Array]:
-    """The same function with a cache of the newest 4 (p + 1) results.
-
-    Standard errors reuse the residuals and the Jacobian with which the search ended.
-    """
+    """The same function with a cache of the newest 4 (p + 1) results, as standard errors reuse the search's last."""
     seen: dict[tuple[float, ...], Array] = {}
 
     def at(values: dict[str, float]) -> Array:
@@ -295,15 +283,15 @@ def _jacobian(
 def _standard_errors(jacobian: Array, scaled: Array, groups: NDArray[np.int64], stds: Array, weights: Array) -> Array:
     """Standard errors of the parameters, shape (p,); infinite where the data contain no information.
 
-    They are cluster-robust (Liang and Zeger 1986): residuals within a group may be correlated in any way. Where errors
-    that treat windows as independent are larger, as they can be with few groups, those are returned.
+    They are cluster-robust (Liang and Zeger 1986): residuals within a group may be correlated in any way. With few
+    groups, errors that treat windows as independent can be larger; the larger ones are returned.
 
     Args:
         jacobian: Of the scaled residuals, shape (n, instants, c, p).
-        scaled: Shape (n, instants, c).
-        groups: Shape (n,).
+        scaled: Scaled residuals, shape (n, instants, c).
+        groups: Of the windows, shape (n,).
         stds: Standard deviations of the priors, shape (p,).
-        weights: Of the priors, 0 without one, shape (p,).
+        weights: Weights of the priors, shape (p,).
     """
     if not jacobian.shape[-1]:
         return np.zeros(0)
@@ -336,12 +324,9 @@ def _inverse_curvature(information: Array, score: Array) -> Array:
     """Inverse of the curvature of the objective, shape (p, p).
 
     log(1 + s) has less curvature than the squares that replace it in a step, by twice the squared score of a window.
+    Where noise dominates the difference, `_MIN_CURVATURE` of the squares' remains.
     """
     root = np.linalg.inv(np.linalg.cholesky(information))
     less, axes = np.linalg.eigh(2 * root @ score.T @ score @ root.T)
     half = axes.T @ root
     return half.T @ (half / np.maximum(1 - less, _MIN_CURVATURE)[:, None])
-
-
-def _error_text(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "unbounded (the log does not depend on it)"

@@ -1,7 +1,7 @@
 """System identification of a robot from a log, and the text of `robot.toml`.
 
-`robot.toml` has a line with value and standard error for each identified field, after the fields that it had before;
-all others keep their published values or those of `scene.toml`. `align.json` has all numbers.
+`robot.toml` has a line with value and standard error for each identified field, after its previous fields; the others
+have their published values or those of `scene.toml`. `align.json` has all numbers.
 """
 
 from collections.abc import Callable
@@ -16,19 +16,18 @@ from twin.robot import HuskyParams
 from twin.sysid import rollout, tires
 from twin.sysid.drivetrain import Drivetrain, fit_drivetrain
 from twin.sysid.estimation import Fit
-from twin.sysid.kinematics import NOMINAL, IcrModel, Prediction, fit_icr, predict
+from twin.sysid.kinematics import NOMINAL, IcrModel, Prediction, fit_icr, predict, steady_windows, track_ratios
 from twin.sysid.logs import Windows
-from twin.sysid.plots import steady_windows, track_ratios
 from twin.types import Array
 
-_DRIVE_FIELDS = {  # field of HuskyParams → parameter of the drivetrain that determines it
-    "separation_multiplier": ("half_gain",),
-    "max_yaw_rate": ("half_limit",),
-    "max_wheel_speed": ("wheel_limit",),
-    "command_latency": ("latency",),
-    "max_acceleration": ("mean_acceleration",),
-    "max_yaw_acceleration": ("half_acceleration",),
-    "servo_lag": ("lag",),
+_DRIVE_FIELDS = {  # field of HuskyParams → parameter of the drivetrain, to which it is proportional
+    "separation_multiplier": "half_gain",
+    "max_yaw_rate": "half_limit",
+    "max_wheel_speed": "wheel_limit",
+    "command_latency": "latency",
+    "max_acceleration": "mean_acceleration",
+    "max_yaw_acceleration": "half_acceleration",
+    "servo_lag": "lag",
 }
 _GROUND_FIELDS = {  # field of HuskyParams → parameters of `tires`
     "friction": ("friction",),
@@ -63,17 +62,16 @@ class Identification:
     def identified(self) -> dict[str, tuple[float | tuple[float, ...], float | tuple[float | None, ...]]]:
         """Identified fields of HuskyParams: value and standard error, each a number or a tuple.
 
-        Errors of yaw rate and yaw acceleration hold at the fitted separation multiplier. In a tuple of errors, None
-        marks components that are not identified.
+        Errors of yaw rate and yaw acceleration hold at the fitted separation multiplier. The error of a component that
+        is not identified is None.
         """
         out: dict[str, tuple[Any, Any]] = {}
         twist = self.windows.twist
         here = self.drivetrain.robot_fields(self.robot, twist)
-        for field, (name,) in _DRIVE_FIELDS.items():
-            if name in self.drive_fit.errors and (twist or field != "separation_multiplier"):
-                # Every field is proportional to its parameter.
-                off = replace(self.drivetrain, **{name: getattr(self.drivetrain, name) + self.drive_fit.errors[name]})
-                out[field] = getattr(self.robot, field), abs(off.robot_fields(self.robot, twist)[field] - here[field])
+        for field in _identified_drive_fields(self.drive_fit, twist):
+            name = _DRIVE_FIELDS[field]
+            off = replace(self.drivetrain, **{name: getattr(self.drivetrain, name) + self.drive_fit.errors[name]})
+            out[field] = getattr(self.robot, field), abs(off.robot_fields(self.robot, twist)[field] - here[field])
         for field, names in _GROUND_FIELDS.items():
             errors: list[Any] = [self.ground_fit.errors.get(name) for name in names]
             if all(error is None for error in errors):
@@ -88,7 +86,7 @@ class Identification:
 
     @property
     def refused(self) -> list[str]:
-        """One line per parameter that the log does not identify."""
+        """A line per parameter that the log does not identify."""
         lines = [*self.drive_fit.refused.values(), *self.ground_fit.refused.values()]
         if not self.windows.twist:
             lines.append(f"separation_multiplier = {self.robot.separation_multiplier:g}: {_NO_TWIST}")
@@ -104,9 +102,9 @@ class Identification:
             "fitted": self.fitted,
             "fitted_on_level_ground": self.level,
         }
-        use = steady_windows(windows)
-        measured_ratios = track_ratios(windows.wheels, windows.poses[:, -1], windows.elapsed[:, -1])[use]
-        fitted_ratios = track_ratios(windows.wheels, self.fitted.ends, windows.elapsed[:, -1])[use]
+        steady = steady_windows(windows)
+        ends = {"measured": windows.poses[:, -1], "fitted": self.fitted.ends}
+        slope = rollout.slope_gravity(windows, self.icr)
         scores = {
             name: {"fitted_to": p.score(fitting).rounded(), "held_out": p.score(scoring).rounded()}
             for name, p in predictions.items()
@@ -119,8 +117,8 @@ class Identification:
                 "position": round(1 - fitted.position_m / baseline.position_m, 4),
                 "yaw": round(1 - fitted.yaw_deg / baseline.yaw_deg, 4),
             },
-            "track_ratio": {"measured": _quantiles(measured_ratios), "fitted": _quantiles(fitted_ratios)},
-            "slope_deg": _quantiles(np.degrees(np.hypot(*self.slope.T) / rollout.GRAVITY)),
+            "track_ratio": {name: _quantiles(track_ratios(windows, end)[steady]) for name, end in ends.items()},
+            "slope_deg": _quantiles(np.degrees(np.hypot(*slope.T) / rollout.GRAVITY)),
             "robot": {
                 name: {"value": _plain(value), "standard_error": _plain(error)}
                 for name, (value, error) in self.identified.items()
@@ -135,10 +133,14 @@ class Identification:
             "refused": self.refused,
         }
 
-    @property
-    def slope(self) -> Array:
-        """Gravity along x and y [m/s²], shape (n, 2); see `rollout.slope_gravity`."""
-        return rollout.slope_gravity(self.windows, self.icr)
+
+def _identified_drive_fields(fit: Fit, twist: bool) -> list[str]:
+    """Fields that the drivetrain's fit identifies; wheel commands bypass the separation multiplier."""
+    return [
+        field
+        for field, name in _DRIVE_FIELDS.items()
+        if name in fit.errors and (twist or field != "separation_multiplier")
+    ]
 
 
 def identify(
@@ -147,9 +149,7 @@ def identify(
     use_slope: bool = True,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Identification:
-    """Fits baseline, drivetrain, tires and ground to the even-numbered groups, then predicts every window.
-
-    Even-numbered groups are the training half of a log; see `logs.py`.
+    """Fits baseline, drivetrain, tires and ground to the windows for fitting, then predicts every window.
 
     Args:
         use_slope: Estimate the slope of the ground from accelerations; False: level ground.
@@ -161,13 +161,9 @@ def identify(
     drivetrain, drive_fit = fit_drivetrain(windows, params)
     slope = rollout.slope_gravity(windows, icr)
     ground_fit = tires.fit_ground(params, drivetrain, windows, slope, progress)
-    robot = tires.robot_with_values(params, ground_fit.values)
-    identified: dict[str, Any] = {
-        field: value
-        for field, value in drivetrain.robot_fields(params, windows.twist).items()
-        if _DRIVE_FIELDS[field][0] in drive_fit.errors and (windows.twist or field != "separation_multiplier")
-    }
-    robot = replace(robot, **identified)
+    fields = drivetrain.robot_fields(params, windows.twist)
+    identified: dict[str, Any] = {f: fields[f] for f in _identified_drive_fields(drive_fit, windows.twist)}
+    robot = replace(tires.robot_with_values(params, ground_fit.values), **identified)
     progress("predicting every window")
 
     def prediction(name: str, gravity: Array) -> Prediction:
@@ -204,24 +200,16 @@ def toml_text(comment: str, previous: dict[str, Any], identified: dict[str, tupl
     """The text of a `robot.toml`.
 
     Args:
-        comment: For the first line; unprintable characters are replaced.
-        previous: Fields of the previous file, by name.
-        identified: Identified fields (value, standard error or None). They replace fields of `previous` with the same
-            name; the rest is appended.
+        comment: The first line; unprintable characters are replaced.
+        previous: Fields of the previous file, kept unless identified.
+        identified: Value and standard error (or None) of identified fields.
     """
-    lines = [
-        "# " + "".join(c if c.isprintable() else "?" for c in comment),
-        *(
-            []
-            if identified
-            else ["# But nothing in it could be identified; the fields below are those of the previous file."]
-        ),
-        *(f"{name} = {_toml(value)}" for name, value in previous.items() if name not in identified),
-        *(
-            f"{name} = {_toml(value)}" + ("" if error is None else f"  # ± {format_error(error)}")
-            for name, (value, error) in identified.items()
-        ),
-    ]
+    lines = ["# " + "".join(c if c.isprintable() else "?" for c in comment)]
+    if not identified:
+        lines.append("# But nothing in it could be identified; the fields below are those of the previous file.")
+    lines += [f"{name} = {_toml(value)}" for name, value in previous.items() if name not in identified]
+    for name, (value, error) in identified.items():
+        lines.append(f"{name} = {_toml(value)}" + ("" if error is None else f"  # ± {format_error(error)}"))
     return "\n".join(lines) + "\n"
 
 
@@ -239,7 +227,7 @@ def _toml(value: Any) -> str:
 
 
 def format_error(error: float | tuple[float | None, ...]) -> str:
-    """A standard error, or those of a tuple's components, as text."""
+    """A standard error, or those of a tuple's components."""
     each = error if isinstance(error, tuple) else (error,)
     return ", ".join("not fitted" if e is None else f"{e:.2g}" for e in each)
 

@@ -1,8 +1,8 @@
-"""Kinematic models of skid steering, the baseline for the fitted model, and the scores of predictions.
+"""Kinematic models of skid steering, the baselines of the fitted model, and the scores of predictions.
 
 *Nominal*: a differential drive whose wheels roll without slip. *ICR model* (Mandow et al. 2007): each side's tread has
-an instantaneous center of rotation at its own lateral offset; with a slip factor per side and a common forward offset
-it has five parameters, fitted with the same robust loss as the MJCF.
+an instantaneous center of rotation at its own lateral offset. It has five parameters, these offsets, a slip factor per
+side and a common forward offset, fitted with the robust loss of the MJCF's fit.
 """
 
 from dataclasses import asdict, dataclass
@@ -22,19 +22,20 @@ POSE_KINDS: Kinds = (0, 0, 1)
 EVALUATED_SAMPLES = (SAMPLES // 2, SAMPLES)
 """Samples of a window at which predicted and measured poses are compared."""
 
+_MIN_DIFFERENCE = 0.25  # [m/s] of the sides; below it the track ratio is noise
+
 
 @dataclass(frozen=True)
 class IcrModel:
-    """The ICR model; the defaults are nominal kinematics."""
+    """The ICR model: slip factors (speed of a side's tread over the ground / circumferential speed of its wheels), and
+    the centers' offsets [m]. The defaults are nominal kinematics.
+    """
 
     slip_left: float = 1.0
     slip_right: float = 1.0
-    """Speed of a side's tread over the ground / circumferential speed of its wheels."""
     y_left: float = TRACK / 2
     y_right: float = -TRACK / 2
-    """[m]"""
     x: float = 0.0
-    """[m]"""
 
     def motion(self, wheels: Array) -> Array:
         """vx, vy [m/s], yaw rate [rad/s], shape (..., 3), for wheel speeds [rad/s], shape (..., 2)."""
@@ -61,20 +62,18 @@ def integrate(motion: Array) -> Array:
 
 
 def predict(model: IcrModel, windows: Windows) -> Array:
-    """Poses since each window's first pose was measured, by measured wheel speeds; the last ones are held.
+    """Poses since the measurement of each window's first one, shape (n, k + MAX_POSE_AGE + 1, 3).
 
-    Shape (n, k + MAX_POSE_AGE + 1, 3).
+    They follow from measured wheel speeds, the last of which are held.
     """
-    before, after = (
-        windows.preceding_wheels[:, -1 - MAX_POSE_AGE : -1],
-        np.repeat(windows.wheels[:, -1:], MAX_POSE_AGE, 1),
-    )
+    before = windows.preceding_wheels[:, -1 - MAX_POSE_AGE : -1]
+    after = np.repeat(windows.wheels[:, -1:], MAX_POSE_AGE, 1)
     poses = integrate(model.motion(np.concatenate([before, windows.wheels, after], 1)))
     return resample_poses(poses, -windows.measurement_times[:, 0], MAX_POSE_AGE)
 
 
 def fit_icr(windows: Windows) -> IcrModel:
-    """The ICR model fitted to the windows for fitting."""
+    """Fits the ICR model to the windows for fitting."""
     start = np.array([1.0, 1.0, 0.5, -0.5, 0.0])
     fitting = windows.fitting
 
@@ -88,7 +87,7 @@ def fit_icr(windows: Windows) -> IcrModel:
 
 
 def interpolate_poses(poses: Array, time: Array) -> Array:
-    """Poses (n, m, 3), `PERIOD` [s] apart, interpolated at one time [s] per window (n,). Shape (n, 3)."""
+    """Poses (n, m, 3), `PERIOD` [s] apart, at one time [s] per window (n,); shape (n, 3)."""
     position = np.clip(time / PERIOD, 0, poses.shape[1] - 1 - 1e-9)
     before = position.astype(int)
     share = (position - before)[:, None]
@@ -110,22 +109,34 @@ def end_errors(predicted: Array, windows: Windows) -> tuple[Array, Array]:
     return np.hypot(error[:, 0], error[:, 1]), np.abs(np.degrees(wrap_angle(error[:, 2])))
 
 
+def track_ratios(windows: Windows, ends: Array) -> Array:
+    """Track ratio chi of each window, effective over geometric track, shape (n,), from poses at its end (n, 3)."""
+    difference = (windows.wheels[..., 1] - windows.wheels[..., 0]).mean(1) * WHEEL_RADIUS
+    turned = np.where(np.abs(ends[:, 2]) < 1e-6, np.nan, ends[:, 2])
+    return difference * windows.elapsed[:, -1] / (TRACK * turned)
+
+
+def steady_windows(windows: Windows) -> NDArray[np.bool_]:
+    """Windows whose sides turn at different constant speeds, for which chi is defined, shape (n,)."""
+    sides = windows.wheels * WHEEL_RADIUS
+    thirds = np.stack([part.mean(1) for part in np.array_split(sides, 3, axis=1)])
+    constant = np.ptp(thirds, axis=0).max(1) < 0.08
+    return constant & (np.abs((sides[..., 1] - sides[..., 0]).mean(1)) > _MIN_DIFFERENCE)
+
+
 # ---- scores of predictions
 
 
 @dataclass(frozen=True)
 class Score:
-    """Errors over several windows; position and yaw are those of the pose at a window's end."""
+    """Median and 90th percentile of errors at the ends of several windows, and median error of wheel speeds."""
 
     windows: int
     position_m: float
-    """Median."""
     yaw_deg: float
-    """Median."""
     position_m_p90: float
     yaw_deg_p90: float
     wheels_rad_s: float
-    """Median over windows, samples and sides."""
 
     def rounded(self) -> dict[str, float]:
         """All numbers, rounded for JSON."""
@@ -138,41 +149,25 @@ class Prediction:
     def __init__(self, name: str, windows: Windows, poses: Array, wheels: Array | None = None) -> None:
         """
         Args:
-            poses: `PERIOD` [s] apart since each window's first was measured, shape (n, k + OLDEST + 1, 3).
+            poses: `PERIOD` [s] apart since the measurement of each window's first, (n, k + MAX_POSE_AGE + 1, 3).
             wheels: Shape (n, ≥ k, 2) [rad/s]; None: the model takes the measured ones.
         """
-        self.name = name
-        self.windows = windows
-        self.poses = poses
+        self.name, self.windows, self.poses = name, windows, poses
         self.wheels = windows.wheels if wheels is None else wheels[:, : windows.wheels.shape[1]]
 
     @cached_property
     def ends(self) -> Array:
-        """Poses at the measurement of each window's last pose, shape (n, 3)."""
+        """Poses at the times of the windows' last poses, shape (n, 3)."""
         return interpolate_poses(self.poses, self.windows.elapsed[:, -1])
 
     @cached_property
-    def _errors(self) -> tuple[Array, Array]:
+    def errors(self) -> tuple[Array, Array]:
+        """Position errors [m] and yaw errors [°] at the end of each window, shapes (n,)."""
         return end_errors(self.poses, self.windows)
-
-    @property
-    def distance(self) -> Array:
-        """Position errors [m], shape (n,)."""
-        return self._errors[0]
-
-    @property
-    def angle(self) -> Array:
-        """Yaw errors [°], shape (n,)."""
-        return self._errors[1]
 
     def score(self, which: NDArray[np.bool_]) -> Score:
         """The score over some of the windows, a mask (n,)."""
+        distance, angle = (error[which] for error in self.errors)
         off = np.abs(self.wheels - self.windows.wheels)[which]
-        return Score(
-            int(which.sum()),
-            float(np.median(self.distance[which])),
-            float(np.median(self.angle[which])),
-            float(np.quantile(self.distance[which], 0.9)),
-            float(np.quantile(self.angle[which], 0.9)),
-            float(np.median(off)),
-        )
+        numbers = np.median(distance), np.median(angle), np.quantile(distance, 0.9), np.quantile(angle, 0.9)
+        return Score(int(which.sum()), *map(float, numbers), float(np.median(off)))

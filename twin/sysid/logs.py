@@ -1,6 +1,6 @@
-"""Drive logs: commands, wheel speeds and poses of a robot, cut into windows of two seconds.
+"""Drive logs: commands, wheel speeds and poses of a robot, cut into windows of two seconds, and their plausibility.
 
-A *window* holds evenly spaced samples of commands, wheel speeds, poses relative to the first one and, with an IMU,
+A *window* contains evenly spaced samples of commands, wheel speeds, poses relative to the first one and, with an IMU,
 accelerations. Windows of one *group* belong to one experiment; even groups are for fitting, odd ones for scoring. A
 window *follows* the previous one if it begins when that one ends. A pose is *fresh* if it differs from the one before.
 
@@ -10,12 +10,13 @@ window *follows* the previous one if it begins when that one ends. A pose is *fr
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
   [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
   [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
-- a ROS 2 bag (`twin.sysid.ros_bags`), which is converted to such a table;
+- a ROS 2 bag, as such a table (`twin.sysid.ros_bags`);
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
 import csv
 import io
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,13 +28,12 @@ from scipy.stats import theilslopes
 from twin import runtime
 from twin.errors import InputError
 from twin.files import exists, load_arrays, read_text, wrap_read_errors
+from twin.robot import TRACK, WHEEL_RADIUS
 from twin.types import Array
 
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are left out
-MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
 MAX_POSE_AGE = 20  # samples between the measurement of a window's first pose and the window's start, at most
 
 TWIST = ("cmd_v", "cmd_yaw_rate")
@@ -42,30 +42,32 @@ WHEEL_SPEEDS = ("left_wheel_vel", "right_wheel_vel")
 POSE = ("x", "y", "yaw")
 ACCELERATION = ("acceleration_x", "acceleration_y")
 
+_MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are left out
+_MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
 _FAST = 1.75  # samples; for sensors of a shorter period, times of appearance are more accurate than counts of poses
-_JITTER = 4  # samples, at most, between measurement and appearance of a pose, apart from the common delay
+_JITTER = 4  # samples between measurement and appearance of a pose, at most, apart from the common delay
 _UNSTEADY = 0.1  # fraction of windows that contradict the period, above which the sensor counts as aperiodic
-_DROPOUT = 30  # samples without a fresh pose; windows with more in which the wheels turn are left out
+_DROPOUT = 30  # samples without a fresh pose; windows with more are left out if the wheels turn
 _TURNING = 0.5  # [rad/s] mean of both sides' wheels
 _STANDING = 0.05  # [rad/s], [m/s]; windows in which neither wheels nor commands are ever faster are left out
 _MAX_BYTES = 512 << 20  # of a log, unpacked
 _TICK = 1e-6  # [s] instants closer than this are the same
-_GROUP_WINDOWS = 3  # of a table without groups: six seconds
-_CONTINUES = 1.0  # [rad/s] sum over both sides by which wheel speeds may change between consecutive windows
+_GROUP_WINDOWS = 3  # in a table without groups: six seconds
+_CONTINUES = 1.0  # [rad/s] change of wheel speeds between consecutive windows, summed over both sides, at most
 
 # ---- measurement times of poses
 
 
 def measurement_times(fresh: NDArray[np.bool_]) -> Array:
-    """When every pose of a log's windows was measured, estimated from when poses changed.
+    """Estimates when every pose of a log's windows was measured, from when poses changed.
 
-    A pose sensor measures at a steady rate, but its poses reach the log with varying delay: from one fresh pose to the
-    next a robot moves as far after 0.05 s as after 0.15 s (DRIVE's log: in windows that turn, yaw is smooth to 0.3°
-    over the number of fresh poses, to 0.7° over their time of appearance). So the n-th fresh pose counts as measured n
-    periods after the first; where later ones stay late by more than half a period, poses were lost.
+    A pose sensor measures at a steady rate, but its poses reach the log with varying delay: between fresh poses a robot
+    moves as far in 0.05 s as in 0.15 s (in turning windows of DRIVE's log, yaw is smooth to 0.3° over the number of
+    fresh poses, to 0.7° over their time of appearance). So the n-th fresh pose counts as measured n periods after the
+    first; if all later ones are late by more than half a period, poses were lost.
 
-    Windows that contradict the log's period by more than `_JITTER` use times of appearance instead, and so do all
-    windows of a log in which many do, or of a fast sensor.
+    Times of appearance are used instead for windows that contradict the period by more than `_JITTER`, and for the
+    whole log if many do or the sensor is fast.
 
     Args:
         fresh: Which poses, without the first, differ from the one before, shape (n, k).
@@ -90,16 +92,15 @@ def measurement_times(fresh: NDArray[np.bool_]) -> Array:
 
 
 def _steady(appeared: Array, period: float) -> Array:
-    """When a window's first pose and its fresh ones were measured by a sensor of this period [samples].
+    """Measurement times of a window's first and fresh poses, for a sensor of this period [samples].
 
-    Args:
-        appeared: When fresh poses appeared [samples].
+    `appeared` are the samples at which fresh poses appeared.
     """
     if not len(appeared):
         return np.zeros(1)
     number = np.arange(1.0, len(appeared) + 1)
     lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
-    number += np.minimum.accumulate(lost[::-1])[::-1]  # late, but not lost
+    number += np.minimum.accumulate(lost[::-1])[::-1]  # a pose that later ones catch up with is late, not lost
     start = float(np.median(appeared - period * number))
     if start > period / 2:  # the robot rested, or the first poses were lost
         first = start - period * np.ceil(start / period)
@@ -110,7 +111,7 @@ def _steady(appeared: Array, period: float) -> Array:
 
 
 def _as_appeared(appeared: Array, period: float) -> Array:
-    """The same by times of appearance; `period` stands in for the interval if there is a single fresh pose."""
+    """The same by times of appearance; `period` is the interval for a single fresh pose."""
     apart = float(np.median(np.diff(appeared))) if len(appeared) > 1 else period
     return np.append(max(min(float(appeared[0]) - apart, 0.0), -MAX_POSE_AGE), appeared)
 
@@ -148,22 +149,31 @@ class Windows:
     def preceding_wheels(self) -> Array:
         """Wheel speeds in the `DURATION` before each window and at its start [rad/s], shape (n, k + 1, 2).
 
-        They come from the previous window if this one follows it; else the speed at the start is repeated.
+        Those of the previous window if this one follows it, else the speed at the start.
         """
         out = np.repeat(self.wheels[:, :1], self.wheels.shape[1] + 1, 1)
         follows = np.flatnonzero(self.follows)
         out[follows, :-1] = self.wheels[follows - 1]
         return out
 
+    @property
+    def commanded_speeds(self) -> Array:
+        """Commanded mean of the sides' wheel speeds and half their difference [rad/s], shape (n, k, 2)."""
+        a, b = self.commands[..., 0], self.commands[..., 1]
+        if self.twist:
+            return np.stack([a, b * TRACK / 2], -1) / WHEEL_RADIUS
+        return np.stack([a + b, b - a], -1) / 2
+
     def select(self, which: NDArray) -> "Windows":
         """Some of the windows, by mask or index; none of them follows another."""
+        wheels = self.wheels[which]
         return Windows(
             self.commands[which],
             self.twist,
-            self.wheels[which],
+            wheels,
             self.poses[which],
             self.groups[which],
-            np.zeros(len(self.wheels[which]), bool),
+            np.zeros(len(wheels), bool),
             None if self.acceleration is None else self.acceleration[which],
         )
 
@@ -179,7 +189,7 @@ class Windows:
 
     @cached_property
     def measurement_times(self) -> Array:
-        """When each pose was measured, up to a common delay [s since the first sample], shape (n, k + 1)."""
+        """Measurement time of each pose, up to a common delay [s since the first sample], shape (n, k + 1)."""
         return measurement_times(self.fresh) * PERIOD
 
     @property
@@ -189,10 +199,7 @@ class Windows:
 
 
 def read_log(path: Path) -> Windows:
-    """Reads a log, see the module's head.
-
-    Raises InputError: unreadable, columns missing, or times or values impossible.
-    """
+    """Reads a log. Raises InputError: an unreadable file, missing columns, or impossible times or values."""
     if not exists(path):
         raise InputError(f"{path}: no such log; expected a .csv, an .npz or the folder of a ROS 2 bag")
     if path.is_dir() or path.suffix in (".db3", ".mcap", ".bag"):
@@ -233,10 +240,10 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
 
     Args:
         columns: By name, shape (rows,) each; see the module's head.
+        where: The log's name in errors.
 
     Raises:
-        InputError: a column is missing or has values that are not finite, or time does not increase or is not in
-            seconds.
+        InputError: a column is missing or not finite, or time does not increase or is not in seconds.
     """
     twist = all(name in columns for name in TWIST)
     commands = TWIST if twist else WHEEL_COMMANDS
@@ -281,7 +288,7 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def _informative(windows: Windows, where: str) -> Windows:
-    """Leaves out windows without information: lost poses while the wheels turn, or a robot that stands as commanded.
+    """Leaves out windows that lose poses while the wheels turn, and those in which the robot stands as commanded.
 
     Raises InputError: poses are lost in more than half of the windows in which the wheels turn.
     """
@@ -308,22 +315,22 @@ def _informative(windows: Windows, where: str) -> Windows:
 def _gapless(time: Array, where: str) -> NDArray[np.int64]:
     """Numbers of the windows without a gap, shape (n,); window i begins i · `DURATION` [s] after the first row.
 
-    Raises InputError: the median interval between rows shows that time is not in seconds, or that rows are too rare.
+    Raises InputError: the median interval between rows is too long, or too short for times in seconds.
     """
     if len(time) < 2:
         return np.zeros(0, np.int64)
     steps = np.diff(time)
     interval = float(np.median(steps))
-    if not MIN_INTERVAL <= interval <= MAX_GAP:
+    if not _MIN_INTERVAL <= interval <= _MAX_GAP:
         units = {"ms": 3, "µs": 6, "ns": 9}
-        fits = [(u, n) for u, n in units.items() if 4 * MIN_INTERVAL <= interval / 10**n <= MAX_GAP]
-        cure = f"record at least {1 / MAX_GAP:g} rows a second" if interval > MAX_GAP else "give time in s"
+        fits = [(u, n) for u, n in units.items() if 4 * _MIN_INTERVAL <= interval / 10**n <= _MAX_GAP]
+        cure = f"record at least {1 / _MAX_GAP:g} rows a second" if interval > _MAX_GAP else "give time in s"
         if fits:
             cure = f"time looks like {fits[0][0]}; divide it by 1e{fits[0][1]}"
         raise InputError(
-            f"{where}: rows are {interval:.3g} s apart (median), expected {MIN_INTERVAL:g} to {MAX_GAP:g} s; {cure}"
+            f"{where}: rows are {interval:.3g} s apart (median), expected {_MIN_INTERVAL:g} to {_MAX_GAP:g} s; {cure}"
         )
-    after = np.flatnonzero(steps > MAX_GAP) + 1  # rows at which a segment without gaps begins
+    after = np.flatnonzero(steps > _MAX_GAP) + 1  # rows at which a segment without gaps begins
     first, last = time[np.append(0, after)], time[np.append(after - 1, len(time) - 1)]
     low = np.ceil((first - time[0]) / DURATION - _TICK).astype(np.int64)
     high = np.floor((last - time[0]) / DURATION + _TICK).astype(np.int64)
@@ -331,10 +338,10 @@ def _gapless(time: Array, where: str) -> NDArray[np.int64]:
 
 
 def _published_windows(columns: dict[str, Array], where: str) -> Windows:
-    """Windows of DRIVE: the pose at 2 s, `gt_icp_*`, is the 41st sample; x and y of the robot's IMU point backwards.
+    """Windows of DRIVE: the pose at 2 s, `gt_icp_*`, is the 41st sample; x and y of the robot's IMU are negated.
 
-    The data show the latter: `imu_acceleration_x` falls when the wheels speed up, and `imu_acceleration_y` points out
-    of the turn (correlations −0.16 and −0.11 over 16,000 samples), whereas the yaw rate has the right sign.
+    The data show their wrong sign: `imu_acceleration_x` falls when the wheels speed up, and `imu_acceleration_y` points
+    out of the turn (correlations −0.16 and −0.11 over 16,000 samples). The yaw rate has the right sign.
     """
     poses = [f"{{}}icp_{name}" for name in POSE]
     imu = ("imu_acceleration_x", "imu_acceleration_y")
@@ -349,34 +356,27 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
         if columns[name].shape != shape[:1]:
             raise InputError(f"{where}: {name} has shape {columns[name].shape}; expected {shape[:1]}, one per window")
     _finite({name: columns[name] for name in ("calib_step", *names, *ends)}, where)
-    pose = np.stack([np.concatenate([columns[p.format("")], columns[p.format("gt_")][:, None]], 1) for p in poses], -1)
+
+    def stacked(names: Iterable[str]) -> Array:
+        return np.stack([columns[name] for name in names], -1)
+
+    pose = np.concatenate([stacked(p.format("") for p in poses), stacked(ends)[:, None]], 1)
     pose[..., 2] = np.unwrap(pose[..., 2], axis=1)
-    wheels = np.stack([columns[name] for name in WHEEL_SPEEDS], -1)
-    step = columns["calib_step"].astype(np.int64)
-    jump = np.abs(wheels[1:, 0] - wheels[:-1, -1]).sum(1)
-    windows = Windows(
-        np.stack([columns[name] for name in WHEEL_COMMANDS], -1),
-        False,
-        wheels,
-        relative_poses(pose),
-        step,
-        np.concatenate([[False], (jump < _CONTINUES) & (np.diff(step) <= 1) & (np.diff(step) >= 0)]),
-        -np.stack([columns[name] for name in imu], -1),
-    )
-    return _informative(windows, where)
+    wheels, step = stacked(WHEEL_SPEEDS), columns["calib_step"].astype(np.int64)
+    jump, advance = np.abs(wheels[1:, 0] - wheels[:-1, -1]).sum(1), np.diff(step)
+    follows = np.concatenate([[False], (jump < _CONTINUES) & (advance <= 1) & (advance >= 0)])
+    commands, acceleration = stacked(WHEEL_COMMANDS), -stacked(imu)
+    return _informative(Windows(commands, False, wheels, relative_poses(pose), step, follows, acceleration), where)
 
 
 def resample_poses(poses: Array, late: Array, before: int) -> Array:
-    """Poses relative to each robot's pose when its first pose was measured.
+    """Poses relative to each robot's pose when its first pose was measured, shape (n, k + MAX_POSE_AGE + 1, 3).
 
     Args:
-        poses: `PERIOD` [s] apart, shape (n, m, 3).
-        late: Age of the first measured pose at time zero [s], at most `before` samples; negative if it is measured
-            later. Shape (n,).
+        poses: `PERIOD` [s] apart, shape (n, m, 3); extrapolated linearly beyond the last one.
+        late: Age of the first measured pose at time zero [s], shape (n,), at most `before` samples; negative if it is
+            measured later.
         before: Index of the pose at time zero.
-
-    Returns:
-        Shape (n, k + MAX_POSE_AGE + 1, 3); extrapolated linearly beyond the last pose.
     """
     position = before - late[:, None] / PERIOD + np.arange(SAMPLES + MAX_POSE_AGE + 1)
     whole = np.clip(position.astype(int), 0, poses.shape[1] - 2)
@@ -411,8 +411,90 @@ def _finite(columns: dict[str, Array], where: str) -> None:
     for name, column in columns.items():
         bad = np.argwhere(~np.isfinite(column))
         if len(bad):
-            place = ", ".join(str(int(i) + 1) for i in bad[0])
-            raise InputError(
-                f"{where}: {name} is {column[tuple(bad[0])]} at row {place} and in {len(bad)} places; "
-                "expected numbers; cut those rows out"
-            )
+            row = ", ".join(str(int(i) + 1) for i in bad[0])
+            found = f"{name} is {column[tuple(bad[0])]} at row {row} and in {len(bad)} places"
+            raise InputError(f"{where}: {found}; expected numbers; cut those rows out")
+
+
+# ---- plausibility
+
+_MIN_WINDOWS = 20  # to fit to; half as many to score on
+_MIN_TURNS = 10  # windows that turn by more than _TURN, at least a quarter of them to either side
+_TURN = 0.25  # [rad]
+
+_MOVING = 0.15  # [m/s] of wheels or robot: slower windows are not used to check units
+_DEGREE = np.pi / 180
+
+
+def check_log(windows: Windows, where: str) -> None:
+    """Raises InputError if a log is too short, turns too little or has implausible units."""
+    driving = windows.fresh[windows.turning].sum(1)
+    if len(driving) and np.median(driving) < 2:
+        raise InputError(
+            f"{where}: {np.median(driving):g} new poses in {DURATION:.0f} s of driving (median); expected at least 2; "
+            "record them at 1 Hz or more, better at 10 Hz"
+        )
+    fitting, scoring = int(windows.fitting.sum()), int((~windows.fitting).sum())
+    if fitting < _MIN_WINDOWS or scoring < _MIN_WINDOWS // 2:
+        raise InputError(
+            f"{where}: {fitting} windows of {DURATION:.0f} s to fit to and {scoring} to score on; expected at least "
+            f"{_MIN_WINDOWS} and {_MIN_WINDOWS // 2}; drive for {1.5 * _MIN_WINDOWS * DURATION / 60:.0f} min or more"
+        )
+    for ratio, expected, message, cures in _unit_ratios(windows):
+        _check_ratio(ratio, expected, where, message, cures)
+    turned = windows.poses[windows.fitting, -1, 2]
+    left, right = int((turned > _TURN).sum()), int((turned < -_TURN).sum())
+    if left + right < _MIN_TURNS or min(left, right) < _MIN_TURNS / 4:
+        raise InputError(
+            f"{where}: {left} windows turn left and {right} right by more than {_TURN} rad; expected {_MIN_TURNS}, a "
+            "quarter of them at least to either side; drive more turns"
+        )
+
+
+def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, float], str, dict[float, str]]]:
+    """Ratios that reveal wrong units: value, expected range, its text, and cures by the factor that units cause."""
+    sides = windows.wheels.mean(1) * WHEEL_RADIUS
+    mean, half = sides.mean(1), (sides[:, 1] - sides[:, 0]) / 2  # [m/s]
+    distance = np.hypot(windows.poses[:, -1, 0], windows.poses[:, -1, 1]) / DURATION
+    straight = (np.maximum(np.abs(mean), distance) > _MOVING) & (np.abs(half) < 0.3 * np.abs(mean))
+    cures = {
+        _DEGREE: "wheel speeds look like °/s; multiply them by π/180",
+        1 / WHEEL_RADIUS: "wheel speeds look like m/s; divide them by the wheel's radius",
+        1000.0: "poses look like millimetres; divide them by 1000",
+    }
+    ratio = _median(distance[straight] / np.abs(mean[straight]))
+    yield ratio, (0.3, 2.0), "the robot moves {:.3g} m for each metre its wheels roll", cures
+    rate = np.abs(windows.poses[:, -1, 2]) / DURATION
+    turning = np.maximum(np.abs(half), rate * TRACK / 2) > _MOVING
+    cures = {
+        1 / _DEGREE: "yaw looks like degrees; multiply it by π/180",
+        _DEGREE: "yaw looks π/180 times too small; divide it by π/180",
+    }
+    ratio = _median(rate[turning] * TRACK / 2 / np.abs(half[turning]))
+    yield ratio, (0.1, 1.3), "the robot turns {:.3g} times as fast as its wheels would have it without slip", cures
+    commanded = windows.commanded_speeds[:, -1] * WHEEL_RADIUS
+    end = windows.wheels[:, -1] * WHEEL_RADIUS
+    measured = np.stack([end.mean(1), (end[:, 1] - end[:, 0]) / 2], -1)
+    names = ("cmd_v", "cmd_yaw_rate") if windows.twist else ("the mean of the wheel commands", "their difference")
+    for i, name in enumerate(names):
+        use = (np.abs(measured[:, i]) > 0.5 * _MOVING) & (np.abs(commanded[:, i]) > 0)
+        cures = {_DEGREE: f"{name} looks like degrees; multiply by π/180", 1 / _DEGREE: f"{name} looks π/180 too small"}
+        ratio = _median(np.abs(measured[use, i] / commanded[use, i]))
+        yield ratio, (0.1, 6.0), f"wheels do {{:.3g}} times what {name} asks for", cures
+
+
+def _check_ratio(
+    ratio: float | None, expected: tuple[float, float], where: str, message: str, cures: dict[float, str]
+) -> None:
+    """Raises InputError if a ratio is out of range, with the cure of the nearest factor."""
+    low, high = expected
+    if ratio is None or low <= ratio <= high:
+        return
+    nearest = min(cures, key=lambda factor: abs(np.log(max(ratio, 1e-9) / factor)))
+    close = abs(np.log(max(ratio, 1e-9) / nearest)) < np.log(6)
+    cure = cures[nearest] if close else "check the units of the columns"
+    raise InputError(f"{where}: {message.format(ratio)}; expected {low:g} to {high:g}; {cure}")
+
+
+def _median(values: Array) -> float | None:
+    return float(np.median(values)) if len(values) >= 3 else None

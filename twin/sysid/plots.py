@@ -8,33 +8,29 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from twin.mjcf.husky import coulomb_track_ratio
-from twin.robot import TRACK, WHEEL_RADIUS
-from twin.sysid.kinematics import Prediction
+from twin.robot import WHEEL_RADIUS
+from twin.sysid.kinematics import Prediction, steady_windows, track_ratios
 from twin.sysid.logs import DURATION, PERIOD, Windows
 from twin.types import Array
 
 _MEASURED, _MODEL, _OTHER = "#444444", "#d1495b", "#3d7ea6"
-_MIN_DIFFERENCE = 0.25  # [m/s] of the sides; below it the track ratio is noise
 _SHOWN = 3  # windows in the plot of wheel speeds
 
 
 def write_plots(folder: Path, windows: Windows, fitted: Prediction, baseline: Prediction) -> list[Path]:
     """Writes four PNGs of the windows for scoring and returns their paths."""
     figures = {
-        "ends.png": _plot_ends(windows, fitted, baseline),
-        "turning.png": _plot_turning(windows, fitted),
-        "wheels.png": _plot_wheels(windows, fitted),
-        "errors.png": _plot_errors(windows, fitted, baseline),
+        folder / "ends.png": _plot_ends(windows, fitted, baseline),
+        folder / "turning.png": _plot_turning(windows, fitted),
+        folder / "wheels.png": _plot_wheels(windows, fitted),
+        folder / "errors.png": _plot_errors(windows, fitted, baseline),
     }
-    paths = []
-    for name, figure in figures.items():
-        figure.savefig(folder / name, dpi=110)
+    for path, figure in figures.items():
+        figure.savefig(path, dpi=110)
         plt.close(figure)
-        paths.append(folder / name)
-    return paths
+    return list(figures)
 
 
 def _plot_ends(windows: Windows, fitted: Prediction, baseline: Prediction) -> plt.Figure:
@@ -53,33 +49,11 @@ def _plot_ends(windows: Windows, fitted: Prediction, baseline: Prediction) -> pl
     return figure
 
 
-def track_ratios(wheels: Array, ends: Array, elapsed: Array) -> Array:
-    """Track ratio chi of each window: effective track over geometric track, shape (n,).
-
-    Args:
-        wheels: Wheel speeds, left and right [rad/s], shape (n, k, 2).
-        ends: Poses at the end x, y [m], yaw [rad], shape (n, 3).
-        elapsed: Durations [s], shape (n,).
-    """
-    difference = (wheels[..., 1] - wheels[..., 0]).mean(1) * WHEEL_RADIUS
-    turned = np.where(np.abs(ends[:, 2]) < 1e-6, np.nan, ends[:, 2])
-    return difference * elapsed / (TRACK * turned)
-
-
-def steady_windows(windows: Windows) -> NDArray[np.bool_]:
-    """Windows whose sides turn at different and constant speeds, so that chi is defined, shape (n,)."""
-    sides = windows.wheels * WHEEL_RADIUS
-    thirds = np.stack([part.mean(1) for part in np.array_split(sides, 3, axis=1)])
-    constant = np.ptp(thirds, axis=0).max(1) < 0.08
-    return constant & (np.abs((sides[..., 1] - sides[..., 0]).mean(1)) > _MIN_DIFFERENCE)
-
-
 def _plot_turning(windows: Windows, fitted: Prediction) -> plt.Figure:
     figure, axes = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained", sharey=True)
     use = steady_windows(windows)
     sides = windows.wheels[use].mean(1) * WHEEL_RADIUS
-    real = track_ratios(windows.wheels[use], windows.poses[use, -1], windows.elapsed[use, -1])
-    ours = track_ratios(windows.wheels[use], fitted.ends[use], windows.elapsed[use, -1])
+    real, ours = (track_ratios(windows, ends)[use] for ends in (windows.poses[:, -1], fitted.ends))
     for axis, x, name in (
         (axes[0], np.abs(sides[:, 1] - sides[:, 0]), "difference of the sides' speeds [m/s]"),
         (axes[1], sides.mean(1), "mean of the sides' speeds [m/s]"),
@@ -98,7 +72,7 @@ def _plot_turning(windows: Windows, fitted: Prediction) -> plt.Figure:
 def _plot_wheels(windows: Windows, fitted: Prediction) -> plt.Figure:
     score = np.flatnonzero(~windows.fitting)
     change = np.ptp(windows.wheels[score], axis=1).sum(1)
-    # Windows with large changes of speed, spread over the log.
+    # Of the windows with large changes of speed, some spread over the log.
     changing = score[change >= np.quantile(change, 0.7)]
     chosen = changing[np.linspace(0, len(changing) - 1, min(_SHOWN, len(changing))).astype(int)]
     figure, axes = plt.subplots(1, len(chosen), figsize=(12, 3.8), layout="constrained", sharey=True, squeeze=False)
@@ -118,8 +92,8 @@ def _plot_errors(windows: Windows, fitted: Prediction, baseline: Prediction) -> 
     figure, axes = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained")
     score = ~windows.fitting
     for prediction, color in ((baseline, _OTHER), (fitted, _MODEL)):
-        _plot_distribution(axes[0], prediction.distance[score], color, prediction.name)
-        _plot_distribution(axes[1], prediction.angle[score], color, prediction.name)
+        for axis, values in zip(axes, prediction.errors, strict=True):
+            _plot_distribution(axis, values[score], color, prediction.name)
     axes[0].set(xlabel="position error [m]", ylabel="fraction of windows below", xlim=(0, 0.8))
     axes[1].set(xlabel="yaw error [°]", xlim=(0, 60))
     axes[0].legend(frameon=False, loc="lower right")

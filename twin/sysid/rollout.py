@@ -1,8 +1,8 @@
 """Simulates the windows of a log with the Husky's MJCF on a plane, in parallel threads of `mujoco.rollout`.
 
-Each simulation starts with the robot settled on the plane. Before time zero its wheels repeat those of the log before
-the window (`Windows.preceding_wheels`), so that body and tires have the momentum that goes with them. From then on the
-servos receive the targets of the drivetrain model. Nothing else of the log enters but the slope, as tilted gravity.
+Each simulation starts with the robot settled on the plane. Before time zero its wheels turn as in the log before the
+window (`Windows.preceding_wheels`), which gives body and tires their momentum. From then on the servos receive the
+targets of the drivetrain model. The only other input from the log is the slope of the ground, as tilted gravity.
 """
 
 import copy
@@ -35,30 +35,29 @@ MAX_SLOPE = 0.2  # of gravity; readings above 11° are bumps or glitches
 
 @dataclass(frozen=True)
 class SlopeModel:
-    """Statistics of the slope along x and along y: a first-order autoregression over windows with noisy readings."""
+    """Statistics of the slope along x and y: a first-order autoregression over windows, with noisy readings."""
 
     steepness: float
     """Standard deviation of the slope [m/s²]."""
     windows: float
-    """Correlation length: windows after which the autocorrelation is 1 / e."""
+    """Windows after which the autocorrelation is 1 / e."""
     noise: float
     """Standard deviation of a window's reading [m/s²]."""
 
 
-_PRIOR = SlopeModel(0.25, 5.0, 0.25)  # gentle: 1.5°
-_PRIOR_STD = 1.0  # prior standard deviation of the logarithms of those three
-_RANGE = 1e-3, 1e3  # of each, for readings without noise
+_PRIOR, _PRIOR_STD = SlopeModel(0.25, 5.0, 0.25), 1.0  # median (gentle: 1.5°), standard deviation of the logarithms
+_RANGE = 1e-3, 1e3  # of each; bounds the fit to readings without noise
 
 
 def slope_gravity(windows: Windows, model: IcrModel) -> Array:
-    """Gravity along x and y [m/s²] of the robot where each window's `preceding_wheels` begin, shape (n, 2).
+    """Gravity along x and y [m/s²] in the robot's frame where each window's `preceding_wheels` begin, shape (n, 2).
 
     Tires that scrub sideways over soft ground slide downhill by more than a good model's error, so a log on real ground
-    is fitted with its slope. At rest an accelerometer reads minus gravity. Its mean over a window of a rattling robot
-    is noisy, but consecutive windows have similar slopes, so the readings are smoothed (`smooth_slopes`) with the
-    statistics that make them most likely (`fit_slope_model`); a rough IMU's slopes shrink towards level ground. The
-    median over the log removes what is constant in the robot's frame (mounting of the IMU, a pitched chassis). Headings
-    and the motion's own acceleration come from wheel speeds alone, never from the poses that are to be predicted.
+    is fitted with its slope. At rest an accelerometer reads minus gravity. A rattling robot's mean over a window is
+    noisy, but consecutive windows have similar slopes, so the readings are smoothed (`smooth_slopes`) with their most
+    probable statistics (`fit_slope_model`), which shrink a rough IMU's slopes towards level ground. Subtracting the
+    log's median removes what is constant in the robot's frame (mounting of the IMU, a pitched chassis). Headings and
+    the motion's own acceleration come from wheel speeds alone, since poses are to be predicted.
 
     Args:
         windows: All of a log; without accelerations the result is zero.
@@ -80,12 +79,12 @@ def slope_gravity(windows: Windows, model: IcrModel) -> Array:
 
 
 def fit_slope_model(readings: Complex, turn: Array, follows: NDArray[np.bool_]) -> SlopeModel:
-    """The slope statistics with the highest posterior probability.
+    """The most probable slope statistics.
 
     Args:
         readings: Slope of every window in the frame of its first pose, shape (n,).
         turn: Yaw change of each window [rad], shape (n,).
-        follows: See `Windows`, shape (n,).
+        follows: `Windows.follows`.
     """
     prior = np.log([_PRIOR.steepness, _PRIOR.windows, _PRIOR.noise])
 
@@ -101,14 +100,13 @@ def fit_slope_model(readings: Complex, turn: Array, follows: NDArray[np.bool_]) 
 def smooth_slopes(
     model: SlopeModel, readings: Complex, turn: Array, follows: NDArray[np.bool_]
 ) -> tuple[Complex, float]:
-    """Kalman smoother (Rauch, Tung and Striebel 1965): every window's slope given all readings, shape (n,).
-
-    Also returns the negative log-likelihood of the readings. For the arguments see `fit_slope_model`.
+    """Kalman smoother (Rauch, Tung and Striebel 1965): every window's slope given all readings, shape (n,), and the
+    negative log-likelihood of the readings. Arguments as `fit_slope_model`.
     """
     n, prior, noise = len(readings), model.steepness**2, model.noise**2
     keep = np.exp(-1 / model.windows)
     predicted, predicted_var = np.zeros(n, complex), np.full(n, prior)  # from previous windows
-    slope, var = np.zeros(n, complex), np.zeros(n)  # updated with the own reading
+    slope, var = np.zeros(n, complex), np.zeros(n)  # updated with the window's reading
     cost = 0.0
     for i in range(n):
         if i and follows[i]:
@@ -129,7 +127,7 @@ def smooth_slopes(
 
 MAX_POSE_LAG, MAX_POSE_LEAD = 4, 3  # samples by which poses may be behind and ahead of the wheel speeds
 LEAD_SAMPLES = MAX_POSE_LAG + MAX_POSE_AGE  # samples before time zero in the result
-COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; poses after 2 s differ by up to 1 cm and 0.8° from a fine one
+COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; poses after 2 s are up to 1 cm and 0.8° off
 
 _SETTLE = 1.0  # [s] at rest before a simulation
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -138,8 +136,8 @@ _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 @dataclass(frozen=True)
 class Rollouts:
     poses: Array
-    """x, y [m], yaw [rad] of the base relative to the first, `PERIOD` [s] apart; number `LEAD_SAMPLES` is time zero.
-    Shape (n, LEAD_SAMPLES + k + EXTRA_SAMPLES, 3)."""
+    """x, y [m], yaw [rad] of the base relative to the first, `PERIOD` [s] apart, with time zero at `LEAD_SAMPLES`;
+    shape (n, LEAD_SAMPLES + k + EXTRA_SAMPLES, 3)."""
     wheels: Array
     """Wheel speeds, left and right [rad/s], shape (n, k + EXTRA_SAMPLES, 2)."""
     torques: Array
@@ -147,7 +145,7 @@ class Rollouts:
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:
-    """The Husky on a plane without visual geometry, which takes a third of the time and nearly all of the memory."""
+    """The Husky on a plane, without the visual geometry, which takes a third of the time and most of the memory."""
     spec = mujoco.MjSpec()
     set_options(spec, params)
     if timestep:
@@ -168,10 +166,9 @@ def simulate_windows(
 
     Args:
         params: The robot and its ground; its `servo_lag` acts on `targets`, but not on `before`.
-        targets: Of the servos, left and right [rad/s], `drivetrain.CONTROL_STEP` [s] apart, shape (n, steps, 2).
-        before: Wheel speeds up to time zero, left and right [rad/s], `PERIOD` [s] apart, shape (n, ≥ LEAD_SAMPLES + 2,
-            2).
-        slope: Gravity along x and y of the robot where `before` begins [m/s²], shape (n, 2).
+        targets: Of the servos, left and right [rad/s], `CONTROL_STEP` [s] apart, shape (n, steps, 2).
+        before: Wheel speeds up to time zero, left and right [rad/s], `PERIOD` [s] apart, (n, ≥ LEAD_SAMPLES + 2, 2).
+        slope: Gravity along x and y in the robot's frame where `before` begins [m/s²], shape (n, 2).
         timestep: [s], a whole fraction of `PERIOD`; None: the scene's.
     """
     model = plane_model(params, timestep)
@@ -188,7 +185,7 @@ def simulate_windows(
     states, sensors = rollout.rollout(models, [mujoco.MjData(model) for _ in range(threads)], states, control)
     torque = [model.sensor(f"{side}_torque").adr[0] for side in ("left", "right")]
     torques = sensors[:, lead:, torque]
-    # A rollout's first state is that after one step, so time zero is the last step of the lead.
+    # A rollout's first state is the one after a step, so time zero is the last step of the lead.
     seen = states[:, lead - 1 - LEAD_SAMPLES * per_sample :: per_sample]
     position, velocity = seen[..., 1 : 1 + model.nq], seen[..., 1 + model.nq : 1 + model.nq + model.nv]
     n, k = targets.shape[0], SAMPLES + EXTRA_SAMPLES
@@ -200,14 +197,9 @@ def simulate_windows(
 
 
 def _lag_compensated(wheels: Array, count: int, lag: float) -> Array:
-    """Targets for lagging servos that make the wheel speeds go linearly from sample to sample.
+    """Targets with which servos of a first-order lag [s] interpolate wheel speeds (n, k, 2), `PERIOD` [s] apart.
 
-    Args:
-        wheels: Shape (n, k, 2), `PERIOD` [s] apart.
-        lag: First-order lag [s]; the output is behind by its change in that time.
-
-    Returns:
-        Shape (n, (k − 1) · count, 2).
+    Shape (n, (k − 1) · count, 2).
     """
     share = (np.arange(count) + 0.5)[:, None] / count
     change = np.diff(wheels, axis=1)[:, :, None]
@@ -219,8 +211,7 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
     """Initial full-physics states, shape (n, ·), and the indices of the wheels' degrees of freedom, shape (4,)."""
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, round(_SETTLE / model.opt.timestep))
-    data.qvel[:] = 0.0
-    data.time = 0.0
+    data.qvel[:], data.time = 0.0, 0.0
     joints = np.array([model.joint(f"{name}_wheel").dofadr[0] for name in WHEELS])
     states = np.empty((len(start), mujoco.mj_stateSize(model, _FULL)))
     for i, sides in enumerate(start):
@@ -235,7 +226,7 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
 
 
 def _tilted_models(model: mujoco.MjModel, slope: Array) -> list[mujoco.MjModel]:
-    """One model per window with tilted gravity; a single model if all slopes are zero."""
+    """A model per window with tilted gravity; a single one if all slopes are zero."""
     if not np.any(slope):
         return [model]
     models = []

@@ -1,9 +1,9 @@
 """ROS 2 bags read as tables, with `rosbags` (the extra `ros`; no ROS installation is needed).
 
-Topics are selected by message type: commands are geometry_msgs/Twist or TwistStamped; wheel speeds are
-sensor_msgs/JointState with joints named like a Husky's wheels; poses are nav_msgs/Odometry, geometry_msgs/PoseStamped
-or PoseWithCovarianceStamped (of several, one whose name does not contain a word of `_FROM_WHEELS`); accelerations are
-sensor_msgs/Imu. The table has a row per joint state, with the newest values of everything else.
+Topics are selected by message type: geometry_msgs/Twist or TwistStamped for commands; sensor_msgs/JointState, with
+joints named like a Husky's wheels, for wheel speeds; nav_msgs/Odometry, geometry_msgs/PoseStamped or
+PoseWithCovarianceStamped for poses, preferably without a word of `_FROM_WHEELS` in the topic's name; sensor_msgs/Imu
+for accelerations. The table has a row per joint state, with the newest values of the other topics.
 """
 
 from pathlib import Path
@@ -15,20 +15,23 @@ from twin.errors import InputError
 from twin.robot import WHEELS
 from twin.types import Array
 
-_TWIST = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
-_POSE = (
-    "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-)
-_JOINTS, _IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
+_TYPES = {
+    "commands": ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"),
+    "wheels": ("sensor_msgs/msg/JointState",),
+    "poses": (
+        "nav_msgs/msg/Odometry",
+        "geometry_msgs/msg/PoseStamped",
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+    ),
+    "imu": ("sensor_msgs/msg/Imu",),
+}
 _FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 
 
 def read_bag(path: Path) -> dict[str, Array]:
-    """Reads the columns that `twin.sysid.logs` describes.
+    """The columns that `twin.sysid.logs` describes.
 
-    Raises InputError: rosbags is not installed, the bag is not readable, or a kind of message is missing.
+    Raises InputError: rosbags is not installed, the bag is unreadable, or a kind of message is missing.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -40,7 +43,7 @@ def read_bag(path: Path) -> dict[str, Array]:
             chosen = _choose(reader.connections, path)
             rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
             kinds = {connection.id: kind for kind, connection in chosen.items()}
-            begin = reader.start_time  # [ns]; subtracted as an integer, because a float would round to 0.2 µs
+            begin = reader.start_time  # [ns], subtracted as an integer: as a float it would be rounded to 0.2 µs
             for connection, stamp, raw in reader.messages(connections=list(chosen.values())):
                 kind = kinds[connection.id]
                 values = _VALUES[kind](reader.deserialize(raw, connection.msgtype))
@@ -48,19 +51,17 @@ def read_bag(path: Path) -> dict[str, Array]:
                     rows[kind].append(((stamp - begin) * 1e-9, *values))
     except InputError:
         raise
-    except Exception as error:  # any of the reader's errors: not a bag, a damaged one, unknown messages
+    except Exception as error:  # of the reader: not a bag, a damaged one, unknown messages
         raise InputError(f"{path}: not a readable ROS 2 bag: {error}; record it anew or give a .csv") from None
     empty = [kind for kind, values in rows.items() if not values]
     if empty:
         raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected some; record those topics")
-    tables = {kind: np.array(values) for kind, values in rows.items()}
-    return _columns(tables)
+    return _columns({kind: np.array(values) for kind, values in rows.items()})
 
 
 def _choose(connections: Any, path: Path) -> dict[str, Any]:
-    wanted = {"commands": _TWIST, "wheels": (_JOINTS,), "poses": _POSE, "imu": (_IMU,)}
     chosen = {}
-    for kind, types in wanted.items():
+    for kind, types in _TYPES.items():
         found = [c for c in connections if c.msgtype in types and c.msgcount]
         if kind == "commands":  # prefer the controller's input to the multiplexer's
             found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
@@ -71,10 +72,8 @@ def _choose(connections: Any, path: Path) -> dict[str, Any]:
         if found:
             chosen[kind] = found[0]
         elif kind != "imu":
-            raise InputError(
-                f"{path}: no topic with {kind} ({' or '.join(types)}) among "
-                f"{', '.join(sorted({c.topic for c in connections})) or 'none'}; record it"
-            )
+            topics = ", ".join(sorted({c.topic for c in connections})) or "none"
+            raise InputError(f"{path}: no topic with {kind} ({' or '.join(types)}) among {topics}; record it")
     return chosen
 
 
@@ -110,7 +109,7 @@ _NAMES = {
 
 
 def _columns(tables: dict[str, Array]) -> dict[str, Array]:
-    """One row per joint state, from when every topic has had a message."""
+    """A row per joint state, once every topic has had a message."""
     begin = max(table[0, 0] for table in tables.values())
     time = np.unique(tables["wheels"][:, 0])
     time = time[time >= begin]

@@ -1,9 +1,9 @@
-"""Tires and ground fitted to the poses of a log.
+"""Tires and ground, fitted to the poses of a log.
 
-All terms are parameters of the MJCF: contact coefficients, `impratio`, and the viscosity of a medium that surrounds
-only the tires. All are off by default, except for the rolling resistance of hard ground. Two more parameters belong to
-the log: the offset of the pose sensor's origin from the base, and the delay of poses against wheel speeds. On level
-ground poses contain no information on the height of the mass. Fluid drag grows with the square of speed and adds mass.
+All terms are parameters of the MJCF: contact coefficients, `impratio`, and the viscosity of a medium around the tires
+alone. All but the rolling resistance of hard ground are off by default. Two more parameters belong to the log: the
+offset of the pose sensor from the base's origin, and the delay of poses against wheel speeds. The height of the mass is
+fitted only on slopes, as poses on level ground do not depend on it.
 """
 
 from collections.abc import Callable
@@ -22,56 +22,52 @@ from twin.types import Array
 
 # ---- choice of terms
 #
-# Four point contacts under Coulomb friction turn with the same track ratio chi at every speed and on every friction,
-# and move the body at the mean speed of the wheels. A Husky on grass (DRIVE's log) turns with chi 2.0 in gentle bends
-# and 2.3 in hard ones, and moves in hard turns at 0.4 to 0.7 of the wheels' mean speed, though it slips 2.5 % going
-# straight. Each model below was fitted to the even groups of that log and scored on its odd ones (median pose error
-# after 2 s):
+# Four point contacts under Coulomb friction turn with the same track ratio chi at every speed and friction, and move
+# the body at the mean speed of the wheels. A Husky on grass (DRIVE's log) turns with chi 2.0 in gentle bends and 2.3 in
+# hard ones; in hard turns it moves at 0.4 to 0.7 of the wheels' mean speed, though it slips 2.5 % going straight. Each
+# model below was fitted to the even groups of that log and scored on its odd ones (median pose error after 2 s):
 #
-#     Coulomb, friction and center of mass fitted        0.23 m, 13 to 26°
-#     + spin friction of the contact patch               0.21 m, 6°: turns correctly, but bodies as fast as wheels
-#     + drag (`ground_viscosity`)                        0.15 m, 6.0°: drag on the tires takes thrust; tires that scrub
-#                                                        sideways have little longitudinal grip left, so they slip
-#     + creep (`slip_stiffness` < 1)                     0.15 m, 5.0°: gentle bends turn more easily than hard ones
-#     + slope, from the log's accelerometer              0.13 m, 5.2°: scrubbing tires slide downhill
-#     + delay of poses against wheel speeds              0.13 m, 4.8°
-#     + wheels and slope as before each window           0.12 m, 4.7°: a body keeps its motion for half a second
-#     + measurement times of poses                       0.12 m, 4.8°: and less of it is noise
-# (`logs.measurement_times`)     + rolling resistance                               0.12 m, 4.8°: grip grows with slip,
-# instead of drag     + ramps continued between windows                  0.12 m, 4.5°: lagging wheels do not show them
-# (`drivetrain`)     + residual scales estimated from the log           0.11 m, 4.6°: fixed ones weighted yaw too much
-# (`estimation`)
+#     Coulomb, friction and center of mass fitted       0.23 m, 13 to 26°
+#     + spin friction of the contact patch              0.21 m, 6°: turns correctly, but moves as fast as its wheels
+#     + drag (`ground_viscosity`)                       0.15 m, 6.0°: scrubbing tires have little grip left for thrust
+#     + creep (`slip_stiffness` < 1)                    0.15 m, 5.0°: gentle bends turn more easily than hard ones
+#     + slope, from the log's accelerometer             0.13 m, 5.2°: scrubbing tires slide downhill
+#     + delay of poses against wheel speeds             0.13 m, 4.8°
+#     + wheels and slope before each window             0.12 m, 4.7°: a body keeps its motion for half a second
+#     + measurement times of poses (`logs`)             0.12 m, 4.8°
+#     + rolling resistance                              0.12 m, 4.8°: grip grows with slip; drag is not needed
+#     + ramps continued between windows (`drivetrain`)  0.12 m, 4.5°: lagging wheels do not show them
+#     + residual scales from the log (`estimation`)     0.11 m, 4.6°: fixed ones weighted yaw too much
 #
 # The last row is the shipped model (`docs/benchmarks.md`). Before rolling resistance, drag on all bodies or on the
-# chassis alone had a 5 % higher loss, and a part of the weight that slides, instead of drag, 1 %: better straight on,
+# chassis alone had a 5 % higher loss. A part of the weight that slides, instead of drag, had 1 %: better straight on,
 # worse in turns.
 #
 # In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire that rolls at v
-# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip across. Grip thus grows with the slip ratio u /
-# v, at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire is
-# Coulomb's; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes this; a Crr
-# by motor currents (`benchmarks/motor_currents.py`) describes power, and may differ.
+# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip across. So grip grows with the slip ratio u / v,
+# at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire is
+# Coulomb's; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes this; the Crr
+# that motor currents show (`benchmarks/motor_currents.py`) describes power, and may differ.
 
-# Prior mean and standard deviation, lowest and highest value, unit, cure. Prior means are those of soft ground and of
-# the published robot without load. Creep is the inverse of slip stiffness, since slip is proportional to it. Published
-# positions of the center of mass differ by as much as the prior of `center_of_mass_x`.
 _MANY = 100  # windows; with fewer the delay of poses is not fitted and the search uses all
 _NEAR = 0.25  # `reach` of the search that starts near the solution
-_TURNS = "hard turns at several speeds"
-_TORQUE = "motor currents or torques"
+_TURNS, _BENDS = "hard turns at several speeds", "gentle bends as well as hard turns"
 _BRAKING = "hard braking, or slopes"
+# Prior mean and standard deviation, lowest and highest value, unit, cure. Prior means are those of soft ground and of
+# the published robot without load, whose published centers of mass differ by as much as the prior of their x. Creep is
+# the inverse of slip stiffness, as slip is proportional to it.
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "friction": (0.3, 0.2, 0.05, 1.5, "", _TURNS),
     "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _TURNS),
-    "rolling_resistance": (0.1, 0.1, 0.0, 0.5, "", "gentle bends as well as hard turns"),
-    "creep": (15.0, 15.0, 0.01, 300.0, "", "gentle bends as well as hard turns"),
+    "rolling_resistance": (0.1, 0.1, 0.0, 0.5, "", _BENDS),
+    "creep": (15.0, 15.0, 0.01, 300.0, "", _BENDS),
     "ground_viscosity": (1.0, 2.0, 0.0, 80.0, "Pa s", "turns while driving at several speeds"),
     "center_of_mass_x": (0.0, 0.08, -0.2, 0.2, "m", "turns forward and backward at speed"),
     "center_of_mass_y": (0.0, 0.04, -0.1, 0.1, "m", "turns to both sides"),
     "center_of_mass_z": (0.062, 0.1, -0.1, 0.45, "m", _BRAKING),
     "radius_left": (WHEEL_RADIUS, 0.012, 0.1, 0.25, "m", "long straight drives"),
     "radius_right": (WHEEL_RADIUS, 0.012, 0.1, 0.25, "m", "long straight drives"),
-    "log10_servo_gain": (np.log10(HuskyParams().servo_gain), 0.3, 1.0, 4.0, "", _TORQUE),
+    "log10_servo_gain": (np.log10(HuskyParams().servo_gain), 0.3, 1.0, 4.0, "", "motor currents or torques"),
     "pose_x": (0.0, 0.2, -1.0, 1.0, "m", "turns on the spot"),
     "pose_y": (0.0, 0.1, -1.0, 1.0, "m", "turns on the spot"),
     "pose_late": (0.0, 0.1, -MAX_POSE_LEAD * PERIOD, MAX_POSE_LAG * PERIOD, "s", "turns that begin and end"),
@@ -79,7 +75,7 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
 
 
 def robot_with_values(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
-    """The robot with the values of parameters in its fields; `params` keeps the others."""
+    """A robot with fitted values in its fields, and those of `params` in the others."""
     x, y, z = params.center_of_mass
     left, right = params.wheel_radius
     return replace(
@@ -100,6 +96,7 @@ def robot_with_values(params: HuskyParams, values: dict[str, float]) -> HuskyPar
 
 
 def values_of_robot(params: HuskyParams) -> dict[str, float]:
+    """The parameters of a robot, with a pose sensor at its origin and without delay."""
     x, y, z = params.center_of_mass
     left, right = params.wheel_radius
     return {
@@ -128,27 +125,27 @@ def simulate_log(
     slope: Array,
     timestep: float | None = None,
 ) -> Rollouts:
-    """Simulates the log's commands with these values; poses are those of `measured_poses`."""
+    """Simulates the log's commands with these values; poses are those of `_measured_poses`."""
     targets, _ = simulate_drivetrain(drivetrain, windows)
-    fitted = robot_with_values(replace(params, servo_lag=drivetrain.lag, max_wheel_speed=5.0), values)
+    fitted = robot_with_values(_with_drivetrain(params, drivetrain), values)
     out = simulate_windows(fitted, targets, windows.preceding_wheels, slope, timestep)
-    return replace(out, poses=measured_poses(out, values, windows))
+    return replace(out, poses=_measured_poses(out, values, windows))
 
 
-def measured_poses(rollouts: Rollouts, values: dict[str, float], windows: Windows) -> Array:
-    """Poses as the log's sensor measures them: of its own origin, with its own delay, relative to each first one.
+def _with_drivetrain(params: HuskyParams, drivetrain: Drivetrain) -> HuskyParams:
+    """A robot with the drivetrain's lag, and without a limit of wheel speeds, which is in the servo targets."""
+    return replace(params, servo_lag=drivetrain.lag, max_wheel_speed=5.0)
 
-    Shape (n, k + MAX_POSE_AGE + 1, 3).
+
+def _measured_poses(rollouts: Rollouts, values: dict[str, float], windows: Windows) -> Array:
+    """Poses as the log's sensor measures them, at its own place and time, shape (n, k + MAX_POSE_AGE + 1, 3).
+
+    Position is relative to the sensor's, yaw to the robot's, at the first measurement.
     """
     poses = resample_poses(rollouts.poses, values["pose_late"] - windows.measurement_times[:, 0], LEAD_SAMPLES)
-    return shift_origin(poses, values["pose_x"], values["pose_y"])
-
-
-def shift_origin(poses: Array, x: float, y: float) -> Array:
-    """Poses (..., 3) of a point x forward and y left of the robot's origin [m], relative to its initial position."""
+    x, y = values["pose_x"], values["pose_y"]
     cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-    moved = np.stack([x * (cos - 1) - y * sin, x * sin + y * (cos - 1), np.zeros_like(cos)], -1)
-    return poses + moved
+    return poses + np.stack([x * (cos - 1) - y * sin, x * sin + y * (cos - 1), np.zeros_like(cos)], -1)
 
 
 def fit_ground(
@@ -158,13 +155,13 @@ def fit_ground(
     slope: Array,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
-    """Fits tires, ground and masses to the poses of a log.
+    """Fits tires, ground and masses to the poses of a log's windows for fitting.
 
     Args:
         params: The robot that gives the defaults.
-        drivetrain: From `drivetrain.fit_drivetrain`.
-        windows: All of a log; those for fitting are used.
-        slope: From `rollout.slope_gravity`, shape (n, 2).
+        drivetrain: See `drivetrain.fit_drivetrain`.
+        windows: All of a log.
+        slope: See `rollout.slope_gravity`, shape (n, 2).
     """
     defaults = values_of_robot(params)
     refused: dict[str, str] = {}
@@ -181,33 +178,27 @@ def fit_ground(
     ]
     targets, _ = simulate_drivetrain(drivetrain, windows)
     before = windows.preceding_wheels
-    base = replace(params, servo_lag=drivetrain.lag, max_wheel_speed=5.0)
+    base = _with_drivetrain(params, drivetrain)
 
     def residuals_of(which: NDArray[np.int64], timestep: float | None) -> Callable[[dict[str, float]], Array]:
         some = windows.select(which)
 
         def pose_residuals(values: dict[str, float]) -> Array:
-            out = simulate_windows(
-                robot_with_values(base, defaults | values), targets[which], before[which], slope[which], timestep
-            )
-            return residuals(measured_poses(out, defaults | values, some), some)
+            values = defaults | values
+            robot = robot_with_values(base, values)
+            out = simulate_windows(robot, targets[which], before[which], slope[which], timestep)
+            return residuals(_measured_poses(out, values, some), some)
 
         return pose_residuals
 
-    # A coarse time step and a third of many windows find the neighborhood in a tenth of the time. The final fit and its
-    # evaluation use the shipped time step, since values fitted at a coarse one compensate for it.
+    # A coarse time step and a third of many windows find the neighborhood in a tenth of the time. The final fit uses
+    # the shipped time step, since values fitted at a coarse one compensate for it.
     some = fitting
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))
     progress(f"coarse search with {len(some)} windows")
-    near = maximize_posterior(
-        table,
-        residuals_of(some, COARSE_TIMESTEP),
-        POSE_KINDS,
-        {p.name: _TABLE[p.name][0] for p in table},
-        progress=progress,
-    )
-    found = fit_parameters(
-        table, residuals_of(fitting, None), POSE_KINDS, windows.groups[fitting], near, _NEAR, progress
-    )
+    start = {p.name: _TABLE[p.name][0] for p in table}
+    coarse, fine = residuals_of(some, COARSE_TIMESTEP), residuals_of(fitting, None)
+    near = maximize_posterior(table, coarse, POSE_KINDS, start, progress=progress)
+    found = fit_parameters(table, fine, POSE_KINDS, windows.groups[fitting], near, _NEAR, progress)
     return replace(found, values=defaults | found.values, refused=refused | found.refused)
