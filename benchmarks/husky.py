@@ -17,10 +17,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import acceptance
 import mujoco
 import numpy as np
-from acceptance import CONTROLS, MEASURES, Row, Subject, chi_on, on_ground, on_plane
+from acceptance.drives import on_ground, on_plane
+from acceptance.grounds import reconstructed
+from acceptance.rows import Row, Subject
+from acceptance.table import CONTROLS, MEASURES
+from acceptance.terrain import chi_on
 from record import add_record_options, save
 
 from twin.assets.ground import Ground
@@ -49,7 +52,7 @@ def steps_per_second(model: mujoco.MjModel) -> float:
 
 def speeds(scene: Path | None) -> list[Row]:
     """Steps per second, and what is wanted of them."""
-    bumps = acceptance.reconstructed(np.random.default_rng(0))
+    bumps = reconstructed(np.random.default_rng(0))
     models = {"a plane": (on_plane(), 30e3), "a reconstructed flat road": (on_ground(bumps, start=(-7, 0, 0)), 20e3)}
     if scene is not None:
         models[f"{scene.name}'s ground, with its convex parts"] = (load_scene(scene).world().model(), 20e3)
