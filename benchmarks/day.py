@@ -1,12 +1,12 @@
-"""What one photo tells of a day, and what it leaves to be drawn.
+"""Appearance gap to another day that remains after a photo of it, and how weather randomisation covers the gap.
 
     python benchmarks/day.py SCENE [--days NAME ...] [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
-The scene has been built from the stand-in's film and knows its days by a photo each (`benchmarks/table1`, step
-`photos`). Pictures of every day at eight other places of the road are compared with the twin's from there under the
-photo's light and air: by dB, and by how they change the steering of policies, against how another day's sun and shadows
-change it that are drawn over the twin's. *Lasting* is the mean over places of a day's change (rms over days), *local*
-the rest.
+The scene was built from the film of the known-truth world and has a lighting from one photo of each day
+(`benchmarks/table1`, step `photos`). Images of every day from eight other stations of the road are compared with
+renderings from the same poses under the photo's appearance and fog, in PSNR and in the change of the policies'
+steering. That change is compared with the one that randomised sun and shadows cause. *Lasting*: mean over stations of
+a day's change, rms over days. *Local*: the rest.
 """
 
 import argparse
@@ -32,18 +32,18 @@ from twin.reality.lighting import WEATHER
 from twin.reality.truth import Truth
 from twin.runtime import track
 
-STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the photos were taken at the first
-STRAIGHT = 4  # of them, where policies of the straight road drive
+STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the lightings come from photos at the first one
+STRAIGHT = 4  # number of stations on the straight segment
 SIZE = (160, 90)
-DRAWS = 8  # of the weather, per day
-RESAMPLED = 500  # times, for intervals of 90 %
-SCALES = (1.0, 0.8, 0.7, KNOWN_WEATHER_FRACTION, 0.5)  # of another day's sun and shadows
+DRAWS = 8  # weather samples per day
+RESAMPLED = 500  # bootstrap samples for 90 % intervals
+SCALES = (1.0, 0.8, 0.7, KNOWN_WEATHER_FRACTION, 0.5)  # fractions of the sun and shadow randomisation
 
 Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 
 
 def real(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
-    """Pictures of every day at every station, and the camera's poses there, (stations, 4, 4), in the true world."""
+    """Images of every day at every station, and the camera_to_world poses (stations, 4, 4) in the true world."""
     line, rows, poses = RoadLine(), [], np.zeros((len(STATIONS), 4, 4))
     for light in track([WEATHER[name] for name in days], "pictures of days", unit="day"):
         road, camera = recordings._road_and_camera(light)
@@ -58,13 +58,13 @@ def real(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
 
 
 def lasting_and_local(change: NDArray) -> NDArray:
-    """Of changes (days, stations): rms over days of the mean over stations, and rms of the rest."""
+    """Rms over days of the mean over stations, and rms of the rest, of changes (days, stations)."""
     mean = change.mean(1, keepdims=True)
     return np.sqrt([(mean**2).mean(), ((change - mean) ** 2).mean()])
 
 
 def steering(policy: Callable, pictures: Pictures) -> NDArray:
-    """The last of a policy's actions (days, stations) before pictures that stand still."""
+    """Steering (days, stations), the last component of a policy's action, for stacks of four equal images."""
     stacks = (np.clip(np.moveaxis(pictures, -1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     return np.array([[policy(np.tile(one, (4, 1, 1)))[-1] for one in row] for row in stacks])
 

@@ -1,6 +1,6 @@
-"""What `env_sections.py` runs in processes of its own: prints one line of JSON.
+"""Measurements that `env_sections.py` runs in processes of their own; each prints one line of JSON.
 
-python benchmarks/env_workers.py WHAT SCENE [NUMBERS ...]
+python benchmarks/env_workers.py FUNCTION SCENE [NUMBERS ...]
 """
 
 import gc
@@ -17,7 +17,7 @@ _STEPS = 60  # per timed run
 
 
 def standard_tasks(scene: Path) -> list[str]:
-    """The standard tasks that a scene has, `right_turn` last; `route` where it has none."""
+    """Standard tasks of a scene, `right_turn` last; `route` if it has none."""
     from twin.env.route_segments import STANDARD_TASKS, scene_tasks
     from twin.loading import load_scene
 
@@ -26,14 +26,14 @@ def standard_tasks(scene: Path) -> list[str]:
 
 
 def one_obstacle(scene: Path) -> dict[str, Any]:
-    """Options with a cone that stays in view ahead for the first twenty metres."""
+    """Options with a cone that stays in view for the first twenty metres."""
     from twin.config import ObstacleConfig
 
     return {"obstacles": (ObstacleConfig("it", "cone", 24.0, 0.9),), "start_offset": 0.0, "start_heading": 0.0}
 
 
 def single(scene: Path, runs: int) -> dict[str, Any]:
-    """One world on one core, alternately with MuJoCo's own renderer where software OpenGL is to be had."""
+    """One environment on one core, alternating with MuJoCo's own renderer if software OpenGL is available."""
     import twin
     from twin.env.drivers import RouteDriver
 
@@ -73,7 +73,7 @@ def _pace(environment: Any, drive: Any, also: Any) -> tuple[float, float]:
 
 
 def software_gl(scene: Path) -> tuple[Any, str]:
-    """A function that draws a physics' front camera with the extracted mesh, and if there is none, why."""
+    """A function that renders the front camera with the extracted mesh; None and the reason if OpenGL is missing."""
     try:
         import mujoco
 
@@ -89,7 +89,7 @@ def software_gl(scene: Path) -> tuple[Any, str]:
         data = mujoco.MjData(model)
         place(obstacles, data, 0.0)
         renderer = mujoco.Renderer(model, 90, 160)
-    except Exception as error:  # whatever a missing library makes of itself
+    except Exception as error:  # each missing library raises its own type
         return None, " ".join(str(error).split())[:200] or type(error).__name__
     shown = mujoco.MjvOption()
     shown.geomgroup[:] = [1, 1, 1, 0, 0, 1]
@@ -105,7 +105,7 @@ def software_gl(scene: Path) -> tuple[Any, str]:
 
 
 def batch(scene: Path, count: int, runs: int) -> dict[str, Any]:
-    """Many worlds on two cores, in two processes, and alternately in one; steps of all worlds counted."""
+    """A vector env on two cores, alternating between two processes and one; counts the steps of all environments."""
     spread, alone = _worlds(scene, count), _worlds(scene, count, 1)
     both = [(_worlds_pace(spread), _worlds_pace(alone)) for _ in range(runs)]
     rates, costs = zip(*(pair[0] for pair in both), strict=True)
@@ -131,7 +131,7 @@ def _worlds_pace(worlds: Any) -> tuple[float, float]:
 
 
 def _cpu_time() -> float:
-    """Of this process and its children [s]."""
+    """Processor time [s] of this process and its children."""
     import psutil
 
     this = psutil.Process()
@@ -140,7 +140,7 @@ def _cpu_time() -> float:
 
 
 def physics(scene: Path, runs: int) -> dict[str, Any]:
-    """One world without pictures, one core."""
+    """One environment without images on one core."""
     import twin
     from twin.env.drivers import RouteDriver
 
@@ -149,6 +149,7 @@ def physics(scene: Path, runs: int) -> dict[str, Any]:
 
 
 def memory(scene: Path, count: int) -> dict[str, Any]:
+    """Peak memory of a vector env and its processes."""
     worlds = _worlds(scene, count)
     worlds.begin(range(count))
     for _ in range(5):
@@ -157,11 +158,12 @@ def memory(scene: Path, count: int) -> dict[str, Any]:
     worlds.begin([0])
     worlds.close()
     peaks = [resource.getrusage(who).ru_maxrss * 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    # Of the children the largest counts; they are alike.
+    # The children are alike; ru_maxrss is that of the largest.
     return {f"worlds{count}.bytes": peaks[0] + peaks[1] * getattr(worlds, "processes", 0)}
 
 
 def soak(scene: Path, steps: int) -> dict[str, Any]:
+    """Non-finite states and memory growth over random steps of eight environments."""
     import psutil
 
     from twin.env.suite import EnvFactory
@@ -169,12 +171,12 @@ def soak(scene: Path, steps: int) -> dict[str, Any]:
 
     count = 8
     stage = EnvFactory.open(scene, standard_tasks(scene)[-1], {"randomise": True, "obstacles": 3})
-    worlds = LocalVectorEnv(stage, list(range(count)))  # here, where bodies can be looked at
+    worlds = LocalVectorEnv(stage, list(range(count)))  # in this process, which gives access to the states
     worlds.begin(range(count))
     rng, sizes, episodes, bad = np.random.default_rng(0), [], 0, 0
     rounds = steps // count
     for k in range(rounds):
-        # Mostly forward, so that episodes get somewhere.
+        # Mostly forward, so that episodes progress.
         actions = np.stack([rng.uniform(0, 1, count), rng.uniform(-0.3, 0.3, count)], 1)
         out = worlds.step(actions)
         bad += int(~np.isfinite(out.reward).all()) + sum(
@@ -196,14 +198,14 @@ def soak(scene: Path, steps: int) -> dict[str, Any]:
 
 
 def gpu(scene: Path, count: int) -> dict[str, Any]:
-    """The same as `batch` on a GPU, nothing but the field in view."""
+    """As `batch` on a GPU, without obstacles."""
     import warp
 
     worlds = _worlds(scene, count, device="cuda", obstacles=())
     worlds.begin(range(count))
     begin, steps = 0.0, 30
     for k in range(steps + 3):
-        if k == 3:  # compiled, and captured
+        if k == 3:  # kernels are compiled and the graph is captured
             warp.synchronize()
             begin = time.perf_counter()
         worlds.step(_onward(worlds))
@@ -213,10 +215,10 @@ def gpu(scene: Path, count: int) -> dict[str, Any]:
 
 
 def host(scene: Path, count: int) -> dict[str, Any]:
-    """What the host does for worlds on a GPU in a step, whatever the GPU: small steps and pictures are left out.
+    """Host time of a GPU vector env per step; physics and rendering are replaced by stubs.
 
-    It holds Python's lock throughout, so `host.steps_per_s` is the most that `Worlds.step` comes to with any GPU;
-    `host.info_us` is what asking a world for its `info` and `state` costs besides, as stable-baselines3 does.
+    The host holds the GIL throughout, so `host.steps_per_s` is an upper limit of `GpuVectorEnv.step` on any GPU.
+    `host.info_us` is the time for `info` and `state` of an environment, which stable-baselines3 requests.
     """
     import dataclasses
 
@@ -230,12 +232,14 @@ def host(scene: Path, count: int) -> dict[str, Any]:
         blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
 
     def show(field: BakedField, cameras: Any, lighting: Any, take: Any) -> None:
-        field._head_biases(lighting, len(cameras.camera_to_world))  # as `render_on_device` does, on the host
+        field._head_biases(lighting, len(cameras.camera_to_world))  # the host's part of `render_on_device`
         take(*blank)
 
     GpuSimulation._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]
     stage = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
-    options = dataclasses.replace(stage.options, device="cuda")  # pictures that stay; the field itself is on the CPU
+    options = dataclasses.replace(
+        stage.options, device="cuda"
+    )  # images stay on the device; the field itself is on the CPU
     worlds = GpuVectorEnv(dataclasses.replace(stage, options=options), list(range(count)), "cpu")
     begin = time.perf_counter()
     worlds.begin(range(count))
@@ -259,7 +263,7 @@ def host(scene: Path, count: int) -> dict[str, Any]:
 
 
 def trust(scene: Path) -> dict[str, Any]:
-    """See `twin.env.trust`: depth error against the known truth at poses on and off the filmed path, by trust."""
+    """See `env_trust.py`."""
     from env_trust import trust_against_truth
 
     return trust_against_truth(scene)
@@ -273,7 +277,7 @@ def _worlds(scene: Path, count: int, processes: int | None = None, **options: An
 
 
 def _onward(worlds: Any) -> np.ndarray:
-    """Straight on at full speed."""
+    """Actions: straight ahead at full speed."""
     return np.tile(np.array([1.0, 0.0]), (len(worlds), 1))
 
 

@@ -1,11 +1,11 @@
-"""How often the forecast's 90 % intervals hold what they aim at, in simulated worlds where that is known.
+"""Coverage of the forecast's 90 % intervals in simulated experiments with a known truth.
 
     python benchmarks/intervals.py [--experiments 300]
     python benchmarks/intervals.py --record benchmarks/table1/results.json
 
-Policies of varied quality drive under two lightings, in a twin that promises too much and misjudges each by some noise.
-Prints a table: a world per row, a statistic per column. With `--record`, worlds are resampled from an experiment's
-record instead: many days of few trials, most of them all or none. See `RECORDED`.
+In an experiment, policies of varied quality drive under two lightings; the twin's rates are biased upwards and noisy.
+Prints a table: one setting per row, one statistic per column. With `--record`, experiments are resampled from a
+recorded one instead, which has many days of few trials with mostly equal outcomes. See `RECORDED`.
 """
 
 import argparse
@@ -22,10 +22,10 @@ from twin.evaluation.prediction_powered import LinearCorrection, leave_one_group
 from twin.evaluation.statistics import mmrv_batched, pearson_batched, spearman_batched, winner_batched
 from twin.files import read_json
 
-_MEAN_OVER = 3000  # experiments, for what an interval aims at
+_MEAN_OVER = 3000  # experiments that estimate the true value of a statistic
 _DRAWS = 400
 
-# policies, trials a cell in the twin and on the road, spread of quality [logit], noise of the twin [logit]
+# policies, trials per cell in the twin and on the road, std of quality [logit], std of the twin's noise [logit]
 WORLDS = {
     "12 policies, 50 real trials": (12, 100, 50, 1.5, 0.5),
     "12, 50, a very good twin": (12, 200, 50, 2.0, 0.2),
@@ -39,7 +39,7 @@ WORLDS = {
 def world(
     rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, spread: float, noise: float
 ) -> PairedCells:
-    """One experiment."""
+    """One simulated experiment."""
     quality = rng.normal(0.0, spread, (n, 1)) + rng.normal(0.0, 0.3, (n, 2))
     twin = expit(quality + 0.5 + rng.normal(0.0, noise, (n, 1)))
     trials = np.full((n, 2), twin_trials), np.full((n, 2), real_trials)
@@ -52,11 +52,11 @@ RECORDED = {
     "policies drawn anew, the same days": False,
     "policies and days drawn anew": True,
 }
-"""Worlds of a record: each policy's trials are driven again at the rates seen, on its days or on days drawn of them."""
+"""Row → True if days are resampled, too. Trials are resampled at each policy's recorded rates."""
 
 
 def recorded(path: Path) -> PairedCells:
-    """An experiment as `benchmarks/table1` records it, by a photo of each day; policies by task."""
+    """The experiment that `benchmarks/table1` recorded, with the twin's lightings from photos; policies by task."""
     read: list[tuple[str, list[list[int]]]] = []
     for run in read_json(path)["runs"]:
         for policy in run["policies"]:
@@ -72,7 +72,7 @@ def recorded(path: Path) -> PairedCells:
 
 
 def again(rng: np.random.Generator, record: PairedCells, days_anew: bool) -> PairedCells:
-    """One experiment with policies drawn with replacement from the record's, task by task, and maybe with its days."""
+    """One experiment with policies resampled within each task, and days if `days_anew`, both with replacement."""
     policies = np.concatenate([rng.choice(members, len(members)) for members in record.strata])
     strata = tuple(np.split(np.arange(len(policies)), np.cumsum([len(m) for m in record.strata])[:-1]))
     days = np.arange(record.weight.shape[1])
@@ -84,7 +84,7 @@ def again(rng: np.random.Generator, record: PairedCells, days_anew: bool) -> Pai
 
 
 def statistics(rates: Rates) -> dict[str, np.ndarray]:
-    """Those with a bootstrap interval."""
+    """The statistics that have a bootstrap interval."""
     agreement, regret = winner_batched(twin=rates.twin, real=rates.real)
     return {
         "Pearson": pearson_batched(twin=rates.twin, real=rates.real),
@@ -98,7 +98,7 @@ def statistics(rates: Rates) -> dict[str, np.ndarray]:
 
 
 def coverage(settings: tuple[int, int, int, float, float], experiments: int, seed: int = 0) -> dict[str, float]:
-    """Share of the experiments in which each interval held what it aims at."""
+    """Fraction of the experiments in which each interval contains the true value."""
     rng = np.random.default_rng(seed)
     aims = aimed_at(lambda: world(rng, *settings))
     held: dict[str, list[float]] = {name: [] for name in (*aims, "predicted", "left out", "mean on the road")}
@@ -121,20 +121,20 @@ def coverage(settings: tuple[int, int, int, float, float], experiments: int, see
 
 
 def aimed_at(experiment: Callable[[], PairedCells]) -> dict[str, float]:
-    """Mean of each statistic over many experiments."""
+    """True value of each statistic: its mean over many experiments."""
     many = [statistics(observed_rates(experiment())) for _ in range(_MEAN_OVER)]
     return {name: float(np.nanmean([one[name] for one in many])) for name in many[0]}
 
 
 def hits(data: PairedCells, rng: np.random.Generator, aims: dict[str, float]) -> dict[str, bool]:
-    """Whether one experiment's bootstrap intervals hold what they aim at, where there are intervals."""
+    """Statistic → True if its bootstrap interval contains the true value; without undefined intervals."""
     own, repeated = statistics(observed_rates(data)), statistics(resample(data, rng, _DRAWS))
     ends = {name: bootstrap_interval(float(own[name]), repeated[name]) for name in aims}
     return {name: end[0] - 1e-9 <= aims[name] <= end[1] + 1e-9 for name, end in ends.items() if end}
 
 
 def recorded_coverage(record: PairedCells, days_anew: bool, experiments: int, seed: int = 0) -> dict[str, float]:
-    """`coverage` in worlds resampled from a record."""
+    """`coverage` in experiments resampled from a record."""
     rng = np.random.default_rng(seed)
     aims = aimed_at(lambda: again(rng, record, days_anew))
     held = [hits(again(rng, record, days_anew), rng, aims) for _ in range(experiments)]

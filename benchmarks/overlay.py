@@ -1,12 +1,12 @@
-"""Figures of the overlay: obstacles in the twin against the same in the true world, and seen against touched.
+"""Benchmark of the compositor: obstacles in the twin against the same ones in the true world.
 
     python benchmarks/overlay.py --scene BUILT_SCENE_WITH_TRUTH [--json FILE] [--pictures FOLDER]
 
-The scene was filmed without any of them. Each is put at a place along the route, once into the twin, through the
-overlay, and once into the known-truth world, in the same colours; both are seen from the same pose of the robot's front
-camera at 160×90, and developed as the film was, without noise. *The obstacle's pixels* are those it is seen in in the
-truth. *Unshaded* is the overlay with everything in its plain colours. How far the field is from what is solid is
-measured along a drive, see `twin/report/visual_vs_collision.py`.
+The scene was filmed without obstacles. Each obstacle is placed along the route twice, composited into the twin and
+rendered in the known-truth world, in the same colors. Both are rendered from the same pose of the robot's front camera
+at 160×90, with the film's camera response and without noise. *Obstacle pixels* are those that show the obstacle in the
+truth. *Unshaded* is the composite with plain colors. A drive along the route also compares the visual with the
+collision geometry, see `twin/report/visual_vs_collision.py`.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from twin.reality.truth import Truth
 
 SIZE = (160, 90)
 KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
-PLACES = tuple(  # station, lateral [m], yaw [°], distance before it [m] the camera is at
+PLACES = tuple(  # station, lateral [m], yaw [°], distance [m] from the camera to the obstacle
     (float(s), lateral, yaw, ahead)
     for s, lateral, yaw, ahead in (
         *((7.0, 0.3, 20.0, 3.0), (13.0, -0.7, -70.0, 5.0), (19.0, 0.9, 130.0, 4.0), (25.0, 0.0, 0.0, 6.5)),
@@ -59,7 +59,7 @@ TARGETS = {
 
 
 class TrueWorld:
-    """The known-truth world under one lighting, with one obstacle of every kind that can be put anywhere."""
+    """The known-truth world under one lighting, with one movable obstacle of every kind."""
 
     def __init__(self, truth: Truth, lighting: str, intrinsics: np.ndarray) -> None:
         spec = reality.world_spec(lighting, truth.place)
@@ -76,7 +76,7 @@ class TrueWorld:
         with wp.ScopedDevice("cpu"):
             self.device_model = mujoco_warp.put_model(self.model)
             self.device = mujoco_warp.put_data(self.model, self.data)
-            # As `twin.reality.filming.Renderer`; a second one through pixels' middles, for the mask.
+            # As `twin.reality.filming.Renderer`; the second one samples pixel centers, for the mask.
             self.contexts = [
                 mujoco_warp.create_render_context(
                     self.model,
@@ -95,7 +95,7 @@ class TrueWorld:
             ]
 
     def show(self, camera_to_world: np.ndarray, kind: str | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Film colours (h, w, 3) and z-depth of pixels' middles [m], with an obstacle of a kind at a pose (4, 4)."""
+        """Film colors (h, w, 3) and z-depth [m] at pixel centers, with an obstacle of a kind at a pose (4, 4)."""
         for name in KINDS:
             mocap = self.model.body(f"added_{name}").mocapid[0]
             self.data.mocap_pos[mocap] = pose[:3, 3] if name == kind else (0, 0, -100.0)
@@ -117,7 +117,7 @@ class TrueWorld:
 
 
 def robot_at(world: World, model: mujoco.MjModel, data: mujoco.MjData, station: float) -> np.ndarray:
-    """Puts the robot on the route as it stands at its start; camera_to_world of its front camera."""
+    """Places the robot on the route, at rest; returns camera_to_world of its front camera."""
     mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
     turn = float(heading_at(world.route, station) - world.spawn[3])
     rest = data.qpos[3:7].copy()
@@ -130,13 +130,13 @@ def robot_at(world: World, model: mujoco.MjModel, data: mujoco.MjData, station: 
 
 
 def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str, ...] = KINDS) -> dict[str, Any]:
-    """Compares the overlay with the truth.
+    """Compares composited obstacles with the truth.
 
     Returns:
         Figures by name: `overlay.obstacle_psnr.<lighting>`, `overlay.unshaded_psnr.<lighting>` [dB],
-        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and its pieces;
-        `overlay.shadow_rms.<lighting>`, how wrong the share is to which pixels beside the obstacle are dimmed by it
-        (those dimmed by 5 % in the twin or in truth), and `overlay.no_shadow_rms.<lighting>`, without any dimming.
+        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and per
+        lighting; `overlay.shadow_rms.<lighting>`, rms error of the shadow factor over pixels beside the obstacle that
+        the obstacle dims by 5 % in the twin or in the truth; `overlay.no_shadow_rms.<lighting>`, without any shadow.
     """
     scene = load_scene(scene_path)
     world, field = scene.world(), scene.field()
@@ -159,7 +159,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
             for station, lateral, yaw, ahead in PLACES:
                 if station > length:
                     continue
-                if kind == "car":  # it needs more room
+                if kind == "car":  # a car needs more room
                     lateral, ahead = lateral + 1.8, ahead + 3.0
                 here = (ObstacleConfig(kind, kind, station, lateral, yaw),)
                 eye = robot_at(world, model, data, max(0.0, station - ahead))
@@ -215,7 +215,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
         figures[f"overlay.gain_over_unshaded.{lighting}"] = shaded - unshaded
         both, either = np.sum(ious[lighting], 0)
         figures[f"overlay.mask_iou.{lighting}"] = float(both / either)
-        # The true world's sky is light without direction, which nothing hides: only its sun throws shadows.
+        # The true world's sky is ambient light without occlusion: only its sun casts shadows.
         casts = any(shadow for _, _, shadow in LIGHTINGS[lighting].suns)
         for name in ("shadow", "no_shadow") if casts else ():
             off = np.concatenate(errors[f"{name}.{lighting}"])
@@ -250,12 +250,12 @@ def luminance(rgb: np.ndarray) -> np.ndarray:
 
 
 def error_db(errors: list[np.ndarray]) -> float:
-    """PSNR [dB] of squared errors, all pixels counting alike."""
+    """PSNR [dB] of squared errors, over all pixels of the arrays."""
     return float(-10.0 * np.log10(max(np.concatenate(errors).mean(), 1e-12)))
 
 
 def save_pictures(folder: Path, lighting: str, rows: list[tuple[str, np.ndarray, float]]) -> None:
-    """Truth, overlay, unshaded overlay side by side, one row per place."""
+    """Writes truth, composite and unshaded composite side by side, one row per placement."""
     import cv2
 
     folder.mkdir(parents=True, exist_ok=True)

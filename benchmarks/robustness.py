@@ -1,11 +1,11 @@
-"""Whether anything is lost when processes are killed or the disk is full, and whether environments last.
+"""Robustness: killed processes and full disks must lose no results, and environments must not leak memory.
 
-    python benchmarks/robustness.py endurance [--steps 1000000]       # control steps of eight worlds together
+    python benchmarks/robustness.py endurance [--steps 1000000]       # control steps of eight environments together
     python benchmarks/robustness.py kills [--times 50] [--only build|train|validate]
-    python benchmarks/robustness.py disk                              # needs the right to mount a tmpfs
+    python benchmarks/robustness.py disk                              # needs permission to mount a tmpfs
 
-Each prints a table and, with --json FILE, writes it; the exit status is 1 where something was lost. Everything happens
-in tiny scenes made up for it, in a temporary folder.
+Each prints a table and, with --json FILE, writes it; the exit status is 1 on any loss. All work is done on tiny
+generated scenes in a temporary folder.
 """
 
 import argparse
@@ -30,7 +30,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(_ROOT), str(_ROOT / "tests")]
 
 _WORLDS = 8
-_GROWTH = 32 << 20  # [bytes] that eight worlds may grow by
+_GROWTH = 32 << 20  # [bytes] allowed memory growth of eight environments
 _QUICK = {
     "nerf.steps": 80,
     "nerf.rays": 1024,
@@ -41,17 +41,17 @@ _QUICK = {
     "review.fps": 3,
     "review.width": 160,
 }
-"""Settings of a whole build in a minute or two."""
+"""Settings for a complete build in one to two minutes."""
 
 
 # ---- endurance
 
 
 def endurance(steps: int, folder: Path) -> dict[str, Any]:
-    """Drives eight tiny worlds at random, with everything drawn that can be.
+    """Drives eight small environments at random, with every randomisation switched on.
 
     Args:
-        steps: Control steps of all worlds together.
+        steps: Control steps of all environments together.
         folder: For the scene.
     """
     import psutil
@@ -84,7 +84,7 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
             gc.collect()
             sizes.append(process.memory_info().rss)
             tqdm.tqdm.write(f"{(k + 1) * _WORLDS} steps, {sizes[-1] / 2**20:.1f} MiB, {bad} rounds not finite")
-    settled = sizes[len(sizes) // 5]  # by then every kind of thing has been in view once
+    settled = sizes[len(sizes) // 5]  # every kind of obstacle has been in view by then
     return {
         "steps": rounds * _WORLDS,
         "episodes": episodes,
@@ -99,13 +99,13 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
 
 
 def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> dict[str, Any]:
-    """Kills a build, a training and a validation at random moments and lets them go on; compares with one that was not.
+    """Kills a build, a training and a validation at random times, resumes them, and compares with undisturbed ones.
 
     Args:
-        times: How often each is killed.
+        times: Kills of each.
         folder: For the scenes.
-        only: One of them.
-        seed: Of the moments.
+        only: Name of a single one.
+        seed: Of the kill times.
     """
     each = {"build": _killed_builds, "train": _killed_trainings, "validate": _killed_validations}
     rng = np.random.default_rng(seed)
@@ -114,7 +114,7 @@ def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> d
 
 
 def _killed_after(command: list[str], seconds: float) -> bool:
-    """Whether a command was killed; False where it had ended before. Nothing that it started may live on."""
+    """Kills a command after `seconds`; False if it had ended before. Asserts that its children die with it."""
     import psutil
 
     with tempfile.TemporaryFile() as said:
@@ -133,14 +133,14 @@ def _killed_after(command: list[str], seconds: float) -> bool:
             children |= {one.pid: one for one in psutil.Process(process.pid).children(recursive=True)}
         process.send_signal(signal.SIGKILL)
         process.wait()
-    # A worker that was just started ends when it has loaded what it runs, which takes seconds.
+    # A worker that has just started notices only after its imports, which take seconds.
     left = psutil.wait_procs(list(children.values()), timeout=30.0)[1]
     assert not left, f"alive after kill -9: {left}"
     return True
 
 
 def _rubbish(root: Path) -> list[str]:
-    """What a finished verb must not leave."""
+    """Temporary files, which a finished verb must have removed."""
     names = [path for path in root.rglob("*") if ".partial" in path.name or path.name.endswith((".lock", ".old"))]
     return [str(path.relative_to(root)) for path in names]
 
@@ -151,13 +151,13 @@ def _build_command(root: Path, *more: str) -> list[str]:
 
 
 def _filmed(folder: Path) -> Path:
-    """A scene with two short films."""
+    """A generated scene with two short films."""
     root = folder / "filmed"
     if not root.exists():
         subprocess.run(
             [sys.executable, "-m", "twin.reality", "film", "--tiny", "--out", str(root)], cwd=_ROOT, check=True
         )
-        shutil.rmtree(root / "truth")  # reports of the truth take longer than the build
+        shutil.rmtree(root / "truth")  # comparison with the truth takes longer than the build
     return root
 
 
@@ -172,11 +172,11 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
 
     root = _filmed(folder)
     scene = SceneDir(root)
-    stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # films of the review know the time they took
+    stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # the review contains its own timings
     subprocess.run(_build_command(root), cwd=_ROOT, check=True)
     wanted, longest = _results(root, stages), max(_seconds(root).values())
     killed = finished = different = 0
-    sfm_until = times // 5  # a fifth of the kills from the very beginning on, where what follows may differ
+    sfm_until = times // 5  # a fifth of the kills hit a build from scratch
     while killed < times:
         from_start = killed < sfm_until
         for name in list(STAGES)[0 if from_start else 3 :]:
@@ -186,7 +186,7 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
         assert _killed_after(_build_command(root), 3600.0) is False
         finished += 1
         now = _results(root, stages)
-        if from_start:  # structure from motion may come out otherwise: what follows is compared with a build from it
+        if from_start:  # structure from motion is not repeatable, so later builds are compared with this one
             wanted = now
         different += now != wanted
     rubbish = _rubbish(root)
@@ -217,7 +217,7 @@ train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)
 
 
 def _killed_trainings(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:
-    """A killed training loses what came after its last save, so its kills come further and further into it."""
+    """Kills trainings. Each resumes from its last save, so the kills hit all parts of a training."""
     from tiny_twin import tiny_twin
 
     root = folder / "trained"
@@ -232,7 +232,7 @@ def _killed_trainings(times: int, folder: Path, rng: np.random.Generator) -> dic
             if _killed_after(command, float(rng.uniform(1.0, 16.0))):
                 killed += 1
                 longest = max(longest, _saved(root / "runs" / name))
-            else:  # it came to its end before: begin anew
+            else:  # it finished first: start a new one
                 runs.append(_trained(root / "runs" / name, steps))
                 shutil.rmtree(root / "runs" / name)
             assert time.monotonic() - begun < 600
@@ -265,7 +265,7 @@ def _rows(run: Path) -> list[dict[str, Any]]:
 
 
 def _trained(run: Path, steps: int) -> dict[str, Any]:
-    """Whether a finished training has all its steps, tables without gap or repetition, and a whole replay buffer."""
+    """Checks a finished training: all steps, tables without gaps or repetitions, a complete replay buffer."""
     head = json.loads((run / "state" / "state.json").read_text())
     rows = _rows(run)
     at = [int(row["step"]) for row in rows]
@@ -275,7 +275,7 @@ def _trained(run: Path, steps: int) -> dict[str, Any]:
     filled = head["replay"]["full"] or head["replay"]["pos"] * written.size == head["steps"]
     tape = np.fromfile(run / "state" / "pictures.bin", np.uint8)
     pictures = tape.reshape(len(written), -1, 3 * 45 * 80)
-    # Every picture that a transition refers to has been written: none is black throughout.
+    # Every image that a transition refers to has been written: none is entirely black.
     shown = [pictures[i, newest[:, i] % pictures.shape[1]].any(-1).all() for i in range(len(written))]
     whole = head["steps"] == steps and at == sorted(at) and len(set(seeds)) == len(seeds) and filled and all(shown)
     return {"whole": bool(whole and (age >= 0).all() and (newest < written).all())}
@@ -321,7 +321,7 @@ def _digest(path: Path) -> str:
 
 @contextlib.contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """A file system of a size [bytes]. Raises OSError where this machine lets nobody mount one."""
+    """Mounts a tmpfs of a size [bytes]. Raises OSError: mounting is not permitted."""
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)], capture_output=True)
     if done.returncode:
@@ -333,7 +333,7 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 
 def fill(disk: Path, leave: int) -> Path:
-    """A file that leaves so many bytes of a disk free."""
+    """Writes a file that leaves this many bytes of a disk free."""
     path = disk / "filling"
     facts = os.statvfs(disk)
     with path.open("wb") as file:
@@ -342,7 +342,7 @@ def fill(disk: Path, leave: int) -> Path:
 
 
 def refused(command: list[str], root: Path) -> str:
-    """What is wrong with how a command ends on a full disk; empty: one line, status 2, and what was there is whole."""
+    """Runs a command that must fail with one line and exit status 2, keeping all files; returns what differs, or ""."""
     before = _contents(root)
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
@@ -355,19 +355,19 @@ def refused(command: list[str], root: Path) -> str:
 
 
 def _contents(root: Path) -> dict[str, str]:
-    skipped = ("/runs/", "/validation/", "/tensorboard/")  # tables there grow, and a row may be cut; see `_mended`
+    skipped = ("/runs/", "/validation/", "/tensorboard/")  # tables there grow, and a row may be cut
     files = [path for path in root.rglob("*") if path.is_file() and not any(s in f"/{path}" for s in skipped)]
     return {str(path.relative_to(root)): _digest(path) for path in files}
 
 
 def disk(folder: Path) -> dict[str, Any]:
-    """Runs every stage of a build, a training, a validation, an export and a film on a disk that gets full."""
+    """Runs every stage of a build, a training, a validation, an export and a film on a full disk."""
     out = full_build(folder) | full_verbs(folder)
     return out | {"ok": all(said == "ok" for said in out.values())}
 
 
 def full_build(folder: Path) -> dict[str, str]:
-    """Every stage of a build, with no space and with a little; then an export of what was built."""
+    """Every stage of a build, without space and with 64 KiB; then an export of the build."""
     from twin.scene import STAGES, SceneDir
 
     out: dict[str, str] = {}
@@ -390,7 +390,7 @@ def full_build(folder: Path) -> dict[str, str]:
 
 
 def full_verbs(folder: Path) -> dict[str, str]:
-    """A training, a validation and a film, with no space and with a little; then again, with enough."""
+    """A training, a validation and a film, without space and with little; then again with enough."""
     from tiny_runs import tiny_runs
     from tiny_twin import tiny_twin
 

@@ -2,9 +2,9 @@
 
     python benchmarks/table1/picture.py SCENE docs/forecast.jpg
 
-The road as randomised episodes of the twin show it, the road of the real test in some of its weather and the twin by a
-photo of each, success on the road over success in the twin for every policy that drove, and success along a training.
-SCENE holds what `benchmarks/table1` left there.
+Shows randomised episodes of the twin, test days of the known-truth world, the twin under lightings from a photo of
+each, success on the road against success in the twin for every policy, and a training's success curve. SCENE holds the
+results of `benchmarks/table1`.
 """
 
 import argparse
@@ -29,9 +29,9 @@ from twin.report.figures import CARD, INK, LINE, MUTED, SERIES
 from twin.report.forecast_report import twin_against_road
 from twin.types import Image
 
-_WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
-_PER_ROW = 5  # pictures
-_SEEDS = range(1, 1 + _PER_ROW)  # of the twin's pictures
+_WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] total width, gap between images, height of a caption
+_PER_ROW = 5  # images
+_SEEDS = range(1, 1 + _PER_ROW)  # of the twin's images
 _SHOWN = list(WEATHER)[: 2 * _PER_ROW]
 _PAPER = {
     INK: "#16202a",
@@ -72,13 +72,13 @@ def main() -> None:
 
 
 def _first(scene: Path, seed: int, **options: Any) -> Image:
-    """The first picture of an episode."""
+    """The first image of an episode."""
     step = twin.load(scene, "straight", seed, **options).reset()
     return step.observation["pixels"][-1]
 
 
 def _drawn(figure: Figure) -> Image:
-    """A figure of a page, whose colours stand for the page's, in those of paper."""
+    """A report figure as an image, with the page's theme colors replaced by those of `_PAPER`."""
     for artist in figure.findobj():
         if isinstance(artist, Text) and artist.get_bbox_patch():
             artist.set_bbox({"facecolor": _PAPER[CARD], "edgecolor": "none", "alpha": 0.7, "pad": 1.0})
@@ -98,13 +98,13 @@ def _caption(text: str) -> Image:
 
 
 def _rows(pictures: list[Image], names: Sequence[str] = ()) -> list[Image]:
-    """Pictures of one size, `_PER_ROW` beside each other."""
+    """Rows of `_PER_ROW` images of equal size."""
     starts = range(0, len(pictures), _PER_ROW)
     return [_row(pictures[i : i + _PER_ROW], names[i : i + _PER_ROW]) for i in starts]
 
 
 def _row(pictures: list[Image], names: Sequence[str]) -> Image:
-    """Pictures of one size beside each other, over the whole width."""
+    """Images of equal size side by side, over the full width."""
     width = (_WIDTH - _GAP) // len(pictures) - _GAP
     height = round(width * pictures[0].shape[0] / pictures[0].shape[1])
     out = np.full((height + _GAP, _WIDTH, 3), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""`results.json` and the table: all that is known of every run so far; none is left out."""
+"""Collects `results.json`, the record of every run, and formats the paper's table from it."""
 
 import csv
 from pathlib import Path
@@ -16,7 +16,7 @@ from twin.files import read_json
 _JUDGED = ("validate", "validate_randomised", "validate_by_photo", "real")
 _BY_DAY = ("validate_by_photo", "real")
 HELD_OUT_FORECAST = "forecast_held_out"
-"""Folder beside `forecast`, which then is of photos."""
+"""Folder of the held-out forecast; `forecast` then holds the one from photos."""
 FORECAST = (
     "pearson",
     "spearman",
@@ -30,7 +30,7 @@ FORECAST = (
 
 
 def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
-    """What `results.json` holds."""
+    """The content of `results.json`."""
     twin = _trials([scene / "validation" / "episodes.csv"])
     real = _trials(sorted((scene / "real").glob("*_trials.csv")))
     rows = []
@@ -41,16 +41,16 @@ def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
             | _training(run.folder(scene))
             | {"policies": [_judged(name, twin, real) for name in policies]}
         )
-    by_photo = scene / HELD_OUT_FORECAST  # is there where `forecast` is of the photos
+    by_photo = scene / HELD_OUT_FORECAST  # exists if `forecast` is from photos
     kinds = (by_photo, scene / "forecast") if by_photo.exists() else (scene / "forecast", by_photo)
     held_out, photo = (_forecast(folder / "forecast.json") for folder in kinds)
     return {"runs": rows, "forecast": held_out, "forecast_by_photo": photo}
 
 
 def table(results: dict[str, Any]) -> str:
-    """The paper's table with ours beside it, in Markdown; finished policies of all seeds together.
+    """The paper's table beside ours, in Markdown, from the finished policies of all seeds.
 
-    Where trials come by days (by photo, real), rates are means over all the days, with intervals over days.
+    Rates by photo and on the road are means over days, with intervals over days.
     """
     told = "train / validate / (ours: another day / a photo of each day of the test) / real"
     lines = [f"| | | straight: {told} | right turn: {told} |", "|---|---|---|---|"]
@@ -126,7 +126,7 @@ def _trials(paths: list[Path]) -> list[Trial]:
 
 
 def _forecast(path: Path) -> dict[str, Any]:
-    """Statistics with their intervals, by task."""
+    """Forecast statistics with their intervals, by task."""
     if not path.exists():
         return {}
     return {
