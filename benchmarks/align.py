@@ -31,7 +31,7 @@ TARGETS = {"position_m": 0.12, "yaw_deg": 4.7, "wheels_rad_s": 0.3}
 """Upper limits of medians over held-out windows."""
 
 
-def efforts(data: Path) -> dict[str, dict[str, float]]:
+def turning_efforts(data: Path) -> dict[str, dict[str, float]]:
     """Current or torque of a side in a steady turn, relative to driving straight: outer, inner, mean of both sides."""
     steady = motor_currents.read_currents(sorted((data / _ASPHALT).glob("ASPHALT_pro_*.npz")))
     published = HuskyParams()
@@ -56,10 +56,10 @@ def against_kinematics(figures: dict[str, Any]) -> list[str]:
 
     The baseline does not use the slope, so only the first line, on level ground, gives both the same information.
     """
-    of = {name: score["held_out"] for name, score in figures["scores"].items()}
-    base, lines = of["icr_kinematics"], []
+    held_out = {name: score["held_out"] for name, score in figures["scores"].items()}
+    base, lines = held_out["icr_kinematics"], []
     for what, name in (("level ground", "fitted_on_level_ground"), ("slope from the accelerometer", "fitted")):
-        ours = of[name]
+        ours = held_out[name]
         gains = [1.0 - ours[key] / base[key] for key in ("position_m", "yaw_deg")]
         lines.append(
             f"{what:30} {ours['position_m']:.3f} m against {base['position_m']:.3f} m ({gains[0]:.0%} better), "
@@ -68,7 +68,7 @@ def against_kinematics(figures: dict[str, Any]) -> list[str]:
     return lines
 
 
-def judged(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
+def verdicts(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
     """Name, value, target and True if the target is met, per target."""
     held_out = figures["scores"]["fitted"]["held_out"]
     rows = [(name, held_out[name], most, held_out[name] <= most) for name, most in TARGETS.items()]
@@ -78,7 +78,9 @@ def judged(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of the real logs")
-    parser.add_argument("--work", type=Path, help="keep robot.toml, align.json and the pictures here")
+    parser.add_argument(
+        "--work", type=Path, help="folder for robot.toml, align.json and the plots (default: a temporary one)"
+    )
     add_record_options(parser)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
@@ -88,12 +90,12 @@ def main() -> int:
     print(summary(result))
     print("MJCF against the kinematic baseline, pose after 2 s, median over windows not fitted to:")
     print("\n".join(against_kinematics(figures)))
-    rows = judged(figures)
+    rows = verdicts(figures)
     for name, value, target, met in rows:
         print(f"{name:28} {value:8.4f}   wanted {target:.4f}   {'met' if met else 'missed'}")
     runtime.log_line("currents on asphalt")
-    asphalt = efforts(options.data)
-    print(f"\n{'a turn against driving straight':64} outer  inner   mean")
+    asphalt = turning_efforts(options.data)
+    print(f"\n{'turning relative to driving straight':64} outer  inner   mean")
     for name, e in asphalt.items():
         print(f"{name:64} {e['outer']:5.2f}  {e['inner']:5.2f}  {e['mean']:5.2f}")
     everything = {"drive": figures, "asphalt": asphalt, "targets": {n: bool(m) for n, _, _, m in rows}}

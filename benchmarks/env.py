@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from field import shown
+from field import format_figure
 from record import add_record_options, save, write_so_far
 
 TARGETS: dict[str, tuple[str, float]] = {
@@ -35,7 +35,7 @@ TARGETS: dict[str, tuple[str, float]] = {
 """Figure → sense and target."""
 
 
-def judge(name: str, value: Any) -> tuple[str, str]:
+def verdict(name: str, value: Any) -> tuple[str, str]:
     """A figure's target and "yes" if it is met, else "no"; two empty strings for a figure without a target."""
     if name not in TARGETS:
         return "", ""
@@ -51,7 +51,7 @@ def main() -> int:
     parser.add_argument("--scene", type=Path, required=True, help="a built scene, such as scenes/demo")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
     add_record_options(parser)
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean little")
+    parser.add_argument("--quick", action="store_true", help="tiny settings that only test the script")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     record: dict[str, Any] = {}
@@ -60,8 +60,8 @@ def main() -> int:
         found = SECTIONS[section](options.scene, options.quick)
         figures |= found
         for name, value in found.items():
-            wanted, met = judge(name, value)
-            print(f"{name:36} {shown(value):>16} {wanted:>14}  {met}".rstrip(), flush=True)
+            wanted, met = verdict(name, value)
+            print(f"{name:36} {format_figure(value):>16} {wanted:>14}  {met}".rstrip(), flush=True)
         if options.json:  # after every section, so that an interrupted run keeps its figures
             record = figures | {"about": about(options)}
             write_so_far(options.json, record)

@@ -120,7 +120,7 @@ def overlay(scene: Path, quick: bool) -> dict[str, Any]:
     return round_trip(scene, None, KINDS[:1] if quick else KINDS)
 
 
-def seen_touched(scene: Path, quick: bool) -> dict[str, Any]:
+def visual_vs_collision(scene: Path, quick: bool) -> dict[str, Any]:
     """Visual against collision geometry (`twin.report.visual_vs_collision`), from the report of the last build."""
     from twin.loading import load_scene
 
@@ -152,7 +152,7 @@ SECTIONS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {
     "soak": soak,
     "trust": trust,
     "overlay": overlay,
-    "seen_touched": seen_touched,
+    "seen_touched": visual_vs_collision,
     "host": host,
     "gpu": gpu,
 }

@@ -39,7 +39,7 @@ def trust_against_truth(path: Path) -> dict[str, Any]:
                 pose = _pose(world.route, float(s), lateral, turn)
                 out = field.render(Viewpoints.of(pose, world.intrinsics, SIZE), lighting, SIZE)
                 number = float(trust.of(pose[None], out)[0])
-                wanted, depth = true_world.show(to_truth.poses(pose), None, np.eye(4))
+                wanted, depth = true_world.render(to_truth.poses(pose), None, np.eye(4))
                 near = depth < _FAR
                 if near.sum() < 500:
                     continue

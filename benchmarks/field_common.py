@@ -43,15 +43,15 @@ def load_field(scene: Path) -> Any:
     return load_scene(scene).radiance_field("cpu")
 
 
-def load_baked(place: Path, where: str = "cpu") -> Any:
+def load_baked(path: Path, device: str = "cpu") -> Any:
     """The baked field of a built scene, or of a folder that contains one."""
-    if (place / "scene.toml").exists() and where == "cpu":
+    if (path / "scene.toml").exists() and device == "cpu":
         from twin.loading import load_scene
 
-        return load_scene(place).field()
+        return load_scene(path).field()
     from twin.nerf.baked import BakedField
 
-    return BakedField.load(place / "build/3_field" if (place / "scene.toml").exists() else place, where)
+    return BakedField.load(path / "build/3_field" if (path / "scene.toml").exists() else path, device)
 
 
 def render(field: Any, poses: NDArray, intrinsics: NDArray, size: tuple[int, int], lighting: str) -> Any:

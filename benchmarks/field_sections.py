@@ -112,7 +112,7 @@ def bake(bench: Bench) -> Figures:
 
     scene = SceneDir(bench.scene)
     field = load_field(bench.scene)
-    baked, about, seconds = _bake(bench, field)
+    baked, report, seconds = _bake(bench, field)
     width = load_config(scene.config_file, ()).nerf.max_width
     cameras = Cameras.load(scene.stage("metric"))
     scores = evaluate(field, cameras, width, bench.pick(len(cameras), 1), baked=baked)
@@ -126,8 +126,8 @@ def bake(bench: Bench) -> Figures:
         "bake.bytes": baked.bytes,
         "bake.file_bytes": file.stat().st_size,
         "bake.seconds": seconds,
-        "bake.bricks": about["bricks_near"] + about["bricks_far"],
-        "bake.cell_m": about["cell_m"],
+        "bake.bricks": report["bricks_near"] + report["bricks_far"],
+        "bake.cell_m": report["cell_m"],
     }
 
 
@@ -144,15 +144,15 @@ def _bake(bench: Bench, field: Any) -> tuple[Any, Figures, float]:
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     wp.load_module("twin.nerf.kernels.bricks", device=field.device)
     began = time.perf_counter()
-    baked, about = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "max_bricks": 1500}))
+    baked, report = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "max_bricks": 1500}))
     seconds = time.perf_counter() - began
     folder = bench.work / "baked"
     folder.mkdir(exist_ok=True)
     baked.save(folder)
-    return baked, about, seconds
+    return baked, report, seconds
 
 
-def baked_place(bench: Bench) -> Path:
+def baked_path(bench: Bench) -> Path:
     """Path of a baked field: the scene's own, or one that is baked into the work folder."""
     if (SceneDir(bench.scene).stage("field") / "baked.json").exists():
         return bench.scene
@@ -164,12 +164,12 @@ def baked_place(bench: Bench) -> Path:
 
 def speed(bench: Bench) -> Figures:
     """Speed of 160×90 images with depth along the route, in processes of their own."""
-    place, views = baked_place(bench), route_views(bench)
+    place, views = baked_path(bench), route_views(bench)
     count, repeats = bench.pick((60, 5), (4, 1))
     found: Figures = {}
-    for used in (1, 2)[: buffers.available_cores()]:
-        row = worker("frames", place, views, used, count, repeats)
-        found |= {f"render.{key}_{used}core": value for key, value in row.items()}
+    for cores in (1, 2)[: buffers.available_cores()]:
+        row = worker("frames", place, views, cores, count, repeats)
+        found |= {f"render.{key}_{cores}core": value for key, value in row.items()}
     row = worker("ratio", place, views, bench.pick(SIZE[0], 16), bench.pick(3, 1))
     found |= {f"render.{key}": value for key, value in row.items()}
     return found | _first_frame(bench, place, views)
@@ -203,7 +203,7 @@ def depth(bench: Bench) -> Figures:
     cameras = Cameras.load(scene.stage("metric"))
     to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
     found: Figures = {}
-    for suffix, field in (("", load_baked(baked_place(bench))), ("_field", load_field(bench.scene))):
+    for suffix, field in (("", load_baked(baked_path(bench))), ("_field", load_field(bench.scene))):
         errors = depth_errors(field, truth, to_truth, _NEAR)
         found[f"depth.median_error{suffix}_m"] = errors["depth_median_m"]
         found[f"depth.median_relative{suffix}"] = errors["depth_relative"]
@@ -231,7 +231,7 @@ def gpu(bench: Bench) -> Figures:
     found |= {f"gpu.fox.{key}": value for key, value in row.items()}
     if bench.scene is None:
         return found
-    place, views = baked_place(bench), route_views(bench)
+    place, views = baked_path(bench), route_views(bench)
     with np.load(views) as data:
         poses, k = data["poses"], data["intrinsics"]
     poses = poses[np.linspace(0, len(poses) - 1, bench.pick(256, 4)).round().astype(int)]
@@ -244,12 +244,12 @@ def gpu(bench: Bench) -> Figures:
         render(on_gpu, poses, k, SIZE, name)  # returns numpy arrays, so it has finished
         times.append(time.perf_counter() - began)
     some = poses[:: max(1, len(poses) // 8)]
-    apart = np.abs(render(on_gpu, some, k, SIZE, name).rgb - render(on_cpu, some, k, SIZE, name).rgb)
+    difference = np.abs(render(on_gpu, some, k, SIZE, name).rgb - render(on_cpu, some, k, SIZE, name).rgb)
     return found | {
         "gpu.render_batch": len(poses),
         "gpu.render_fps": len(poses) / float(np.median(times)),
-        "gpu.cpu_difference_max": float(apart.max()),
-        "gpu.cpu_difference_mean": float(apart.mean()),
+        "gpu.cpu_difference_max": float(difference.max()),
+        "gpu.cpu_difference_mean": float(difference.mean()),
     }
 
 

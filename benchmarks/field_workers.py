@@ -99,21 +99,21 @@ def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
     render(field, poses[:1], k, size, lightings[0])
     turns = []
     for first_view in range(0, 8 * int(repeats), 8):
-        slow = seconds(plain, first_view, nerfacto_reference.CHUNK)
-        less_slow = seconds(tuned, first_view, nerfacto_tuned.CHUNK)
-        of_turn = []
+        plain_s = seconds(plain, first_view, nerfacto_reference.CHUNK)
+        tuned_s = seconds(tuned, first_view, nerfacto_tuned.CHUNK)
+        baked_s = []
         for i in range(first_view, first_view + 8):
             began = time.perf_counter()
             render(field, poses[i : i + 1], k, size, lightings[i])
-            of_turn.append(time.perf_counter() - began)
-        turns.append((slow, less_slow, float(np.median(of_turn))))
-    of_plain, of_tuned, baked = np.transpose(turns)
+            baked_s.append(time.perf_counter() - began)
+        turns.append((plain_s, tuned_s, float(np.median(baked_s))))
+    plain_times, tuned_times, baked_times = np.transpose(turns)
     return {
-        "ratio_to_nerfacto": float(np.median(of_plain / baked)),
-        "ratio_to_nerfacto_tuned": float(np.median(of_tuned / baked)),
-        "nerfacto_s": float(np.median(of_plain)),
-        "nerfacto_tuned_s": float(np.median(of_tuned)),
-        "ms_beside_nerfacto": float(np.median(baked)) * 1e3,
+        "ratio_to_nerfacto": float(np.median(plain_times / baked_times)),
+        "ratio_to_nerfacto_tuned": float(np.median(tuned_times / baked_times)),
+        "nerfacto_s": float(np.median(plain_times)),
+        "nerfacto_tuned_s": float(np.median(tuned_times)),
+        "ms_beside_nerfacto": float(np.median(baked_times)) * 1e3,
     }
 
 

@@ -86,7 +86,7 @@ def line(row: Row) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene")
-    parser.add_argument("--only", nargs="+", metavar="ID", help="rows such as B6, or: controls, speed")
+    parser.add_argument("--only", nargs="+", metavar="ID", help="row ids such as B6, controls or speed")
     add_record_options(parser)
     arguments = parser.parse_args()
 

@@ -94,7 +94,7 @@ class TrueWorld:
                 for samples in (2, 1)
             ]
 
-    def show(self, camera_to_world: np.ndarray, kind: str | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def render(self, camera_to_world: np.ndarray, kind: str | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Film colors (h, w, 3) and z-depth [m] at pixel centers, with an obstacle of a kind at a pose (4, 4)."""
         for name in KINDS:
             mocap = self.model.body(f"added_{name}").mocapid[0]
@@ -148,7 +148,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     add_obstacles(spec, pool, world)
     model = spec.compile()
     data = mujoco.MjData(model)
-    overlays = {"shaded": Compositor(model, field, SIZE), "unshaded": Compositor(model, field, SIZE, shaded=False)}
+    compositors = {"shaded": Compositor(model, field, SIZE), "unshaded": Compositor(model, field, SIZE, shaded=False)}
     errors: dict[str, list[np.ndarray]] = defaultdict(list)
     ious: dict[str, list[tuple[int, int]]] = defaultdict(list)
     length = float(arc_lengths(world.route)[-1])
@@ -165,7 +165,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                 eye = robot_at(world, model, data, max(0.0, station - ahead))
                 place((), data, 0.0)
                 mujoco.mj_forward(model, data)
-                empty = overlays["shaded"].render([data], lighting)
+                empty = compositors["shaded"].render([data], lighting)
                 place(here, data, 0.0)
                 mujoco.mj_forward(model, data)
                 pose = np.eye(4)
@@ -174,14 +174,14 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                     data.body(f"obstacle_{kind}").xpos,
                 )
                 true_eye, true_pose = to_truth.poses(eye), to_truth.poses(pose)
-                bare, bare_depth = true_world.show(true_eye, None, true_pose)
-                wanted, depth = true_world.show(true_eye, kind, true_pose)
+                bare, bare_depth = true_world.render(true_eye, None, true_pose)
+                wanted, depth = true_world.render(true_eye, kind, true_pose)
                 seen = depth < bare_depth - 1e-3
                 if seen.sum() < 20:
                     continue
                 shown = {}
-                for name, overlay in overlays.items():
-                    out = overlay.render([data], lighting)
+                for name, compositor in compositors.items():
+                    out = compositor.render([data], lighting)
                     shown[name] = out.rgb[0]
                     error = ((out.rgb[0] - wanted)[seen] ** 2).ravel()
                     errors[f"{name}.{lighting}"].append(error)
@@ -213,8 +213,8 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
         figures[f"overlay.obstacle_psnr.{lighting}"] = shaded
         figures[f"overlay.unshaded_psnr.{lighting}"] = unshaded
         figures[f"overlay.gain_over_unshaded.{lighting}"] = shaded - unshaded
-        both, either = np.sum(ious[lighting], 0)
-        figures[f"overlay.mask_iou.{lighting}"] = float(both / either)
+        intersection, union = np.sum(ious[lighting], 0)
+        figures[f"overlay.mask_iou.{lighting}"] = float(intersection / union)
         # The true world's sky is ambient light without occlusion: only its sun casts shadows.
         casts = any(shadow for _, _, shadow in LIGHTINGS[lighting].suns)
         for name in ("shadow", "no_shadow") if casts else ():
@@ -224,12 +224,12 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     for kind in kinds:
         if errors[f"kind.{kind}"]:
             figures[f"overlay.psnr_of.{kind}"] = error_db(errors[f"kind.{kind}"])
-    both, either = np.sum([pair for pairs in ious.values() for pair in pairs], 0)
-    figures["overlay.mask_iou"] = float(both / either)
+    intersection, union = np.sum([pair for pairs in ious.values() for pair in pairs], 0)
+    figures["overlay.mask_iou"] = float(intersection / union)
     return figures
 
 
-def seen_touched(scene_path: Path) -> dict[str, Any]:
+def visual_vs_collision(scene_path: Path) -> dict[str, Any]:
     """`seen_touched.*` of `twin.report.visual_vs_collision`, along a drive of the scripted follower."""
     from twin.assets.ground import Ground
     from twin.env.physics import HuskyPhysics
@@ -240,8 +240,8 @@ def seen_touched(scene_path: Path) -> dict[str, Any]:
     scene = load_scene(scene_path)
     world, field, mesh = scene.world(), scene.field(), scene.scene.stage("mesh")
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
-    looks = render_views(field, world, view_poses(drive.camera_to_world), field.lightings[0])
-    found = compare_geometry(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
+    views = render_views(field, world, view_poses(drive.camera_to_world), field.lightings[0])
+    found = compare_geometry(views, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
     return {f"seen_touched.{name}": value for name, value in found.items() if name != "along"}
 
 
@@ -272,10 +272,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene with its truth, such as scenes/demo")
     add_record_options(parser)
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="where pictures to judge by go")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="folder for comparison images")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     options = parser.parse_args()
-    figures = round_trip(options.scene, options.pictures, tuple(options.kinds)) | seen_touched(options.scene)
+    figures = round_trip(options.scene, options.pictures, tuple(options.kinds)) | visual_vs_collision(options.scene)
     for name, value in figures.items():
         sense, wanted = TARGETS.get(name, ("", 0.0))
         print(f"{name:40} {value:10.4g}  {f'{sense} {wanted:g}' if sense else ''}".rstrip())

@@ -92,7 +92,7 @@ def write_record(path: Path, record: dict[str, Any], replace: bool = False) -> N
             in `<path>.partial`.
     """
     if not replace and path.exists():
-        wrong = _objection(path, record)
+        wrong = _reason_to_keep(path, record)
         if wrong:
             write_so_far(path, record)
             raise InputError(
@@ -103,7 +103,7 @@ def write_record(path: Path, record: dict[str, Any], replace: bool = False) -> N
     _partial(path).unlink(missing_ok=True)
 
 
-def _objection(path: Path, record: dict[str, Any]) -> str:
+def _reason_to_keep(path: Path, record: dict[str, Any]) -> str:
     """Reason not to overwrite a file; empty if there is none."""
     try:
         old = read_json(path)

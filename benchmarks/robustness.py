@@ -29,7 +29,7 @@ import numpy as np
 _ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(_ROOT), str(_ROOT / "tests")]
 
-_WORLDS = 8
+_ENVS = 8
 _GROWTH = 32 << 20  # [bytes] allowed memory growth of eight environments
 _QUICK = {
     "nerf.steps": 80,
@@ -66,31 +66,31 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
     camera = CameraOptions(vibration=0.3, exposure=0.1, shutter=0.02, blur_samples=2)
     options = {"lighting": TRAINING, "lighting_drift": True, "obstacles": 2, "randomise": True, "camera": camera}
     scene = tiny_twin(folder / "endurance")
-    worlds = LocalVectorEnv(
-        EnvFactory.open(scene, "bend", {**options, "size": (32, 18), "start_along": 0.5}), list(range(_WORLDS))
+    envs = LocalVectorEnv(
+        EnvFactory.open(scene, "bend", {**options, "size": (32, 18), "start_along": 0.5}), list(range(_ENVS))
     )
-    worlds.begin(range(_WORLDS))
+    envs.begin(range(_ENVS))
     rng, process = np.random.default_rng(0), psutil.Process()
-    rounds, sizes, episodes, bad, start = steps // _WORLDS, [], 0, 0, time.perf_counter()
+    rounds, sizes, episodes, bad, start = steps // _ENVS, [], 0, 0, time.perf_counter()
     for k in tqdm.trange(rounds, desc="endurance", mininterval=60.0):
-        actions = np.stack([rng.uniform(0, 1, _WORLDS), rng.uniform(-0.4, 0.4, _WORLDS)], 1)  # mostly forward
-        out = worlds.step(actions)
-        states = [p.data.qpos for p in worlds.physics] + [p.data.qvel for p in worlds.physics]
+        actions = np.stack([rng.uniform(0, 1, _ENVS), rng.uniform(-0.4, 0.4, _ENVS)], 1)  # mostly forward
+        out = envs.step(actions)
+        states = [p.data.qpos for p in envs.physics] + [p.data.qvel for p in envs.physics]
         bad += not np.isfinite(out.reward).all() or not all(np.isfinite(one).all() for one in states)
         if over := np.flatnonzero(out.over).tolist():
             episodes += len(over)
-            worlds.begin(over)
+            envs.begin(over)
         if (k + 1) % max(1, rounds // 50) == 0:
             gc.collect()
             sizes.append(process.memory_info().rss)
-            tqdm.tqdm.write(f"{(k + 1) * _WORLDS} steps, {sizes[-1] / 2**20:.1f} MiB, {bad} rounds not finite")
+            tqdm.tqdm.write(f"{(k + 1) * _ENVS} steps, {sizes[-1] / 2**20:.1f} MiB, {bad} rounds not finite")
     settled = sizes[len(sizes) // 5]  # every kind of obstacle has been in view by then
     return {
-        "steps": rounds * _WORLDS,
+        "steps": rounds * _ENVS,
         "episodes": episodes,
         "rounds_not_finite": bad,
         "growth_mib": round((max(sizes[-5:]) - settled) / 2**20, 1),
-        "steps_per_s": round(rounds * _WORLDS / (time.perf_counter() - start), 1),
+        "steps_per_s": round(rounds * _ENVS / (time.perf_counter() - start), 1),
         "ok": bad == 0 and max(sizes[-5:]) - settled <= _GROWTH,
     }
 
@@ -117,8 +117,8 @@ def _killed_after(command: list[str], seconds: float) -> bool:
     """Kills a command after `seconds`; False if it had ended before. Asserts that its children die with it."""
     import psutil
 
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(command, cwd=_ROOT, stdout=subprocess.DEVNULL, stderr=said)
+    with tempfile.TemporaryFile() as stderr:
+        process = subprocess.Popen(command, cwd=_ROOT, stdout=subprocess.DEVNULL, stderr=stderr)
         children: dict[int, psutil.Process] = {}
         until = time.monotonic() + seconds
         while process.poll() is None and time.monotonic() < until:
@@ -126,8 +126,8 @@ def _killed_after(command: list[str], seconds: float) -> bool:
                 children |= {one.pid: one for one in psutil.Process(process.pid).children(recursive=True)}
             time.sleep(0.02)
         if process.poll() is not None:
-            said.seek(0)
-            assert process.returncode == 0, said.read().decode()[-3000:]
+            stderr.seek(0)
+            assert process.returncode == 0, stderr.read().decode()[-3000:]
             return False
         with contextlib.suppress(psutil.Error):
             children |= {one.pid: one for one in psutil.Process(process.pid).children(recursive=True)}
@@ -139,7 +139,7 @@ def _killed_after(command: list[str], seconds: float) -> bool:
     return True
 
 
-def _rubbish(root: Path) -> list[str]:
+def _leftovers(root: Path) -> list[str]:
     """Temporary files, which a finished verb must have removed."""
     names = [path for path in root.rglob("*") if ".partial" in path.name or path.name.endswith((".lock", ".old"))]
     return [str(path.relative_to(root)) for path in names]
@@ -189,13 +189,13 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
         if from_start:  # structure from motion is not repeatable, so later builds are compared with this one
             wanted = now
         different += now != wanted
-    rubbish = _rubbish(root)
+    leftovers = _leftovers(root)
     return {
         "killed": killed,
         "finished": finished,
         "different": different,
-        "rubbish": rubbish,
-        "ok": not different and not rubbish,
+        "leftovers": leftovers,
+        "ok": not different and not leftovers,
     }
 
 
@@ -233,22 +233,22 @@ def _killed_trainings(times: int, folder: Path, rng: np.random.Generator) -> dic
                 killed += 1
                 longest = max(longest, _saved(root / "runs" / name))
             else:  # it finished first: start a new one
-                runs.append(_trained(root / "runs" / name, steps))
+                runs.append(_is_complete(root / "runs" / name, steps))
                 shutil.rmtree(root / "runs" / name)
             assert time.monotonic() - begun < 600
         assert _killed_after(command, 3600.0) is False
-        runs.append(_trained(root / "runs" / name, steps))
+        runs.append(_is_complete(root / "runs" / name, steps))
     rates = [np.mean([row["success"] for row in _rows(root / "runs" / name)]) for name in ("whole", "killed")]
-    rubbish = _rubbish(root)
-    good = all(run["whole"] for run in runs)
+    leftovers = _leftovers(root)
+    complete = all(runs)
     noise = 3.0 * np.sqrt(0.25 / max(1, min(len(_rows(root / "runs" / name)) for name in ("whole", "killed"))))
     return {
         "killed": killed,
         "finished": len(runs),
-        "whole": good,
+        "complete": complete,
         "success": [round(float(rate), 3) for rate in rates],
-        "rubbish": rubbish,
-        "ok": bool(good and not rubbish and abs(rates[0] - rates[1]) <= noise),
+        "leftovers": leftovers,
+        "ok": bool(complete and not leftovers and abs(rates[0] - rates[1]) <= noise),
     }
 
 
@@ -264,7 +264,7 @@ def _rows(run: Path) -> list[dict[str, Any]]:
         return [row | {"success": int(row["success"])} for row in csv.DictReader(file)]
 
 
-def _trained(run: Path, steps: int) -> dict[str, Any]:
+def _is_complete(run: Path, steps: int) -> bool:
     """Checks a finished training: all steps, tables without gaps or repetitions, a complete replay buffer."""
     head = json.loads((run / "state" / "state.json").read_text())
     rows = _rows(run)
@@ -273,12 +273,12 @@ def _trained(run: Path, steps: int) -> dict[str, Any]:
     with np.load(run / "state" / head["folder"] / "replay.npz", allow_pickle=False) as data:
         written, newest, age = data["written"], data["newest"], data["age"]
     filled = head["replay"]["full"] or head["replay"]["pos"] * written.size == head["steps"]
-    tape = np.fromfile(run / "state" / "pictures.bin", np.uint8)
-    pictures = tape.reshape(len(written), -1, 3 * 45 * 80)
+    stored = np.fromfile(run / "state" / "pictures.bin", np.uint8)
+    images = stored.reshape(len(written), -1, 3 * 45 * 80)
     # Every image that a transition refers to has been written: none is entirely black.
-    shown = [pictures[i, newest[:, i] % pictures.shape[1]].any(-1).all() for i in range(len(written))]
-    whole = head["steps"] == steps and at == sorted(at) and len(set(seeds)) == len(seeds) and filled and all(shown)
-    return {"whole": bool(whole and (age >= 0).all() and (newest < written).all())}
+    written_images = [images[i, newest[:, i] % images.shape[1]].any(-1).all() for i in range(len(written))]
+    tables = head["steps"] == steps and at == sorted(at) and len(set(seeds)) == len(seeds)
+    return bool(tables and filled and all(written_images) and (age >= 0).all() and (newest < written).all())
 
 
 def _killed_validations(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:
@@ -302,13 +302,13 @@ def _killed_validations(times: int, folder: Path, rng: np.random.Generator) -> d
         assert _killed_after(command, 3600.0) is False
         finished += 1
         different += digests != {name: _digest(root / "validation" / name) for name in files}
-    rubbish = _rubbish(root)
+    leftovers = _leftovers(root)
     return {
         "killed": killed,
         "finished": finished,
         "different": different,
-        "rubbish": rubbish,
-        "ok": not different and not rubbish,
+        "leftovers": leftovers,
+        "ok": not different and not leftovers,
     }
 
 
@@ -341,7 +341,7 @@ def fill(disk: Path, leave: int) -> Path:
     return path
 
 
-def refused(command: list[str], root: Path) -> str:
+def full_disk_fault(command: list[str], root: Path) -> str:
     """Runs a command that must fail with one line and exit status 2, keeping all files; returns what differs, or ""."""
     before = _contents(root)
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
@@ -350,8 +350,8 @@ def refused(command: list[str], root: Path) -> str:
         return f"exit status {done.returncode}, {len(lines)} lines: {done.stderr[-1500:]}"
     after = _contents(root)
     lost = [name for name, digest in before.items() if after.get(name) != digest]
-    rubbish = [name for name in _rubbish(root) if name not in before]
-    return f"lost {lost}, left {rubbish}" if lost or rubbish else ""
+    leftovers = [name for name in _leftovers(root) if name not in before]
+    return f"lost {lost}, left {leftovers}" if lost or leftovers else ""
 
 
 def _contents(root: Path) -> dict[str, str]:
@@ -363,7 +363,7 @@ def _contents(root: Path) -> dict[str, str]:
 def disk(folder: Path) -> dict[str, Any]:
     """Runs every stage of a build, a training, a validation, an export and a film on a full disk."""
     out = full_build(folder) | full_verbs(folder)
-    return out | {"ok": all(said == "ok" for said in out.values())}
+    return out | {"ok": all(result == "ok" for result in out.values())}
 
 
 def full_build(folder: Path) -> dict[str, str]:
@@ -380,12 +380,12 @@ def full_build(folder: Path) -> dict[str, str]:
         for name in reversed(STAGES):
             shutil.rmtree(SceneDir(root).stage(name))
             for leave in (0, 64 << 10):
-                out[f"build, {name}, {leave >> 10} KiB left"] = _on_full(mounted, leave, _build_command(root), root)
+                out[f"build, {name}, {leave >> 10} KiB left"] = _fault_or_ok(mounted, leave, _build_command(root), root)
         done = subprocess.run(_build_command(root), cwd=_ROOT, capture_output=True, text=True)
         same = done.returncode == 0 and _results(root, ("capture",)) == whole
         out["build, afterwards"] = "ok" if same else done.stderr[-1500:]
         export = _verb(root, "export", "--ply", str(root / "road.ply"), "--glb", str(root / "road.glb"))
-        out["export, 8 KiB left"] = _on_full(mounted, 8 << 10, export, root)
+        out["export, 8 KiB left"] = _fault_or_ok(mounted, 8 << 10, export, root)
     return out
 
 
@@ -405,16 +405,16 @@ def full_verbs(folder: Path) -> dict[str, str]:
         }
         for name, command in verbs.items():
             for leave in (0, 8 << 10, 5 << 20) if name == "train" else (0, 8 << 10):
-                out[f"{name}, {leave >> 10} KiB left"] = _on_full(mounted, leave, command, root)
+                out[f"{name}, {leave >> 10} KiB left"] = _fault_or_ok(mounted, leave, command, root)
             done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
             out[f"{name}, afterwards"] = "ok" if done.returncode == 0 else done.stderr[-1500:]
     return out
 
 
-def _on_full(mounted: Path, leave: int, command: list[str], root: Path) -> str:
+def _fault_or_ok(mounted: Path, leave: int, command: list[str], root: Path) -> str:
     filling = fill(mounted, leave)
     try:
-        return refused(command, root) or "ok"
+        return full_disk_fault(command, root) or "ok"
     finally:
         filling.unlink()
 
@@ -436,20 +436,20 @@ def _verb(root: Path, name: str, *arguments: str) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("endurance", "kills", "disk"))
-    parser.add_argument("--steps", type=int, default=1_000_000, help="of endurance (default %(default)s)")
+    parser.add_argument("test", choices=("endurance", "kills", "disk"))
+    parser.add_argument("--steps", type=int, default=1_000_000, help="control steps of endurance (default %(default)s)")
     parser.add_argument("--times", type=int, default=50, help="kills of each verb (default %(default)s)")
-    parser.add_argument("--only", choices=("build", "train", "validate"), help="of kills")
-    parser.add_argument("--json", type=Path, help="where to write the table")
+    parser.add_argument("--only", choices=("build", "train", "validate"), help="a single verb to kill")
+    parser.add_argument("--json", type=Path, help="write the results here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        works: dict[str, Callable[[], dict[str, Any]]] = {
+        tests: dict[str, Callable[[], dict[str, Any]]] = {
             "endurance": lambda: endurance(options.steps, folder),
             "kills": lambda: kills(options.times, folder, options.only),
             "disk": lambda: disk(folder),
         }
-        out = works[options.what]()
+        out = tests[options.test]()
     for key, value in out.items():
         print(f"{key:40} {value}")
     if options.json:

@@ -117,8 +117,8 @@ def _digest(path: Path) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("commit", help="what is compared with")
-    parser.add_argument("--work", type=Path, help="folder to work in, kept (default: a temporary one)")
+    parser.add_argument("commit", help="commit to compare with")
+    parser.add_argument("--work", type=Path, help="working folder, kept (default: a temporary one)")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         work = (options.work or Path(temporary)).resolve()

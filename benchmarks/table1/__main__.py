@@ -129,9 +129,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--setups", nargs="+", choices=SETUPS, default=list(SETUPS))
-    parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="none: the table alone")
+    parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="no names: the tables only")
     parser.add_argument("--jobs", type=int, default=2, help="runs at once, one core each")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: results.json beside this)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: the one beside this file)")
     add_replace_option(parser)
     given = parser.parse_args()
     asked = runs(given.seeds, given.tasks, given.setups)
@@ -159,7 +159,7 @@ def main() -> int:
         return status
     print(tables(results))
     print(f"\nThe paper's table, over all {len(WEATHER)} weathers\n\n{table(results)}")
-    print("\nForecasts over all of them; their 90 % intervals are nominal, see benchmarks/intervals.py --record")
+    print("\nForecasts over all weathers; coverage of their 90 % intervals: benchmarks/intervals.py --record")
     for kind in ("forecast", "forecast_by_photo"):
         for task, group in results[kind].items():
             print(kind, task, json.dumps(group))

@@ -60,18 +60,18 @@ class Run:
         return scene / "runs" / self.name
 
     def checkpoints(self, scene: Path) -> list[Path]:
-        """Checkpoints for the forecast: the last one at or before each of `SHARES`."""
-        there = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
-        picked = [[path for path in there if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
-        return [some[-1] for some in picked if some]
+        """Checkpoints for the forecast: the last one of each of `SHARES`, up to 100 steps late."""
+        saved = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
+        before = [[path for path in saved if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
+        return [some[-1] for some in before if some]
 
     def finished(self, scene: Path) -> bool:
         path, steps = self.folder(scene), STEPS[self.task]
         if not (path / "config.json").exists():
             return False
-        asked = read_json(path / "config.json")["steps"]
-        if asked != steps:  # the learning rate schedule depends on the total steps, so a longer run is another training
-            raise SystemExit(f"{path} is a run of {asked} steps, not of {steps}; move it away")
+        planned = read_json(path / "config.json")["steps"]
+        if planned != steps:  # the learning rate schedule depends on the total, so a longer run is another training
+            raise SystemExit(f"{path} is a run of {planned} steps, not of {steps}; move it away")
         return (path / CHOICE_FILE).exists() and read_json(path / CHOICE_FILE)["steps"] >= steps
 
 

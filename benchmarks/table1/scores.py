@@ -41,7 +41,7 @@ _DAYS = [name for name in WEATHER if name.startswith("day_")]
 _STATED = len(WEATHER) - len(_DAYS)
 GROUPS: dict[str, tuple[str, ...]] = {
     f"days {_USED + 1} to {len(_DAYS)}, which no choice had seen": tuple(_DAYS[_USED:]),
-    f"days 1 to {len(_DAYS)}, drawn by chance": tuple(_DAYS),
+    f"days 1 to {len(_DAYS)}, sampled at random": tuple(_DAYS),
     "the stated weathers and days 1 to 5, seen during development": tuple(WEATHER)[: _STATED + _USED],
     f"all {len(WEATHER)} weathers, half of them seen during development": tuple(WEATHER),
 }
@@ -56,7 +56,7 @@ Counts = dict[str, tuple[int, int]]
 
 
 @dataclass(frozen=True)
-class Judged:
+class PolicyRecord:
     """Record of one policy on its task."""
 
     name: str
@@ -71,7 +71,7 @@ class Judged:
     real: Counts
 
 
-def judged(results: dict[str, Any]) -> list[Judged]:
+def policy_records(results: dict[str, Any]) -> list[PolicyRecord]:
     """The policies of a record."""
     names = {task: short for short, task in TASKS.items()}
     out = []
@@ -80,7 +80,7 @@ def judged(results: dict[str, Any]) -> list[Judged]:
             _, _, step = policy["policy"].partition("/")
             held_out = policy["validate_randomised"]
             out.append(
-                Judged(
+                PolicyRecord(
                     name=policy["policy"],
                     setup=run["setup"],
                     task=run["task"],
@@ -94,10 +94,10 @@ def judged(results: dict[str, Any]) -> list[Judged]:
 
 
 def counts(part: dict[str, Any]) -> Counts:
-    return {name: (told["successes"], told["trials"]) for name, told in part["by_lighting"].items()}
+    return {name: (cell["successes"], cell["trials"]) for name, cell in part["by_lighting"].items()}
 
 
-def rule(policy: Judged) -> float:
+def rule(policy: PolicyRecord) -> float:
     """A baseline without the twin: 1 if lightings varied in training and at least half of it is done, else 0.
 
     It was formulated when all trials were known.
@@ -105,7 +105,7 @@ def rule(policy: Judged) -> float:
     return float(policy.setup == "varied" and policy.trained >= _HALF)
 
 
-def by_photo(policy: Judged, days: Sequence[str]) -> float:
+def by_photo(policy: PolicyRecord, days: Sequence[str]) -> float:
     """Mean over days of the twin's rates under lightings from photos."""
     return _mean(policy.twin, days)
 
@@ -114,10 +114,10 @@ def _mean(counts: Counts, days: Sequence[str]) -> float:
     return float(np.mean([counts[day][0] / counts[day][1] for day in days]))
 
 
-PREDICTORS: dict[str, Callable[[Judged, Sequence[str]], float]] = {
+PREDICTORS: dict[str, Callable[[PolicyRecord, Sequence[str]], float]] = {
     "twin, by a photo of each day": by_photo,
     "twin, held-out lights": lambda policy, days: policy.held_out,
-    "rule that never looks at the twin": lambda policy, days: rule(policy),
+    "rule without the twin": lambda policy, days: rule(policy),
 }
 
 
@@ -139,7 +139,7 @@ class Scores:
     """Number of policies within the interval predicted from the task's other policies, and number of intervals."""
 
 
-def scores(predictor: str, policies: Sequence[Judged], days: Sequence[str]) -> Scores | None:
+def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> Scores | None:
     """Scores of one of `PREDICTORS`; None if fewer than `MIN_POLICIES` drove on all the days."""
     mine = [p for p in policies if set(days) <= p.real.keys() and (set(days) <= p.twin.keys())]
     if len(mine) < MIN_POLICIES:
@@ -180,24 +180,24 @@ def _defined(statistic: Callable[..., float], twin: np.ndarray, real: np.ndarray
         return None
 
 
-def _cells_held(predictor: str, policies: Sequence[Judged], days: Sequence[str]) -> float | None:
+def _cells_held(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> float | None:
     """Fraction of cells compatible as in the forecast: the interval of the difference of rates contains 0."""
-    if predictor not in ("twin, by a photo of each day", "rule that never looks at the twin"):
+    if predictor not in ("twin, by a photo of each day", "rule without the twin"):
         return None
-    told = [
+    predicted = [
         p.twin[day] if predictor.startswith("twin") else (round(RULE_TRIALS * rule(p)), RULE_TRIALS)
         for p in policies
         for day in days
     ]
-    seen = [policy.real[day] for policy in policies for day in days]
-    (won, trials), (real_won, real_trials) = np.transpose(told), np.transpose(seen)
+    real = [policy.real[day] for policy in policies for day in days]
+    (won, trials), (real_won, real_trials) = np.transpose(predicted), np.transpose(real)
     _, low, high = rate_difference(
         twin_successes=won, twin_trials=trials, real_successes=real_won, real_trials=real_trials
     )
     return float(((low <= 0.0) & (high >= 0.0)).mean())
 
 
-def finals(policies: Sequence[Judged], setup: str, task: str, days: Sequence[str]) -> str:
+def finals(policies: Sequence[PolicyRecord], setup: str, task: str, days: Sequence[str]) -> str:
     """Success on the road of a setup's finished policies, in the format of `over_days`."""
     mine = [p for p in policies if (p.setup, p.task, p.trained) == (setup, task, 1.0) and set(days) <= p.real.keys()]
     return over_days([{day: policy.real[day] for day in days} for policy in mine])
@@ -222,7 +222,7 @@ def over_days(parts: Sequence[Counts]) -> str:
 
 def tables(results: dict[str, Any]) -> str:
     """Success of finished policies, and scores of every predictor, by group of days, in Markdown."""
-    policies = judged(results)
+    policies = policy_records(results)
     lines = ["Finished policies on the road: mean over days, its 90 % interval over days, successes/trials", ""]
     lines += ["| days | setup | straight | right turn |", "|---|---|---|---|"]
     for group, days in GROUPS.items():
@@ -239,7 +239,7 @@ def tables(results: dict[str, Any]) -> str:
         "cells that agree",
         "corrected hold",
     )
-    lines += ["", "How predictors rank the policies, finished ones and checkpoints; no interval is known to hold", ""]
+    lines += ["", "Ranking of all policies, finished and checkpoints, by predictor; without intervals", ""]
     lines += [f"| days | task | predictor | {' | '.join(heads)} |", f"|---|---|---|{'---|' * len(heads)}"]
     for group, days in GROUPS.items():
         for task in ("both tasks", *TASKS.values()):
@@ -252,18 +252,18 @@ def tables(results: dict[str, Any]) -> str:
 
 
 def _row(found: Scores) -> list[str]:
-    def told(value: float | None, form: str) -> str:
+    def text(value: float | None, form: str) -> str:
         return "–" if value is None else format(value, form).replace("-", "−")
 
     values = (found.spearman, found.pearson, found.mmrv, found.regret, found.bias)
     forms = (".2f", ".3f", ".3f", ".3f", "+.3f")
     corrected = f"{found.corrected[0]} of {found.corrected[1]}" if found.corrected[1] else "–"
-    return [str(found.policies), *map(told, values, forms), told(found.cells, ".1%"), corrected]
+    return [str(found.policies), *map(text, values, forms), text(found.cells, ".1%"), corrected]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: results.json beside this)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: the one beside this file)")
     print(tables(read_json(parser.parse_args().results)))
 
 
