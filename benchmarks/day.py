@@ -45,7 +45,7 @@ Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 def true_images(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
     """Images of every day at every station, and the camera_to_world poses (stations, 4, 4) in the true world."""
     line, rows, poses = RoadLine(), [], np.zeros((len(STATIONS), 4, 4))
-    for light in track([WEATHER[name] for name in days], "pictures of days", unit="day"):
+    for light in track([WEATHER[name] for name in days], "images of days", unit="day"):
         road, camera = recordings._road_and_camera(light)
         row = []
         for k, station in enumerate(STATIONS):
@@ -70,19 +70,19 @@ def steering(policy: Callable, pictures: Pictures) -> NDArray:
 
 
 def ratios(gaps: list[NDArray], randomised: list[NDArray], rng: np.random.Generator | None = None) -> NDArray:
-    """What lasts and what is local of changes over the same of others, geometric means over policies.
+    """Ratios of lasting and local changes to those of randomised weather, geometric means over policies.
 
     Args:
-        gaps: Of every policy, (days, stations).
-        randomised: The others, (more days, stations).
-        rng: Resamples policies and days, if given.
+        gaps: Steering changes between twin and truth, (days, stations) per policy.
+        randomised: Steering changes under randomised weather, (samples, stations) per policy.
+        rng: Resamples policies and days for a bootstrap, if given.
     """
     policies = np.arange(len(gaps))
     days, others = np.arange(len(gaps[0])), np.arange(len(randomised[0]))
     if rng:
         policies, days, others = (rng.choice(one, len(one)) for one in (policies, days, others))
-    each = [np.log(lasting_and_local(gaps[k][days]) / lasting_and_local(randomised[k][others])) for k in policies]
-    return np.exp(np.mean(each, 0))
+    log_ratios = [np.log(lasting_and_local(gaps[k][days]) / lasting_and_local(randomised[k][others])) for k in policies]
+    return np.exp(np.mean(log_ratios, 0))
 
 
 def main() -> int:
@@ -103,7 +103,7 @@ def main() -> int:
     intrinsics = camera_intrinsics(model, model.camera("front").id, SIZE)
     rays = unproject(pixel_grid(*SIZE), intrinsics)
     lengths = np.linalg.norm(rays, axis=-1).astype(np.float32)
-    shown, true_poses = true_images(given.days)
+    truth, true_poses = true_images(given.days)
     to_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras))
     poses = to_truth.inverse().poses(true_poses)
     views = Viewpoints.of(poses, intrinsics, SIZE)
@@ -122,7 +122,7 @@ def main() -> int:
     for i, name in enumerate(given.days):
         report(f"day.extinction.{name}", field.fog(name).extinction)
         for what, many in (("filmed", filmed), ("photo", [fogged[i]])):
-            means = [np.mean([psnr(a, b) for a, b in zip(p[1:], shown[i, 1:], strict=True)]) for p in many]
+            means = [np.mean([psnr(a, b) for a, b in zip(p[1:], truth[i, 1:], strict=True)]) for p in many]
             report(f"day.psnr.{what}.{name}", max(means))
 
     rng = np.random.default_rng(0)
@@ -141,7 +141,7 @@ def main() -> int:
     pictures = {scale: [weathered(scale, *one) for one in zip(samples, seeds, strict=True)] for scale in SCALES}
     if given.pictures:
         for i, name in enumerate(given.days):
-            both = np.hstack([np.vstack(p[i]) for p in (shown, fogged, pictures[KNOWN_WEATHER_FRACTION][0])])
+            both = np.hstack([np.vstack(p[i]) for p in (truth, fogged, pictures[KNOWN_WEATHER_FRACTION][0])])
             write_image(given.pictures / f"{name}.png", (np.clip(both, 0.0, 1.0) * 255.0).astype(np.uint8))
     gaps: list[NDArray] = []
     responses: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
@@ -149,7 +149,7 @@ def main() -> int:
         policy = load_policy(str(find_policy(given.scene, source)), False)
         places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # not where photos were taken
         before = steering(policy, fogged[:, places])
-        gaps.append(steering(policy, shown[:, places]) - before)
+        gaps.append(steering(policy, truth[:, places]) - before)
         for scale, many in pictures.items():
             responses[scale].append(np.concatenate([steering(policy, one[:, places]) - before for one in many]))
     for scale, randomised in responses.items() if gaps else ():

@@ -1,4 +1,4 @@
-"""Validity of the trust score: rendered depth and colour against the known truth, on and off the filmed path."""
+"""Validity of the trust score: rendered depth and color against the known truth, on and off the filmed path."""
 
 from pathlib import Path
 from typing import Any

@@ -159,8 +159,8 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     trained, _, _ = train_field(
         cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height, "cpu"
     )
-    shown = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
-    return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(shown).tolist()}
+    size = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
+    return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(size).tolist()}
 
 
 def peak_bytes() -> int:

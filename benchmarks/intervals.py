@@ -101,23 +101,23 @@ def coverage(settings: tuple[int, int, int, float, float], experiments: int, see
     """Fraction of the experiments in which each interval contains the true value."""
     rng = np.random.default_rng(seed)
     truth = true_values(lambda: simulated_experiment(rng, *settings))
-    held: dict[str, list[float]] = {name: [] for name in (*truth, "predicted", "left out", "mean on the road")}
+    hits: dict[str, list[float]] = {name: [] for name in (*truth, "predicted", "left out", "mean on the road")}
     n = settings[0]
     for _ in range(experiments):
         data = simulated_experiment(rng, *settings)
         for name, hit in intervals_hold(data, rng, truth).items():
-            held[name].append(hit)
+            hits[name].append(hit)
         further = observed_rates(simulated_experiment(rng, 2 * n, *settings[1:]))
         driven, others = slice(0, n), slice(n, 2 * n)
         f, y = further.twin, further.real
         _, low, high = LinearCorrection.fit(twin=f[driven], real=y[driven]).predict(f[others])
-        held["predicted"].append(float(np.mean((low <= y[others]) & (y[others] <= high))))
+        hits["predicted"].append(float(np.mean((low <= y[others]) & (y[others] <= high))))
         if n > 5:
             _, low, high = leave_one_group_out(twin=f[driven], real=y[driven], groups=range(n))
-            held["left out"].append(float(np.mean((low <= y[driven]) & (y[driven] <= high))))
+            hits["left out"].append(float(np.mean((low <= y[driven]) & (y[driven] <= high))))
         mean = prediction_powered_mean(twin=f[driven], real=y[driven], twin_only=f[others])
-        held["mean on the road"].append(mean.low <= 0.5 <= mean.high)  # one half, by symmetry
-    return {name: float(np.mean(each)) if each else float("nan") for name, each in held.items()}
+        hits["mean on the road"].append(mean.low <= 0.5 <= mean.high)  # one half, by symmetry
+    return {name: float(np.mean(each)) if each else float("nan") for name, each in hits.items()}
 
 
 def true_values(experiment: Callable[[], PairedCells]) -> dict[str, float]:
@@ -137,8 +137,8 @@ def recorded_coverage(record: PairedCells, resample_days: bool, experiments: int
     """`coverage` in experiments resampled from a record."""
     rng = np.random.default_rng(seed)
     truth = true_values(lambda: resampled_experiment(rng, record, resample_days))
-    held = [intervals_hold(resampled_experiment(rng, record, resample_days), rng, truth) for _ in range(experiments)]
-    return {name: float(np.mean([one[name] for one in held if name in one])) for name in truth}
+    hits = [intervals_hold(resampled_experiment(rng, record, resample_days), rng, truth) for _ in range(experiments)]
+    return {name: float(np.mean([one[name] for one in hits if name in one])) for name in truth}
 
 
 def main() -> None:
@@ -151,7 +151,7 @@ def main() -> None:
     }
     if given.record:
         record = read_experiment(given.record)
-        rows = {name: partial(recorded_coverage, record, anew, given.experiments) for name, anew in RESAMPLING.items()}
+        rows = {name: partial(recorded_coverage, record, days, given.experiments) for name, days in RESAMPLING.items()}
     for i, (name, measure) in enumerate(rows.items()):
         row = measure()
         if i == 0:

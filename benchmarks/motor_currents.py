@@ -77,8 +77,8 @@ def read_currents(paths: list[Path]) -> SteadySamples:
         last = np.searchsorted(time, time + _HALF_WINDOW, side="right")
         for i, (a, b) in enumerate(zip(first, last, strict=True)):
             near = speed[a:b]
-            whole = time[i] - time[0] >= _HALF_WINDOW and time[-1] - time[i] >= _HALF_WINDOW
-            if whole and np.ptp(near, axis=0).max() <= _MAX_VARIATION and near.min() > _MIN_SPEED:
+            complete = time[i] - time[0] >= _HALF_WINDOW and time[-1] - time[i] >= _HALF_WINDOW
+            if complete and np.ptp(near, axis=0).max() <= _MAX_VARIATION and near.min() > _MIN_SPEED:
                 speeds.append(near.mean(0))
                 currents.append(current[i])
     steady = SteadySamples(np.array(speeds).reshape(-1, 2), np.array(currents).reshape(-1, 2))

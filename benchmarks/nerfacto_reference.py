@@ -82,8 +82,8 @@ class Field:
         density, geometry = self.base(self.grid(unit_cube(points))).split([1, GEOMETRY], -1)
         samples = points.shape[:-1]
         seen_from = harmonics(directions)[:, None].expand(*samples, -1)
-        colour = self.head(torch.cat([geometry, seen_from, self.appearance.expand(*samples, -1)], -1)).sigmoid()
-        return density[..., 0].exp(), colour
+        color = self.head(torch.cat([geometry, seen_from, self.appearance.expand(*samples, -1)], -1)).sigmoid()
+        return density[..., 0].exp(), color
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Nerfacto:
             weights = weights_of(density_of(points_on(origins, directions, edges)), edges)
             spacing = resampled(spacing, weights, following)
         edges = distance_of(spacing)
-        density, colour = self.field(points_on(origins, directions, edges), directions)
+        density, color = self.field(points_on(origins, directions, edges), directions)
         weights = weights_of(density, edges)
-        rgb = (weights[..., None] * colour).sum(1)
+        rgb = (weights[..., None] * color).sum(1)
         reached = weights.cumsum(-1)
         middle = (edges[:, 1:] + edges[:, :-1]) / 2
         half = torch.searchsorted(reached, torch.full((len(edges), 1), 0.5)).clamp(max=middle.shape[1] - 1)

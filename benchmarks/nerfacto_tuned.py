@@ -87,11 +87,11 @@ class TunedField:
         out = columns(self.base[2], columns(self.base[0], self.grid(cube_columns(points))).relu_())
         # Direction and appearance are constant along a ray: their part of the first layer acts as a bias.
         first: Any = self.head[0]
-        of_sample, of_direction, of_frame = first.weight.split([GEOMETRY, HARMONICS, len(self.appearance)], 1)
-        of_ray = of_direction @ harmonics(directions).T + (first.bias + of_frame @ self.appearance)[:, None]
-        hidden = (of_sample @ out[1:]).view(-1, *samples).add_(of_ray[:, :, None]).relu_().flatten(1)
-        colour = columns(self.head[4], columns(self.head[2], hidden).relu_()).sigmoid_()
-        return out[0].exp().view(samples), colour.view(3, *samples).permute(1, 2, 0)
+        w_geometry, w_direction, w_appearance = first.weight.split([GEOMETRY, HARMONICS, len(self.appearance)], 1)
+        ray_bias = w_direction @ harmonics(directions).T + (first.bias + w_appearance @ self.appearance)[:, None]
+        hidden = (w_geometry @ out[1:]).view(-1, *samples).add_(ray_bias[:, :, None]).relu_().flatten(1)
+        color = columns(self.head[4], columns(self.head[2], hidden).relu_()).sigmoid_()
+        return out[0].exp().view(samples), color.view(3, *samples).permute(1, 2, 0)
 
 
 def columns(layer: Any, x: Tensor) -> Tensor:

@@ -161,12 +161,12 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                     continue
                 if kind == "car":  # a car needs more room
                     lateral, ahead = lateral + 1.8, ahead + 3.0
-                here = (ObstacleConfig(kind, kind, station, lateral, yaw),)
+                placed = (ObstacleConfig(kind, kind, station, lateral, yaw),)
                 eye = robot_at(world, model, data, max(0.0, station - ahead))
                 place((), data, 0.0)
                 mujoco.mj_forward(model, data)
                 empty = compositors["shaded"].render([data], lighting)
-                place(here, data, 0.0)
+                place(placed, data, 0.0)
                 mujoco.mj_forward(model, data)
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = (
@@ -174,21 +174,21 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                     data.body(f"obstacle_{kind}").xpos,
                 )
                 true_eye, true_pose = to_truth.poses(eye), to_truth.poses(pose)
-                bare, bare_depth = true_world.render(true_eye, None, true_pose)
-                wanted, depth = true_world.render(true_eye, kind, true_pose)
-                seen = depth < bare_depth - 1e-3
+                empty_truth, empty_truth_depth = true_world.render(true_eye, None, true_pose)
+                truth_rgb, depth = true_world.render(true_eye, kind, true_pose)
+                seen = depth < empty_truth_depth - 1e-3
                 if seen.sum() < 20:
                     continue
-                shown = {}
+                composites = {}
                 for name, compositor in compositors.items():
                     out = compositor.render([data], lighting)
-                    shown[name] = out.rgb[0]
-                    error = ((out.rgb[0] - wanted)[seen] ** 2).ravel()
+                    composites[name] = out.rgb[0]
+                    error = ((out.rgb[0] - truth_rgb)[seen] ** 2).ravel()
                     errors[f"{name}.{lighting}"].append(error)
                     if name == "shaded":
                         dimmed = [
                             luminance(a) / np.maximum(luminance(b), 0.02)
-                            for a, b in ((wanted, bare), (out.rgb[0], empty.rgb[0]))
+                            for a, b in ((truth_rgb, empty_truth), (out.rgb[0], empty.rgb[0]))
                         ]
                         ground = (
                             ~seen & (out.depth[0] > empty.depth[0] - 1e-3) & ((dimmed[0] < 0.95) | (dimmed[1] < 0.95))
@@ -201,7 +201,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                 rows.append(
                     (
                         kind,
-                        np.concatenate([wanted, shown["shaded"], shown["unshaded"]], 1),
+                        np.concatenate([truth_rgb, composites["shaded"], composites["unshaded"]], 1),
                         error_db(errors[f"shaded.{lighting}"][-1:]),
                     )
                 )
@@ -277,8 +277,8 @@ def main() -> int:
     options = parser.parse_args()
     figures = round_trip(options.scene, options.pictures, tuple(options.kinds)) | visual_vs_collision(options.scene)
     for name, value in figures.items():
-        sense, wanted = TARGETS.get(name, ("", 0.0))
-        print(f"{name:40} {value:10.4g}  {f'{sense} {wanted:g}' if sense else ''}".rstrip())
+        sense, target = TARGETS.get(name, ("", 0.0))
+        print(f"{name:40} {value:10.4g}  {f'{sense} {target:g}' if sense else ''}".rstrip())
     return save(options.json, figures, options.replace_record)
 
 

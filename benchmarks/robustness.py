@@ -376,13 +376,13 @@ def full_build(folder: Path) -> dict[str, str]:
     with small_disk(folder / "disk", 600 << 20) as mounted:
         root = mounted / "filmed"
         shutil.copytree(source, root)
-        whole = _results(root, ("capture",))
+        expected = _results(root, ("capture",))
         for name in reversed(STAGES):
             shutil.rmtree(SceneDir(root).stage(name))
             for leave in (0, 64 << 10):
                 out[f"build, {name}, {leave >> 10} KiB left"] = _fault_or_ok(mounted, leave, _build_command(root), root)
         done = subprocess.run(_build_command(root), cwd=_ROOT, capture_output=True, text=True)
-        same = done.returncode == 0 and _results(root, ("capture",)) == whole
+        same = done.returncode == 0 and _results(root, ("capture",)) == expected
         out["build, afterwards"] = "ok" if same else done.stderr[-1500:]
         export = _verb(root, "export", "--ply", str(root / "road.ply"), "--glb", str(root / "road.glb"))
         out["export, 8 KiB left"] = _fault_or_ok(mounted, 8 << 10, export, root)

@@ -30,7 +30,7 @@ from twin.env.options import CameraOptions
 
 out = {}
 camera = CameraOptions(vibration=0.3, exposure=0.1, shutter=0.02)
-obstacles = {"none": 0, "drawn": 2, "scene": "scene"}
+obstacles = {"none": 0, "sampled": 2, "scene": "scene"}
 lightings = sys.argv[2].split(",")
 settings = itertools.product(("route",), lightings, obstacles, (False, True), ("twist", "steering"))
 for k, (task, lighting, which, randomise, action) in enumerate(settings):

@@ -40,7 +40,7 @@ def reconstructed(
     high = np.array(size)
     x, y = (np.arange(-h + _SPACING / 2, h, _SPACING) for h in size)
     field = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    # The sway of a hand-held camera shifts all data across the path alike.
+    # The sway of a hand-held camera shifts all data of a cross-section alike.
     sway = np.repeat(rng.normal(0.0, _PATH_NOISE, len(x)), len(_LATERAL_OFFSETS))
     path = np.stack(np.meshgrid(x, _LATERAL_OFFSETS, indexing="ij"), -1).reshape(-1, 2)
     data = HeightData.join(

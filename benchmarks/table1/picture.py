@@ -53,7 +53,7 @@ def main() -> None:
     run = given.scene / "runs" / given.run
     test = RealTest(load_policy(run), "straight")
     road = [test.reset(name, _TRIAL).capture(test.road.physics.camera_to_world, 0.0) for name in _SHOWN]
-    drawn = twin_against_road(Forecast.load(given.scene / "forecast"))
+    agreement = twin_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(write_success_curve(run)))[..., ::-1]
     parts = [
         _caption("The twin in training: randomised lighting, sun, shadows and haze"),
@@ -64,10 +64,10 @@ def main() -> None:
         *_rows(road, _SHOWN),
         _caption("The twin under the appearance and the haze of one photo of each of these days"),
         *_rows([_first(given.scene, 1, lighting=name) for name in _SHOWN], _SHOWN),
-        _side_by_side(_in_paper_colors(drawn), curve),
+        _side_by_side(_in_paper_colors(agreement), curve),
     ]
-    whole = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
-    if not cv2.imwrite(str(given.out), whole[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86]):
+    page = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
+    if not cv2.imwrite(str(given.out), page[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86]):
         parser.error(f"{given.out} cannot be written")
 
 
@@ -131,8 +131,8 @@ def _side_by_side(*drawings: Image) -> Image:
     return out
 
 
-def _with_text(out: Image, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int], thick: int = 1):
-    return cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
+def _with_text(out: Image, text: str, at: tuple[int, int], size: float, color: tuple[int, int, int], thick: int = 1):
+    return cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, thick, cv2.LINE_AA)
 
 
 if __name__ == "__main__":
