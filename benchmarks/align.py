@@ -1,10 +1,11 @@
-"""How well the Husky's model can be aligned to logs of real ones: every figure of `python -m twin.align`, and motor
-currents on asphalt beside simulated torques; as JSON where asked.
+"""Agreement of the aligned Husky model with logs of real ones.
+
+Prints the figures of `python -m twin.align`, and measured motor currents on asphalt beside simulated torques.
 
     python benchmarks/align.py [--data FOLDER] [--work FOLDER] [--json FILE]
 
-`--data` holds `husky_drive` and `borealtc_asphalt`. Takes about 20 minutes on two cores of the machine of
-`docs/benchmarks.md`. Exit status 1 where a target is missed.
+`--data` holds `husky_drive` and `borealtc_asphalt`. A run takes about 20 minutes on two cores of the machine in
+`docs/benchmarks.md`. The exit status is 1 if a target is missed.
 """
 
 import argparse
@@ -27,11 +28,11 @@ _LOG = Path("husky_drive") / "husky_drive_dev.npz"
 _ASPHALT = "borealtc_asphalt"
 
 TARGETS = {"position_m": 0.12, "yaw_deg": 4.7, "wheels_rad_s": 0.3}
-"""Of medians over windows not fitted to; at most."""
+"""Upper limits of medians over held-out windows."""
 
 
-def efforts(data: Path) -> dict[str, dict[str, float]]:
-    """Current or torque of a side in a steady turn / of one driving straight: outer, inner, mean of both."""
+def turning_efforts(data: Path) -> dict[str, dict[str, float]]:
+    """Current or torque of a side in a steady turn, relative to driving straight: outer, inner, mean of both sides."""
     steady = motor_currents.read_currents(sorted((data / _ASPHALT).glob("ASPHALT_pro_*.npz")))
     published = HuskyParams()
     rolling = motor_currents.rolling_resistance_of(steady, published)
@@ -51,14 +52,14 @@ def efforts(data: Path) -> dict[str, dict[str, float]]:
 
 
 def against_kinematics(figures: dict[str, Any]) -> list[str]:
-    """The model beside the kinematic baseline, medians over windows not fitted to: first both on level ground.
+    """One line per assumption on the slope: medians of the model and of the kinematic baseline over held-out windows.
 
-    The baseline gets no slope, so only the first line compares like with like.
+    The baseline does not use the slope, so only the first line, on level ground, gives both the same information.
     """
-    of = {name: score["held_out"] for name, score in figures["scores"].items()}
-    base, lines = of["icr_kinematics"], []
+    held_out = {name: score["held_out"] for name, score in figures["scores"].items()}
+    base, lines = held_out["icr_kinematics"], []
     for what, name in (("level ground", "fitted_on_level_ground"), ("slope from the accelerometer", "fitted")):
-        ours = of[name]
+        ours = held_out[name]
         gains = [1.0 - ours[key] / base[key] for key in ("position_m", "yaw_deg")]
         lines.append(
             f"{what:30} {ours['position_m']:.3f} m against {base['position_m']:.3f} m ({gains[0]:.0%} better), "
@@ -67,8 +68,8 @@ def against_kinematics(figures: dict[str, Any]) -> list[str]:
     return lines
 
 
-def judged(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
-    """Name, value, target, whether it is met."""
+def verdicts(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
+    """Name, value, target and True if the target is met, per target."""
     held_out = figures["scores"]["fitted"]["held_out"]
     rows = [(name, held_out[name], most, held_out[name] <= most) for name, most in TARGETS.items()]
     return [*rows, *((f"better than ICR, {k}", v, 1 / 3, v >= 1 / 3) for k, v in figures["better_than_icr"].items())]
@@ -77,7 +78,9 @@ def judged(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of the real logs")
-    parser.add_argument("--work", type=Path, help="keep robot.toml, align.json and the pictures here")
+    parser.add_argument(
+        "--work", type=Path, help="folder for robot.toml, align.json and the plots (default: a temporary one)"
+    )
     add_record_options(parser)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
@@ -87,12 +90,12 @@ def main() -> int:
     print(summary(result))
     print("MJCF against the kinematic baseline, pose after 2 s, median over windows not fitted to:")
     print("\n".join(against_kinematics(figures)))
-    rows = judged(figures)
+    rows = verdicts(figures)
     for name, value, target, met in rows:
         print(f"{name:28} {value:8.4f}   wanted {target:.4f}   {'met' if met else 'missed'}")
     runtime.log_line("currents on asphalt")
-    asphalt = efforts(options.data)
-    print(f"\n{'a turn against driving straight':64} outer  inner   mean")
+    asphalt = turning_efforts(options.data)
+    print(f"\n{'turning relative to driving straight':64} outer  inner   mean")
     for name, e in asphalt.items():
         print(f"{name:64} {e['outer']:5.2f}  {e['inner']:5.2f}  {e['mean']:5.2f}")
     everything = {"drive": figures, "asphalt": asphalt, "targets": {n: bool(m) for n, _, _, m in rows}}

@@ -1,13 +1,13 @@
-"""Audit of a scene for physics and task rules that a learning policy could exploit.
+"""Audit of a scene for flaws of physics or task rules that a learning policy could exploit.
 
-Two *explorers* drive: the *random* one wanders; the *greedy* one takes short cuts to the goal in episodes and rams
-convex parts at full speed while roaming. *Episodes* end by the task's rules; *roaming* has no task, so walls can be
-pushed, slid along and climbed at length.
+Two *explorers* drive: the *random* one follows a random walk; the *greedy* one takes short cuts to the goal in episodes
+and rams convex parts at full speed while roaming. *Episodes* end by the task's rules; *roaming* has no task, so the
+robot can push, slide along and climb walls for long.
 
-*Tunnelling*: a part is penetrated deeper than `_TUNNEL_DEPTH`. *Climbing*: the base is more than `_CLIMB_HEIGHT` above
-its standing height. *Wall sliding*: the robot touches a part and moves faster than `_SLIDE_SPEED`; legitimate while
-roaming, a flaw of the rules in an episode. *Gap*: the visual mesh is inside the robot's body without a contact. A
-*false success* is an episode that reached its goal after any of these.
+*Tunnelling*: the robot penetrates a part deeper than `_TUNNEL_DEPTH`. *Climbing*: the base is more than
+`_CLIMB_HEIGHT` above its standing height. *Wall sliding*: the robot touches a part and moves faster than
+`_SLIDE_SPEED`, which is legitimate while roaming and a flaw of the rules in an episode. *Gap*: the visual mesh is
+inside the robot's body without a contact. A *false success* is an episode that reached its goal after any of these.
 """
 
 import time
@@ -37,7 +37,7 @@ _CLIMB_HEIGHT = 0.08  # [m]
 _SLIDE_SPEED = 0.2  # [m/s]
 _BODY = ((-0.40, 0.40), (-0.22, 0.22), (0.02, 0.20))  # [m] x, y, z ranges in the base, well inside its collision boxes
 _ROAM_WIDTH = 6.0  # [m] from the route
-_ROAM_TIME = 20.0  # [s] before the robot is moved elsewhere
+_ROAM_TIME = 20.0  # [s] between relocations of the robot
 _CONTROL_PERIOD = 0.1  # [s]
 _PUSH_STEPS, _BACK_STEPS = 60, 15  # control steps towards a part, and away from it
 
@@ -49,24 +49,24 @@ class Findings:
     seconds: float = 0.0
     """Simulated time."""
     episodes: Counter = field(default_factory=Counter)
-    """Number of episodes by cause of their end."""
+    """Number of episodes by cause of termination."""
     touching: int = 0
     """Control steps with a contact."""
     events: Counter = field(default_factory=Counter)
     """Control steps with an event, by its name; in an episode with the prefix `episode_`."""
     places: dict[str, list[list[float]]] = field(default_factory=dict)
-    """x, y [m] of the first 20 of each event."""
+    """x, y [m] of the first 20 occurrences of each event."""
     false_successes: int = 0
     wall_seconds: float = 0.0
 
     def note(self, name: str, xy: Array) -> None:
-        """Counts an event at x, y [m]."""
+        """Counts an event and keeps its x, y [m]."""
         self.events[name] += 1
         if len(self.places.setdefault(name, [])) < 20:
             self.places[name].append([round(float(v), 2) for v in xy])
 
     def summary(self) -> dict[str, Any]:
-        """Results for JSON."""
+        """Results as a JSON object."""
         names = [*(f"episode_{name}" for name in EVENTS), *EVENTS]
         return {
             "simulated_s": round(self.seconds, 1),
@@ -116,7 +116,7 @@ class VisualMesh:
 
 
 class EventDetector:
-    """Detects events of a robot after each control step."""
+    """Detects the events of a control step."""
 
     def __init__(self, physics: HuskyPhysics, visual_mesh: VisualMesh) -> None:
         self._physics, self._visual_mesh = physics, visual_mesh
@@ -126,7 +126,7 @@ class EventDetector:
         self._solid = ~self._robot & (np.arange(model.ngeom) != model.geom("ground").id)
 
     def events(self) -> list[str]:
-        """Names of the current events."""
+        """Names of the events at the current state."""
         physics, found = self._physics, []
         contact = physics.data.contact
         pairs = contact.geom
@@ -243,7 +243,7 @@ class _ShortCut:
 
 
 class _Rammer:
-    """Drives into one convex part after the other, and pushes."""
+    """Drives into one convex part after another and pushes."""
 
     def __init__(self, model: mujoco.MjModel, rng: np.random.Generator) -> None:
         parts = np.flatnonzero(model.geom_group == PART_GROUP)
@@ -254,7 +254,7 @@ class _Rammer:
         if not self._left:
             near = np.argsort(np.linalg.norm(self._targets - pose[:2], axis=1))[:20]
             self._target = self._targets[self._rng.choice(near)] if len(near) else pose[:2] + self._rng.normal(0, 3, 2)
-            self._target = self._target + self._rng.normal(0.0, 0.4, 2)  # so that some are only grazed
+            self._target = self._target + self._rng.normal(0.0, 0.4, 2)  # some contacts are only glancing
             self._left = _PUSH_STEPS + _BACK_STEPS
         self._left -= 1
         if self._left < _BACK_STEPS:

@@ -1,12 +1,12 @@
-"""What one photo tells of a day, and what it leaves to be drawn.
+"""Appearance gap to another day that remains after a photo of it, and how weather randomisation covers the gap.
 
     python benchmarks/day.py SCENE [--days NAME ...] [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
-The scene has been built from the stand-in's film and knows its days by a photo each (`benchmarks/table1`, step
-`photos`). Pictures of every day at eight other places of the road are compared with the twin's from there under the
-photo's light and air: by dB, and by how they change the steering of policies, against how another day's sun and shadows
-change it that are drawn over the twin's. *Lasting* is the mean over places of a day's change (rms over days), *local*
-the rest.
+The scene was built from the film of the known-truth world and has a lighting from one photo of each day
+(`benchmarks/table1`, step `photos`). Images of every day from eight other stations of the road are compared with
+renderings from the same poses under the photo's appearance and fog, in PSNR and in the change of the policies'
+steering. That change is compared with the one that randomised sun and shadows cause. *Lasting*: mean over stations of
+a day's change, rms over days. *Local*: the rest.
 """
 
 import argparse
@@ -32,20 +32,20 @@ from twin.reality.lighting import WEATHER
 from twin.reality.truth import Truth
 from twin.runtime import track
 
-STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the photos were taken at the first
-STRAIGHT = 4  # of them, where policies of the straight road drive
+STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the lightings come from photos at the first one
+STRAIGHT = 4  # number of stations on the straight segment
 SIZE = (160, 90)
-DRAWS = 8  # of the weather, per day
-RESAMPLED = 500  # times, for intervals of 90 %
-SCALES = (1.0, 0.8, 0.7, KNOWN_WEATHER_FRACTION, 0.5)  # of another day's sun and shadows
+DRAWS = 8  # weather samples per day
+RESAMPLED = 500  # bootstrap samples for 90 % intervals
+SCALES = (1.0, 0.8, 0.7, KNOWN_WEATHER_FRACTION, 0.5)  # fractions of the sun and shadow randomisation
 
 Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 
 
-def real(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
-    """Pictures of every day at every station, and the camera's poses there, (stations, 4, 4), in the true world."""
+def true_images(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
+    """Images of every day at every station, and the camera_to_world poses (stations, 4, 4) in the true world."""
     line, rows, poses = RoadLine(), [], np.zeros((len(STATIONS), 4, 4))
-    for light in track([WEATHER[name] for name in days], "pictures of days", unit="day"):
+    for light in track([WEATHER[name] for name in days], "images of days", unit="day"):
         road, camera = recordings._road_and_camera(light)
         row = []
         for k, station in enumerate(STATIONS):
@@ -58,31 +58,31 @@ def real(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
 
 
 def lasting_and_local(change: NDArray) -> NDArray:
-    """Of changes (days, stations): rms over days of the mean over stations, and rms of the rest."""
+    """Rms over days of the mean over stations, and rms of the rest, of changes (days, stations)."""
     mean = change.mean(1, keepdims=True)
     return np.sqrt([(mean**2).mean(), ((change - mean) ** 2).mean()])
 
 
 def steering(policy: Callable, pictures: Pictures) -> NDArray:
-    """The last of a policy's actions (days, stations) before pictures that stand still."""
+    """Steering (days, stations), the last component of a policy's action, for stacks of four equal images."""
     stacks = (np.clip(np.moveaxis(pictures, -1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     return np.array([[policy(np.tile(one, (4, 1, 1)))[-1] for one in row] for row in stacks])
 
 
-def ratios(gaps: list[NDArray], moved: list[NDArray], rng: np.random.Generator | None = None) -> NDArray:
-    """What lasts and what is local of changes over the same of others, geometric means over policies.
+def ratios(gaps: list[NDArray], randomised: list[NDArray], rng: np.random.Generator | None = None) -> NDArray:
+    """Ratios of lasting and local changes to those of randomised weather, geometric means over policies.
 
     Args:
-        gaps: Of every policy, (days, stations).
-        moved: The others, (more days, stations).
-        rng: Resamples policies and days, if given.
+        gaps: Steering changes between twin and truth, (days, stations) per policy.
+        randomised: Steering changes under randomised weather, (samples, stations) per policy.
+        rng: Resamples policies and days for a bootstrap, if given.
     """
     policies = np.arange(len(gaps))
-    days, others = np.arange(len(gaps[0])), np.arange(len(moved[0]))
+    days, others = np.arange(len(gaps[0])), np.arange(len(randomised[0]))
     if rng:
         policies, days, others = (rng.choice(one, len(one)) for one in (policies, days, others))
-    each = [np.log(lasting_and_local(gaps[k][days]) / lasting_and_local(moved[k][others])) for k in policies]
-    return np.exp(np.mean(each, 0))
+    log_ratios = [np.log(lasting_and_local(gaps[k][days]) / lasting_and_local(randomised[k][others])) for k in policies]
+    return np.exp(np.mean(log_ratios, 0))
 
 
 def main() -> int:
@@ -93,7 +93,9 @@ def main() -> int:
     )
     parser.add_argument("--policies", nargs="*", default=[], help="runs of the scene, named after their task")
     add_record_options(parser)
-    parser.add_argument("--pictures", type=Path, help="folder for pictures: day, twin, twin with weather drawn")
+    parser.add_argument(
+        "--pictures", type=Path, help="folder for images: the day, the twin, the twin with randomised weather"
+    )
     given = parser.parse_args()
     twin = load_scene(given.scene)
     field, cameras = twin.field(), Cameras.load(twin.scene.stage("metric"))
@@ -101,30 +103,30 @@ def main() -> int:
     intrinsics = camera_intrinsics(model, model.camera("front").id, SIZE)
     rays = unproject(pixel_grid(*SIZE), intrinsics)
     lengths = np.linalg.norm(rays, axis=-1).astype(np.float32)
-    shown, true_poses = real(given.days)
+    truth, true_poses = true_images(given.days)
     to_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras))
     poses = to_truth.inverse().poses(true_poses)
     views = Viewpoints.of(poses, intrinsics, SIZE)
     clear = [field.render(views, name) for name in given.days]
     depth = clear[0].depth
-    hazed = np.array(
+    fogged = np.array(
         [field.fog(name).apply(one.rgb, depth * lengths) for name, one in zip(given.days, clear, strict=True)]
     )
     filmed = [field.render(views, name).rgb for name in field.lightings_by_name.filmed().names]
     figures: dict[str, float] = {}
 
-    def tell(name: str, value: float) -> None:
+    def report(name: str, value: float) -> None:
         figures[name] = float(value)
         print(f"{name:44} {value:8.3f}", flush=True)
 
     for i, name in enumerate(given.days):
-        tell(f"day.extinction.{name}", field.fog(name).extinction)
-        for what, many in (("filmed", filmed), ("photo", [hazed[i]])):
-            means = [np.mean([psnr(a, b) for a, b in zip(p[1:], shown[i, 1:], strict=True)]) for p in many]
-            tell(f"day.psnr.{what}.{name}", max(means))
+        report(f"day.extinction.{name}", field.fog(name).extinction)
+        for what, many in (("filmed", filmed), ("photo", [fogged[i]])):
+            means = [np.mean([psnr(a, b) for a, b in zip(p[1:], truth[i, 1:], strict=True)]) for p in many]
+            report(f"day.psnr.{what}.{name}", max(means))
 
     rng = np.random.default_rng(0)
-    drawn = [[EVALUATION_RANGES.sample(rng) for _ in given.days] for _ in range(DRAWS)]
+    samples = [[EVALUATION_RANGES.sample(rng) for _ in given.days] for _ in range(DRAWS)]
     seeds = rng.integers(2**31, size=(DRAWS, len(given.days)))
 
     def weathered(scale: float, days: list[RandomizationSample], numbers: NDArray) -> Pictures:
@@ -136,27 +138,27 @@ def main() -> int:
             rows.append([weather.apply(rgb, far, rays, pose) for rgb, far, pose in seen])
         return np.array(rows)
 
-    pictures = {scale: [weathered(scale, *one) for one in zip(drawn, seeds, strict=True)] for scale in SCALES}
+    pictures = {scale: [weathered(scale, *one) for one in zip(samples, seeds, strict=True)] for scale in SCALES}
     if given.pictures:
         for i, name in enumerate(given.days):
-            both = np.hstack([np.vstack(p[i]) for p in (shown, hazed, pictures[KNOWN_WEATHER_FRACTION][0])])
+            both = np.hstack([np.vstack(p[i]) for p in (truth, fogged, pictures[KNOWN_WEATHER_FRACTION][0])])
             write_image(given.pictures / f"{name}.png", (np.clip(both, 0.0, 1.0) * 255.0).astype(np.uint8))
     gaps: list[NDArray] = []
-    moves: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
+    responses: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
     for source in track(given.policies, "policies", unit="policy"):
         policy = load_policy(str(find_policy(given.scene, source)), False)
         places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # not where photos were taken
-        before = steering(policy, hazed[:, places])
-        gaps.append(steering(policy, shown[:, places]) - before)
+        before = steering(policy, fogged[:, places])
+        gaps.append(steering(policy, truth[:, places]) - before)
         for scale, many in pictures.items():
-            moves[scale].append(np.concatenate([steering(policy, one[:, places]) - before for one in many]))
-    for scale, moved in moves.items() if gaps else ():
-        low, high = np.quantile([ratios(gaps, moved, rng) for _ in range(RESAMPLED)], (0.05, 0.95), axis=0)
+            responses[scale].append(np.concatenate([steering(policy, one[:, places]) - before for one in many]))
+    for scale, randomised in responses.items() if gaps else ():
+        low, high = np.quantile([ratios(gaps, randomised, rng) for _ in range(RESAMPLED)], (0.05, 0.95), axis=0)
         for k, kind in enumerate(("lasting", "local")):
             name = f"day.change_over_drawn.{kind}.{scale:g}"
-            tell(name, ratios(gaps, moved)[k])
-            tell(f"{name}.low", low[k])
-            tell(f"{name}.high", high[k])
+            report(name, ratios(gaps, randomised)[k])
+            report(f"{name}.low", low[k])
+            report(f"{name}.high", high[k])
     return save(given.json, figures, given.replace_record)
 
 

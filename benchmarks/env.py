@@ -1,10 +1,10 @@
-"""Figures of the environment: a table on standard output, and as JSON where asked.
+"""Benchmark of the environment: speed, memory, scripted drivers, exploits, endurance, trust, obstacles, GPU.
 
     python benchmarks/env.py --scene BUILT_SCENE [--only SECTION ...] [--json FILE]
 
-Needs a built scene; of one that has neither `straight` nor `right_turn` the whole route is driven. What each figure is,
-is said where it is measured: `env_sections.py`. Speeds are of 160×90 pictures, 10 Hz control and 2 ms physics; each is
-the best of several short runs in processes that have the cores they are said to have and nothing else in them.
+Prints a table; `env_sections.py` defines each figure. The robot drives the tasks `straight` and `right_turn`, or the
+whole route in a scene that has neither. Speeds are for 160×90 images, 10 Hz control and 2 ms physics; each is the best
+of several short runs in a process of its own, bound to the stated number of cores.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from field import shown
+from field import format_figure
 from record import add_record_options, save, write_so_far
 
 TARGETS: dict[str, tuple[str, float]] = {
@@ -32,11 +32,11 @@ TARGETS: dict[str, tuple[str, float]] = {
     "overlay.mask_iou": ("≥", 0.9),
     "gpu.steps_per_s": ("≥", 10_000.0),
 }
-"""What is wanted of a figure."""
+"""Figure → sense and target."""
 
 
-def judge(name: str, value: Any) -> tuple[str, str]:
-    """A figure's target and whether it is met, in words; empty where nothing is wanted of it."""
+def verdict(name: str, value: Any) -> tuple[str, str]:
+    """A figure's target and "yes" if it is met, else "no"; two empty strings for a figure without a target."""
     if name not in TARGETS:
         return "", ""
     sense, wanted = TARGETS[name]
@@ -51,7 +51,7 @@ def main() -> int:
     parser.add_argument("--scene", type=Path, required=True, help="a built scene, such as scenes/demo")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
     add_record_options(parser)
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean little")
+    parser.add_argument("--quick", action="store_true", help="tiny settings that only test the script")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     record: dict[str, Any] = {}
@@ -60,16 +60,16 @@ def main() -> int:
         found = SECTIONS[section](options.scene, options.quick)
         figures |= found
         for name, value in found.items():
-            wanted, met = judge(name, value)
-            print(f"{name:36} {shown(value):>16} {wanted:>14}  {met}".rstrip(), flush=True)
-        if options.json:  # after every section, as a run is long
+            wanted, met = verdict(name, value)
+            print(f"{name:36} {format_figure(value):>16} {wanted:>14}  {met}".rstrip(), flush=True)
+        if options.json:  # after every section, so that an interrupted run keeps its figures
             record = figures | {"about": about(options)}
             write_so_far(options.json, record)
     return save(options.json, record, options.replace_record)
 
 
 def about(options: argparse.Namespace) -> dict[str, Any]:
-    """What the figures were measured with."""
+    """Machine and package versions of the measurement."""
     versions = {name: metadata.version(name) for name in ("twin", "mujoco", "mujoco-warp", "warp-lang", "numpy")}
     return {"machine": platform.machine(), "versions": versions, "quick": options.quick}
 

@@ -1,4 +1,4 @@
-"""The sections of `env.py`: each takes the scene and whether to be quick, and returns figures by name."""
+"""Sections of `env.py`. Each takes a built scene and `quick`, which makes it tiny, and returns figures by name."""
 
 import json
 import os
@@ -15,15 +15,15 @@ _HERE = Path(__file__).parent
 
 
 def worker(*arguments: str | Path | int, cores: int = 1) -> dict[str, Any]:
-    """What `env_workers.py` says, run in a process of its own that has so many cores.
+    """Figures of a function of `env_workers.py`, run in a process of its own that is bound to this many cores.
 
     Raises:
-        RuntimeError: it failed.
+        RuntimeError: the process failed.
     """
     command = [sys.executable, str(_HERE / "env_workers.py"), *map(str, arguments)]
     path = os.pathsep.join(filter(None, [str(_HERE.parent), os.environ.get("PYTHONPATH", "")]))
     threads = {"OMP_NUM_THREADS": str(cores), "OPENBLAS_NUM_THREADS": str(cores)}
-    # MuJoCo chooses its OpenGL when it is imported: Mesa's, which draws in software where there is no GPU.
+    # MuJoCo selects its OpenGL at import; these select Mesa's software renderer.
     threads |= {"MUJOCO_GL": "egl", "LIBGL_ALWAYS_SOFTWARE": "1"}
     own = sorted(os.sched_getaffinity(0))[:cores]
     done = subprocess.run(
@@ -38,13 +38,13 @@ def worker(*arguments: str | Path | int, cores: int = 1) -> dict[str, Any]:
 
 
 def speed(scene: Path, quick: bool) -> dict[str, Any]:
-    """Environment steps per second with pixels and one obstacle in view, of one world on one core and of eight on two.
+    """Environment steps per second with pixels and one obstacle in view: one environment on one core, eight on two.
 
-    `ratio_to_software_gl` is one world's speed over that of the same environment whose picture is MuJoCo's own of the
-    extracted mesh, drawn by `mujoco.Renderer` with OpenGL in software (Mesa through EGL), alternately in one process.
-    `ratio_to_one_process` is that of many worlds in two processes over the same in one with two threads, alternately.
-    `cpu_ms_per_step` is processor time, which other work on the machine disturbs less. `load_s` is `twin.load` and the
-    first reset, kernels cached.
+    `ratio_to_software_gl`: speed of one environment over that of the same environment with `mujoco.Renderer` images of
+    the extracted mesh in software OpenGL (Mesa through EGL); both alternate in one process. `ratio_to_one_process`:
+    speed of a vector env in two processes over one in a single process with two threads, alternating.
+    `cpu_ms_per_step`: processor time, which other load on the machine affects less. `load_s`: `twin.load` and the first
+    reset with cached kernels.
     """
     runs = 1 if quick else 4
     out = worker("single", scene, runs)
@@ -56,15 +56,15 @@ def speed(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def memory(scene: Path, quick: bool) -> dict[str, Any]:
-    """Peak memory of all processes of 64 worlds that have been stepped with pixels."""
+    """Peak memory of all processes of a vector env of 64, after steps with pixels."""
     return worker("memory", scene, 4 if quick else 64, cores=2)
 
 
 def driver(scene: Path, quick: bool) -> dict[str, Any]:
-    """Share of episodes that the scripted driver brings to the goal, and the blind one, no obstacles, by task.
+    """Success rate of the scripted driver and of the blind one, without obstacles, by task.
 
-    `driver.n` episodes each, seeds 0, 1, ...; `driver.random_robot` the same with the robot drawn from the default
-    ranges of domain randomisation.
+    Each rate is over `driver.n` episodes with seeds 0, 1, ...; in `driver.random_robot` the robot is sampled from the
+    default ranges of domain randomisation.
     """
     import twin
     from twin.env.drivers import BlindDriver, RouteDriver
@@ -92,7 +92,7 @@ def driver(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def audit(scene: Path, quick: bool) -> dict[str, Any]:
-    """The exploit audit (`audit.py`): control steps with each event in an hour of simulated time."""
+    """Exploit audit (`audit.py`): control steps with each event in one hour of simulated time."""
     from audit import audit as run
 
     from twin.env.suite import EnvFactory
@@ -104,24 +104,24 @@ def audit(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def soak(scene: Path, quick: bool) -> dict[str, Any]:
-    """Random steps with pixels, robot, light, obstacles drawn for every episode: NaNs and growth of memory."""
+    """Endurance: NaNs and memory growth over random steps with pixels, with everything randomised per episode."""
     return worker("soak", scene, 400 if quick else 100_000, cores=2)
 
 
 def trust(scene: Path, quick: bool) -> dict[str, Any]:
-    """What the trust number is worth, where the truth is known: rendered depth error by trust, off the filmed path."""
+    """Validity of the trust score (`env_trust.py`): rendered depth error by trust, on and off the filmed path."""
     return worker("trust", scene, cores=2)
 
 
 def overlay(scene: Path, quick: bool) -> dict[str, Any]:
-    """Obstacles put into the twin against the same in the true world, see `overlay.py`; needs the known truth."""
+    """Obstacles composited into the twin against the same ones in the true world (`overlay.py`); needs the truth."""
     from overlay import KINDS, round_trip
 
     return round_trip(scene, None, KINDS[:1] if quick else KINDS)
 
 
-def seen_touched(scene: Path, quick: bool) -> dict[str, Any]:
-    """What the last build's report says of what is seen against what is solid (`twin.report.visual_vs_collision`)."""
+def visual_vs_collision(scene: Path, quick: bool) -> dict[str, Any]:
+    """Visual against collision geometry (`twin.report.visual_vs_collision`), from the report of the last build."""
     from twin.loading import load_scene
 
     found = load_scene(scene).report().get("seen_touched")
@@ -131,7 +131,7 @@ def seen_touched(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def gpu(scene: Path, quick: bool) -> dict[str, Any]:
-    """1024 worlds on one GPU, physics and pictures, with the pictures left there for torch."""
+    """Steps per second of 1024 environments on one GPU, with images that stay on it for torch."""
     import warp
 
     if not warp.is_cuda_available():
@@ -140,7 +140,7 @@ def gpu(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def host(scene: Path, quick: bool) -> dict[str, Any]:
-    """What the host costs of 1024 worlds on a GPU, and what that leaves possible; needs no GPU."""
+    """Host time per step of 1024 environments on a GPU, and the speed limit that follows from it; needs no GPU."""
     return worker("host", scene, 8 if quick else 1024, cores=len(os.sched_getaffinity(0)))
 
 
@@ -152,7 +152,7 @@ SECTIONS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {
     "soak": soak,
     "trust": trust,
     "overlay": overlay,
-    "seen_touched": seen_touched,
+    "seen_touched": visual_vs_collision,
     "host": host,
     "gpu": gpu,
 }

@@ -1,4 +1,4 @@
-"""What the trust number is worth: rendered depth and colour against the known truth, on and off the filmed path."""
+"""Validity of the trust score: rendered depth and color against the known truth, on and off the filmed path."""
 
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,15 @@ from twin.reality.lighting import LIGHTINGS
 from twin.reality.truth import Truth
 
 LATERALS = (0.0, 0.8, -1.6, 2.5, -4.0)  # [m] from the route
-TURNS = (0.0, 20.0, -45.0, 90.0, 180.0)  # [°] from its heading
-_EYE = 0.6  # [m]
-_STEP = 6.0  # [m] of the route between places
-_FAR = 20.0  # [m] of true depth up to which errors count
+TURNS = (0.0, 20.0, -45.0, 90.0, 180.0)  # [°] from the route's heading
+_EYE = 0.6  # [m] camera height
+_STEP = 6.0  # [m] along the route between positions
+_FAR = 20.0  # [m] errors are evaluated up to this true depth
 _BINS = ((0.9, 1.01), (0.5, 0.9), (0.0, 0.5))
 
 
 def trust_against_truth(path: Path) -> dict[str, Any]:
-    """Median depth error [m] and PSNR [dB] of pictures by their trust, and the rank correlation of trust and each."""
+    """Median depth error [m] and PSNR [dB] of images by their trust, and rank correlations of trust with both."""
     scene = load_scene(path)
     world, field, trust = scene.world(), scene.field(), Trust(scene.cameras())
     truth, cameras = Truth.load(scene.scene.truth), scene.cameras()
@@ -39,7 +39,7 @@ def trust_against_truth(path: Path) -> dict[str, Any]:
                 pose = _pose(world.route, float(s), lateral, turn)
                 out = field.render(Viewpoints.of(pose, world.intrinsics, SIZE), lighting, SIZE)
                 number = float(trust.of(pose[None], out)[0])
-                wanted, depth = true_world.show(to_truth.poses(pose), None, np.eye(4))
+                wanted, depth = true_world.render(to_truth.poses(pose), None, np.eye(4))
                 near = depth < _FAR
                 if near.sum() < 500:
                     continue

@@ -1,6 +1,6 @@
-"""What `env_sections.py` runs in processes of its own: prints one line of JSON.
+"""Measurements that `env_sections.py` runs in processes of their own; each prints one line of JSON.
 
-python benchmarks/env_workers.py WHAT SCENE [NUMBERS ...]
+python benchmarks/env_workers.py FUNCTION SCENE [NUMBERS ...]
 """
 
 import gc
@@ -17,7 +17,7 @@ _STEPS = 60  # per timed run
 
 
 def standard_tasks(scene: Path) -> list[str]:
-    """The standard tasks that a scene has, `right_turn` last; `route` where it has none."""
+    """Standard tasks of a scene, `right_turn` last; `route` if it has none."""
     from twin.env.route_segments import STANDARD_TASKS, scene_tasks
     from twin.loading import load_scene
 
@@ -26,14 +26,14 @@ def standard_tasks(scene: Path) -> list[str]:
 
 
 def one_obstacle(scene: Path) -> dict[str, Any]:
-    """Options with a cone that stays in view ahead for the first twenty metres."""
+    """Options with a cone that stays in view for the first twenty metres."""
     from twin.config import ObstacleConfig
 
     return {"obstacles": (ObstacleConfig("it", "cone", 24.0, 0.9),), "start_offset": 0.0, "start_heading": 0.0}
 
 
 def single(scene: Path, runs: int) -> dict[str, Any]:
-    """One world on one core, alternately with MuJoCo's own renderer where software OpenGL is to be had."""
+    """One environment on one core, alternating with MuJoCo's own renderer if software OpenGL is available."""
     import twin
     from twin.env.drivers import RouteDriver
 
@@ -41,7 +41,7 @@ def single(scene: Path, runs: int) -> dict[str, Any]:
     environment, drive = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene)), RouteDriver()
     environment.reset()
     out: dict[str, Any] = {"single.load_s": time.perf_counter() - begin}
-    renderer, why = software_gl(scene)
+    renderer, reason = software_gl(scene)
     plain = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene), pixels=False)
     own, theirs = [], []
     for _ in range(runs):
@@ -55,25 +55,25 @@ def single(scene: Path, runs: int) -> dict[str, Any]:
     if theirs:
         out |= {"software_gl.steps_per_s": max(theirs), "ratio_to_software_gl": max(paces) / max(theirs)}
     else:
-        out |= {"ratio_to_software_gl": None, "software_gl.why_not": why}
+        out |= {"ratio_to_software_gl": None, "software_gl.why_not": reason}
     return out
 
 
-def _pace(environment: Any, drive: Any, also: Any) -> tuple[float, float]:
+def _pace(environment: Any, drive: Any, after_step: Any) -> tuple[float, float]:
     """Steps per second from the start of an episode, and processor time per step [s]."""
     step = environment.reset()
     for _ in range(10):
         step = environment.step(drive(environment, step))
-        also()
+        after_step()
     begin, used = time.perf_counter(), time.process_time()
     for _ in range(_STEPS):
         step = environment.step(drive(environment, step))
-        also()
+        after_step()
     return _STEPS / (time.perf_counter() - begin), (time.process_time() - used) / _STEPS
 
 
 def software_gl(scene: Path) -> tuple[Any, str]:
-    """A function that draws a physics' front camera with the extracted mesh, and if there is none, why."""
+    """A function that renders the front camera with the extracted mesh; None and the reason if OpenGL is missing."""
     try:
         import mujoco
 
@@ -89,25 +89,25 @@ def software_gl(scene: Path) -> tuple[Any, str]:
         data = mujoco.MjData(model)
         place(obstacles, data, 0.0)
         renderer = mujoco.Renderer(model, 90, 160)
-    except Exception as error:  # whatever a missing library makes of itself
+    except Exception as error:  # each missing library raises its own type
         return None, " ".join(str(error).split())[:200] or type(error).__name__
-    shown = mujoco.MjvOption()
-    shown.geomgroup[:] = [1, 1, 1, 0, 0, 1]
+    visible = mujoco.MjvOption()
+    visible.geomgroup[:] = [1, 1, 1, 0, 0, 1]
 
     def draw(physics: Any) -> Any:
         data.qpos[:] = physics.data.qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        renderer.update_scene(data, "front", shown)
+        renderer.update_scene(data, "front", visible)
         return renderer.render()
 
     return draw, ""
 
 
 def batch(scene: Path, count: int, runs: int) -> dict[str, Any]:
-    """Many worlds on two cores, in two processes, and alternately in one; steps of all worlds counted."""
-    spread, alone = _worlds(scene, count), _worlds(scene, count, 1)
-    both = [(_worlds_pace(spread), _worlds_pace(alone)) for _ in range(runs)]
+    """A vector env on two cores, alternating between two processes and one; counts the steps of all environments."""
+    spread, alone = _vector_env(scene, count), _vector_env(scene, count, 1)
+    both = [(_vector_env_pace(spread), _vector_env_pace(alone)) for _ in range(runs)]
     rates, costs = zip(*(pair[0] for pair in both), strict=True)
     return {
         f"batch{count}.steps_per_s": max(rates),
@@ -117,21 +117,21 @@ def batch(scene: Path, count: int, runs: int) -> dict[str, Any]:
     }
 
 
-def _worlds_pace(worlds: Any) -> tuple[float, float]:
+def _vector_env_pace(envs: Any) -> tuple[float, float]:
     """Steps per second from the start of an episode, and processor time per step [s], children included."""
-    count = len(worlds)
-    worlds.begin(range(count))
+    count = len(envs)
+    envs.begin(range(count))
     begin, used, steps = 0.0, 0.0, max(8, _STEPS * 4 // count)
     for k in range(steps + 3):
         if k == 3:
             begin, used = time.perf_counter(), _cpu_time()
-        worlds.step(_onward(worlds))
-        worlds.observation()
+        envs.step(_ahead(envs))
+        envs.observation()
     return count * steps / (time.perf_counter() - begin), (_cpu_time() - used) / (count * steps)
 
 
 def _cpu_time() -> float:
-    """Of this process and its children [s]."""
+    """Processor time [s] of this process and its children."""
     import psutil
 
     this = psutil.Process()
@@ -140,7 +140,7 @@ def _cpu_time() -> float:
 
 
 def physics(scene: Path, runs: int) -> dict[str, Any]:
-    """One world without pictures, one core."""
+    """One environment without images on one core."""
     import twin
     from twin.env.drivers import RouteDriver
 
@@ -149,41 +149,43 @@ def physics(scene: Path, runs: int) -> dict[str, Any]:
 
 
 def memory(scene: Path, count: int) -> dict[str, Any]:
-    worlds = _worlds(scene, count)
-    worlds.begin(range(count))
+    """Peak memory of a vector env and its processes."""
+    envs = _vector_env(scene, count)
+    envs.begin(range(count))
     for _ in range(5):
-        worlds.step(_onward(worlds))
-        worlds.observation()
-    worlds.begin([0])
-    worlds.close()
+        envs.step(_ahead(envs))
+        envs.observation()
+    envs.begin([0])
+    envs.close()
     peaks = [resource.getrusage(who).ru_maxrss * 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    # Of the children the largest counts; they are alike.
-    return {f"worlds{count}.bytes": peaks[0] + peaks[1] * getattr(worlds, "processes", 0)}
+    # The children are alike; ru_maxrss is that of the largest.
+    return {f"worlds{count}.bytes": peaks[0] + peaks[1] * getattr(envs, "processes", 0)}
 
 
 def soak(scene: Path, steps: int) -> dict[str, Any]:
+    """Non-finite states and memory growth over random steps of eight environments."""
     import psutil
 
     from twin.env.suite import EnvFactory
     from twin.env.vector_env_local import LocalVectorEnv
 
     count = 8
-    stage = EnvFactory.open(scene, standard_tasks(scene)[-1], {"randomise": True, "obstacles": 3})
-    worlds = LocalVectorEnv(stage, list(range(count)))  # here, where bodies can be looked at
-    worlds.begin(range(count))
+    factory = EnvFactory.open(scene, standard_tasks(scene)[-1], {"randomise": True, "obstacles": 3})
+    envs = LocalVectorEnv(factory, list(range(count)))  # in this process, which gives access to the states
+    envs.begin(range(count))
     rng, sizes, episodes, bad = np.random.default_rng(0), [], 0, 0
     rounds = steps // count
     for k in range(rounds):
-        # Mostly forward, so that episodes get somewhere.
+        # Mostly forward, so that episodes progress.
         actions = np.stack([rng.uniform(0, 1, count), rng.uniform(-0.3, 0.3, count)], 1)
-        out = worlds.step(actions)
+        out = envs.step(actions)
         bad += int(~np.isfinite(out.reward).all()) + sum(
-            not np.isfinite(p.data.qpos).all() or not np.isfinite(p.data.qvel).all() for p in worlds.physics
+            not np.isfinite(p.data.qpos).all() or not np.isfinite(p.data.qvel).all() for p in envs.physics
         )
         over = np.flatnonzero(out.over).tolist()
         if over:
             episodes += len(over)
-            worlds.begin(over)
+            envs.begin(over)
         if (k + 1) % max(1, rounds // 10) == 0:
             gc.collect()
             sizes.append(psutil.Process().memory_info().rss)
@@ -196,27 +198,27 @@ def soak(scene: Path, steps: int) -> dict[str, Any]:
 
 
 def gpu(scene: Path, count: int) -> dict[str, Any]:
-    """The same as `batch` on a GPU, nothing but the field in view."""
+    """As `batch` on a GPU, without obstacles."""
     import warp
 
-    worlds = _worlds(scene, count, device="cuda", obstacles=())
-    worlds.begin(range(count))
+    envs = _vector_env(scene, count, device="cuda", obstacles=())
+    envs.begin(range(count))
     begin, steps = 0.0, 30
     for k in range(steps + 3):
-        if k == 3:  # compiled, and captured
+        if k == 3:  # kernels are compiled and the graph is captured
             warp.synchronize()
             begin = time.perf_counter()
-        worlds.step(_onward(worlds))
-        worlds.pixels.tensor()
+        envs.step(_ahead(envs))
+        envs.pixels.tensor()
     warp.synchronize()
     return {"gpu.worlds": count, "gpu.steps_per_s": count * steps / (time.perf_counter() - begin)}
 
 
 def host(scene: Path, count: int) -> dict[str, Any]:
-    """What the host does for worlds on a GPU in a step, whatever the GPU: small steps and pictures are left out.
+    """Host time of a GPU vector env per step; physics and rendering are replaced by stubs.
 
-    It holds Python's lock throughout, so `host.steps_per_s` is the most that `Worlds.step` comes to with any GPU;
-    `host.info_us` is what asking a world for its `info` and `state` costs besides, as stable-baselines3 does.
+    The host holds the GIL throughout, so `host.steps_per_s` is an upper limit of `GpuVectorEnv.step` on any GPU.
+    `host.info_us` is the time for `info` and `state` of an environment, which stable-baselines3 requests.
     """
     import dataclasses
 
@@ -230,53 +232,54 @@ def host(scene: Path, count: int) -> dict[str, Any]:
         blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
 
     def show(field: BakedField, cameras: Any, lighting: Any, take: Any) -> None:
-        field._head_biases(lighting, len(cameras.camera_to_world))  # as `render_on_device` does, on the host
+        field._head_biases(lighting, len(cameras.camera_to_world))  # the host's part of `render_on_device`
         take(*blank)
 
     GpuSimulation._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]
-    stage = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
-    options = dataclasses.replace(stage.options, device="cuda")  # pictures that stay; the field itself is on the CPU
-    worlds = GpuVectorEnv(dataclasses.replace(stage, options=options), list(range(count)), "cpu")
+    factory = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
+    # Images stay on the device; the field itself is on the CPU.
+    options = dataclasses.replace(factory.options, device="cuda")
+    envs = GpuVectorEnv(dataclasses.replace(factory, options=options), list(range(count)), "cpu")
     begin = time.perf_counter()
-    worlds.begin(range(count))
-    begun, times = time.perf_counter() - begin, []
+    envs.begin(range(count))
+    reset_time, times = time.perf_counter() - begin, []
     for _ in range(23):
         times.append(time.perf_counter())
-        worlds.step(_onward(worlds))
-        worlds.pixels.tensor()
+        envs.step(_ahead(envs))
+        envs.pixels.tensor()
     step = float(np.median(np.diff(times)[2:]))
-    asked = time.perf_counter()
+    begin = time.perf_counter()
     for i in range(count):
-        worlds.info(i), worlds.state(i)
-    asked = time.perf_counter() - asked
+        envs.info(i), envs.state(i)
+    info_time = time.perf_counter() - begin
     return {
         "host.worlds": count,
         "host.us_per_step": 1e6 * step / count,
         "host.steps_per_s": count / step,
-        "host.info_us": 1e6 * asked / count,
-        "host.begin_ms": 1e3 * begun / count,
+        "host.info_us": 1e6 * info_time / count,
+        "host.begin_ms": 1e3 * reset_time / count,
     }
 
 
 def trust(scene: Path) -> dict[str, Any]:
-    """See `twin.env.trust`: depth error against the known truth at poses on and off the filmed path, by trust."""
+    """See `env_trust.py`."""
     from env_trust import trust_against_truth
 
     return trust_against_truth(scene)
 
 
-def _worlds(scene: Path, count: int, processes: int | None = None, **options: Any) -> Any:
+def _vector_env(scene: Path, count: int, processes: int | None = None, **options: Any) -> Any:
     from twin.env.vector_env import make_vector_env
 
     options = one_obstacle(scene) | options
     return make_vector_env(scene, standard_tasks(scene)[-1], options, list(range(count)), processes)
 
 
-def _onward(worlds: Any) -> np.ndarray:
-    """Straight on at full speed."""
-    return np.tile(np.array([1.0, 0.0]), (len(worlds), 1))
+def _ahead(envs: Any) -> np.ndarray:
+    """Actions: straight ahead at full speed."""
+    return np.tile(np.array([1.0, 0.0]), (len(envs), 1))
 
 
 if __name__ == "__main__":
-    what, folder, *numbers = sys.argv[1:]
-    print(json.dumps(globals()[what](Path(folder), *map(int, numbers))))
+    function, folder, *numbers = sys.argv[1:]
+    print(json.dumps(globals()[function](Path(folder), *map(int, numbers))))

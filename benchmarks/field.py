@@ -1,10 +1,10 @@
-"""Figures of the radiance field and of its renderer: a table on standard output, and as JSON where asked.
+"""Benchmark of the radiance field and its renderer: training within budgets, baking, speed, depth, memory, GPU.
 
     python benchmarks/field.py --scene BUILT_SCENE [--only fox bake render depth train gpu] [--json FILE] [--quick]
 
-`fox` reads the real captures in ../shared/data beside the project (or `--data`) and trains for 60, 300 and 1200 s;
-all sections but `fox` and `gpu` need a scene that was built to its end. Nothing is written into the scene. Alone on
-the machine the whole takes some 35 minutes. What each figure is, is said where it is measured: `field_sections.py`.
+Prints a table; `field_sections.py` defines each figure. `fox` reads the real captures in ../shared/data beside the
+project (or `--data`) and trains for 60, 300 and 1200 s. All sections except `fox` and `gpu` need a complete build and
+write nothing into the scene. A full run takes about 35 minutes on an otherwise idle machine.
 """
 
 import argparse
@@ -37,28 +37,28 @@ TARGETS: dict[str, tuple[str, float]] = {
     "gpu.render_fps": ("≥", 10000.0),
     "gpu.cpu_difference_mean": ("≤", 1 / 255),
 }
-"""What is wanted of a figure. A score within a budget is not met either where the budget was exceeded."""
+"""Figure → sense and target. A PSNR within a budget also fails if training exceeded the budget."""
 
 
-def judge(name: str, figures: dict[str, Any]) -> tuple[str, str]:
-    """A figure's target and whether it is met, in words; empty where nothing is wanted of it."""
+def verdict(name: str, figures: dict[str, Any]) -> tuple[str, str]:
+    """A figure's target and "yes" or "no" with a reason; empty strings for a figure without a target."""
     sense, wanted = TARGETS.get(name, (None, 0.0))
-    late = ""
+    overtime = ""
     section, _, rest = name.rpartition(".")
     if rest.startswith("psnr_") and rest.split("_")[1].removesuffix("s").isdigit():
         budget = rest.split("_")[1]
         wall = figures.get(f"{section}.seconds_{budget}", 0.0)
         if wall > float(budget.removesuffix("s")):
-            late = f"no, took {wall:.1f} s"
+            overtime = f"no, took {wall:.1f} s"
     if sense is None:
-        return "", late
+        return "", overtime
     value = figures[name]
     met = value is not None and (value <= wanted if sense == "≤" else value >= wanted)
-    return f"{sense} {wanted:.4g}", late or ("yes" if met else "no")
+    return f"{sense} {wanted:.4g}", overtime or ("yes" if met else "no")
 
 
-def shown(value: Any) -> str:
-    """A figure for the table."""
+def format_figure(value: Any) -> str:
+    """A figure as text for the table."""
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
     return f"{value:,}" if isinstance(value, int) else str(value)
@@ -72,14 +72,16 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared/data")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
     add_record_options(parser)
-    parser.add_argument("--budgets", nargs="+", type=int, default=[60, 300, 1200], metavar="S", help="of the fox [s]")
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs; the figures mean nothing")
+    parser.add_argument(
+        "--budgets", nargs="+", type=int, default=[60, 300, 1200], metavar="S", help="training times of the fox [s]"
+    )
+    parser.add_argument("--quick", action="store_true", help="tiny settings that only test the script")
     options = parser.parse_args()
     sections = options.only or list(SECTIONS)
     if not options.scene and any(name in NEED_SCENE for name in sections):
         parser.error(f"--scene is needed for {', '.join(name for name in sections if name in NEED_SCENE)}")
     if "fox" in sections and not (options.data / "fox").is_dir():
-        parser.error(f"no fox in {options.data}; say where with --data, or leave the section out with --only")
+        parser.error(f"no fox in {options.data}; give its folder with --data, or leave the section out with --only")
 
     figures: dict[str, Any] = {}
     record: dict[str, Any] = {}
@@ -90,16 +92,16 @@ def main() -> int:
             found = SECTIONS[section](bench)
             figures |= found
             for name in found:
-                wanted, met = judge(name, figures)
-                print(f"{name:32} {shown(figures[name]):>16} {wanted:>12}  {met}".rstrip(), flush=True)
-            if options.json:  # after every section, as a run is long
+                wanted, met = verdict(name, figures)
+                print(f"{name:32} {format_figure(figures[name]):>16} {wanted:>12}  {met}".rstrip(), flush=True)
+            if options.json:  # after every section, so that an interrupted run keeps its figures
                 record = figures | {"about": about(options)}
                 write_so_far(options.json, record)
     return save(options.json, record, options.replace_record)
 
 
 def about(options: argparse.Namespace) -> dict[str, Any]:
-    """What the figures were measured with."""
+    """Machine and package versions of the measurement."""
     from twin.nerf import buffers
 
     packages = {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")}

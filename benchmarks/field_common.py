@@ -1,4 +1,4 @@
-"""What the parts of `field.py` share: where things are, and the only calls that load and render."""
+"""Settings of a run of `field.py`, and the calls that load fields, render and start workers."""
 
 import json
 import os
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIZE = (160, 90)
-"""Width, height of the robot's picture [px]."""
+"""Width, height of the robot's image [px]."""
 
 _HERE = Path(__file__).parent
 
@@ -22,50 +22,50 @@ class Bench:
     """One run of the benchmark."""
 
     scene: Path | None
-    """A built scene; None where only sections run that need none."""
+    """A built scene; None if no section needs one."""
     data: Path
     """Folder of the real captures."""
     work: Path
-    """Empty folder for what is made on the way."""
+    """Empty folder for intermediate files."""
     budgets: tuple[int, ...]
-    """For training [s]."""
+    """Wall times of training [s]."""
     quick: bool
-    """Everything tiny: proves that the script runs, and no more."""
+    """Tiny settings that only show that the script runs."""
 
     def pick(self, usual: Any, quick: Any) -> Any:
         return quick if self.quick else usual
 
 
 def load_field(scene: Path) -> Any:
-    """The radiance field of a built scene, as it was trained (torch)."""
+    """The trained radiance field of a built scene (torch)."""
     from twin.loading import load_scene
 
     return load_scene(scene).radiance_field("cpu")
 
 
-def load_baked(place: Path, where: str = "cpu") -> Any:
-    """The baked field of a built scene, or of a folder that holds one."""
-    if (place / "scene.toml").exists() and where == "cpu":
+def load_baked(path: Path, device: str = "cpu") -> Any:
+    """The baked field of a built scene, or of a folder that contains one."""
+    if (path / "scene.toml").exists() and device == "cpu":
         from twin.loading import load_scene
 
-        return load_scene(place).field()
+        return load_scene(path).field()
     from twin.nerf.baked import BakedField
 
-    return BakedField.load(place / "build/3_field" if (place / "scene.toml").exists() else place, where)
+    return BakedField.load(path / "build/3_field" if (path / "scene.toml").exists() else path, device)
 
 
 def render(field: Any, poses: NDArray, intrinsics: NDArray, size: tuple[int, int], lighting: str) -> Any:
-    """n views under one lighting from either field; poses (n, 4, 4), intrinsics (4,) [px] at `size`."""
+    """Renders n views of either field under one lighting; poses (n, 4, 4), intrinsics (4,) [px] at `size`."""
     from twin.geometry.cameras import Viewpoints
 
     return field.render(Viewpoints.of(poses, intrinsics, size), lighting, size)
 
 
 def worker(*arguments: str | Path | int, environment: dict[str, str] | None = None) -> dict[str, Any]:
-    """What `field_workers.py` says, run in a process of its own so that nothing else is in its memory or caches.
+    """Figures of a function of `field_workers.py`, run in a process of its own with clean memory and caches.
 
     Raises:
-        RuntimeError: it failed.
+        RuntimeError: the process failed.
     """
     command = [sys.executable, str(_HERE / "field_workers.py"), *map(str, arguments)]
     path = os.pathsep.join(filter(None, [str(_HERE.parent), os.environ.get("PYTHONPATH", "")]))
@@ -77,9 +77,9 @@ def worker(*arguments: str | Path | int, environment: dict[str, str] | None = No
 
 
 def route_views(bench: Bench) -> Path:
-    """A file with what the robot's front camera sees from along the route: poses (k, 4, 4), intrinsics (4,) [px].
+    """A file with views of the robot's front camera along the route: poses (k, 4, 4), intrinsics (4,) [px].
 
-    The scripted follower drives the route, so that the camera stands and nods as it does on the robot.
+    The scripted follower drives the route, so the camera has the height and the pitching of the robot's.
     """
     file = bench.work / "views.npz"
     if not file.exists():

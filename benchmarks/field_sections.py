@@ -1,7 +1,7 @@
-"""The sections of `field.py`: each measures one thing and returns figures by name.
+"""Sections of `field.py`. Each returns figures by name.
 
-*Unfitted* and *fitted* scores are those of `twin/nerf/evaluate.py`. A *budget* is wall time [s] from the start of `fit`
-to the finished field, reading the frames and stereo included; what is compiled once per machine is compiled before.
+*Unfitted* and *fitted* scores are defined in `twin/nerf/evaluate.py`. A *budget* is the wall time [s] from the start of
+training to the finished field, including reading the frames and stereo; kernels are compiled before.
 """
 
 import time
@@ -18,29 +18,29 @@ from twin.geometry.cameras import Cameras, SparsePoints
 from twin.nerf import buffers
 from twin.scene import SceneDir
 
-_MARGIN = 0.05  # share of a budget that is left for what the forecast of the pace misses
+_MARGIN = 0.05  # fraction of a budget kept for errors of the predicted pace
 _PROBE_STEPS = 150
-_NEAR = 10.0  # [m] depth is compared up to here
+_NEAR = 10.0  # [m] depth errors are evaluated up to this depth
 
 Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How long `fit` takes: seconds before the first step, and per step."""
+    """Training time: seconds before the first step, and per step."""
 
     overhead: float
     step: float
 
     def steps(self, budget: float) -> int:
-        """Steps that fit into a budget [s], less the margin."""
+        """Steps that fit into a budget [s] less the margin."""
         return max(1, int(((1.0 - _MARGIN) * budget - self.overhead) / self.step))
 
 
 def timed_fit(
     cameras: Cameras, points: SparsePoints, config: NerfConfig, steps: int, device: str = "cpu"
 ) -> tuple[Any, float, Pace]:
-    """The field after so many steps, the wall seconds of the whole call, and its pace."""
+    """The field after this many steps, the wall time of the call [s], and its pace."""
     from twin.nerf.trainer import train_field
 
     began = time.perf_counter()
@@ -50,7 +50,7 @@ def timed_fit(
 
 
 def fox(bench: Bench) -> Figures:
-    """Training within budgets on the fox: poses given, every 8th image held out, 270 × 480 px, default settings."""
+    """Training within budgets on the fox capture: given poses, every 8th image held out, 270×480 px, defaults."""
     cameras, points = _fox_scene(bench)
     config = replace(NerfConfig(), max_width=bench.pick(NerfConfig().max_width, 96))
     budgets = bench.pick(bench.budgets, (10,))
@@ -58,7 +58,7 @@ def fox(bench: Bench) -> Figures:
 
 
 def _fox_scene(bench: Bench) -> tuple[Cameras, SparsePoints]:
-    """The capture through the product's own stages, which undistort the pictures and keep the poses."""
+    """Cameras and points of the fox from the build stages, which undistort the images and keep the poses."""
     from twin.build import build
 
     root = bench.work / "fox"
@@ -86,7 +86,7 @@ def _within_budgets(
     from twin.nerf.dataset import load_frame
     from twin.nerf.evaluate import evaluate
 
-    timed_fit(cameras, points, config, 2, device)  # compiles kernels and reads the files once
+    timed_fit(cameras, points, config, 2, device)  # compiles kernels and warms the file cache
     _, _, pace = timed_fit(cameras, points, config, bench.pick(_PROBE_STEPS, 20), device)
     found: Figures = {"overhead_s": pace.overhead, "step_s": pace.step}
     found["frame_size"] = "{1}x{0}".format(*load_frame(cameras, 0, config.max_width)[1].shape)
@@ -107,12 +107,12 @@ def _within_budgets(
 
 
 def bake(bench: Bench) -> Figures:
-    """What baking costs in quality, bytes and time; all held-out frames."""
+    """PSNR loss of baking over all held-out frames, its size and its time."""
     from twin.nerf.evaluate import evaluate
 
     scene = SceneDir(bench.scene)
     field = load_field(bench.scene)
-    baked, about, seconds = _bake(bench, field)
+    baked, report, seconds = _bake(bench, field)
     width = load_config(scene.config_file, ()).nerf.max_width
     cameras = Cameras.load(scene.stage("metric"))
     scores = evaluate(field, cameras, width, bench.pick(len(cameras), 1), baked=baked)
@@ -126,13 +126,13 @@ def bake(bench: Bench) -> Figures:
         "bake.bytes": baked.bytes,
         "bake.file_bytes": file.stat().st_size,
         "bake.seconds": seconds,
-        "bake.bricks": about["bricks_near"] + about["bricks_far"],
-        "bake.cell_m": about["cell_m"],
+        "bake.bricks": report["bricks_near"] + report["bricks_far"],
+        "bake.cell_m": report["cell_m"],
     }
 
 
 def _bake(bench: Bench, field: Any) -> tuple[Any, Figures, float]:
-    """Bakes the scene's field into the work folder: the baked field, what `bake` says, and its wall seconds."""
+    """Bakes the scene's field into the work folder: the baked field, the report of `bake`, and its wall time [s]."""
     import warp as wp
 
     from twin.nerf.bake import bake as run
@@ -144,16 +144,16 @@ def _bake(bench: Bench, field: Any) -> tuple[Any, Figures, float]:
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     wp.load_module("twin.nerf.kernels.bricks", device=field.device)
     began = time.perf_counter()
-    baked, about = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "max_bricks": 1500}))
+    baked, report = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "max_bricks": 1500}))
     seconds = time.perf_counter() - began
     folder = bench.work / "baked"
     folder.mkdir(exist_ok=True)
     baked.save(folder)
-    return baked, about, seconds
+    return baked, report, seconds
 
 
-def baked_place(bench: Bench) -> Path:
-    """Where a baked field is: the scene, if it was built with one, else a folder it is baked into now."""
+def baked_path(bench: Bench) -> Path:
+    """Path of a baked field: the scene's own, or one that is baked into the work folder."""
     if (SceneDir(bench.scene).stage("field") / "baked.json").exists():
         return bench.scene
     folder = bench.work / "baked"
@@ -163,22 +163,22 @@ def baked_place(bench: Bench) -> Path:
 
 
 def speed(bench: Bench) -> Figures:
-    """160 × 90 pictures with depth along the route, in processes of their own."""
-    place, views = baked_place(bench), route_views(bench)
+    """Speed of 160×90 images with depth along the route, in processes of their own."""
+    place, views = baked_path(bench), route_views(bench)
     count, repeats = bench.pick((60, 5), (4, 1))
     found: Figures = {}
-    for used in (1, 2)[: buffers.available_cores()]:
-        row = worker("frames", place, views, used, count, repeats)
-        found |= {f"render.{key}_{used}core": value for key, value in row.items()}
+    for cores in (1, 2)[: buffers.available_cores()]:
+        row = worker("frames", place, views, cores, count, repeats)
+        found |= {f"render.{key}_{cores}core": value for key, value in row.items()}
     row = worker("ratio", place, views, bench.pick(SIZE[0], 16), bench.pick(3, 1))
     found |= {f"render.{key}": value for key, value in row.items()}
     return found | _first_frame(bench, place, views)
 
 
 def _first_frame(bench: Bench, place: Path, views: Path) -> Figures:
-    """New processes: the median of three with the kernels cached, and one with an empty cache."""
+    """Time to the first frame of a new process: median of three with cached kernels, and one with an empty cache."""
     runs = [worker("first", place, views) for _ in range(bench.pick(4, 1))]
-    runs = runs[1:] or runs  # the first one brings the files into memory
+    runs = runs[1:] or runs  # the first one fills the file cache
     warm = {key: float(np.median([run[key] for run in runs])) for key in runs[0]}
     cache = bench.work / "cold_cache"
     cold = worker("first", place, views, environment={"WARP_CACHE_PATH": str(cache)})
@@ -192,7 +192,7 @@ def _first_frame(bench: Bench, place: Path, views: Path) -> Figures:
 
 
 def depth(bench: Bench) -> Figures:
-    """Rendered depth against the known truth, up to 10 m away, at the true cameras."""
+    """Error of rendered depth against the known truth up to 10 m, at the true cameras."""
     from twin.reality.comparison import align_rigid, depth_errors, matched_poses
     from twin.reality.truth import Truth
 
@@ -203,7 +203,7 @@ def depth(bench: Bench) -> Figures:
     cameras = Cameras.load(scene.stage("metric"))
     to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
     found: Figures = {}
-    for suffix, field in (("", load_baked(baked_place(bench))), ("_field", load_field(bench.scene))):
+    for suffix, field in (("", load_baked(baked_path(bench))), ("_field", load_field(bench.scene))):
         errors = depth_errors(field, truth, to_truth, _NEAR)
         found[f"depth.median_error{suffix}_m"] = errors["depth_median_m"]
         found[f"depth.median_relative{suffix}"] = errors["depth_relative"]
@@ -211,14 +211,14 @@ def depth(bench: Bench) -> Figures:
 
 
 def train(bench: Bench) -> Figures:
-    """Memory of training: 200 frames of the scene at the trained size, in a process of its own."""
+    """Peak memory of training on 200 frames of the scene at the trained size, in a process of its own."""
     row = worker("memory", bench.scene, bench.pick(200, 12), bench.pick(60, 3))
     size = "{:.0f}x{:.0f}".format(*row["size"])
     return {"train.peak_bytes": row["peak_bytes"], "train.frames": row["frames"], "train.frame_size": size}
 
 
 def gpu(bench: Bench) -> Figures:
-    """On CUDA, where both torch and Warp see it."""
+    """Training and rendering on CUDA, if both torch and Warp support the device."""
     import torch
     import warp as wp
 
@@ -231,7 +231,7 @@ def gpu(bench: Bench) -> Figures:
     found |= {f"gpu.fox.{key}": value for key, value in row.items()}
     if bench.scene is None:
         return found
-    place, views = baked_place(bench), route_views(bench)
+    place, views = baked_path(bench), route_views(bench)
     with np.load(views) as data:
         poses, k = data["poses"], data["intrinsics"]
     poses = poses[np.linspace(0, len(poses) - 1, bench.pick(256, 4)).round().astype(int)]
@@ -241,15 +241,15 @@ def gpu(bench: Bench) -> Figures:
     times = []
     for _ in range(bench.pick(10, 2)):
         began = time.perf_counter()
-        render(on_gpu, poses, k, SIZE, name)  # its pictures come back as numpy arrays, so it is done when it returns
+        render(on_gpu, poses, k, SIZE, name)  # returns numpy arrays, so it has finished
         times.append(time.perf_counter() - began)
     some = poses[:: max(1, len(poses) // 8)]
-    apart = np.abs(render(on_gpu, some, k, SIZE, name).rgb - render(on_cpu, some, k, SIZE, name).rgb)
+    difference = np.abs(render(on_gpu, some, k, SIZE, name).rgb - render(on_cpu, some, k, SIZE, name).rgb)
     return found | {
         "gpu.render_batch": len(poses),
         "gpu.render_fps": len(poses) / float(np.median(times)),
-        "gpu.cpu_difference_max": float(apart.max()),
-        "gpu.cpu_difference_mean": float(apart.mean()),
+        "gpu.cpu_difference_max": float(difference.max()),
+        "gpu.cpu_difference_mean": float(difference.mean()),
     }
 
 

@@ -1,12 +1,12 @@
-"""Measurements that need a process of their own; `field.py` starts them. Each prints one line of JSON.
+"""Measurements that `field.py` runs in processes of their own; each prints one line of JSON.
 
     python field_workers.py frames PLACE VIEWS CORES FRAMES REPEATS
     python field_workers.py ratio  PLACE VIEWS WIDTH REPEATS
     python field_workers.py first  PLACE VIEWS
     python field_workers.py memory SCENE FRAMES STEPS
 
-PLACE is a scene with a baked field, or a folder that holds one; VIEWS is a file of `field_common.route_views`.
-Whatever is imported late is so because the core count must be set, or the clock be running, before.
+PLACE is a scene with a baked field, or a folder that contains one; VIEWS is a file of `field_common.route_views`.
+Imports within functions are late because the core count must be set, or the clock started, before them.
 """
 
 import itertools
@@ -20,12 +20,12 @@ from typing import Any
 
 
 def use_cores(count: int) -> None:
-    """Binds this process to so many cores; call before numpy and torch, which count cores when they are imported.
+    """Binds this process to this many cores. Call it before importing numpy and torch, which count cores at import.
 
-    Threads are left to the product: what it does by itself on such a machine is what counts.
+    The number of threads stays the package's own choice, as on a machine with this many cores.
 
     Raises:
-        OSError: the system cannot bind processes, so that no figure of one core can be had.
+        OSError: the system cannot bind processes to cores.
     """
     if not hasattr(os, "sched_setaffinity"):
         raise OSError("this system cannot bind a process to a core; figures per core need Linux")
@@ -33,7 +33,7 @@ def use_cores(count: int) -> None:
 
 
 def frames(place: str, views: str, cores: str, count: str, repeats: str) -> dict[str, Any]:
-    """Single frames one after another, and batches; times [ms] and frames per second."""
+    """Times [ms] of single frames, and frames per second of single frames and of batches."""
     use_cores(int(cores))
     import numpy as np
     from field_common import SIZE, load_baked, render
@@ -68,7 +68,7 @@ def frames(place: str, views: str, cores: str, count: str, repeats: str) -> dict
 
 
 def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
-    """By turns on one core: Nerfacto plain and tuned, one frame each, and eight of the baked field."""
+    """Frame times on one core, alternating: one frame of Nerfacto, plain and tuned, and eight of the baked field."""
     use_cores(1)
     import nerfacto_reference
     import nerfacto_tuned
@@ -83,7 +83,7 @@ def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
     poses, k, lightings = _views(views, 8 * int(repeats), field.lightings)
     k = k * size[0] / SIZE[0]
     low, high = field.bounds
-    scaled = poses.copy()  # into Nerfacto's units
+    scaled = poses.copy()  # in Nerfacto's units
     scaled[:, :3, 3] = (poses[:, :3, 3] - (low + high) / 2) / (high - low).max() * 2
     scaled = torch.as_tensor(scaled, dtype=torch.float32)
     intrinsics, networks = torch.as_tensor(k), nerfacto_reference.networks()
@@ -94,31 +94,31 @@ def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
         reference.frame(scaled[i], intrinsics / shrink, (size[0] // shrink, size[1] // shrink), chunk)
         return time.perf_counter() - began
 
-    seconds(plain, 0, nerfacto_reference.CHUNK, 8)  # a small picture, to have everything loaded
+    seconds(plain, 0, nerfacto_reference.CHUNK, 8)  # a small image, to load everything
     seconds(tuned, 0, nerfacto_tuned.CHUNK)
     render(field, poses[:1], k, size, lightings[0])
     turns = []
     for first_view in range(0, 8 * int(repeats), 8):
-        slow = seconds(plain, first_view, nerfacto_reference.CHUNK)
-        less_slow = seconds(tuned, first_view, nerfacto_tuned.CHUNK)
-        of_turn = []
+        plain_s = seconds(plain, first_view, nerfacto_reference.CHUNK)
+        tuned_s = seconds(tuned, first_view, nerfacto_tuned.CHUNK)
+        baked_s = []
         for i in range(first_view, first_view + 8):
             began = time.perf_counter()
             render(field, poses[i : i + 1], k, size, lightings[i])
-            of_turn.append(time.perf_counter() - began)
-        turns.append((slow, less_slow, float(np.median(of_turn))))
-    of_plain, of_tuned, baked = np.transpose(turns)
+            baked_s.append(time.perf_counter() - began)
+        turns.append((plain_s, tuned_s, float(np.median(baked_s))))
+    plain_times, tuned_times, baked_times = np.transpose(turns)
     return {
-        "ratio_to_nerfacto": float(np.median(of_plain / baked)),
-        "ratio_to_nerfacto_tuned": float(np.median(of_tuned / baked)),
-        "nerfacto_s": float(np.median(of_plain)),
-        "nerfacto_tuned_s": float(np.median(of_tuned)),
-        "ms_beside_nerfacto": float(np.median(baked)) * 1e3,
+        "ratio_to_nerfacto": float(np.median(plain_times / baked_times)),
+        "ratio_to_nerfacto_tuned": float(np.median(tuned_times / baked_times)),
+        "nerfacto_s": float(np.median(plain_times)),
+        "nerfacto_tuned_s": float(np.median(tuned_times)),
+        "ms_beside_nerfacto": float(np.median(baked_times)) * 1e3,
     }
 
 
 def first(place: str, views: str) -> dict[str, Any]:
-    """From nothing to the first frame: `import_s`, then `first_frame_s` from the call that loads to the frame."""
+    """Start-up time: `import_s`, then `first_frame_s` from loading the field to the first frame."""
     began = time.perf_counter()
     from field_common import SIZE, load_baked, render
 
@@ -136,7 +136,7 @@ def first(place: str, views: str) -> dict[str, Any]:
 
 
 def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
-    """Peak resident memory of training on so many frames, the scene's own and, where too few, the first ones again."""
+    """Peak resident memory of training on this many frames; the scene's frames repeat if there are too few."""
     from dataclasses import replace
 
     import numpy as np
@@ -154,19 +154,19 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     cameras = Cameras.load(paths.stage("metric"))
     points = SparsePoints.load(paths.stage("metric"))
     cameras = replace(cameras, held_out=np.zeros(len(cameras), bool))
-    chosen = np.resize(np.arange(len(cameras)), int(count))  # the points know the frames by index, so no sorting
+    chosen = np.resize(np.arange(len(cameras)), int(count))  # unsorted, as the points refer to frames by index
     height = constant_height(read_json(paths.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     trained, _, _ = train_field(
         cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height, "cpu"
     )
-    shown = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
-    return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(shown).tolist()}
+    size = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
+    return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(size).tolist()}
 
 
 def peak_bytes() -> int:
-    """Most memory this process ever held.
+    """Peak resident memory of this process [bytes].
 
-    Linux counts it from the program's start; `getrusage`, used elsewhere, would also count the parent's at the fork.
+    Linux measures it from the start of the program; `getrusage` also includes the parent's memory at the fork.
     """
     status = Path("/proc/self/status")
     if status.exists():
@@ -178,7 +178,7 @@ def peak_bytes() -> int:
 
 
 def _views(file: str, count: int, lightings: tuple[str, ...]) -> tuple[Any, Any, list[str]]:
-    """Poses spread along the route, intrinsics, and a lighting for each: every one by name, and mixtures."""
+    """Poses spread along the route, intrinsics, and a lighting for each: named ones and mixtures in turn."""
     import numpy as np
 
     with np.load(file) as data:

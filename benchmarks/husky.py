@@ -1,10 +1,9 @@
-"""The Husky's acceptance table, its negative controls and its steps per second; as JSON where asked.
+"""Acceptance table of the Husky model, its negative controls and its simulation speed.
 
     python benchmarks/husky.py [--scene BUILT_SCENE] [--only A1 B6 ...] [--json FILE]
 
-With `--scene` also chi on that scene's ground, of that scene's robot, and the steps per second in it. The whole takes
-40 s on the machine of `docs/benchmarks.md`. Exit status 1 where a row fails that
-should pass, or a control passes that should fail.
+With `--scene` also chi of the scene's robot on the scene's ground, and the simulation speed there. A run takes 40 s on
+the machine in `docs/benchmarks.md`. The exit status is 1 if a row fails or a control passes.
 """
 
 import argparse
@@ -17,22 +16,28 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import acceptance
 import mujoco
 import numpy as np
-from acceptance import CONTROLS, MEASURES, Row, Subject, chi_on, on_ground, on_plane
+from acceptance.drives import on_ground, on_plane
+from acceptance.grounds import reconstructed
+from acceptance.rows import Row, Subject
+from acceptance.table import CONTROLS, MEASURES
+from acceptance.terrain import chi_on
 from record import add_record_options, save
 
 from twin.assets.ground import Ground
 from twin.loading import load_scene
 
 _STEPS, _PIECES, _REPEATS = 5000, 50, 7
-_SPEED = (4.0, 4.5)  # [rad/s] of the left and of the right wheels, a gentle bend at 0.7 m/s
+_SPEED = (4.0, 4.5)  # [rad/s] of the left and right wheels: a gentle bend at 0.7 m/s
 
 
 def steps_per_second(model: mujoco.MjModel) -> float:
-    """`mj_step` on one core over one drive of 10 s. Each fifth of a second counts with the fastest of its repeats, as
-    what else runs on the machine only ever slows it down; asked of MuJoCo in one call, so that Python takes no part."""
+    """Calls of `mj_step` per second on one core, over one drive of 10 s.
+
+    The drive is timed in pieces of 0.2 s, one call each; the fastest repeat of a piece counts, which excludes other
+    load on the machine.
+    """
     seconds = np.full(_PIECES, np.inf)
     for _ in range(_REPEATS):
         data = mujoco.MjData(model)
@@ -48,8 +53,8 @@ def steps_per_second(model: mujoco.MjModel) -> float:
 
 
 def speeds(scene: Path | None) -> list[Row]:
-    """Steps per second, and what is wanted of them."""
-    bumps = acceptance.reconstructed(np.random.default_rng(0))
+    """Rows of steps per second on a plane, a reconstructed road, and the scene."""
+    bumps = reconstructed(np.random.default_rng(0))
     models = {"a plane": (on_plane(), 30e3), "a reconstructed flat road": (on_ground(bumps, start=(-7, 0, 0)), 20e3)}
     if scene is not None:
         models[f"{scene.name}'s ground, with its convex parts"] = (load_scene(scene).world().model(), 20e3)
@@ -81,7 +86,7 @@ def line(row: Row) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene")
-    parser.add_argument("--only", nargs="+", metavar="ID", help="rows such as B6, or: controls, speed")
+    parser.add_argument("--only", nargs="+", metavar="ID", help="row ids such as B6, controls or speed")
     add_record_options(parser)
     arguments = parser.parse_args()
 
@@ -119,7 +124,7 @@ def main() -> int:
             "machine": platform.processor() or platform.machine(),
             "mujoco": metadata.version("mujoco"),
         }
-        # JSON knows no infinity: an open limit is null.
+        # JSON has no infinity, so an open limit is null.
         open_limits = {math.inf: None, -math.inf: None}
         for row in [*report["rows"], *(row for control in controls.values() for row in control["rows"])]:
             row |= {k: open_limits.get(row[k], row[k]) for k in ("value", "low", "high")}

@@ -1,9 +1,9 @@
 """Motor effort of turning relative to driving straight: measured currents against simulated torques.
 
-*Steady*: both sides drive forward at constant speed for 1 s. *Straight*, *turning*: by the speed difference of the
-sides. In a turn the *outer* side pushes and the *inner* side is dragged along. Currents in the logs are unsigned and
-zero when a motor brakes, so negative simulated torques count as zero. Torque per ampere is not published but cancels in
-the ratios; without poses nothing else can be compared.
+*Steady*: both sides drive forward at constant speed for 1 s. *Straight* and *turning* differ by the speed difference of
+the sides. In a turn the *outer* side drives and the *inner* side is dragged. Currents in the logs are unsigned and zero
+while a motor brakes, so negative simulated torques count as zero. Torque per ampere is not published but cancels in the
+ratios. The logs have no poses, so nothing else can be compared.
 """
 
 from dataclasses import dataclass, replace
@@ -21,10 +21,10 @@ from twin.sysid.rollout import COARSE_TIMESTEP, LEAD_SAMPLES, simulate_windows
 from twin.types import Array
 
 COLUMNS = ("time", "curL", "curR", "velL", "velR")
-"""[s], [A], [A], [m/s], [m/s]; speeds are those of the wheel circumference."""
+"""Units [s], [A], [A], [m/s], [m/s]; speeds are those of the wheel circumference."""
 
 _HALF_WINDOW = 0.5  # [s]
-_MAX_VARIATION = 0.06  # [m/s] range of the speed of a steady side; the encoders resolve 0.016
+_MAX_VARIATION = 0.06  # [m/s] speed range of a steady side; the encoders resolve 0.016
 _MIN_SPEED = 0.1  # [m/s]
 _MAX_STRAIGHT, _MIN_TURNING = 0.04, 0.08  # [m/s] largest and smallest speed difference of the sides
 _MIN_SAMPLES = 30  # steady samples of each kind
@@ -33,7 +33,7 @@ _MAX_SIMULATED = 150  # turning samples simulated
 
 @dataclass(frozen=True)
 class Effort:
-    """Mean current or torque of a side in turns / mean when driving straight."""
+    """Mean current or torque of a side in turns, relative to the mean when driving straight."""
 
     outer: float
     inner: float
@@ -46,7 +46,7 @@ class Effort:
 
 @dataclass(frozen=True)
 class SteadySamples:
-    """SteadySamples samples of logs."""
+    """Samples of steady driving."""
 
     speeds: Array
     """Left and right [m/s], shape (n, 2)."""
@@ -63,7 +63,7 @@ class SteadySamples:
 
 
 def read_currents(paths: list[Path]) -> SteadySamples:
-    """SteadySamples samples of .npz logs with `COLUMNS`. Raises InputError: columns are missing, too few samples."""
+    """Steady samples of .npz logs with `COLUMNS`. Raises InputError: columns are missing, or samples are too few."""
     speeds, currents = [], []
     for path in paths:
         columns = read_npz(path)
@@ -77,8 +77,8 @@ def read_currents(paths: list[Path]) -> SteadySamples:
         last = np.searchsorted(time, time + _HALF_WINDOW, side="right")
         for i, (a, b) in enumerate(zip(first, last, strict=True)):
             near = speed[a:b]
-            whole = time[i] - time[0] >= _HALF_WINDOW and time[-1] - time[i] >= _HALF_WINDOW
-            if whole and np.ptp(near, axis=0).max() <= _MAX_VARIATION and near.min() > _MIN_SPEED:
+            complete = time[i] - time[0] >= _HALF_WINDOW and time[-1] - time[i] >= _HALF_WINDOW
+            if complete and np.ptp(near, axis=0).max() <= _MAX_VARIATION and near.min() > _MIN_SPEED:
                 speeds.append(near.mean(0))
                 currents.append(current[i])
     steady = SteadySamples(np.array(speeds).reshape(-1, 2), np.array(currents).reshape(-1, 2))
@@ -114,7 +114,8 @@ def simulated_effort(steady: SteadySamples, params: HuskyParams) -> Effort:
 def rolling_resistance_of(steady: SteadySamples, params: HuskyParams) -> float:
     """Rolling resistance, including gear and belt losses, at which the simulated effort equals the measured one.
 
-    Raises InputError: there is none between 0.002 and 0.4.
+    Raises:
+        InputError: no value between 0.002 and 0.4 does.
     """
     target = measured_effort(steady).total
 

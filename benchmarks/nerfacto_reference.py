@@ -1,10 +1,10 @@
-"""Nerfacto in plain torch: what a frame costs without this project's march and bricks.
+"""Nerfacto in plain torch, the baseline for the renderer's speed.
 
 Nerfacto is Tancik et al. 2023, "Nerfstudio" (arXiv 2302.04264); its hash grid is Müller et al. 2022, "Instant NGP", its
 proposal networks and its contraction of space are Barron et al. 2022, "Mip-NeRF 360". The sizes are the published ones;
-the weights are random, for timing only. Written as one reads it there, nothing optimised: every sample goes through
-every network on inputs that are concatenated for it, as in nerfstudio's own torch path. `nerfacto_tuned.py` renders the
-same picture as fast as plain torch goes.
+the weights are random, as only time is measured. The code follows the papers without optimisation: every sample passes
+through every network on concatenated inputs, as in nerfstudio's torch implementation. `nerfacto_tuned.py` renders the
+same image with optimised torch code.
 
 Shapes: r rays, s samples on each, s + 1 *edges* that bound them. *Spacing* is the coordinate in [0, 1] along a ray:
 uniform in distance up to one unit, in inverse distance beyond.
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 PROPOSAL_SAMPLES = (256, 96)
 SAMPLES = 48
 CHUNK = 1 << 15
-"""Rays at a time: nerfstudio's `eval_num_rays_per_chunk` for Nerfacto. A picture of 160 × 90 is a single chunk."""
+"""Rays per chunk: nerfstudio's `eval_num_rays_per_chunk` for Nerfacto. A 160×90 image is a single chunk."""
 _PROPOSAL_FINEST = (128, 256)
 _PROPOSAL_LEVELS, _PROPOSAL_LOG2, _PROPOSAL_HIDDEN = 5, 17, 16
 _LEVELS, _LOG2, _FINEST, _HIDDEN = 16, 19, 2048, 64
@@ -28,7 +28,7 @@ _COARSEST = 16
 FEATURES = 2  # per level
 GEOMETRY, _APPEARANCE, HARMONICS = 15, 32, 16
 NEAR, FAR = 0.05, 1000.0  # [half sides of the near box]
-_PADDING = 0.01  # added to every weight before resampling, so that no place is ruled out
+_PADDING = 0.01  # added to every weight before resampling, so that no interval has probability zero
 _PRIMES = torch.tensor([1, 2654435761, 805459861])
 _CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  # (8, 3)
 
@@ -69,7 +69,7 @@ class Proposal:
 
 
 class Field:
-    """The field that is shown: density, and colour by direction and appearance."""
+    """The main field: density, and color by direction and appearance."""
 
     def __init__(self) -> None:
         self.grid = HashGrid(_LEVELS, _LOG2, _FINEST)
@@ -78,35 +78,35 @@ class Field:
         self.appearance = torch.randn(_APPEARANCE)
 
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (r, s) and colour (r, s, 3) at points (r, s, 3) of rays with unit directions (r, 3)."""
+        """Density (r, s) and color (r, s, 3) at points (r, s, 3) of rays with unit directions (r, 3)."""
         density, geometry = self.base(self.grid(unit_cube(points))).split([1, GEOMETRY], -1)
         samples = points.shape[:-1]
         seen_from = harmonics(directions)[:, None].expand(*samples, -1)
-        colour = self.head(torch.cat([geometry, seen_from, self.appearance.expand(*samples, -1)], -1)).sigmoid()
-        return density[..., 0].exp(), colour
+        color = self.head(torch.cat([geometry, seen_from, self.appearance.expand(*samples, -1)], -1)).sigmoid()
+        return density[..., 0].exp(), color
 
 
 @dataclass(frozen=True)
 class Nerfacto:
-    """The functions a frame is made of; distances in half sides of the near box."""
+    """The renderer: proposal sampling and compositing; distances in half sides of the near box."""
 
     proposals: tuple[Callable[[Tensor], Tensor], ...]
-    """Each as `Proposal`."""
+    """Called as `Proposal`."""
     field: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-    """As `Field`."""
+    """Called as `Field`."""
 
     @torch.no_grad()
     def rays(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Colour (r, 3), median distance (r,) and opacity (r,) of rays; origins and unit directions (r, 3)."""
+        """Color (r, 3), median distance (r,) and opacity (r,) of rays; origins and unit directions (r, 3)."""
         spacing = torch.linspace(0.0, 1.0, PROPOSAL_SAMPLES[0] + 1).expand(len(origins), -1)
         for density_of, following in zip(self.proposals, (*PROPOSAL_SAMPLES[1:], SAMPLES), strict=True):
             edges = distance_of(spacing)
             weights = weights_of(density_of(points_on(origins, directions, edges)), edges)
             spacing = resampled(spacing, weights, following)
         edges = distance_of(spacing)
-        density, colour = self.field(points_on(origins, directions, edges), directions)
+        density, color = self.field(points_on(origins, directions, edges), directions)
         weights = weights_of(density, edges)
-        rgb = (weights[..., None] * colour).sum(1)
+        rgb = (weights[..., None] * color).sum(1)
         reached = weights.cumsum(-1)
         middle = (edges[:, 1:] + edges[:, :-1]) / 2
         half = torch.searchsorted(reached, torch.full((len(edges), 1), 0.5)).clamp(max=middle.shape[1] - 1)
@@ -115,13 +115,13 @@ class Nerfacto:
     def frame(
         self, camera_to_world: Tensor, intrinsics: Tensor, size: tuple[int, int], chunk: int = CHUNK
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Colour (h, w, 3), z-depth (h, w) and opacity (h, w) of one view.
+        """Color (h, w, 3), z-depth (h, w) and opacity (h, w) of one view.
 
         Args:
             camera_to_world: OpenCV axes, shape (4, 4).
             intrinsics: fx, fy, cx, cy [px] at `size`, shape (4,).
             size: Width, height [px].
-            chunk: Rays at a time.
+            chunk: Rays per chunk.
         """
         width, height = size
         v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -136,7 +136,7 @@ class Nerfacto:
 
 
 def networks(seed: int = 0) -> tuple[tuple[Proposal, ...], Field]:
-    """Of the published sizes, with random weights."""
+    """Proposal networks and field of the published sizes, with random weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return tuple(Proposal(finest) for finest in _PROPOSAL_FINEST), Field()
@@ -157,7 +157,7 @@ def spatial_hash(vertices: Tensor, size: int) -> Tensor:
 
 
 def spacing_of(distance: Tensor) -> Tensor:
-    """Spacing of distances, up to scale: half of [0, 1] for the first unit, the other half for all that is beyond."""
+    """Spacing of distances, up to scale: [0, 0.5] for the first unit, [0.5, 1] beyond."""
     return torch.where(distance < 1.0, distance / 2, 1.0 - 0.5 / distance)
 
 
@@ -169,7 +169,7 @@ def distance_of(spacing: Tensor) -> Tensor:
 
 
 def points_on(origins: Tensor, directions: Tensor, edges: Tensor) -> Tensor:
-    """The middles (r, s, 3) between edges (r, s + 1) on rays (r, 3)."""
+    """Midpoints (r, s, 3) between edges (r, s + 1) on rays (r, 3)."""
     middle = (edges[:, 1:] + edges[:, :-1]) / 2
     return origins[:, None] + directions[:, None] * middle[..., None]
 
@@ -181,16 +181,16 @@ def unit_cube(points: Tensor) -> Tensor:
 
 
 def weights_of(density: Tensor, edges: Tensor) -> Tensor:
-    """Share of the light that each sample stops (Mildenhall et al. 2020, eq. 3); (r, s) and (r, s + 1) → (r, s)."""
+    """Compositing weights of samples (Mildenhall et al. 2020, eq. 3): (r, s) and (r, s + 1) → (r, s)."""
     depth = density * (edges[:, 1:] - edges[:, :-1])
     before = torch.cat([torch.zeros(len(depth), 1), depth[:, :-1].cumsum(-1)], -1)
     return (1.0 - torch.exp(-depth)) * torch.exp(-before)
 
 
 def resampled(spacing: Tensor, weights: Tensor, count: int) -> Tensor:
-    """Edges (r, count + 1) at equal shares of the weights (r, s) between edges (r, s + 1); edges in spacing.
+    """Edges (r, count + 1) at equal quantiles of the weights (r, s) between edges (r, s + 1), all in spacing.
 
-    Barron et al. 2022, section 3; with nerfstudio's padding of the weights.
+    Barron et al. 2022, section 3, with nerfstudio's padding of the weights.
     """
     padded = weights + _PADDING
     share = torch.cat([torch.zeros(len(padded), 1), (padded / padded.sum(-1, keepdim=True)).cumsum(-1)], -1)

@@ -1,8 +1,8 @@
-"""The picture of `nerfacto_reference.py` from the same weights, as fast as plain torch goes on one core.
+"""Nerfacto of `nerfacto_reference.py`, optimised for one core in plain torch: same weights, same image.
 
-What is tuned: few rays at a time, so that all stays in the cache; columns are samples, so that every network is one
-product of matrices; coarse levels lie dense; both features of a vertex are gathered as one number; what is the same for
-all samples of a ray or a frame is computed once. n samples in all, r rays.
+Optimisations: chunks of few rays, which fit the cache; samples are columns, so a layer is one matrix product; coarse
+levels are stored densely; both features of a vertex are gathered as one number; terms that are constant along a ray or
+over a frame are computed once. Shapes: n samples in all, r rays.
 """
 
 from typing import Any
@@ -13,17 +13,17 @@ from nerfacto_reference import spatial_hash as hashed
 from torch import Tensor
 
 CHUNK = 512
-"""Rays at a time: 256 to 1024 are equally fast on the machine of `docs/benchmarks.md`, more is slower."""
+"""Rays per chunk: 256 to 1024 are equally fast on the machine in `docs/benchmarks.md`, more are slower."""
 _PRIMES = (1, 2654435761 - 2**32, 805459861)  # as signed 32-bit numbers; only the low bits count
 
 
 def tuned(proposals: tuple[Proposal, ...], field: Field) -> Nerfacto:
-    """The renderer, to be called with `CHUNK`."""
+    """The renderer; call `frame` with `CHUNK`."""
     return Nerfacto(tuple(TunedProposal(proposal) for proposal in proposals), TunedField(field))
 
 
 class TunedGrid:
-    """As `HashGrid`."""
+    """Optimised `HashGrid`."""
 
     def __init__(self, grid: HashGrid):
         self.levels = []  # (resolution, whether dense, both features of each entry as one number)
@@ -62,7 +62,7 @@ class TunedGrid:
 
 
 class TunedProposal:
-    """As `Proposal`."""
+    """Optimised `Proposal`."""
 
     def __init__(self, plain: Proposal):
         self.grid = TunedGrid(plain.grid)
@@ -75,23 +75,23 @@ class TunedProposal:
 
 
 class TunedField:
-    """As `Field`."""
+    """Optimised `Field`."""
 
     def __init__(self, plain: Field):
         self.grid = TunedGrid(plain.grid)
         self.base, self.head, self.appearance = plain.base, plain.head, plain.appearance
 
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (r, s) and colour (r, s, 3) at points (r, s, 3) of rays with unit directions (r, 3)."""
+        """Density (r, s) and color (r, s, 3) at points (r, s, 3) of rays with unit directions (r, 3)."""
         samples = points.shape[:-1]
         out = columns(self.base[2], columns(self.base[0], self.grid(cube_columns(points))).relu_())
-        # Direction and appearance are those of the ray: their part of the first layer is its bias.
+        # Direction and appearance are constant along a ray: their part of the first layer acts as a bias.
         first: Any = self.head[0]
-        of_sample, of_direction, of_frame = first.weight.split([GEOMETRY, HARMONICS, len(self.appearance)], 1)
-        of_ray = of_direction @ harmonics(directions).T + (first.bias + of_frame @ self.appearance)[:, None]
-        hidden = (of_sample @ out[1:]).view(-1, *samples).add_(of_ray[:, :, None]).relu_().flatten(1)
-        colour = columns(self.head[4], columns(self.head[2], hidden).relu_()).sigmoid_()
-        return out[0].exp().view(samples), colour.view(3, *samples).permute(1, 2, 0)
+        w_geometry, w_direction, w_appearance = first.weight.split([GEOMETRY, HARMONICS, len(self.appearance)], 1)
+        ray_bias = w_direction @ harmonics(directions).T + (first.bias + w_appearance @ self.appearance)[:, None]
+        hidden = (w_geometry @ out[1:]).view(-1, *samples).add_(ray_bias[:, :, None]).relu_().flatten(1)
+        color = columns(self.head[4], columns(self.head[2], hidden).relu_()).sigmoid_()
+        return out[0].exp().view(samples), color.view(3, *samples).permute(1, 2, 0)
 
 
 def columns(layer: Any, x: Tensor) -> Tensor:
@@ -100,7 +100,7 @@ def columns(layer: Any, x: Tensor) -> Tensor:
 
 
 def cube_columns(points: Tensor) -> Tensor:
-    """As `unit_cube`: shape (r, s, 3) → (3, n)."""
+    """`unit_cube` with samples as columns: (r, s, 3) → (3, n)."""
     points = points.reshape(-1, 3).T.contiguous()
     norm = points.abs().amax(0).clamp_(min=1.0)
     return points.mul_((2.0 - 1.0 / norm) / norm).mul_(0.25).add_(0.5)

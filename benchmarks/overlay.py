@@ -1,12 +1,12 @@
-"""Figures of the overlay: obstacles in the twin against the same in the true world, and seen against touched.
+"""Benchmark of the compositor: obstacles in the twin against the same ones in the true world.
 
     python benchmarks/overlay.py --scene BUILT_SCENE_WITH_TRUTH [--json FILE] [--pictures FOLDER]
 
-The scene was filmed without any of them. Each is put at a place along the route, once into the twin, through the
-overlay, and once into the known-truth world, in the same colours; both are seen from the same pose of the robot's front
-camera at 160×90, and developed as the film was, without noise. *The obstacle's pixels* are those it is seen in in the
-truth. *Unshaded* is the overlay with everything in its plain colours. How far the field is from what is solid is
-measured along a drive, see `twin/report/visual_vs_collision.py`.
+The scene was filmed without obstacles. Each obstacle is placed along the route twice, composited into the twin and
+rendered in the known-truth world, in the same colors. Both are rendered from the same pose of the robot's front camera
+at 160×90, with the film's camera response and without noise. *Obstacle pixels* are those that show the obstacle in the
+truth. *Unshaded* is the composite with plain colors. A drive along the route also compares the visual with the
+collision geometry, see `twin/report/visual_vs_collision.py`.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from twin.reality.truth import Truth
 
 SIZE = (160, 90)
 KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
-PLACES = tuple(  # station, lateral [m], yaw [°], distance before it [m] the camera is at
+PLACES = tuple(  # station, lateral [m], yaw [°], distance [m] from the camera to the obstacle
     (float(s), lateral, yaw, ahead)
     for s, lateral, yaw, ahead in (
         *((7.0, 0.3, 20.0, 3.0), (13.0, -0.7, -70.0, 5.0), (19.0, 0.9, 130.0, 4.0), (25.0, 0.0, 0.0, 6.5)),
@@ -59,7 +59,7 @@ TARGETS = {
 
 
 class TrueWorld:
-    """The known-truth world under one lighting, with one obstacle of every kind that can be put anywhere."""
+    """The known-truth world under one lighting, with one movable obstacle of every kind."""
 
     def __init__(self, truth: Truth, lighting: str, intrinsics: np.ndarray) -> None:
         spec = reality.world_spec(lighting, truth.place)
@@ -76,7 +76,7 @@ class TrueWorld:
         with wp.ScopedDevice("cpu"):
             self.device_model = mujoco_warp.put_model(self.model)
             self.device = mujoco_warp.put_data(self.model, self.data)
-            # As `twin.reality.filming.Renderer`; a second one through pixels' middles, for the mask.
+            # As `twin.reality.filming.Renderer`; the second one samples pixel centers, for the mask.
             self.contexts = [
                 mujoco_warp.create_render_context(
                     self.model,
@@ -94,8 +94,8 @@ class TrueWorld:
                 for samples in (2, 1)
             ]
 
-    def show(self, camera_to_world: np.ndarray, kind: str | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Film colours (h, w, 3) and z-depth of pixels' middles [m], with an obstacle of a kind at a pose (4, 4)."""
+    def render(self, camera_to_world: np.ndarray, kind: str | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Film colors (h, w, 3) and z-depth [m] at pixel centers, with an obstacle of a kind at a pose (4, 4)."""
         for name in KINDS:
             mocap = self.model.body(f"added_{name}").mocapid[0]
             self.data.mocap_pos[mocap] = pose[:3, 3] if name == kind else (0, 0, -100.0)
@@ -117,7 +117,7 @@ class TrueWorld:
 
 
 def robot_at(world: World, model: mujoco.MjModel, data: mujoco.MjData, station: float) -> np.ndarray:
-    """Puts the robot on the route as it stands at its start; camera_to_world of its front camera."""
+    """Places the robot on the route, at rest; returns camera_to_world of its front camera."""
     mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
     turn = float(heading_at(world.route, station) - world.spawn[3])
     rest = data.qpos[3:7].copy()
@@ -130,13 +130,13 @@ def robot_at(world: World, model: mujoco.MjModel, data: mujoco.MjData, station: 
 
 
 def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str, ...] = KINDS) -> dict[str, Any]:
-    """Compares the overlay with the truth.
+    """Compares composited obstacles with the truth.
 
     Returns:
         Figures by name: `overlay.obstacle_psnr.<lighting>`, `overlay.unshaded_psnr.<lighting>` [dB],
-        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and its pieces;
-        `overlay.shadow_rms.<lighting>`, how wrong the share is to which pixels beside the obstacle are dimmed by it
-        (those dimmed by 5 % in the twin or in truth), and `overlay.no_shadow_rms.<lighting>`, without any dimming.
+        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and per
+        lighting; `overlay.shadow_rms.<lighting>`, rms error of the shadow factor over pixels beside the obstacle that
+        the obstacle dims by 5 % in the twin or in the truth; `overlay.no_shadow_rms.<lighting>`, without any shadow.
     """
     scene = load_scene(scene_path)
     world, field = scene.world(), scene.field()
@@ -148,7 +148,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     add_obstacles(spec, pool, world)
     model = spec.compile()
     data = mujoco.MjData(model)
-    overlays = {"shaded": Compositor(model, field, SIZE), "unshaded": Compositor(model, field, SIZE, shaded=False)}
+    compositors = {"shaded": Compositor(model, field, SIZE), "unshaded": Compositor(model, field, SIZE, shaded=False)}
     errors: dict[str, list[np.ndarray]] = defaultdict(list)
     ious: dict[str, list[tuple[int, int]]] = defaultdict(list)
     length = float(arc_lengths(world.route)[-1])
@@ -159,14 +159,14 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
             for station, lateral, yaw, ahead in PLACES:
                 if station > length:
                     continue
-                if kind == "car":  # it needs more room
+                if kind == "car":  # a car needs more room
                     lateral, ahead = lateral + 1.8, ahead + 3.0
-                here = (ObstacleConfig(kind, kind, station, lateral, yaw),)
+                placed = (ObstacleConfig(kind, kind, station, lateral, yaw),)
                 eye = robot_at(world, model, data, max(0.0, station - ahead))
                 place((), data, 0.0)
                 mujoco.mj_forward(model, data)
-                empty = overlays["shaded"].render([data], lighting)
-                place(here, data, 0.0)
+                empty = compositors["shaded"].render([data], lighting)
+                place(placed, data, 0.0)
                 mujoco.mj_forward(model, data)
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = (
@@ -174,21 +174,21 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                     data.body(f"obstacle_{kind}").xpos,
                 )
                 true_eye, true_pose = to_truth.poses(eye), to_truth.poses(pose)
-                bare, bare_depth = true_world.show(true_eye, None, true_pose)
-                wanted, depth = true_world.show(true_eye, kind, true_pose)
-                seen = depth < bare_depth - 1e-3
+                empty_truth, empty_truth_depth = true_world.render(true_eye, None, true_pose)
+                truth_rgb, depth = true_world.render(true_eye, kind, true_pose)
+                seen = depth < empty_truth_depth - 1e-3
                 if seen.sum() < 20:
                     continue
-                shown = {}
-                for name, overlay in overlays.items():
-                    out = overlay.render([data], lighting)
-                    shown[name] = out.rgb[0]
-                    error = ((out.rgb[0] - wanted)[seen] ** 2).ravel()
+                composites = {}
+                for name, compositor in compositors.items():
+                    out = compositor.render([data], lighting)
+                    composites[name] = out.rgb[0]
+                    error = ((out.rgb[0] - truth_rgb)[seen] ** 2).ravel()
                     errors[f"{name}.{lighting}"].append(error)
                     if name == "shaded":
                         dimmed = [
                             luminance(a) / np.maximum(luminance(b), 0.02)
-                            for a, b in ((wanted, bare), (out.rgb[0], empty.rgb[0]))
+                            for a, b in ((truth_rgb, empty_truth), (out.rgb[0], empty.rgb[0]))
                         ]
                         ground = (
                             ~seen & (out.depth[0] > empty.depth[0] - 1e-3) & ((dimmed[0] < 0.95) | (dimmed[1] < 0.95))
@@ -201,7 +201,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                 rows.append(
                     (
                         kind,
-                        np.concatenate([wanted, shown["shaded"], shown["unshaded"]], 1),
+                        np.concatenate([truth_rgb, composites["shaded"], composites["unshaded"]], 1),
                         error_db(errors[f"shaded.{lighting}"][-1:]),
                     )
                 )
@@ -213,9 +213,9 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
         figures[f"overlay.obstacle_psnr.{lighting}"] = shaded
         figures[f"overlay.unshaded_psnr.{lighting}"] = unshaded
         figures[f"overlay.gain_over_unshaded.{lighting}"] = shaded - unshaded
-        both, either = np.sum(ious[lighting], 0)
-        figures[f"overlay.mask_iou.{lighting}"] = float(both / either)
-        # The true world's sky is light without direction, which nothing hides: only its sun throws shadows.
+        intersection, union = np.sum(ious[lighting], 0)
+        figures[f"overlay.mask_iou.{lighting}"] = float(intersection / union)
+        # The true world's sky is ambient light without occlusion: only its sun casts shadows.
         casts = any(shadow for _, _, shadow in LIGHTINGS[lighting].suns)
         for name in ("shadow", "no_shadow") if casts else ():
             off = np.concatenate(errors[f"{name}.{lighting}"])
@@ -224,12 +224,12 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     for kind in kinds:
         if errors[f"kind.{kind}"]:
             figures[f"overlay.psnr_of.{kind}"] = error_db(errors[f"kind.{kind}"])
-    both, either = np.sum([pair for pairs in ious.values() for pair in pairs], 0)
-    figures["overlay.mask_iou"] = float(both / either)
+    intersection, union = np.sum([pair for pairs in ious.values() for pair in pairs], 0)
+    figures["overlay.mask_iou"] = float(intersection / union)
     return figures
 
 
-def seen_touched(scene_path: Path) -> dict[str, Any]:
+def visual_vs_collision(scene_path: Path) -> dict[str, Any]:
     """`seen_touched.*` of `twin.report.visual_vs_collision`, along a drive of the scripted follower."""
     from twin.assets.ground import Ground
     from twin.env.physics import HuskyPhysics
@@ -240,8 +240,8 @@ def seen_touched(scene_path: Path) -> dict[str, Any]:
     scene = load_scene(scene_path)
     world, field, mesh = scene.world(), scene.field(), scene.scene.stage("mesh")
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
-    looks = render_views(field, world, view_poses(drive.camera_to_world), field.lightings[0])
-    found = compare_geometry(looks, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
+    views = render_views(field, world, view_poses(drive.camera_to_world), field.lightings[0])
+    found = compare_geometry(views, world, scene.cameras(), Ground.load(mesh), Parts.load(mesh / "parts.npz"))
     return {f"seen_touched.{name}": value for name, value in found.items() if name != "along"}
 
 
@@ -250,12 +250,12 @@ def luminance(rgb: np.ndarray) -> np.ndarray:
 
 
 def error_db(errors: list[np.ndarray]) -> float:
-    """PSNR [dB] of squared errors, all pixels counting alike."""
+    """PSNR [dB] of squared errors, over all pixels of the arrays."""
     return float(-10.0 * np.log10(max(np.concatenate(errors).mean(), 1e-12)))
 
 
 def save_pictures(folder: Path, lighting: str, rows: list[tuple[str, np.ndarray, float]]) -> None:
-    """Truth, overlay, unshaded overlay side by side, one row per place."""
+    """Writes truth, composite and unshaded composite side by side, one row per placement."""
     import cv2
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -272,13 +272,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene with its truth, such as scenes/demo")
     add_record_options(parser)
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="where pictures to judge by go")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="folder for comparison images")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     options = parser.parse_args()
-    figures = round_trip(options.scene, options.pictures, tuple(options.kinds)) | seen_touched(options.scene)
+    figures = round_trip(options.scene, options.pictures, tuple(options.kinds)) | visual_vs_collision(options.scene)
     for name, value in figures.items():
-        sense, wanted = TARGETS.get(name, ("", 0.0))
-        print(f"{name:40} {value:10.4g}  {f'{sense} {wanted:g}' if sense else ''}".rstrip())
+        sense, target = TARGETS.get(name, ("", 0.0))
+        print(f"{name:40} {value:10.4g}  {f'{sense} {target:g}' if sense else ''}".rstrip())
     return save(options.json, figures, options.replace_record)
 
 

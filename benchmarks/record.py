@@ -1,8 +1,7 @@
-"""The files in which benchmarks record their figures: none is replaced by one that has less.
+"""Records of benchmark figures: JSON files that are not overwritten by a record with fewer entries.
 
-A record is a JSON object. What it *has* are the names of its nested objects' members, the items of lists of objects
-(runs, policies, rows), and the number of `trials` behind a rate; plain values may change. JSON has no NaN and no
-infinity: these become null.
+Entries of a record are the members of its nested objects, the items of lists of objects (runs, policies, rows), and the
+number of `trials` behind a rate; plain values may change. JSON has no NaN and no infinity: these become null.
 """
 
 import argparse
@@ -15,9 +14,9 @@ from twin.errors import InputError, print_error
 from twin.files import read_json, write_json
 
 _NAMES = ("id", "quantity", "task", "setup", "seed", "policy", "name")
-"""Members that identify an object of a list."""
+"""Members that identify an object in a list."""
 _LISTED = 4
-"""Missing entries that a refusal names."""
+"""Number of missing entries that an error names."""
 
 
 def add_record_options(parser: argparse.ArgumentParser) -> None:
@@ -34,12 +33,12 @@ def add_replace_option(parser: argparse.ArgumentParser) -> None:
 
 
 def lost(old: Any, new: Any, where: str = "") -> list[str]:
-    """Names of the entries that a record has and another lacks.
+    """Names of the entries that a new JSON value lacks.
 
     Args:
-        old: A JSON value.
-        new: Another.
-        where: Name of the two.
+        old: The recorded value.
+        new: Its replacement.
+        where: Name of both.
     """
     if isinstance(old, dict):
         if not isinstance(new, dict):
@@ -65,7 +64,7 @@ def _lost_member(old: dict[str, Any], new: dict[str, Any], key: str, where: str)
 
 
 def _labelled(items: list[Any]) -> dict[str, Any]:
-    """The objects of a list by what identifies them; those that share it are counted. Other items have no label."""
+    """The objects of a list by label, numbered where labels repeat; other items are left out."""
     out, count = {}, Counter[str]()
     for item in items:
         if isinstance(item, dict):
@@ -76,7 +75,7 @@ def _labelled(items: list[Any]) -> dict[str, Any]:
 
 
 def write_so_far(path: Path, record: dict[str, Any]) -> None:
-    """Writes what a long run has so far to `<path>.partial`; `write_record` removes it."""
+    """Writes the intermediate record of a long run to `<path>.partial`, which `write_record` removes."""
     write_json(_partial(path), _finite(record))
 
 
@@ -84,16 +83,16 @@ def write_record(path: Path, record: dict[str, Any], replace: bool = False) -> N
     """Writes a record.
 
     Args:
-        path: Its file.
-        record: What to write.
-        replace: Whether a record that has more may be overwritten.
+        path: The file.
+        record: A JSON object; may contain NaN and infinity.
+        replace: True overwrites a record even if the new one lacks entries.
 
     Raises:
-        InputError: the file has entries that the new record lacks, or is no record. It is left alone then, and the
-            new record is in `<path>.partial`.
+        InputError: the file has entries that the new record lacks, or is no record. It is kept, and the new record is
+            in `<path>.partial`.
     """
     if not replace and path.exists():
-        wrong = _objection(path, record)
+        wrong = _reason_to_keep(path, record)
         if wrong:
             write_so_far(path, record)
             raise InputError(
@@ -104,8 +103,8 @@ def write_record(path: Path, record: dict[str, Any], replace: bool = False) -> N
     _partial(path).unlink(missing_ok=True)
 
 
-def _objection(path: Path, record: dict[str, Any]) -> str:
-    """What is against overwriting a file; empty: nothing."""
+def _reason_to_keep(path: Path, record: dict[str, Any]) -> str:
+    """Reason not to overwrite a file; empty if there is none."""
     try:
         old = read_json(path)
     except InputError:
@@ -118,12 +117,10 @@ def _objection(path: Path, record: dict[str, Any]) -> str:
 
 
 def save(path: Path | None, record: dict[str, Any], replace: bool = False) -> int:
-    """`write_record` for the end of a script: returns its exit status, 0, or 2 with one line on standard error.
+    """`write_record` for the end of a script; writes nothing if `path` is None.
 
-    Args:
-        path: None: nothing is written.
-        record: As `write_record` takes it.
-        replace: As `write_record` takes it.
+    Returns:
+        The exit status: 0, or 2 with one line on standard error.
     """
     try:
         if path:

@@ -1,11 +1,11 @@
-"""Whether anything is lost when processes are killed or the disk is full, and whether environments last.
+"""Robustness: killed processes and full disks must lose no results, and environments must not leak memory.
 
-    python benchmarks/robustness.py endurance [--steps 1000000]       # control steps of eight worlds together
+    python benchmarks/robustness.py endurance [--steps 1000000]       # control steps of eight environments together
     python benchmarks/robustness.py kills [--times 50] [--only build|train|validate]
-    python benchmarks/robustness.py disk                              # needs the right to mount a tmpfs
+    python benchmarks/robustness.py disk                              # needs permission to mount a tmpfs
 
-Each prints a table and, with --json FILE, writes it; the exit status is 1 where something was lost. Everything happens
-in tiny scenes made up for it, in a temporary folder.
+Each prints a table and, with --json FILE, writes it; the exit status is 1 on any loss. All work is done on tiny
+generated scenes in a temporary folder.
 """
 
 import argparse
@@ -29,8 +29,8 @@ import numpy as np
 _ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(_ROOT), str(_ROOT / "tests")]
 
-_WORLDS = 8
-_GROWTH = 32 << 20  # [bytes] that eight worlds may grow by
+_ENVS = 8
+_GROWTH = 32 << 20  # [bytes] allowed memory growth of eight environments
 _QUICK = {
     "nerf.steps": 80,
     "nerf.rays": 1024,
@@ -41,17 +41,17 @@ _QUICK = {
     "review.fps": 3,
     "review.width": 160,
 }
-"""Settings of a whole build in a minute or two."""
+"""Settings for a complete build in one to two minutes."""
 
 
 # ---- endurance
 
 
 def endurance(steps: int, folder: Path) -> dict[str, Any]:
-    """Drives eight tiny worlds at random, with everything drawn that can be.
+    """Drives eight small environments at random, with every randomisation switched on.
 
     Args:
-        steps: Control steps of all worlds together.
+        steps: Control steps of all environments together.
         folder: For the scene.
     """
     import psutil
@@ -66,31 +66,31 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
     camera = CameraOptions(vibration=0.3, exposure=0.1, shutter=0.02, blur_samples=2)
     options = {"lighting": TRAINING, "lighting_drift": True, "obstacles": 2, "randomise": True, "camera": camera}
     scene = tiny_twin(folder / "endurance")
-    worlds = LocalVectorEnv(
-        EnvFactory.open(scene, "bend", {**options, "size": (32, 18), "start_along": 0.5}), list(range(_WORLDS))
+    envs = LocalVectorEnv(
+        EnvFactory.open(scene, "bend", {**options, "size": (32, 18), "start_along": 0.5}), list(range(_ENVS))
     )
-    worlds.begin(range(_WORLDS))
+    envs.begin(range(_ENVS))
     rng, process = np.random.default_rng(0), psutil.Process()
-    rounds, sizes, episodes, bad, start = steps // _WORLDS, [], 0, 0, time.perf_counter()
+    rounds, sizes, episodes, bad, start = steps // _ENVS, [], 0, 0, time.perf_counter()
     for k in tqdm.trange(rounds, desc="endurance", mininterval=60.0):
-        actions = np.stack([rng.uniform(0, 1, _WORLDS), rng.uniform(-0.4, 0.4, _WORLDS)], 1)  # mostly forward
-        out = worlds.step(actions)
-        states = [p.data.qpos for p in worlds.physics] + [p.data.qvel for p in worlds.physics]
+        actions = np.stack([rng.uniform(0, 1, _ENVS), rng.uniform(-0.4, 0.4, _ENVS)], 1)  # mostly forward
+        out = envs.step(actions)
+        states = [p.data.qpos for p in envs.physics] + [p.data.qvel for p in envs.physics]
         bad += not np.isfinite(out.reward).all() or not all(np.isfinite(one).all() for one in states)
         if over := np.flatnonzero(out.over).tolist():
             episodes += len(over)
-            worlds.begin(over)
+            envs.begin(over)
         if (k + 1) % max(1, rounds // 50) == 0:
             gc.collect()
             sizes.append(process.memory_info().rss)
-            tqdm.tqdm.write(f"{(k + 1) * _WORLDS} steps, {sizes[-1] / 2**20:.1f} MiB, {bad} rounds not finite")
-    settled = sizes[len(sizes) // 5]  # by then every kind of thing has been in view once
+            tqdm.tqdm.write(f"{(k + 1) * _ENVS} steps, {sizes[-1] / 2**20:.1f} MiB, {bad} rounds not finite")
+    settled = sizes[len(sizes) // 5]  # every kind of obstacle has been in view by then
     return {
-        "steps": rounds * _WORLDS,
+        "steps": rounds * _ENVS,
         "episodes": episodes,
         "rounds_not_finite": bad,
         "growth_mib": round((max(sizes[-5:]) - settled) / 2**20, 1),
-        "steps_per_s": round(rounds * _WORLDS / (time.perf_counter() - start), 1),
+        "steps_per_s": round(rounds * _ENVS / (time.perf_counter() - start), 1),
         "ok": bad == 0 and max(sizes[-5:]) - settled <= _GROWTH,
     }
 
@@ -99,13 +99,13 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
 
 
 def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> dict[str, Any]:
-    """Kills a build, a training and a validation at random moments and lets them go on; compares with one that was not.
+    """Kills a build, a training and a validation at random times, resumes them, and compares with undisturbed ones.
 
     Args:
-        times: How often each is killed.
+        times: Kills of each.
         folder: For the scenes.
-        only: One of them.
-        seed: Of the moments.
+        only: Name of a single one.
+        seed: Of the kill times.
     """
     each = {"build": _killed_builds, "train": _killed_trainings, "validate": _killed_validations}
     rng = np.random.default_rng(seed)
@@ -114,11 +114,11 @@ def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> d
 
 
 def _killed_after(command: list[str], seconds: float) -> bool:
-    """Whether a command was killed; False where it had ended before. Nothing that it started may live on."""
+    """Kills a command after `seconds`; False if it had ended before. Asserts that its children die with it."""
     import psutil
 
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(command, cwd=_ROOT, stdout=subprocess.DEVNULL, stderr=said)
+    with tempfile.TemporaryFile() as stderr:
+        process = subprocess.Popen(command, cwd=_ROOT, stdout=subprocess.DEVNULL, stderr=stderr)
         children: dict[int, psutil.Process] = {}
         until = time.monotonic() + seconds
         while process.poll() is None and time.monotonic() < until:
@@ -126,21 +126,21 @@ def _killed_after(command: list[str], seconds: float) -> bool:
                 children |= {one.pid: one for one in psutil.Process(process.pid).children(recursive=True)}
             time.sleep(0.02)
         if process.poll() is not None:
-            said.seek(0)
-            assert process.returncode == 0, said.read().decode()[-3000:]
+            stderr.seek(0)
+            assert process.returncode == 0, stderr.read().decode()[-3000:]
             return False
         with contextlib.suppress(psutil.Error):
             children |= {one.pid: one for one in psutil.Process(process.pid).children(recursive=True)}
         process.send_signal(signal.SIGKILL)
         process.wait()
-    # A worker that was just started ends when it has loaded what it runs, which takes seconds.
+    # A worker that has just started notices only after its imports, which take seconds.
     left = psutil.wait_procs(list(children.values()), timeout=30.0)[1]
     assert not left, f"alive after kill -9: {left}"
     return True
 
 
-def _rubbish(root: Path) -> list[str]:
-    """What a finished verb must not leave."""
+def _leftovers(root: Path) -> list[str]:
+    """Temporary files, which a finished verb must have removed."""
     names = [path for path in root.rglob("*") if ".partial" in path.name or path.name.endswith((".lock", ".old"))]
     return [str(path.relative_to(root)) for path in names]
 
@@ -151,13 +151,13 @@ def _build_command(root: Path, *more: str) -> list[str]:
 
 
 def _filmed(folder: Path) -> Path:
-    """A scene with two short films."""
+    """A generated scene with two short films."""
     root = folder / "filmed"
     if not root.exists():
         subprocess.run(
             [sys.executable, "-m", "twin.reality", "film", "--tiny", "--out", str(root)], cwd=_ROOT, check=True
         )
-        shutil.rmtree(root / "truth")  # reports of the truth take longer than the build
+        shutil.rmtree(root / "truth")  # comparison with the truth takes longer than the build
     return root
 
 
@@ -172,11 +172,11 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
 
     root = _filmed(folder)
     scene = SceneDir(root)
-    stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # films of the review know the time they took
+    stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # the review contains its own timings
     subprocess.run(_build_command(root), cwd=_ROOT, check=True)
     wanted, longest = _results(root, stages), max(_seconds(root).values())
     killed = finished = different = 0
-    sfm_until = times // 5  # a fifth of the kills from the very beginning on, where what follows may differ
+    sfm_until = times // 5  # a fifth of the kills hit a build from scratch
     while killed < times:
         from_start = killed < sfm_until
         for name in list(STAGES)[0 if from_start else 3 :]:
@@ -186,16 +186,16 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
         assert _killed_after(_build_command(root), 3600.0) is False
         finished += 1
         now = _results(root, stages)
-        if from_start:  # structure from motion may come out otherwise: what follows is compared with a build from it
+        if from_start:  # structure from motion is not repeatable, so later builds are compared with this one
             wanted = now
         different += now != wanted
-    rubbish = _rubbish(root)
+    leftovers = _leftovers(root)
     return {
         "killed": killed,
         "finished": finished,
         "different": different,
-        "rubbish": rubbish,
-        "ok": not different and not rubbish,
+        "leftovers": leftovers,
+        "ok": not different and not leftovers,
     }
 
 
@@ -217,7 +217,7 @@ train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)
 
 
 def _killed_trainings(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:
-    """A killed training loses what came after its last save, so its kills come further and further into it."""
+    """Kills trainings. Each resumes from its last save, so the kills hit all parts of a training."""
     from tiny_twin import tiny_twin
 
     root = folder / "trained"
@@ -232,23 +232,23 @@ def _killed_trainings(times: int, folder: Path, rng: np.random.Generator) -> dic
             if _killed_after(command, float(rng.uniform(1.0, 16.0))):
                 killed += 1
                 longest = max(longest, _saved(root / "runs" / name))
-            else:  # it came to its end before: begin anew
-                runs.append(_trained(root / "runs" / name, steps))
+            else:  # it finished first: start a new one
+                runs.append(_is_complete(root / "runs" / name, steps))
                 shutil.rmtree(root / "runs" / name)
             assert time.monotonic() - begun < 600
         assert _killed_after(command, 3600.0) is False
-        runs.append(_trained(root / "runs" / name, steps))
+        runs.append(_is_complete(root / "runs" / name, steps))
     rates = [np.mean([row["success"] for row in _rows(root / "runs" / name)]) for name in ("whole", "killed")]
-    rubbish = _rubbish(root)
-    good = all(run["whole"] for run in runs)
+    leftovers = _leftovers(root)
+    complete = all(runs)
     noise = 3.0 * np.sqrt(0.25 / max(1, min(len(_rows(root / "runs" / name)) for name in ("whole", "killed"))))
     return {
         "killed": killed,
         "finished": len(runs),
-        "whole": good,
+        "complete": complete,
         "success": [round(float(rate), 3) for rate in rates],
-        "rubbish": rubbish,
-        "ok": bool(good and not rubbish and abs(rates[0] - rates[1]) <= noise),
+        "leftovers": leftovers,
+        "ok": bool(complete and not leftovers and abs(rates[0] - rates[1]) <= noise),
     }
 
 
@@ -264,8 +264,8 @@ def _rows(run: Path) -> list[dict[str, Any]]:
         return [row | {"success": int(row["success"])} for row in csv.DictReader(file)]
 
 
-def _trained(run: Path, steps: int) -> dict[str, Any]:
-    """Whether a finished training has all its steps, tables without gap or repetition, and a whole replay buffer."""
+def _is_complete(run: Path, steps: int) -> bool:
+    """Checks a finished training: all steps, tables without gaps or repetitions, a complete replay buffer."""
     head = json.loads((run / "state" / "state.json").read_text())
     rows = _rows(run)
     at = [int(row["step"]) for row in rows]
@@ -273,12 +273,12 @@ def _trained(run: Path, steps: int) -> dict[str, Any]:
     with np.load(run / "state" / head["folder"] / "replay.npz", allow_pickle=False) as data:
         written, newest, age = data["written"], data["newest"], data["age"]
     filled = head["replay"]["full"] or head["replay"]["pos"] * written.size == head["steps"]
-    tape = np.fromfile(run / "state" / "pictures.bin", np.uint8)
-    pictures = tape.reshape(len(written), -1, 3 * 45 * 80)
-    # Every picture that a transition refers to has been written: none is black throughout.
-    shown = [pictures[i, newest[:, i] % pictures.shape[1]].any(-1).all() for i in range(len(written))]
-    whole = head["steps"] == steps and at == sorted(at) and len(set(seeds)) == len(seeds) and filled and all(shown)
-    return {"whole": bool(whole and (age >= 0).all() and (newest < written).all())}
+    stored = np.fromfile(run / "state" / "pictures.bin", np.uint8)
+    images = stored.reshape(len(written), -1, 3 * 45 * 80)
+    # Every image that a transition refers to has been written: none is entirely black.
+    written_images = [images[i, newest[:, i] % images.shape[1]].any(-1).all() for i in range(len(written))]
+    tables = head["steps"] == steps and at == sorted(at) and len(set(seeds)) == len(seeds)
+    return bool(tables and filled and all(written_images) and (age >= 0).all() and (newest < written).all())
 
 
 def _killed_validations(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:
@@ -302,13 +302,13 @@ def _killed_validations(times: int, folder: Path, rng: np.random.Generator) -> d
         assert _killed_after(command, 3600.0) is False
         finished += 1
         different += digests != {name: _digest(root / "validation" / name) for name in files}
-    rubbish = _rubbish(root)
+    leftovers = _leftovers(root)
     return {
         "killed": killed,
         "finished": finished,
         "different": different,
-        "rubbish": rubbish,
-        "ok": not different and not rubbish,
+        "leftovers": leftovers,
+        "ok": not different and not leftovers,
     }
 
 
@@ -321,7 +321,7 @@ def _digest(path: Path) -> str:
 
 @contextlib.contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """A file system of a size [bytes]. Raises OSError where this machine lets nobody mount one."""
+    """Mounts a tmpfs of a size [bytes]. Raises OSError: mounting is not permitted."""
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)], capture_output=True)
     if done.returncode:
@@ -333,7 +333,7 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 
 def fill(disk: Path, leave: int) -> Path:
-    """A file that leaves so many bytes of a disk free."""
+    """Writes a file that leaves this many bytes of a disk free."""
     path = disk / "filling"
     facts = os.statvfs(disk)
     with path.open("wb") as file:
@@ -341,8 +341,8 @@ def fill(disk: Path, leave: int) -> Path:
     return path
 
 
-def refused(command: list[str], root: Path) -> str:
-    """What is wrong with how a command ends on a full disk; empty: one line, status 2, and what was there is whole."""
+def full_disk_fault(command: list[str], root: Path) -> str:
+    """Runs a command that must fail with one line and exit status 2, keeping all files; returns what differs, or ""."""
     before = _contents(root)
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
@@ -350,24 +350,24 @@ def refused(command: list[str], root: Path) -> str:
         return f"exit status {done.returncode}, {len(lines)} lines: {done.stderr[-1500:]}"
     after = _contents(root)
     lost = [name for name, digest in before.items() if after.get(name) != digest]
-    rubbish = [name for name in _rubbish(root) if name not in before]
-    return f"lost {lost}, left {rubbish}" if lost or rubbish else ""
+    leftovers = [name for name in _leftovers(root) if name not in before]
+    return f"lost {lost}, left {leftovers}" if lost or leftovers else ""
 
 
 def _contents(root: Path) -> dict[str, str]:
-    skipped = ("/runs/", "/validation/", "/tensorboard/")  # tables there grow, and a row may be cut; see `_mended`
+    skipped = ("/runs/", "/validation/", "/tensorboard/")  # tables there grow, and a row may be cut
     files = [path for path in root.rglob("*") if path.is_file() and not any(s in f"/{path}" for s in skipped)]
     return {str(path.relative_to(root)): _digest(path) for path in files}
 
 
 def disk(folder: Path) -> dict[str, Any]:
-    """Runs every stage of a build, a training, a validation, an export and a film on a disk that gets full."""
+    """Runs every stage of a build, a training, a validation, an export and a film on a full disk."""
     out = full_build(folder) | full_verbs(folder)
-    return out | {"ok": all(said == "ok" for said in out.values())}
+    return out | {"ok": all(result == "ok" for result in out.values())}
 
 
 def full_build(folder: Path) -> dict[str, str]:
-    """Every stage of a build, with no space and with a little; then an export of what was built."""
+    """Every stage of a build, without space and with 64 KiB; then an export of the build."""
     from twin.scene import STAGES, SceneDir
 
     out: dict[str, str] = {}
@@ -376,21 +376,21 @@ def full_build(folder: Path) -> dict[str, str]:
     with small_disk(folder / "disk", 600 << 20) as mounted:
         root = mounted / "filmed"
         shutil.copytree(source, root)
-        whole = _results(root, ("capture",))
+        expected = _results(root, ("capture",))
         for name in reversed(STAGES):
             shutil.rmtree(SceneDir(root).stage(name))
             for leave in (0, 64 << 10):
-                out[f"build, {name}, {leave >> 10} KiB left"] = _on_full(mounted, leave, _build_command(root), root)
+                out[f"build, {name}, {leave >> 10} KiB left"] = _fault_or_ok(mounted, leave, _build_command(root), root)
         done = subprocess.run(_build_command(root), cwd=_ROOT, capture_output=True, text=True)
-        same = done.returncode == 0 and _results(root, ("capture",)) == whole
+        same = done.returncode == 0 and _results(root, ("capture",)) == expected
         out["build, afterwards"] = "ok" if same else done.stderr[-1500:]
         export = _verb(root, "export", "--ply", str(root / "road.ply"), "--glb", str(root / "road.glb"))
-        out["export, 8 KiB left"] = _on_full(mounted, 8 << 10, export, root)
+        out["export, 8 KiB left"] = _fault_or_ok(mounted, 8 << 10, export, root)
     return out
 
 
 def full_verbs(folder: Path) -> dict[str, str]:
-    """A training, a validation and a film, with no space and with a little; then again, with enough."""
+    """A training, a validation and a film, without space and with little; then again with enough."""
     from tiny_runs import tiny_runs
     from tiny_twin import tiny_twin
 
@@ -405,16 +405,16 @@ def full_verbs(folder: Path) -> dict[str, str]:
         }
         for name, command in verbs.items():
             for leave in (0, 8 << 10, 5 << 20) if name == "train" else (0, 8 << 10):
-                out[f"{name}, {leave >> 10} KiB left"] = _on_full(mounted, leave, command, root)
+                out[f"{name}, {leave >> 10} KiB left"] = _fault_or_ok(mounted, leave, command, root)
             done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
             out[f"{name}, afterwards"] = "ok" if done.returncode == 0 else done.stderr[-1500:]
     return out
 
 
-def _on_full(mounted: Path, leave: int, command: list[str], root: Path) -> str:
+def _fault_or_ok(mounted: Path, leave: int, command: list[str], root: Path) -> str:
     filling = fill(mounted, leave)
     try:
-        return refused(command, root) or "ok"
+        return full_disk_fault(command, root) or "ok"
     finally:
         filling.unlink()
 
@@ -436,20 +436,20 @@ def _verb(root: Path, name: str, *arguments: str) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("endurance", "kills", "disk"))
-    parser.add_argument("--steps", type=int, default=1_000_000, help="of endurance (default %(default)s)")
+    parser.add_argument("test", choices=("endurance", "kills", "disk"))
+    parser.add_argument("--steps", type=int, default=1_000_000, help="control steps of endurance (default %(default)s)")
     parser.add_argument("--times", type=int, default=50, help="kills of each verb (default %(default)s)")
-    parser.add_argument("--only", choices=("build", "train", "validate"), help="of kills")
-    parser.add_argument("--json", type=Path, help="where to write the table")
+    parser.add_argument("--only", choices=("build", "train", "validate"), help="a single verb to kill")
+    parser.add_argument("--json", type=Path, help="write the results here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        works: dict[str, Callable[[], dict[str, Any]]] = {
+        tests: dict[str, Callable[[], dict[str, Any]]] = {
             "endurance": lambda: endurance(options.steps, folder),
             "kills": lambda: kills(options.times, folder, options.only),
             "disk": lambda: disk(folder),
         }
-        out = works[options.what]()
+        out = tests[options.test]()
     for key, value in out.items():
         print(f"{key:40} {value}")
     if options.json:

@@ -1,11 +1,11 @@
-"""Compares this tree with another commit, bit for bit: for changes that move and rename, and change nothing else.
+"""Regression test for refactorings: compares results of this tree with those of another commit, bit for bit.
 
     python benchmarks/sameness.py COMMIT [--work DIR]
 
-A tiny place is filmed and built by COMMIT. Both trees then open that build, drive the same episodes, train the same few
-steps, forecast from the same tables, and build field, mesh and scene again from the same cameras. Digests of what came
-out are compared; the exit status is 1 where one differs. Only public names are used, so that it outlives renames.
-Structure from motion is not compared, as it is not repeatable.
+COMMIT films and builds a tiny scene. Both trees then open that build, drive the same episodes, train the same few
+steps, validate the trained policy, and rebuild field, mesh and scene from the same cameras. The digests of the results
+are compared; the exit status is 1 if any differs. The scripts use public names only, so they run before and after
+renames. Structure from motion is not compared, as it is not repeatable.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from twin.env.options import CameraOptions
 
 out = {}
 camera = CameraOptions(vibration=0.3, exposure=0.1, shutter=0.02)
-obstacles = {"none": 0, "drawn": 2, "scene": "scene"}
+obstacles = {"none": 0, "sampled": 2, "scene": "scene"}
 lightings = sys.argv[2].split(",")
 settings = itertools.product(("route",), lightings, obstacles, (False, True), ("twist", "steering"))
 for k, (task, lighting, which, randomise, action) in enumerate(settings):
@@ -66,13 +66,13 @@ train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)
 
 
 class Tree:
-    """A source tree whose `twin` is run in processes of their own."""
+    """A source tree, whose `twin` runs in separate processes."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def python(self, *arguments: str | Path) -> str:
-        """Runs Python with this tree's `twin`; returns what it printed."""
+        """Runs Python with this tree's `twin`; returns its standard output."""
         done = subprocess.run(
             [sys.executable, *map(str, arguments)],
             cwd=self.root,
@@ -89,7 +89,7 @@ class Tree:
         self.python("-m", "twin.build", scene, "--quiet", *settings)
 
     def digests(self, scene: Path, lightings: str, work: Path) -> dict[str, str]:
-        """Of everything that is compared; `scene` was built by either tree."""
+        """Digests of all compared results; either tree may have built `scene`."""
         out: dict[str, str] = json.loads(self.python("-c", _EPISODES, scene, lightings).splitlines()[-1])
         again = work / "again"
         shutil.rmtree(again, ignore_errors=True)
@@ -117,8 +117,8 @@ def _digest(path: Path) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("commit", help="what is compared with")
-    parser.add_argument("--work", type=Path, help="folder to work in, kept (default: a temporary one)")
+    parser.add_argument("commit", help="commit to compare with")
+    parser.add_argument("--work", type=Path, help="working folder, kept (default: a temporary one)")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         work = (options.work or Path(temporary)).resolve()
@@ -131,7 +131,7 @@ def main() -> int:
         before, after = Tree(old), Tree(_ROOT)
         if not (scene / "build").exists():
             before.python("-m", "twin.reality", "film", "--tiny", "--out", scene)
-            shutil.rmtree(scene / "truth")  # its comparison takes longer than the build
+            shutil.rmtree(scene / "truth")  # comparison with the truth takes longer than the build
             before.build(scene)
         was = before.digests(scene, "sun,overcast,training", work)
         now = after.digests(scene, "sun,overcast,training", work)

@@ -1,9 +1,10 @@
-"""Runs the README's commands as a newcomer pastes them, on a copy of the checkout: an hour, once per release.
+"""Runs the README's commands in order on a copy of the checkout, before a release; takes an hour.
 
     python benchmarks/walk.py [--shell bash|zsh] [--index]
 
-Left out: commands on `scenes/my_road`, which needs films, the test suite, which CI runs, and without `--index` the one
-line that fetches PyTorch from its own index. Exit status 1 where a command fails; prints the seconds of each.
+Skipped: commands on `scenes/my_road`, which needs films; the test suite, which CI runs; and without `--index` the
+command that fetches PyTorch from its own index. Prints each command with its start time; the exit status is 1 if one
+fails.
 """
 
 import argparse
@@ -18,7 +19,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 
 def commands(text: str, index: bool) -> list[str]:
-    """The commands of a page's shell blocks that are run here."""
+    """Commands in the shell blocks of a page, without the skipped ones."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", text, re.S | re.M)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines() if line.strip()]
     lines = [line for line in lines if "my_road" not in line and "pytest" not in line]
@@ -34,7 +35,7 @@ def main() -> int:
         archive = subprocess.run(["git", "archive", "HEAD"], cwd=_ROOT, check=True, stdout=subprocess.PIPE)
         subprocess.run(["tar", "x", "-C", folder], input=archive.stdout, check=True)
         lines = commands((Path(folder) / "README.md").read_text(encoding="utf-8"), options.index)
-        # One shell for all of them, as the first activates the environment.
+        # One shell for all, as the first command activates the environment.
         script = "".join(
             f"echo '+ {line}'; date +%s\n{line} || exit 1\n" for line in (one.replace("'", '"') for one in lines)
         )

@@ -1,9 +1,12 @@
 """The Husky's acceptance table row by row, and the wrong robots that must not pass it."""
 
-import acceptance
 import numpy as np
 import pytest
-from acceptance import CONTROLS, MEASURES, Row, Subject, chi_on, drive, on_ground
+from acceptance import grounds
+from acceptance.drives import drive, on_ground
+from acceptance.rows import Row, Subject
+from acceptance.table import CONTROLS, MEASURES
+from acceptance.terrain import chi_on
 
 from twin.robot import TRACK, HuskyParams
 
@@ -42,12 +45,12 @@ ALIGNED = Subject(
 
 
 def test_the_subject_s_own_ground_and_controller_are_measured():
-    for model in (ALIGNED.plane(), on_ground(acceptance.level(), ALIGNED.params)):
+    for model in (ALIGNED.plane(), on_ground(grounds.level(), ALIGNED.params)):
         assert (model.opt.impratio, model.opt.viscosity) == (0.025, 4.0)
     assert ALIGNED.turn(1.0).wheel_difference == pytest.approx(0.5 * 1.4 * TRACK, rel=0.02)
     assert ALIGNED.turn(1.0, separation_multiplier=1.2).wheel_difference == pytest.approx(0.5 * 1.2 * TRACK, rel=0.02)
     line = np.array([[-5.0, 0.0], [5.0, 0.0]])
-    (row,) = chi_on(ALIGNED, acceptance.level(), (0.0, 0.0, 0.0), line, "a level field")
+    (row,) = chi_on(ALIGNED, grounds.level(), (0.0, 0.0, 0.0), line, "a level field")
     assert row.value == pytest.approx(ALIGNED.turn(1.0, seconds=2.0).chi, rel=0.03)
     assert row.value < drive(ALIGNED.plane(), 0.0, 1.0).chi - 0.05  # the published controller would turn it faster
     fastest = {r.quantity: r.value for r in MEASURES["D1 D2 D3 D5"](ALIGNED)}["fastest wheel"]
@@ -62,19 +65,19 @@ def test_a_number_that_is_none_fails():
 def test_roughness_of_known_bumps():
     """Bumps of a Gaussian kernel σ have the autocorrelation exp(−d²/4σ²), which is 1/e at 2σ; the slow rise that is
     taken out takes a little of them along."""
-    relief = acceptance.random_relief(0.02, 0.2, np.random.default_rng(3), half=40.0)
-    flat = acceptance.level(half=39.0)
+    relief = grounds.random_relief(0.02, 0.2, np.random.default_rng(3), half=40.0)
+    flat = grounds.level(half=39.0)
     x = flat.origin[0] + flat.cell * np.arange(len(flat.height))
     bumps = type(flat)(relief(np.stack(np.meshgrid(x, x), -1)), flat.origin, flat.cell, flat.measured, flat.rgb)
-    values = [acceptance.roughness(bumps, np.array([[-38.0, y], [38.0, y]])) for y in range(-30, 31, 3)]
+    values = [grounds.roughness(bumps, np.array([[-38.0, y], [38.0, y]])) for y in range(-30, 31, 3)]
     rms, length = np.mean(values, axis=0)
     assert rms == pytest.approx(0.02, rel=0.15) and length == pytest.approx(0.4, rel=0.15)
 
 
 def test_reconstruction_removes_noise_and_keeps_relief():
     rng = np.random.default_rng(4)
-    flat = acceptance.reconstructed(rng)
+    flat = grounds.reconstructed(rng)
     assert np.abs(flat.at(np.stack([np.linspace(-7, 7, 200), np.zeros(200)], 1))).max() < 0.02
-    hill = acceptance.reconstructed(rng, lambda xy: 0.1 * np.sin(xy[:, 0] / 2))
+    hill = grounds.reconstructed(rng, lambda xy: 0.1 * np.sin(xy[:, 0] / 2))
     x = np.linspace(-7, 7, 200)
     np.testing.assert_allclose(hill.at(np.stack([x, np.zeros(200)], 1)), 0.1 * np.sin(x / 2), atol=0.03)

@@ -1,5 +1,7 @@
-"""The benchmark of the field: how it fills a budget and judges a figure; that it runs is shown on the real captures
-here, and on a built scene in `test_end_to_end.py`."""
+"""Benchmarks of the field, the environment and the Husky: budgets, targets, tables, and a run on the real captures.
+
+`test_end_to_end.py` runs the benchmarks that need a built scene.
+"""
 
 import json
 import subprocess
@@ -28,23 +30,27 @@ def test_steps_fill_a_budget_and_leave_a_margin(scripts):
     assert pace.steps(10.0) == 1
 
 
-def test_a_score_is_not_met_where_its_budget_was_exceeded(scripts, monkeypatch):
+def test_a_score_over_its_budget_misses_its_target(scripts, monkeypatch):
     import field
 
     monkeypatch.setitem(field.TARGETS, "fox.psnr_60s", ("≥", 25.0))
     figures = {"fox.psnr_60s": 26.0, "fox.psnr_60s_unfitted": 25.0, "fox.seconds_60s": 59.0}
-    assert field.judge("fox.psnr_60s", figures) == ("≥ 25", "yes")
-    assert field.judge("fox.psnr_60s", figures | {"fox.psnr_60s": 24.0}) == ("≥ 25", "no")
-    assert field.judge("fox.seconds_60s", figures) == ("≤ 60", "yes")
-    late = figures | {"fox.seconds_60s": 61.0}
-    assert field.judge("fox.psnr_60s", late)[1] == field.judge("fox.psnr_60s_unfitted", late)[1] == "no, took 61.0 s"
-    apart = {"gpu.cpu_difference_mean": 1 / 255, "gpu.cpu_difference_max": 0.5}  # the mean is what is wanted of
-    assert field.judge("gpu.cpu_difference_mean", apart) == ("≤ 0.003922", "yes")
-    assert field.judge("gpu.cpu_difference_max", apart) == ("", "")
-    assert field.judge("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
+    assert field.verdict("fox.psnr_60s", figures) == ("≥ 25", "yes")
+    assert field.verdict("fox.psnr_60s", figures | {"fox.psnr_60s": 24.0}) == ("≥ 25", "no")
+    assert field.verdict("fox.seconds_60s", figures) == ("≤ 60", "yes")
+    overtime = figures | {"fox.seconds_60s": 61.0}
+    assert (
+        field.verdict("fox.psnr_60s", overtime)[1]
+        == field.verdict("fox.psnr_60s_unfitted", overtime)[1]
+        == "no, took 61.0 s"
+    )
+    differences = {"gpu.cpu_difference_mean": 1 / 255, "gpu.cpu_difference_max": 0.5}  # only the mean has a target
+    assert field.verdict("gpu.cpu_difference_mean", differences) == ("≤ 0.003922", "yes")
+    assert field.verdict("gpu.cpu_difference_max", differences) == ("", "")
+    assert field.verdict("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
 
 
-def test_nothing_is_wanted_of_a_gpu_that_is_not_measured(scripts, monkeypatch, tmp_path):
+def test_a_missing_gpu_is_reported(scripts, monkeypatch, tmp_path):
     import env
     import warp
     from env_sections import gpu
@@ -55,25 +61,25 @@ def test_nothing_is_wanted_of_a_gpu_that_is_not_measured(scripts, monkeypatch, t
     assert [name for name in env.TARGETS if name.startswith("gpu.")] == ["gpu.steps_per_s"]
 
 
-def test_seen_and_touched_is_driven_by_the_scene_s_own_robot(scripts, monkeypatch, tmp_path):
+def test_visual_vs_collision_drives_the_scene_s_own_robot(scripts, monkeypatch, tmp_path):
     import overlay
 
-    class Told(Exception):
+    class Called(Exception):
         pass
 
     def physics(model, params=None):
-        raise Told(params)
+        raise Called(params)
 
     monkeypatch.setattr("twin.env.physics.HuskyPhysics", physics)
     world = SimpleNamespace(model=lambda: None, robot=HuskyParams(friction=0.5))
     opened = SimpleNamespace(world=lambda: world, field=lambda: None, scene=SceneDir(tmp_path))
     monkeypatch.setattr(overlay, "load_scene", lambda path: opened)
-    with pytest.raises(Told) as told:
-        overlay.seen_touched(tmp_path)
-    assert told.value.args == (world.robot,)
+    with pytest.raises(Called) as called:
+        overlay.visual_vs_collision(tmp_path)
+    assert called.value.args == (world.robot,)
 
 
-def test_the_peak_is_that_of_this_process(scripts):
+def test_peak_memory_is_that_of_this_process(scripts):
     from field_workers import peak_bytes
 
     before = peak_bytes()
@@ -95,7 +101,7 @@ def test_training_within_a_budget(real_data, tmp_path):
     assert "fox.psnr_10s" in done.stdout and any(name.startswith("gpu.") for name in figures)
 
 
-def test_husky_s_table_is_printed_and_written(tmp_path):
+def test_the_husky_table_is_printed_and_written(tmp_path):
     file = tmp_path / "husky.json"
     command = [sys.executable, str(BENCHMARKS / "husky.py"), "--only", "A1", "B5", "--json", str(file)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

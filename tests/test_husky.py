@@ -3,7 +3,8 @@
 import mujoco
 import numpy as np
 import pytest
-from acceptance import MASS, drive, on_plane, start_of
+from acceptance.drives import drive, on_plane, state_at_rest
+from acceptance.rows import MASS
 
 from twin.env.physics import HuskyPhysics
 from twin.mjcf.husky import HUSKY_XML, add_husky, center_of_mass, coulomb_track_ratio, set_options, standalone_xml
@@ -73,7 +74,7 @@ def test_lag_is_first_order():
     """A step command with lag τ: the filtered command is 1 − e^(−t/τ) of it, and the wheels follow the filter."""
     lag = 0.2
     model = on_plane(HuskyParams(servo_lag=lag))
-    data = start_of(model)
+    data = state_at_rest(model)
     data.ctrl[:] = 3.0
     for steps in (50, 50, 100):
         mujoco.mj_step(model, data, steps)

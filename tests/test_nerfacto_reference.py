@@ -1,4 +1,4 @@
-"""The reference renderer of the benchmarks: its samples and its compositing are those of a radiance field."""
+"""The Nerfacto baseline of the benchmarks: sampling, compositing, hash grid, and equality of its two forms."""
 
 import math
 import sys
@@ -24,12 +24,12 @@ def rays() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def renderer(density) -> reference.Nerfacto:
-    """With a density by formula of points (r, s, 3), and the same colour everywhere."""
+    """A renderer of a density function of points (r, s, 3) and a constant color."""
     return reference.Nerfacto((density, density), lambda points, _: (density(points), COLOUR.expand(points.shape)))
 
 
 def vivid_networks():
-    """With weights so large that the picture has contrast: features of the start, ±1e-4, make an even fog."""
+    """Networks with large weights, so that the image has contrast; initial features of ±1e-4 give a uniform fog."""
     proposals, field = reference.networks()
     with torch.no_grad():
         for network in (*proposals, field):
@@ -39,16 +39,16 @@ def vivid_networks():
     return proposals, field
 
 
-# The farther, the coarser: 256 samples are uniform in inverse distance beyond one unit.
+# Tolerances grow with distance: beyond one unit the 256 samples are uniform in inverse distance.
 @pytest.mark.parametrize(("radius", "tolerance"), [(0.3, 0.01), (2.0, 0.02), (40.0, 0.08)])
-def test_an_opaque_shell_is_seen_at_its_distance(radius, tolerance):
+def test_an_opaque_shell_has_its_distance(radius, tolerance):
     rgb, distance, opacity = renderer(lambda points: 1e4 * (points.norm(dim=-1) > radius)).rays(*rays())
     assert torch.allclose(distance, torch.full((RAYS,), radius), rtol=tolerance)
     assert torch.allclose(opacity, torch.ones(RAYS), atol=1e-4)
     assert torch.allclose(rgb, COLOUR.expand(RAYS, 3), atol=1e-3)
 
 
-def test_a_thin_fog_stops_what_the_law_says():
+def test_a_thin_fog_has_the_opacity_of_beer_and_lambert():
     fog = 0.7
     density = lambda points: fog * ((points.norm(dim=-1) > 1.0) & (points.norm(dim=-1) < 2.0))  # noqa: E731
     rgb, _, opacity = renderer(density).rays(*rays())
@@ -56,7 +56,7 @@ def test_a_thin_fog_stops_what_the_law_says():
     assert torch.allclose(rgb[:, 1], 0.5 * opacity)
 
 
-def test_empty_space_stops_nothing():
+def test_empty_space_is_transparent():
     _, _, opacity = renderer(lambda points: torch.zeros(points.shape[:-1])).rays(*rays())
     assert not opacity.any()
 
@@ -69,13 +69,13 @@ def test_a_frame_of_random_weights():
     assert torch.allclose(nerfacto.frame(POSE, INTRINSICS, SIZE, chunk=7)[0], rgb, atol=1e-5)
 
 
-def test_the_tuned_form_shows_the_same_picture():
+def test_the_tuned_form_renders_the_same_image():
     networks = vivid_networks()
     plain = reference.Nerfacto(*networks).frame(POSE, INTRINSICS, SIZE)
     tuned = nerfacto_tuned.tuned(*networks).frame(POSE, INTRINSICS, SIZE, chunk=20)
-    assert plain[0].std(dim=(0, 1)).min() > 0.01 and plain[1].std() > 0.1  # there is something to see
+    assert plain[0].std(dim=(0, 1)).min() > 0.01 and plain[1].std() > 0.1  # the image has contrast
     assert torch.allclose(plain[0], tuned[0], atol=5e-4) and torch.allclose(plain[2], tuned[2], atol=5e-4)
-    # A median jumps to the next sample where a rounding decides.
+    # Rounding can move a median to the next sample.
     assert (torch.isclose(plain[1], tuned[1], atol=5e-4)).float().mean() > 0.9
 
 
@@ -87,14 +87,14 @@ def test_the_tuned_grid_has_the_same_features():
         assert torch.allclose(plain, tuned.T, rtol=1e-4, atol=1e-4)
 
 
-def test_depth_is_along_the_axis():
+def test_depth_is_z_depth():
     nerfacto = renderer(lambda points: 1e4 * (points[..., 2] > 1.5))
     _, depth, _ = nerfacto.frame(POSE, INTRINSICS, SIZE, chunk=16)
     assert torch.allclose(depth, torch.full((6, 8), 1.5), rtol=0.02)
 
 
 def test_the_hash_grid_is_trilinear():
-    """At a vertex the stored features; half way along an edge the mean of its two ends."""
+    """At a vertex it returns the stored features, at the middle of an edge the mean of its ends."""
     grid = reference.HashGrid(2, 17, 32)
     corner = torch.tensor([3.0, 5.0, 7.0])
     step = torch.tensor([0.0, 0.0, 1.0])

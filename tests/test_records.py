@@ -1,4 +1,4 @@
-"""Benchmarks' records do not shrink, and what Table 1 says of its record follows from it."""
+"""Benchmark records do not lose entries, and the figures of Table 1 follow from its record."""
 
 import copy
 import importlib.util
@@ -32,13 +32,13 @@ def results() -> dict:
 # ---- records
 
 
-def test_a_record_that_has_more_is_kept(scripts, tmp_path):
+def test_a_record_with_more_entries_is_kept(scripts, tmp_path):
     from record import write_record
 
     file = tmp_path / "figures.json"
     full = {"a": 1.0, "rows": [{"id": "B5", "value": 1.0}, {"id": "B5", "value": 2.0}, {"id": "C1", "value": 3.0}]}
     write_record(file, full)
-    write_record(file, full | {"a": 2.0, "b": 3.0})  # other values and more of them
+    write_record(file, full | {"a": 2.0, "b": 3.0})  # other values, and more of them
     kept = file.read_bytes()
     assert json.loads(kept)["a"] == 2.0
     fewer = copy.deepcopy(full) | {"b": 3.0}
@@ -48,12 +48,12 @@ def test_a_record_that_has_more_is_kept(scripts, tmp_path):
             write_record(file, less)
         assert f"({name})" in str(refused.value) and "--replace-record" in str(refused.value)
         assert file.read_bytes() == kept
-        assert json.loads((tmp_path / "figures.json.partial").read_text()) == less  # an hour's run is not lost
+        assert json.loads((tmp_path / "figures.json.partial").read_text()) == less  # the new figures are kept, too
     write_record(file, {"b": 3.0}, replace=True)
     assert json.loads(file.read_text()) == {"b": 3.0} and [path.name for path in tmp_path.iterdir()] == [file.name]
 
 
-def test_fewer_trials_and_figures_that_became_none_are_less(scripts):
+def test_fewer_trials_and_null_figures_count_as_lost(scripts):
     from record import lost
 
     old = {"policies": [{"policy": "p", "real": {"trials": 10, "successes": 3}}], "mmrv": 0.1}
@@ -65,14 +65,14 @@ def test_fewer_trials_and_figures_that_became_none_are_less(scripts):
     assert lost(old, []) == ["all of it"]
 
 
-def test_what_is_no_record_is_kept_and_a_run_s_figures_need_not_be_finite(scripts, tmp_path, capsys):
+def test_other_files_are_kept_and_non_finite_figures_become_null(scripts, tmp_path, capsys):
     from record import save, write_so_far
 
     file = tmp_path / "notes.json"
     file.write_text("my notes")
     assert save(file, {"a": 1.0}) == 2
-    said = capsys.readouterr().err
-    assert "is no record of figures" in said and said.count("\n") == 1 and file.read_text() == "my notes"
+    err = capsys.readouterr().err
+    assert "is no record of figures" in err and err.count("\n") == 1 and file.read_text() == "my notes"
     other = tmp_path / "other.json"
     write_so_far(other, {"a": 1.0})
     assert not other.exists()
@@ -87,20 +87,20 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 
-def test_table_1_without_runs_leaves_its_record_alone(tmp_path, results):
+def test_table_1_without_runs_keeps_its_record(tmp_path, results):
     record, scene = tmp_path / "results.json", tmp_path / "scene"
     record.write_bytes((TABLE1 / "results.json").read_bytes())
     scene.mkdir()
     done = run(TABLE1, scene, "--steps", "--results", record)
     assert done.returncode == 2 and done.stdout == ""
-    said = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(said) == 1 and "runs[straight simulator 0]" in said[0] and "--replace-record" in said[0]
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and "runs[straight simulator 0]" in errors[0] and "--replace-record" in errors[0]
     assert json.loads(record.read_text()) == results
     assert run(TABLE1, scene, "--steps", "--results", record, "--replace-record").returncode == 0
     assert json.loads(record.read_text())["runs"] == []
 
 
-def test_a_benchmark_that_measured_less_is_refused(tmp_path):
+def test_a_partial_run_does_not_overwrite_a_record(tmp_path):
     file = tmp_path / "husky.json"
     script = ROOT / "benchmarks" / "husky.py"
     assert run(script, "--only", "A1", "B5", "--json", file).returncode == 0
@@ -112,25 +112,25 @@ def test_a_benchmark_that_measured_less_is_refused(tmp_path):
 # ---- Table 1's scores
 
 
-def test_what_no_choice_had_seen_comes_first_and_is_what_the_docs_say(scripts, results):
+def test_days_that_no_choice_had_seen_come_first_and_match_the_docs(scripts, results):
     import scores
 
     (first, unseen), *_ = scores.GROUPS.items()
     assert unseen == tuple(f"day_{k}" for k in range(6, 16)) and "no choice had seen" in first
-    policies = scores.judged(results)
+    policies = scores.policy_records(results)
     twin, rule = (scores.scores(name, policies, unseen) for name in list(scores.PREDICTORS)[::2])
     assert (round(twin.spearman, 2), round(twin.pearson, 2), round(twin.mmrv, 3)) == (0.78, 0.98, 0.084)
     assert (round(rule.spearman, 2), round(rule.pearson, 2), round(rule.mmrv, 3)) == (0.77, 0.97, 0.143)
     everything = list(scores.GROUPS.values())[-1]
     assert len(everything) == 20
-    assert scores.scores("rule that never looks at the twin", policies, everything).cells == pytest.approx(694 / 720)
+    assert scores.scores("rule without the twin", policies, everything).cells == pytest.approx(694 / 720)
     full = scores.scores("twin, by a photo of each day", policies, everything)
-    told = results["forecast_by_photo"]["all tasks"]  # as twin.forecast computed it
+    forecast = results["forecast_by_photo"]["all tasks"]  # as twin.forecast computed it
     for name in ("spearman", "pearson", "mmrv"):
-        assert getattr(full, name) == pytest.approx(told[name]["value"])
-    assert full.cells == pytest.approx(told["coverage"]["value"])
-    assert full.regret == pytest.approx(told["winner_regret"]["value"])
-    assert full.corrected == (31, 36) and told["corrected_coverage"]["value"] == pytest.approx(31 / 36)
+        assert getattr(full, name) == pytest.approx(forecast[name]["value"])
+    assert full.cells == pytest.approx(forecast["coverage"]["value"])
+    assert full.regret == pytest.approx(forecast["winner_regret"]["value"])
+    assert full.corrected == (31, 36) and forecast["corrected_coverage"]["value"] == pytest.approx(31 / 36)
     drawn = list(scores.GROUPS.values())[1]
     assert scores.finals(policies, "varied", "straight", drawn) == "1.00 [0.85, 1.00], 150/150"
     assert scores.finals(policies, "varied", "right_turn", drawn) == "0.99 [0.84, 1.00], 149/150"
@@ -146,10 +146,10 @@ def test_what_no_choice_had_seen_comes_first_and_is_what_the_docs_say(scripts, r
     assert "| 0.78 / 0.98 / 0.084 |" in readme and "| 0.77 / 0.97 / 0.143 |" in readme
 
 
-def test_the_rule_does_not_look_at_the_twin(scripts, results):
+def test_the_rule_does_not_depend_on_the_twin(scripts, results):
     import scores
 
-    policies = scores.judged(results)
+    policies = scores.policy_records(results)
     assert {scores.rule(p) for p in policies} == {0.0, 1.0}
     kinds = {(p.setup == "varied", p.trained >= 0.49): scores.rule(p) for p in policies}
     assert kinds == {(True, True): 1.0, (True, False): 0.0, (False, True): 0.0, (False, False): 0.0}
@@ -160,16 +160,16 @@ def test_the_rule_does_not_look_at_the_twin(scripts, results):
                 for cell in policy[part]["by_lighting"].values():
                     cell["successes"] = cell["trials"]
     days = next(iter(scores.GROUPS.values()))
-    blind, twin = "rule that never looks at the twin", "twin, by a photo of each day"
-    changed = scores.judged(results)
-    assert scores.scores(blind, changed, days) == scores.scores(blind, policies, days)
-    assert scores.scores(twin, changed, days).spearman is None  # all alike now
+    rule, twin = "rule without the twin", "twin, by a photo of each day"
+    changed = scores.policy_records(results)
+    assert scores.scores(rule, changed, days) == scores.scores(rule, policies, days)
+    assert scores.scores(twin, changed, days).spearman is None  # the twin's rates are all equal
 
 
-def test_scores_of_too_few_policies_or_days_are_left_out(scripts, results):
+def test_too_few_policies_or_days_have_no_scores(scripts, results):
     import scores
 
-    policies = scores.judged(results)
+    policies = scores.policy_records(results)
     assert scores.scores("twin, by a photo of each day", policies[:4], ("dawn",)) is None
     assert scores.scores("twin, by a photo of each day", policies, ("dawn", "unknown")) is None
     assert scores.over_days([]) == scores.over_days([{}]) == "–"
@@ -186,7 +186,7 @@ def test_table_1_s_real_rates_have_intervals_over_days(scripts, results):
 # ---- rates over days
 
 
-def test_trials_of_a_day_tell_no_more_than_the_day():
+def test_trials_of_a_day_count_as_one_sample():
     assert rate_over_days([1.0] * 20) == (1.0, pytest.approx(0.8808, abs=1e-4), 1.0)
     mean, low, high = rate_over_days([1.0] + [0.0] * 19)
     assert (mean, low, high) == pytest.approx((0.05, *wilson(1, 20)))
@@ -196,7 +196,7 @@ def test_trials_of_a_day_tell_no_more_than_the_day():
             rate_over_days(wrong)
 
 
-def test_intervals_over_days_hold_where_a_day_s_trials_end_alike_and_those_over_trials_do_not():
+def test_intervals_over_days_cover_correlated_trials_and_those_over_trials_do_not():
     rng = np.random.default_rng(0)
     rate, days, trials = 0.7, 20, 10
     by_day, by_trial = [], []
@@ -209,34 +209,34 @@ def test_intervals_over_days_hold_where_a_day_s_trials_end_alike_and_those_over_
     assert np.mean(by_day) > 0.86 and np.mean(by_trial) < 0.7
 
 
-# ---- the intervals of a forecast in worlds of this shape
+# ---- coverage of the forecast's intervals in resampled experiments
 
 
-def test_an_experiment_is_drawn_from_the_record(scripts, results):
+def test_an_experiment_is_resampled_from_the_record(scripts, results):
     import intervals
 
-    record = intervals.recorded(TABLE1 / "results.json")
+    record = intervals.read_experiment(TABLE1 / "results.json")
     assert record.weight.shape == (36, 20) and [len(s) for s in record.strata] == [18, 18]
     totals = [[p["real"]["successes"], p["real"]["trials"]] for r in results["runs"] for p in r["policies"]]
     assert np.array_equal(np.stack([record.real_successes.sum(1), record.real_trials.sum(1)], 1), totals)
     rng = np.random.default_rng(0)
-    one = intervals.again(rng, record, days_anew=False)
+    one = intervals.resampled_experiment(rng, record, resample_days=False)
     assert [s.tolist() for s in one.strata] == [list(range(18)), list(range(18, 36))]
     assert (one.real_trials[:, 5:] == 5).all() and set(one.real_trials[:, :5].flat) == {5, 10}
     assert (one.real_successes <= one.real_trials).all() and (one.twin_successes <= one.twin_trials).all()
-    assert (record.real_successes.sum(1) == 0).sum() == 15  # which never arrive in a repetition either
+    assert (record.real_successes.sum(1) == 0).sum() == 15  # a resampled policy without a success has none either
     assert (one.real_successes.sum(1) == 0).sum() > 5
-    other = intervals.again(rng, record, days_anew=True)
+    other = intervals.resampled_experiment(rng, record, resample_days=True)
     of_finals = other.real_trials[other.real_trials.max(1) == 10]
-    assert (of_finals == of_finals[0]).all() and (of_finals[0, 5:] == 10).any()  # one draw of days for all policies
-    aims = intervals.aimed_at(lambda: record)
-    assert aims["Spearman"] == pytest.approx(results["forecast_by_photo"]["all tasks"]["spearman"]["value"])
+    assert (of_finals == of_finals[0]).all() and (of_finals[0, 5:] == 10).any()  # all policies share the resampled days
+    truth = intervals.true_values(lambda: record)
+    assert truth["Spearman"] == pytest.approx(results["forecast_by_photo"]["all tasks"]["spearman"]["value"])
 
 
-# ---- the alignment's lines
+# ---- comparison of the aligned model with kinematics
 
 
-def test_level_stands_beside_level_first(scripts):
+def test_the_first_line_compares_both_on_level_ground(scripts):
     spec = importlib.util.spec_from_file_location("benchmark_align", ROOT / "benchmarks" / "align.py")
     align = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(align)

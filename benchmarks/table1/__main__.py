@@ -1,15 +1,19 @@
-"""The paper's table 1, on a road whose reality is known.
+"""Replication of the paper's table 1 on a road with known truth.
 
     python benchmarks/table1 SCENE [--seeds 0] [--jobs 2] [--steps train validate photos real forecast]
 
-films reality and builds the twin in SCENE (unless that is done), aligns its robot to a drive log of reality's Husky and
-to a film by that one's camera, trains the three setups on both tasks, validates every policy in the twin under held-out
-lightings, as filmed and with all else drawn anew, drives them in reality under weather that was not filmed, and
-forecasts: once from held-out lightings, by who knows nothing of the weather, and once, after all training, from a photo
-of each day of the test. Every step is a command of `twin`, goes on where it was cut off, and adds to what is there: the
-same call with more seeds keeps all runs. `results.json` beside this file holds every run, and is not replaced by one
-that has less unless `--replace-record` is given. Setups, sizes, checkpoints: `plan.py`. What is printed first, scores
-on days that no choice had seen, `scores.py` recounts from `results.json` alone.
+Steps, each a command of `twin` that resumes where it was interrupted:
+
+- build: films the known-truth world and builds the twin in SCENE; aligns the robot to a drive log and an onboard film.
+- train: trains the three setups on both tasks.
+- validate: drives every policy in the twin under held-out lightings, as filmed and with everything else randomised.
+- photos: drives every policy in the twin under a lighting from one photo of each test day.
+- real: drives every policy in the known-truth world under weather that was not filmed.
+- forecast: forecasts real success, once from held-out lightings, once from the photos.
+
+The same call with more seeds adds runs. `results.json` beside this file records every run; `--replace-record` is needed
+to overwrite it with fewer. `plan.py` defines setups, sizes and checkpoints. The first tables printed are those of
+`scores.py`, which needs `results.json` alone.
 """
 
 import argparse
@@ -47,12 +51,12 @@ def verb(*arguments: str | Path) -> None:
 def build(scene: Path) -> None:
     if not (scene / "scene.toml").exists():
         verb("twin.reality", "film", "--out", scene)
-    verb("twin.build", scene)  # what is up to date it leaves alone
+    verb("twin.build", scene)  # skips stages that are up to date
     for kind, name, figures in (("log", "drive.csv", "align.json"), ("onboard", "robot.mp4", "camera.json")):
         if not (scene / "alignment" / figures).exists():
             verb("twin.reality", kind, "--out", scene / name)
             verb("twin.align", scene, scene / name)
-    verb("twin.build", scene)  # with the robot at hand
+    verb("twin.build", scene)  # with the aligned robot
 
 
 def train(scene: Path, run: Run) -> None:
@@ -71,7 +75,7 @@ def validate(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
 
 
 def photos(scene: Path, task: str, every: Iterable[Run], jobs: int) -> None:
-    """Validates in the light of each day of the test, as a photo tells it."""
+    """Validates under lightings from one photo of each test day."""
     for name in WEATHER:
         if name not in twin.load_scene(scene).field().lightings:
             photo = scene / "photos" / f"{name}.png"
@@ -89,7 +93,7 @@ def real(scene: Path, run: Run) -> None:
 
 
 def forecast(scene: Path) -> None:
-    """From held-out lightings, kept in `HELD_OUT_FORECAST`; then from photos, of what was validated in their light."""
+    """Forecasts from held-out lightings, kept in `HELD_OUT_FORECAST`, then from photos, if validated under them."""
     tables = sorted(path for path in (scene / "real").glob("*_*.csv") if path.stem.split("_")[0] in TASKS)
     rows = [row for path in tables if not path.stem.endswith("_trials") for row in _rows(path)]
     _forecast(scene, "results.csv", rows)
@@ -125,9 +129,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--setups", nargs="+", choices=SETUPS, default=list(SETUPS))
-    parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="none: the table alone")
+    parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="no names: the tables only")
     parser.add_argument("--jobs", type=int, default=2, help="runs at once, one core each")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: results.json beside this)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: the one beside this file)")
     add_replace_option(parser)
     given = parser.parse_args()
     asked = runs(given.seeds, given.tasks, given.setups)
@@ -155,7 +159,7 @@ def main() -> int:
         return status
     print(tables(results))
     print(f"\nThe paper's table, over all {len(WEATHER)} weathers\n\n{table(results)}")
-    print("\nForecasts over all of them; their 90 % intervals are nominal, see benchmarks/intervals.py --record")
+    print("\nForecasts over all weathers; coverage of their 90 % intervals: benchmarks/intervals.py --record")
     for kind in ("forecast", "forecast_by_photo"):
         for task, group in results[kind].items():
             print(kind, task, json.dumps(group))

@@ -2,9 +2,9 @@
 
     python benchmarks/table1/picture.py SCENE docs/forecast.jpg
 
-The road as randomised episodes of the twin show it, the road of the real test in some of its weather and the twin by a
-photo of each, success on the road over success in the twin for every policy that drove, and success along a training.
-SCENE holds what `benchmarks/table1` left there.
+Shows randomised episodes of the twin, test days of the known-truth world, the twin under lightings from a photo of
+each, success on the road against success in the twin for every policy, and a training's success curve. SCENE holds the
+results of `benchmarks/table1`.
 """
 
 import argparse
@@ -29,9 +29,9 @@ from twin.report.figures import CARD, INK, LINE, MUTED, SERIES
 from twin.report.forecast_report import twin_against_road
 from twin.types import Image
 
-_WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] of the whole, between pictures, of a caption
-_PER_ROW = 5  # pictures
-_SEEDS = range(1, 1 + _PER_ROW)  # of the twin's pictures
+_WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] total width, gap between images, height of a caption
+_PER_ROW = 5  # images
+_SEEDS = range(1, 1 + _PER_ROW)  # of the twin's images
 _SHOWN = list(WEATHER)[: 2 * _PER_ROW]
 _PAPER = {
     INK: "#16202a",
@@ -48,43 +48,43 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--run", default="straight_varied_0", help="whose training is shown")
+    parser.add_argument("--run", default="straight_varied_0", help="run whose success curve is shown")
     given = parser.parse_args()
     run = given.scene / "runs" / given.run
     test = RealTest(load_policy(run), "straight")
     road = [test.reset(name, _TRIAL).capture(test.road.physics.camera_to_world, 0.0) for name in _SHOWN]
-    drawn = twin_against_road(Forecast.load(given.scene / "forecast"))
+    agreement = twin_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(write_success_curve(run)))[..., ::-1]
     parts = [
-        _caption("The road as the twin shows it in training: lights, suns, shadows and haze are drawn anew"),
+        _caption("The twin in training: randomised lighting, sun, shadows and haze"),
         *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),
         _caption(
-            f"The road of the real test in {len(_SHOWN)} of its {len(WEATHER)} weathers, none filmed; things were moved"
+            f"The test road in {len(_SHOWN)} of its {len(WEATHER)} weathers, none of them filmed; objects were moved"
         ),
         *_rows(road, _SHOWN),
-        _caption("The twin by one photo of each of these days, which told its light and its air"),
+        _caption("The twin under the appearance and the haze of one photo of each of these days"),
         *_rows([_first(given.scene, 1, lighting=name) for name in _SHOWN], _SHOWN),
-        _side_by_side(_drawn(drawn), curve),
+        _side_by_side(_in_paper_colors(agreement), curve),
     ]
-    whole = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
-    if not cv2.imwrite(str(given.out), whole[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86]):
+    page = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
+    if not cv2.imwrite(str(given.out), page[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86]):
         parser.error(f"{given.out} cannot be written")
 
 
 def _first(scene: Path, seed: int, **options: Any) -> Image:
-    """The first picture of an episode."""
+    """The first image of an episode."""
     step = twin.load(scene, "straight", seed, **options).reset()
     return step.observation["pixels"][-1]
 
 
-def _drawn(figure: Figure) -> Image:
-    """A figure of a page, whose colours stand for the page's, in those of paper."""
+def _in_paper_colors(figure: Figure) -> Image:
+    """A report figure as an image, with the page's theme colors replaced by those of `_PAPER`."""
     for artist in figure.findobj():
         if isinstance(artist, Text) and artist.get_bbox_patch():
             artist.set_bbox({"facecolor": _PAPER[CARD], "edgecolor": "none", "alpha": 0.7, "pad": 1.0})
         for part in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
-            told = getattr(artist, f"get_{part}", lambda: None)()
-            one = np.asarray(told)[0] if np.ndim(told) == 2 and len(told) else told
+            value = getattr(artist, f"get_{part}", lambda: None)()
+            one = np.asarray(value)[0] if np.ndim(value) == 2 and len(value) else value
             if is_color_like(one) and to_hex(one) in _PAPER:
                 getattr(artist, f"set_{part}")(_PAPER[to_hex(one)])
     file = BytesIO()
@@ -94,17 +94,17 @@ def _drawn(figure: Figure) -> Image:
 
 def _caption(text: str) -> Image:
     out = np.full((_LINE, _WIDTH, 3), 255, np.uint8)
-    return _written(out, text, (_GAP, _LINE - 11), 0.62, (20, 20, 20))
+    return _with_text(out, text, (_GAP, _LINE - 11), 0.62, (20, 20, 20))
 
 
 def _rows(pictures: list[Image], names: Sequence[str] = ()) -> list[Image]:
-    """Pictures of one size, `_PER_ROW` beside each other."""
+    """Rows of `_PER_ROW` images of equal size."""
     starts = range(0, len(pictures), _PER_ROW)
     return [_row(pictures[i : i + _PER_ROW], names[i : i + _PER_ROW]) for i in starts]
 
 
 def _row(pictures: list[Image], names: Sequence[str]) -> Image:
-    """Pictures of one size beside each other, over the whole width."""
+    """Images of equal size side by side, over the full width."""
     width = (_WIDTH - _GAP) // len(pictures) - _GAP
     height = round(width * pictures[0].shape[0] / pictures[0].shape[1])
     out = np.full((height + _GAP, _WIDTH, 3), 255, np.uint8)
@@ -112,8 +112,8 @@ def _row(pictures: list[Image], names: Sequence[str]) -> Image:
         left = _GAP + i * (width + _GAP)
         large = cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
         if names:
-            _written(large, names[i], (8, 24), 0.62, (0, 0, 0), 4)
-            _written(large, names[i], (8, 24), 0.62, (255, 255, 255))
+            _with_text(large, names[i], (8, 24), 0.62, (0, 0, 0), 4)
+            _with_text(large, names[i], (8, 24), 0.62, (255, 255, 255))
         out[:height, left : left + width] = large
     return out
 
@@ -131,8 +131,8 @@ def _side_by_side(*drawings: Image) -> Image:
     return out
 
 
-def _written(out: Image, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int], thick: int = 1):
-    return cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
+def _with_text(out: Image, text: str, at: tuple[int, int], size: float, color: tuple[int, int, int], thick: int = 1):
+    return cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, thick, cv2.LINE_AA)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What the experiment is: setups, tasks, runs, and which policies go to the road.
+"""Design of the experiment: setups, tasks, runs, and the policies that are driven on the road.
 
-A *setup* is a way to train. A *run* is a training: a setup on a task with a seed. Of every run, besides the finished
-policy, the checkpoints at a quarter and at half of the steps are taken: policies of varied quality for the forecast,
-chosen here and thus before anything is known of how they drive.
+A *setup* is a set of training options. A *run* trains a setup on a task with a seed. Each run contributes its finished
+policy and its checkpoints at a quarter and at half of the steps, which gives the forecast policies of varied quality.
+The selection is fixed here, before any result is known.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from twin.files import read_json
 from twin.reality.lighting import WEATHER
 
 TASKS = {"straight": "straight", "right": "right_turn"}
-"""In names of runs → in `twin.load`."""
+"""Name in run names → name in `twin.load`."""
 SETUPS: dict[str, tuple[str, ...]] = {
     "simulator": ("--observe", "simulator"),
     "one_light": ("--lighting", "sun"),
@@ -24,17 +24,17 @@ SETUPS: dict[str, tuple[str, ...]] = {
 """Name → options of `twin.train`."""
 STEPS = {"straight": 12_000, "right": 16_000}
 SHARES = (0.25, 0.5)
-"""Of a run's steps, at which checkpoints are taken for the forecast."""
+"""Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50
-"""In the twin, per policy and lighting."""
+"""Episodes in the twin per policy and held-out lighting."""
 LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMIZED), "checkpoint": (HELD_OUT + RANDOMIZED,)}
-"""Of the twin. The latter is what reality is compared with; the former, for finished policies, is the paper's."""
+"""Lightings of the twin. Forecasts use the randomised one; the paper's table, of finished policies, the other."""
 PHOTOS = tuple(f"{name}{RANDOMIZED}" for name in WEATHER)
-"""Of the twin, by a photo of each day of the test: what reality is compared with, weather by weather."""
+"""Lightings of the twin from a photo of each test day, for forecasts per weather."""
 PHOTO_EPISODES = 5
-"""In the twin, per policy and weather."""
+"""Episodes in the twin per policy and weather."""
 TRIALS = MIN_TRIALS
-"""In reality, per policy and weather. From fewer nothing is forecast."""
+"""Trials in the known-truth world per policy and weather, the minimum of a forecast."""
 PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
     ("simulator", "straight"): (0.94, 0.57, 0.00),
     ("one_light", "straight"): (1.00, 0.19, 0.00),
@@ -60,21 +60,21 @@ class Run:
         return scene / "runs" / self.name
 
     def checkpoints(self, scene: Path) -> list[Path]:
-        """Those for the forecast: at each of `SHARES`, the last before it."""
-        there = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
-        picked = [[path for path in there if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
-        return [some[-1] for some in picked if some]
+        """Checkpoints for the forecast: the last one of each of `SHARES`, up to 100 steps late."""
+        saved = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
+        before = [[path for path in saved if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
+        return [some[-1] for some in before if some]
 
     def finished(self, scene: Path) -> bool:
         path, steps = self.folder(scene), STEPS[self.task]
         if not (path / "config.json").exists():
             return False
-        asked = read_json(path / "config.json")["steps"]
-        if asked != steps:  # the learning rate falls by the steps asked for: a longer run is another training
-            raise SystemExit(f"{path} is a run of {asked} steps, not of {steps}; move it away")
+        planned = read_json(path / "config.json")["steps"]
+        if planned != steps:  # the learning rate schedule depends on the total, so a longer run is another training
+            raise SystemExit(f"{path} is a run of {planned} steps, not of {steps}; move it away")
         return (path / CHOICE_FILE).exists() and read_json(path / CHOICE_FILE)["steps"] >= steps
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:
-    """Every cell once before any has a second seed."""
+    """Runs of all cells, seed by seed."""
     return [Run(task, setup, seed) for seed in seeds for setup in setups for task in tasks]

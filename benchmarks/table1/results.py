@@ -1,4 +1,4 @@
-"""`results.json` and the table: all that is known of every run so far; none is left out."""
+"""Collects `results.json`, the record of every run, and formats the paper's table from it."""
 
 import csv
 from pathlib import Path
@@ -13,10 +13,10 @@ from twin.evaluation.training_curves import CHOICE_FILE, read_episodes
 from twin.evaluation.trials import RECENT_EPISODES, Trial, read_trials
 from twin.files import read_json
 
-_JUDGED = ("validate", "validate_randomised", "validate_by_photo", "real")
+_EVALUATIONS = ("validate", "validate_randomised", "validate_by_photo", "real")
 _BY_DAY = ("validate_by_photo", "real")
 HELD_OUT_FORECAST = "forecast_held_out"
-"""Folder beside `forecast`, which then is of photos."""
+"""Folder of the held-out forecast; `forecast` then holds the one from photos."""
 FORECAST = (
     "pearson",
     "spearman",
@@ -30,7 +30,7 @@ FORECAST = (
 
 
 def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
-    """What `results.json` holds."""
+    """The content of `results.json`."""
     twin = _trials([scene / "validation" / "episodes.csv"])
     real = _trials(sorted((scene / "real").glob("*_trials.csv")))
     rows = []
@@ -39,28 +39,29 @@ def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
         rows.append(
             {"setup": run.setup, "task": TASKS[run.task], "seed": run.seed, "finished": run.finished(scene)}
             | _training(run.folder(scene))
-            | {"policies": [_judged(name, twin, real) for name in policies]}
+            | {"policies": [_evaluations(name, twin, real) for name in policies]}
         )
-    by_photo = scene / HELD_OUT_FORECAST  # is there where `forecast` is of the photos
+    by_photo = scene / HELD_OUT_FORECAST  # exists if `forecast` is from photos
     kinds = (by_photo, scene / "forecast") if by_photo.exists() else (scene / "forecast", by_photo)
     held_out, photo = (_forecast(folder / "forecast.json") for folder in kinds)
     return {"runs": rows, "forecast": held_out, "forecast_by_photo": photo}
 
 
 def table(results: dict[str, Any]) -> str:
-    """The paper's table with ours beside it, in Markdown; finished policies of all seeds together.
+    """The paper's table beside ours, in Markdown, from the finished policies of all seeds.
 
-    Where trials come by days (by photo, real), rates are means over all the days, with intervals over days.
+    Rates by photo and on the road are means over days, with intervals over days.
     """
-    told = "train / validate / (ours: another day / a photo of each day of the test) / real"
-    lines = [f"| | | straight: {told} | right turn: {told} |", "|---|---|---|---|"]
+    columns = "train / validate / (ours: another day / a photo of each day of the test) / real"
+    lines = [f"| | | straight: {columns} | right turn: {columns} |", "|---|---|---|---|"]
     for setup in SETUPS:
         lines.append(f"| paper | {setup} | " + " | ".join(_numbers(PAPER[setup, task]) for task in TASKS) + " |")
         ours = []
         for task in TASKS:
             some = [r for r in results["runs"] if r["finished"] and (r["setup"], r["task"]) == (setup, TASKS[task])]
-            parts = {"train": [r["train"] for r in some]} | {k: [r["policies"][0][k] for r in some] for k in _JUDGED}
-            cells = [_over_days(part) if name in _BY_DAY else _together(part) for name, part in parts.items()]
+            parts = {"train": [r["train"] for r in some]}
+            parts |= {k: [r["policies"][0][k] for r in some] for k in _EVALUATIONS}
+            cells = [_over_days(part) if name in _BY_DAY else _pooled(part) for name, part in parts.items()]
             ours.append(" / ".join(cells) + f" ({len(some)} runs)")
         lines.append(f"| ours | {setup} | " + " | ".join(ours) + " |")
     return "\n".join(lines)
@@ -70,7 +71,7 @@ def _numbers(rates: tuple[float, ...]) -> str:
     return " / ".join(f"{rate:.2f}" for rate in rates)
 
 
-def _together(parts: list[dict[str, Any]]) -> str:
+def _pooled(parts: list[dict[str, Any]]) -> str:
     trials, won = sum(p["trials"] for p in parts), sum(p["successes"] for p in parts)
     if not trials:
         return "–"
@@ -99,11 +100,11 @@ def _training(folder: Path) -> dict[str, Any]:
     }
 
 
-def _judged(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
+def _evaluations(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
     out: dict[str, Any] = {"policy": name}
     parts = [[t for t in twin if t.lighting == HELD_OUT], [t for t in twin if t.lighting == HELD_OUT + RANDOMIZED]]
     photos = [trial for trial in twin if trial.lighting in PHOTOS]
-    for where, trials in zip(_JUDGED, (*parts, photos, real), strict=True):
+    for where, trials in zip(_EVALUATIONS, (*parts, photos, real), strict=True):
         mine = [trial for trial in trials if trial.policy == name]
         out[where] = _rate([trial.success for trial in mine]) | {
             "by_lighting": {
@@ -126,7 +127,7 @@ def _trials(paths: list[Path]) -> list[Trial]:
 
 
 def _forecast(path: Path) -> dict[str, Any]:
-    """Statistics with their intervals, by task."""
+    """Forecast statistics with their intervals, by task."""
     if not path.exists():
         return {}
     return {

@@ -1,14 +1,14 @@
-"""What the experiment's record says, recounted without driving anything; what no choice had seen comes first.
+"""Scores of the experiment, computed from `results.json`; days that no choice had seen come first.
 
     python benchmarks/table1/scores.py [--results FILE]
 
-prints, from `results.json`, success on the road by groups of days and how well the twin's rates rank the policies
-there. Rates on the road have intervals over days. Scores have none: the forecast's own are too narrow in worlds of this
-shape (`benchmarks/intervals.py --record`). Beside the twin stands a *rule* that never looks at it; see `rule`.
+Prints success on the road by groups of days, and how well the twin's rates rank the policies there. Rates on the road
+have intervals over days. Scores have none, because the forecast's are too narrow for experiments of this shape
+(`benchmarks/intervals.py --record`). A *rule* that does not use the twin is the baseline; see `rule`.
 
-A choice is anything that was decided while the trials of a day, or its pictures, were known: the methods of training,
-developed in the five stated weathers; the share of weather that a photo leaves untold, measured on pictures of these
-and of days 1 to 5. Days 6 to 15 were driven when all was fixed.
+A *choice* is a decision made while trials or images of a day were known: the training methods, developed in the five
+stated weathers, and the fraction of the weather randomisation kept beside a photo, measured on images of these and of
+days 1 to 5. Days 6 to 15 were driven after everything was fixed.
 """
 
 import argparse
@@ -36,42 +36,42 @@ from twin.files import read_json
 from twin.reality.lighting import WEATHER
 
 RESULTS = Path(__file__).with_name("results.json")
-_USED = 5  # of the drawn days, the first, were looked at before everything was fixed
+_USED = 5  # number of sampled days that were examined before everything was fixed
 _DAYS = [name for name in WEATHER if name.startswith("day_")]
 _STATED = len(WEATHER) - len(_DAYS)
 GROUPS: dict[str, tuple[str, ...]] = {
     f"days {_USED + 1} to {len(_DAYS)}, which no choice had seen": tuple(_DAYS[_USED:]),
-    f"days 1 to {len(_DAYS)}, drawn by chance": tuple(_DAYS),
+    f"days 1 to {len(_DAYS)}, sampled at random": tuple(_DAYS),
     "the stated weathers and days 1 to 5, seen during development": tuple(WEATHER)[: _STATED + _USED],
     f"all {len(WEATHER)} weathers, half of them seen during development": tuple(WEATHER),
 }
-"""Weathers by what may be claimed of them."""
+"""Group of days → weathers."""
 
 RULE_TRIALS = 5
-"""Episodes per day that the rule is taken to have driven, as many as the twin."""
-_HALF = max(SHARES) - 0.05  # of a training; checkpoints are saved within 100 steps of what is asked
+"""Episodes per day assumed for the rule, as many as in the twin."""
+_HALF = max(SHARES) - 0.05  # fraction of a training; checkpoints are saved within 100 steps of the fraction
 
 Counts = dict[str, tuple[int, int]]
 """Successes and trials by weather."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One policy on its task."""
+class PolicyRecord:
+    """Record of one policy on its task."""
 
     name: str
     setup: str
     task: str
     trained: float
-    """Share of its training that it has behind it, 1 for a finished policy."""
+    """Fraction of its training that is done, 1 for a finished policy."""
     twin: Counts
-    """In the twin by a photo of each day."""
+    """In the twin under a lighting from a photo of each day."""
     held_out: float
-    """Rate in the twin under held-out lights, everything else drawn anew."""
+    """Success rate in the twin under held-out lightings with everything else randomised."""
     real: Counts
 
 
-def judged(results: dict[str, Any]) -> list[Judged]:
+def policy_records(results: dict[str, Any]) -> list[PolicyRecord]:
     """The policies of a record."""
     names = {task: short for short, task in TASKS.items()}
     out = []
@@ -80,7 +80,7 @@ def judged(results: dict[str, Any]) -> list[Judged]:
             _, _, step = policy["policy"].partition("/")
             held_out = policy["validate_randomised"]
             out.append(
-                Judged(
+                PolicyRecord(
                     name=policy["policy"],
                     setup=run["setup"],
                     task=run["task"],
@@ -94,17 +94,19 @@ def judged(results: dict[str, Any]) -> list[Judged]:
 
 
 def counts(part: dict[str, Any]) -> Counts:
-    return {name: (told["successes"], told["trials"]) for name, told in part["by_lighting"].items()}
+    return {name: (cell["successes"], cell["trials"]) for name, cell in part["by_lighting"].items()}
 
 
-def rule(policy: Judged) -> float:
-    """A predictor that does not look at the twin: every trial succeeds if the light varied in training and at least
-    half of the training is done, else none. It was thought of when all trials were known."""
+def rule(policy: PolicyRecord) -> float:
+    """A baseline without the twin: 1 if lightings varied in training and at least half of it is done, else 0.
+
+    It was formulated when all trials were known.
+    """
     return float(policy.setup == "varied" and policy.trained >= _HALF)
 
 
-def by_photo(policy: Judged, days: Sequence[str]) -> float:
-    """Mean over days of the twin's rates by a photo of each."""
+def by_photo(policy: PolicyRecord, days: Sequence[str]) -> float:
+    """Mean over days of the twin's rates under lightings from photos."""
     return _mean(policy.twin, days)
 
 
@@ -112,16 +114,16 @@ def _mean(counts: Counts, days: Sequence[str]) -> float:
     return float(np.mean([counts[day][0] / counts[day][1] for day in days]))
 
 
-PREDICTORS: dict[str, Callable[[Judged, Sequence[str]], float]] = {
+PREDICTORS: dict[str, Callable[[PolicyRecord, Sequence[str]], float]] = {
     "twin, by a photo of each day": by_photo,
     "twin, held-out lights": lambda policy, days: policy.held_out,
-    "rule that never looks at the twin": lambda policy, days: rule(policy),
+    "rule without the twin": lambda policy, days: rule(policy),
 }
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How a predictor does on some policies and days; None where it is not defined."""
+    """Scores of a predictor on some policies and days; None where undefined."""
 
     policies: int
     spearman: float | None
@@ -132,13 +134,13 @@ class Scores:
     bias: float
     """Mean over policies of real minus predicted rate."""
     cells: float | None
-    """Share of the cells whose predicted and real counts differ by no more than chance; None: it counts none."""
+    """Fraction of the cells whose predicted and real counts are compatible; None if the predictor has no counts."""
     corrected: tuple[int, int]
-    """Policies within the interval predicted from the task's other policies, as the forecast corrects; of how many."""
+    """Number of policies within the interval predicted from the task's other policies, and number of intervals."""
 
 
-def scores(predictor: str, policies: Sequence[Judged], days: Sequence[str]) -> Scores | None:
-    """Scores of one of `PREDICTORS`; None where fewer than five policies drove on all the days."""
+def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> Scores | None:
+    """Scores of one of `PREDICTORS`; None if fewer than `MIN_POLICIES` drove on all the days."""
     mine = [p for p in policies if set(days) <= p.real.keys() and (set(days) <= p.twin.keys())]
     if len(mine) < MIN_POLICIES:
         return None
@@ -178,34 +180,34 @@ def _defined(statistic: Callable[..., float], twin: np.ndarray, real: np.ndarray
         return None
 
 
-def _cells_held(predictor: str, policies: Sequence[Judged], days: Sequence[str]) -> float | None:
-    """As the forecast counts it: the interval of the difference of rates contains none."""
-    if predictor not in ("twin, by a photo of each day", "rule that never looks at the twin"):
+def _cells_held(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> float | None:
+    """Fraction of cells compatible as in the forecast: the interval of the difference of rates contains 0."""
+    if predictor not in ("twin, by a photo of each day", "rule without the twin"):
         return None
-    told = [
+    predicted = [
         p.twin[day] if predictor.startswith("twin") else (round(RULE_TRIALS * rule(p)), RULE_TRIALS)
         for p in policies
         for day in days
     ]
-    seen = [policy.real[day] for policy in policies for day in days]
-    (won, trials), (real_won, real_trials) = np.transpose(told), np.transpose(seen)
+    real = [policy.real[day] for policy in policies for day in days]
+    (won, trials), (real_won, real_trials) = np.transpose(predicted), np.transpose(real)
     _, low, high = rate_difference(
         twin_successes=won, twin_trials=trials, real_successes=real_won, real_trials=real_trials
     )
     return float(((low <= 0.0) & (high >= 0.0)).mean())
 
 
-def finals(policies: Sequence[Judged], setup: str, task: str, days: Sequence[str]) -> str:
-    """Success on the road of a setup's finished policies, as `over_days` tells it."""
+def finals(policies: Sequence[PolicyRecord], setup: str, task: str, days: Sequence[str]) -> str:
+    """Success on the road of a setup's finished policies, in the format of `over_days`."""
     mine = [p for p in policies if (p.setup, p.task, p.trained) == (setup, task, 1.0) and set(days) <= p.real.keys()]
     return over_days([{day: policy.real[day] for day in days} for policy in mine])
 
 
 def over_days(parts: Sequence[Counts]) -> str:
-    """The mean over days of the rates of several policies on them, its interval over days, and the counts.
+    """Mean over days of the rates of several policies, its interval over days, and the counts.
 
     Args:
-        parts: By policy, all with the same days.
+        parts: Counts by policy, all of the same days.
 
     Returns:
         "0.05 [0.01, 0.20], 15/250"; "–" without trials.
@@ -219,8 +221,8 @@ def over_days(parts: Sequence[Counts]) -> str:
 
 
 def tables(results: dict[str, Any]) -> str:
-    """Success of finished policies and scores of every predictor, by groups of days, in Markdown."""
-    policies = judged(results)
+    """Success of finished policies, and scores of every predictor, by group of days, in Markdown."""
+    policies = policy_records(results)
     lines = ["Finished policies on the road: mean over days, its 90 % interval over days, successes/trials", ""]
     lines += ["| days | setup | straight | right turn |", "|---|---|---|---|"]
     for group, days in GROUPS.items():
@@ -237,7 +239,7 @@ def tables(results: dict[str, Any]) -> str:
         "cells that agree",
         "corrected hold",
     )
-    lines += ["", "How predictors rank the policies, finished ones and checkpoints; no interval is known to hold", ""]
+    lines += ["", "Ranking of all policies, finished and checkpoints, by predictor; without intervals", ""]
     lines += [f"| days | task | predictor | {' | '.join(heads)} |", f"|---|---|---|{'---|' * len(heads)}"]
     for group, days in GROUPS.items():
         for task in ("both tasks", *TASKS.values()):
@@ -250,18 +252,18 @@ def tables(results: dict[str, Any]) -> str:
 
 
 def _row(found: Scores) -> list[str]:
-    def told(value: float | None, form: str) -> str:
+    def text(value: float | None, form: str) -> str:
         return "–" if value is None else format(value, form).replace("-", "−")
 
     values = (found.spearman, found.pearson, found.mmrv, found.regret, found.bias)
     forms = (".2f", ".3f", ".3f", ".3f", "+.3f")
     corrected = f"{found.corrected[0]} of {found.corrected[1]}" if found.corrected[1] else "–"
-    return [str(found.policies), *map(told, values, forms), told(found.cells, ".1%"), corrected]
+    return [str(found.policies), *map(text, values, forms), text(found.cells, ".1%"), corrected]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: results.json beside this)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: the one beside this file)")
     print(tables(read_json(parser.parse_args().results)))
 
 

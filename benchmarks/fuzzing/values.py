@@ -1,4 +1,7 @@
-"""Hostile values, texts and bytes for `fuzz.py`, all drawn from a `random.Random`."""
+"""Hostile values and mutations of valid ones: Python objects, JSON and TOML trees, texts, bytes.
+
+Every draw comes from the `random.Random` that is passed in.
+"""
 
 import copy
 import json
@@ -6,12 +9,12 @@ from collections.abc import Sequence
 from random import Random
 from typing import Any
 
-DEEP = 100_000  # levels of nesting
-OUTSIDE = "../kept/notes.txt"  # of a case's folder: must stay as it is
+DEEP_NESTING = 100_000  # levels
+OUTSIDE_PATH = "../kept/notes.txt"  # relative to a case's folder; must not change
 
 
-class Raw(str):
-    """A value that is written as it stands, valid or not."""
+class RawLiteral(str):
+    """JSON or TOML source that is written verbatim, valid or not."""
 
 
 _NUMBERS = (
@@ -27,7 +30,21 @@ _TOML = (
     *("{a = 1}", '[1, "a"]', "[nan]", "[inf, -inf]", "'a'", "bare", '"\\ud800"', "[{}]", "1_000", '"\\u0000"', ""),
 )
 _WORDS = (
-    *("", " ", ".", "..", "/", "~", "a/b", OUTSIDE, "../../../../etc/passwd", "/etc/passwd", "/dev/null", "a:b:c", "+"),
+    *(
+        "",
+        " ",
+        ".",
+        "..",
+        "/",
+        "~",
+        "a/b",
+        OUTSIDE_PATH,
+        "../../../../etc/passwd",
+        "/etc/passwd",
+        "/dev/null",
+        "a:b:c",
+        "+",
+    ),
     *("\x00", "a\x00b", "\ud800", "\udcff", "\ufeff", "\x07\x1b[31m", "a\nb", "a\r\nb", "\u202e", "é", "²", "∞", "'"),
     *("nan", "inf", "-inf", "1e400", "-1", "0", "9" * 5000, "1" + "0" * 400, "x" * 300, "%s%n", "{}", "{0}", "<b>&"),
     *("training", "held-out", "any", "+randomised", "day:night:nan", "day:night:2", "day", "true", "None", '"', "\\"),
@@ -39,42 +56,42 @@ _OBJECTS: tuple[Any, ...] = (
 )
 
 
-def word(rng: Random) -> str:
-    """A hostile text, rarely of a megabyte."""
+def hostile_text(rng: Random) -> str:
+    """A hostile text; 1 % of them have a megabyte."""
     return "x" * 1_000_000 if rng.random() < 0.01 else rng.choice(_WORDS)
 
 
-def anything(rng: Random) -> Any:
+def hostile_value(rng: Random) -> Any:
     """A hostile Python value."""
     which = rng.random()
     if which < 0.3:
-        return word(rng)
+        return hostile_text(rng)
     if which < 0.32:
-        return nested(500 if which < 0.31 else DEEP)
+        return nested(500 if which < 0.31 else DEEP_NESTING)
     return rng.choice(_OBJECTS)
 
 
 def nested(levels: int) -> list[Any]:
-    """Lists in lists."""
+    """A list nested this many levels deep."""
     out: list[Any] = []
     for _ in range(levels):
         out = [out]
     return out
 
 
-def literal(rng: Random, toml: bool = False) -> Raw:
-    """A hostile value as JSON or TOML has it, or as neither has."""
+def hostile_literal(rng: Random, toml: bool = False) -> RawLiteral:
+    """JSON or TOML source of a hostile value, valid or not."""
     which = rng.random()
     if which < 0.35:
-        return Raw(rng.choice(_NUMBERS))
+        return RawLiteral(rng.choice(_NUMBERS))
     if which < 0.6:
-        return Raw(json.dumps(word(rng)))
+        return RawLiteral(json.dumps(hostile_text(rng)))
     if which < 0.94:
-        return Raw(rng.choice(_TOML if toml else _JSON))
-    levels = rng.choice((50, 900, 5000, DEEP))
+        return RawLiteral(rng.choice(_TOML if toml else _JSON))
+    levels = rng.choice((50, 900, 5000, DEEP_NESTING))
     equals = "=" if toml else ":"
     key = "a" if toml else '"a"'
-    return Raw(
+    return RawLiteral(
         rng.choice(
             (
                 "[" * levels,
@@ -86,32 +103,33 @@ def literal(rng: Random, toml: bool = False) -> Raw:
     )
 
 
-def spoiled(rng: Random, table: Any, toml: bool = False) -> Any:
-    """A copy of a tree of dicts and lists with one to three things in it changed."""
+def mutated(rng: Random, table: Any, toml: bool = False) -> Any:
+    """A copy of a tree of dicts and lists with one to three changes: entries replaced, removed, copied or renamed."""
     out = copy.deepcopy(table)
     for _ in range(rng.choice((1, 1, 2, 3))):
-        places = _places(out)
-        if not places:
-            return literal(rng, toml)
-        holder, key = rng.choice(places)
+        slots = _slots(out)
+        if not slots:
+            return hostile_literal(rng, toml)
+        holder, key = rng.choice(slots)
         what = rng.random()
         if what < 0.65:
-            holder[key] = literal(rng, toml)
+            holder[key] = hostile_literal(rng, toml)
         elif what < 0.75:
             del holder[key]
         elif what < 0.85:
-            other, its = rng.choice(places)
+            other, its = rng.choice(slots)
             if its in other if isinstance(other, dict) else its < len(other):
                 holder[key] = copy.deepcopy(other[its])
         elif isinstance(holder, dict):
-            name = word(rng) if toml is False else rng.choice(("a.b", '""', '"\\u0000"', "frames", "x" * 300))
-            holder[name if what < 0.93 else key + "s"] = holder[key] if what < 0.93 else literal(rng, toml)
+            name = hostile_text(rng) if toml is False else rng.choice(("a.b", '""', '"\\u0000"', "frames", "x" * 300))
+            holder[name if what < 0.93 else key + "s"] = holder[key] if what < 0.93 else hostile_literal(rng, toml)
         else:
             holder.extend([holder[key]] * rng.choice((1, 3, 1000)))
     return out
 
 
-def _places(tree: Any, most: int = 2000) -> list[tuple[Any, Any]]:
+def _slots(tree: Any, most: int = 2000) -> list[tuple[Any, Any]]:
+    """Container and key of every entry of a tree, up to about `most`."""
     out: list[tuple[Any, Any]] = []
     stack = [tree]
     while stack and len(out) < most:
@@ -125,8 +143,8 @@ def _places(tree: Any, most: int = 2000) -> list[tuple[Any, Any]]:
 
 
 def json_text(tree: Any) -> str:
-    """A tree as JSON, with its `Raw` values as they stand."""
-    if isinstance(tree, Raw):
+    """JSON source of a tree; its `RawLiteral` values are written verbatim."""
+    if isinstance(tree, RawLiteral):
         return str(tree)
     if isinstance(tree, dict):
         return "{" + ", ".join(f"{json.dumps(str(k))}: {json_text(v)}" for k, v in tree.items()) + "}"
@@ -136,12 +154,12 @@ def json_text(tree: Any) -> str:
 
 
 def toml_text(table: dict[str, Any]) -> str:
-    """A tree as TOML, with its `Raw` values as they stand; tables within are inline."""
+    """TOML source of a table; its `RawLiteral` values are written verbatim, nested tables inline."""
     return "".join(f"{key} = {_toml(value)}\n" for key, value in table.items())
 
 
 def _toml(value: Any) -> str:
-    if isinstance(value, Raw):
+    if isinstance(value, RawLiteral):
         return str(value)
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
@@ -150,8 +168,13 @@ def _toml(value: Any) -> str:
     return json.dumps(value)
 
 
-def mangled_text(rng: Random, text: str) -> bytes:
-    """A text as bytes, as it is or changed as a text can be."""
+def mutated_json(rng: Random, tree: Any) -> bytes:
+    """JSON of a mutated copy of a tree, as `mutated_text` of it."""
+    return mutated_text(rng, json_text(mutated(rng, tree)))
+
+
+def mutated_text(rng: Random, text: str) -> bytes:
+    """A text as bytes: unchanged (60 %), in another encoding, with a character inserted, or corrupted."""
     what = rng.random()
     if what < 0.6:
         return text.encode("utf-8", "surrogatepass")
@@ -164,14 +187,14 @@ def mangled_text(rng: Random, text: str) -> bytes:
         text = text[:at] + rng.choice(("\x00", "\x1b", "\n", '"', "[", "=", ",", "\ufeff", "\r", "ÿ")) + text[at:]
         return text.encode("utf-8", "surrogatepass")
     if what < 0.87:
-        return (rng.choice(("a." * DEEP + "a = 1\n", "[" + "a." * 5000 + "a]\n", "x" * 1_000_000)) + text).encode(
-            "utf-8", "surrogatepass"
-        )
-    return damaged(rng, text.encode("utf-8", "surrogatepass"))
+        return (
+            rng.choice(("a." * DEEP_NESTING + "a = 1\n", "[" + "a." * 5000 + "a]\n", "x" * 1_000_000)) + text
+        ).encode("utf-8", "surrogatepass")
+    return corrupted(rng, text.encode("utf-8", "surrogatepass"))
 
 
-def damaged(rng: Random, data: bytes) -> bytes:
-    """Bytes cut, flipped, doubled, emptied or overwritten by extreme numbers."""
+def corrupted(rng: Random, data: bytes) -> bytes:
+    """Bytes with one to five changes: flipped, cut, inserted, doubled, emptied or overwritten by extreme numbers."""
     out = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 5))):
         n = len(out)
