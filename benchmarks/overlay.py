@@ -232,8 +232,8 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
 def seen_touched(scene_path: Path) -> dict[str, Any]:
     """`seen_touched.*` of `twin.report.visual_vs_collision`, along a drive of the scripted follower."""
     from twin.assets.ground import Ground
+    from twin.env.drivers import follow_route
     from twin.env.physics import HuskyPhysics
-    from twin.env.route_follower import follow_route
     from twin.mjcf.scene_xml import Parts
     from twin.report.visual_vs_collision import compare_geometry, render_views, view_poses
 

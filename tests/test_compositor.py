@@ -7,8 +7,8 @@ from test_baked import LOW, baked, wall
 
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraNoise, CameraOptions, soft_clip
-from twin.env.compositor import Compositor
-from twin.env.mujoco_renderer import ObjectRenderer, camera_intrinsics, camera_pose
+from twin.env.compositor import Compositor, ObjectRenderer
+from twin.env.mujoco_renderer import camera_intrinsics, camera_pose
 from twin.env.obstacles import add_obstacles
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints

@@ -19,10 +19,10 @@ import twin
 from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraOptions
-from twin.env.chase_camera import chase_poses
 from twin.env.domain_randomization import Ranges
 from twin.env.drivers import BlindDriver, RouteDriver
 from twin.env.gym_env import DriveEnv
+from twin.env.mujoco_renderer import chase_poses
 from twin.env.options import CAUSES
 from twin.env.suite import EnvFactory
 from twin.env.task import Motion

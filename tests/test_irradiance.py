@@ -8,8 +8,14 @@ from test_baked import baked
 from test_compositor import SIZE, K, nothing
 
 from twin.config import ObstacleConfig
-from twin.env.compositor import Compositor, ContactShadows
-from twin.env.irradiance import SIDE_DIRECTIONS, Irradiance, IrradianceEstimator, spherical_harmonics_numpy
+from twin.env.compositor import Compositor
+from twin.env.irradiance import (
+    SIDE_DIRECTIONS,
+    ContactShadows,
+    Irradiance,
+    IrradianceEstimator,
+    spherical_harmonics_numpy,
+)
 from twin.env.obstacles import add_obstacles
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.poses import look_at

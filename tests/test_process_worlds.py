@@ -14,9 +14,8 @@ from tiny_twin import tiny_twin
 import twin
 from twin import runtime
 from twin.env.suite import EnvFactory
-from twin.env.vector_env import make_vector_env
+from twin.env.vector_env import ProcessVectorEnv, _Child, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
-from twin.env.vector_env_processes import ProcessVectorEnv, _Child
 from twin.errors import InputError
 
 PICTURES = {"size": (32, 18), "randomise": True, "time_limit": 1.5}
@@ -138,7 +137,7 @@ def test_they_end_with_their_parent(scene):
     """However it ends, and though its script has no `if __name__ == "__main__"`."""
     script = f"""
         import os, signal
-        from twin.env.vector_env_processes import ProcessVectorEnv
+        from twin.env.vector_env import ProcessVectorEnv
         worlds = ProcessVectorEnv({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
         worlds.begin([0, 1])
         fork = os.fork()

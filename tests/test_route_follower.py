@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from tiny_world import tiny_config, tiny_scene, tiny_world
 
-from twin.env.chase_camera import SceneCamera, blend_parts, chase_poses
+from twin.env.drivers import follow_route, pursuit_curvature
+from twin.env.mujoco_renderer import SceneCamera, blend_parts, chase_poses
 from twin.env.physics import HuskyPhysics
-from twin.env.route_follower import follow_route, pursuit_curvature
 from twin.geometry.cameras import project
 from twin.geometry.poses import inverse_pose
 from twin.mjcf.husky import add_husky, set_options

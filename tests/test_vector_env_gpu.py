@@ -12,10 +12,10 @@ import twin
 from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraOptions
-from twin.env.dm import control
 from twin.env.domain_randomization import Ranges
 from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.suite import EnvFactory
+from twin.env.task import control
 from twin.env.vector_env_gpu import GpuVectorEnv
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError

@@ -13,11 +13,13 @@ import mujoco
 import numpy as np
 
 from twin.config import RANDOMIZED
-from twin.env.episode_model import PAYLOAD
 from twin.errors import InputError, short_repr
 from twin.robot import HuskyParams
 
 Range = tuple[float, float]
+
+PAYLOAD = "payload"
+"""Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
 """Version of what a sample does. Raise it when fog, relighting, shadows or distractors of the same sample change."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from twin.config import ObstacleConfig
 from twin.config_file import parse_table
-from twin.env.dm import control
 from twin.env.drivers import Driver
+from twin.env.task import control
 from twin.files import read_json, write_json
 from twin.types import Array
 

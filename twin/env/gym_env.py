@@ -25,12 +25,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from twin.env.chase_camera import ChaseCamera, SceneCamera
+from twin.env.mujoco_renderer import ChaseCamera, SceneCamera
 from twin.env.observation import PixelObserver
 from twin.env.options import parse_options
-from twin.env.vector_env import make_vector_env
+from twin.env.vector_env import ProcessVectorEnv, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
-from twin.env.vector_env_processes import ProcessVectorEnv
 from twin.errors import InputError, short_repr
 from twin.loading import Twin
 from twin.warp_runtime import wp

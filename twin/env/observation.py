@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from twin.config import RANDOMIZED
 from twin.env.camera_noise import CameraNoise
 from twin.env.compositor import Compositor
-from twin.env.dm import DrivePhysics
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.mujoco_renderer import FRONT_CAMERA, SceneRenderer, camera_intrinsics
 from twin.env.options import SIMULATOR, Options
-from twin.env.task import CAMERA, LIGHTING, WEATHER, DriveTask
+from twin.env.task import CAMERA, LIGHTING, WEATHER, DrivePhysics, DriveTask
 from twin.env.trust import SKY_OPACITY, Trust
 from twin.env.weather import Weather
 from twin.geometry.cameras import Viewpoints

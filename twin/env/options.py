@@ -13,6 +13,7 @@ from twin.env.camera_noise import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.domain_randomization import Ranges
 from twin.errors import InputError, short_repr
+from twin.types import Array
 from twin.warp_runtime import wp
 
 CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
@@ -201,3 +202,19 @@ def _parse_rewards(given: dict[str, float]) -> Rewards:
         if name not in names:
             raise InputError(f"unknown reward {name!r}; there are {', '.join(names)}")
     return Rewards(**given)
+
+
+def check_actions(actions: Any, shape: tuple[int, ...]) -> Array:
+    """Returns actions as float64.
+
+    Raises:
+        ValueError: wrong shape, not real numbers (booleans are not accepted), or not finite.
+    """
+    try:
+        given = np.asarray(actions)
+    except (TypeError, ValueError):  # ragged lists
+        given = np.empty(0, object)
+    if given.dtype.kind not in "iuf" or given.shape != shape or not np.isfinite(given).all():
+        kind = f"{given.dtype} of shape {given.shape}"
+        raise ValueError(f"action {short_repr(actions)} ({kind}); expected finite numbers of shape {shape}")
+    return given.astype(np.float64, copy=False)

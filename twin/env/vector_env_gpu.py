@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from twin.env.controller import SubstepSchedules, VectorController
-from twin.env.dm import DrivePhysics, control
 from twin.env.observation import GpuPixelObserver
 from twin.env.obstacles import ObstacleMotion
 from twin.env.physics import TIME_TOLERANCE
 from twin.env.suite import EnvFactory
-from twin.env.task import DriveTask, Motion, RewardAndTermination
+from twin.env.task import DrivePhysics, DriveTask, Motion, RewardAndTermination, control
 from twin.env.vector_env_local import LocalVectorEnv, StepResult
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.types import Array, Indices

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.config import RESERVED_LIGHTINGS
-from twin.env.dm import DrivePhysics, control
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.observation import PixelObserver
+from twin.env.options import check_actions
 from twin.env.suite import EnvFactory
-from twin.env.task import DriveTask, check_actions
+from twin.env.task import DrivePhysics, DriveTask, control
 from twin.nerf.lightings import Lightings
 from twin.runtime import available_cores
 from twin.types import Array, Array32

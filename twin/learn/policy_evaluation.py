@@ -27,9 +27,8 @@ from twin import runtime
 from twin.cli import signals_held, signals_kept
 from twin.env.domain_randomization import Ranges, lighting_options
 from twin.env.suite import EnvFactory
-from twin.env.vector_env import make_vector_env
+from twin.env.vector_env import ProcessVectorEnv, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
-from twin.env.vector_env_processes import ProcessVectorEnv
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.files import read_json, wrap_read_errors, write_json

@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from twin.config import HELD_OUT, RANDOMIZED
-from twin.env.dm import control
 from twin.env.options import STEERING, parse_options
-from twin.env.task import CAMERA
+from twin.env.task import CAMERA, control
 from twin.errors import InputError
 from twin.evaluation.trials import (
     EPISODE_COLUMNS,
