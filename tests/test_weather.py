@@ -8,12 +8,13 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import runtime
+from twin.config import Condition
 from twin.env.domain_randomization import (
     EVALUATION_RANGES,
     KNOWN_WEATHER_FRACTION,
     RandomizationSample,
     Ranges,
-    lighting_options,
+    condition_options,
 )
 from twin.env.episode_lighting import LightingSets, sample_lighting
 from twin.env.suite import EnvFactory, fingerprint
@@ -209,9 +210,9 @@ def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows
 
 def test_validations_know_how_much_a_photo_leaves_to_be_drawn(photos, monkeypatch):
     names = ("foggy", "foggy+randomised", "day+randomised")
-    before = [fingerprint(photos, "ahead", name) for name in names]
+    before = [fingerprint(photos, "ahead", Condition.parse(name)) for name in names]
     monkeypatch.setattr("twin.env.suite.KNOWN_WEATHER_FRACTION", 0.5)
-    after = [fingerprint(photos, "ahead", name) for name in names]
+    after = [fingerprint(photos, "ahead", Condition.parse(name)) for name in names]
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, True]
 
 
@@ -257,7 +258,7 @@ def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]
 def test_days_of_an_evaluation_are_never_as_mild_as_those_of_training():
     """The road never has the film's sun: every draw of an evaluation shows another one, and shadows not filmed. Those
     of training begin at none."""
-    ranges, rng = lighting_options("day+randomised")["randomise"], np.random.default_rng(0)
+    ranges, rng = condition_options(Condition("day", True))["randomise"], np.random.default_rng(0)
     tried, trained = ([one.sample(rng) for _ in range(300)] for one in (ranges, Ranges()))
     for strength in ("sunlight", "shade"):
         least, first = (min(getattr(one, strength) for one in many) for many in (tried, trained))

@@ -8,7 +8,7 @@ chosen here and thus before anything is known of how they drive.
 from dataclasses import dataclass
 from pathlib import Path
 
-from twin.config import HELD_OUT, RANDOMIZED
+from twin.config import HELD_OUT, Condition
 from twin.evaluation.statistics import MIN_TRIALS
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.files import read_json
@@ -27,9 +27,9 @@ SHARES = (0.25, 0.5)
 """Of a run's steps, at which checkpoints are taken for the forecast."""
 EPISODES = 50
 """In the twin, per policy and lighting."""
-LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMIZED), "checkpoint": (HELD_OUT + RANDOMIZED,)}
+LIGHTINGS = {"final": (HELD_OUT, str(Condition(HELD_OUT, True))), "checkpoint": (str(Condition(HELD_OUT, True)),)}
 """Of the twin. The latter is what reality is compared with; the former, for finished policies, is the paper's."""
-PHOTOS = tuple(f"{name}{RANDOMIZED}" for name in WEATHER)
+PHOTOS = tuple(str(Condition(name, True)) for name in WEATHER)
 """Of the twin, by a photo of each day of the test: what reality is compared with, weather by weather."""
 PHOTO_EPISODES = 5
 """In the twin, per policy and weather."""

@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.errors import InputError, short_repr
 from twin.robot import HuskyParams
 
@@ -37,6 +37,14 @@ fog and the pictures of that day is 0.8 times that of the full randomization (0.
 _PAYLOAD_SIDE = 0.3  # [m] of the cube whose inertia the payload gets
 _TIRE_SUFFIX = "_tyre"
 _MAX_BOUND = 1e6
+_ABOVE_ZERO = float(np.nextafter(0.0, 1.0))
+_BOUNDS = {
+    **dict.fromkeys(("friction", "wheel_radius"), (_ABOVE_ZERO, _MAX_BOUND)),
+    **dict.fromkeys(("payload", "latency", "extinction", "airlight", "sunlight", "shade"), (0.0, _MAX_BOUND)),
+    "bystanders": (0.0, _MAX_BOUND),
+    "wheel_difference": (-0.5, 0.5),
+}
+"""Allowed values of ranges; others are within ±`_MAX_BOUND`."""
 _RANGES_BY_PARAMETER = {
     "friction": ("friction",),
     "center_of_mass": ("payload",),
@@ -87,23 +95,18 @@ class Ranges:
     def __post_init__(self) -> None:
         """Raises InputError: a value is not a range, or lies outside the allowed bounds."""
         for name, pair in self.by_name().items():
+            least, most = _BOUNDS.get(name, (-_MAX_BOUND, _MAX_BOUND))
             try:
-                low, high = np.asarray(pair, float)  # a fixed range may have a value per axis
-                valid = bool((np.abs([low, high]) < _MAX_BOUND).all())
+                low, high = np.asarray(pair, float)
+                per_axis = name in ("camera_shift", "camera_turn")  # these may be held at a value per axis
+                valid = (low.ndim == 0 or per_axis) and bool(np.all((least <= low) & (low <= high) & (high <= most)))
             except (TypeError, ValueError, OverflowError):
                 valid = False
             if not valid:
-                raise InputError(f"randomise: {name} = {short_repr(pair)}; expected (lowest, highest), finite numbers")
-            if not np.all(low <= high):
-                raise InputError(f"randomise: {name} = {short_repr(pair)}; expected (lowest, highest)")
-        for name in ("friction", "wheel_radius"):
-            if not getattr(self, name)[0] > 0.0:
-                raise InputError(f"randomise: {name} = {getattr(self, name)}; expected more than 0")
-        if max(map(abs, self.wheel_difference)) > 0.5:
-            raise InputError(f"randomise: wheel_difference = {self.wheel_difference}; expected at most ±0.5")
-        for name in ("payload", "latency", "extinction", "airlight", "sunlight", "shade", "bystanders"):
-            if not getattr(self, name)[0] >= 0.0:
-                raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
+                expected = "more than 0" if least == _ABOVE_ZERO else f"{least:,g}"
+                raise InputError(
+                    f"randomise: {name} = {short_repr(pair)}; expected (lowest, highest), from {expected} to {most:,g}"
+                )
 
     def by_name(self) -> dict[str, Range]:
         """Every range by its name."""
@@ -180,10 +183,9 @@ def measured_parameters(robot: HuskyParams) -> list[str]:
     return [name for name in _RANGES_BY_PARAMETER if getattr(robot, name) != getattr(published, name)]
 
 
-def lighting_options(lighting: str) -> dict[str, Any]:
-    """Environment options for a lighting's name in tables, such as `held-out+randomised`."""
-    plain = lighting.removesuffix(RANDOMIZED)
-    return {"lighting": plain, "randomise": EVALUATION_RANGES if plain != lighting else None}
+def condition_options(condition: Condition) -> dict[str, Any]:
+    """Environment options for the evaluation of a policy under a condition."""
+    return {"lighting": condition.lighting, "randomise": EVALUATION_RANGES if condition.randomised else None}
 
 
 class NominalModel:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from twin.env.mujoco_renderer import ChaseCamera, SceneCamera
 from twin.env.observation import PixelObserver
-from twin.env.options import parse_options
+from twin.env.options import IMAGE_SIZE, check_option, parse_options
 from twin.env.vector_env import ProcessVectorEnv, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError, short_repr
@@ -37,7 +37,6 @@ from twin.warp_runtime import wp
 ROBOT, CHASE = "robot", "chase"
 
 _RENDER_SIZE = 640, 360  # [px] default width and height of a chase view
-_MIN_SIDE, _MAX_SIDE = 8, 4096  # [px]
 
 
 def make_spaces(envs: LocalVectorEnv | ProcessVectorEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -68,13 +67,7 @@ def _check_view(size: Any, view: str, pixels: bool) -> tuple[int, int] | None:
         raise InputError(f"render_view = {short_repr(view)}; expected {ROBOT!r} or {CHASE!r}")
     if size is None:
         return _RENDER_SIZE if view == CHASE else None
-    valid = isinstance(size, Sequence) and not isinstance(size, str) and len(size) == 2
-    if not valid or not all(
-        isinstance(n, int | np.integer) and not isinstance(n, bool) and _MIN_SIDE <= n <= _MAX_SIDE for n in size
-    ):
-        raise InputError(
-            f"render_size = {short_repr(size)}; expected (width, height), whole numbers from {_MIN_SIDE} to {_MAX_SIDE}"
-        )
+    check_option("render_size", size, IMAGE_SIZE)
     if view == ROBOT and not pixels:
         raise InputError(
             f"render_size = {short_repr(size)} with pixels=False: no field is loaded; expected pixels=True, or "

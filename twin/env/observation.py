@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.env.camera_noise import CameraNoise
 from twin.env.compositor import Compositor
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
@@ -91,7 +91,7 @@ class PixelObserver:
     def info(self, i: int) -> dict[str, Any]:
         """Entries of env i's info: `lighting`, by its name in tables, and `trust`."""
         lighting = self.lightings[i]
-        name = lighting.name + (RANDOMIZED if self.options.randomise else "") if lighting else ""
+        name = str(Condition(lighting.name, bool(self.options.randomise))) if lighting else ""
         return {"lighting": name, "trust": float(self.trust[i])}
 
     def _add_frames(self, which: Sequence[int], fill: bool) -> None:

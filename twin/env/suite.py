@@ -18,7 +18,7 @@ import numpy as np
 from dm_env import specs
 from scipy.spatial import cKDTree
 
-from twin.config import HELD_OUT, RANDOMIZED, TRAINING
+from twin.config import HELD_OUT, TRAINING, Condition
 from twin.config_file import load_config
 from twin.env import episode_lighting
 from twin.env.compositor import Compositor, ObjectRenderer
@@ -120,27 +120,28 @@ class EnvFactory:
         return PixelObserver(SceneRenderer(spec.compile(), size, count), None, self.trust, self.options, envs)
 
 
-def fingerprint(twin: Twin, task: str, lighting: str) -> str:
+def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     """Returns a digest of everything that determines an episode, except for its seed and driver.
 
     It covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`, photo
-    lightings that `lighting` names, the version of lighting sets, and the randomization of a `+randomised` lighting.
+    lightings that the condition names, the version of lighting sets, and the randomization of a randomized condition.
 
     Raises:
         InputError: see `EnvFactory.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
     ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
-    randomization = {"version": VERSION, "ranges": ranges} if lighting.endswith(RANDOMIZED) else {}
-    plain = lighting.removesuffix(RANDOMIZED)
-    photos = [path for name in plain.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()]
+    randomization = {"version": VERSION, "ranges": ranges} if condition.randomised else {}
+    photos = [
+        path for name in condition.lighting.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()
+    ]
     return digest_json(
         {
             "stages": [stage_result(twin.scene, factory) for factory in ("field", "mjcf")],
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
             **({"randomise": randomization} if randomization else {}),
-            **({"lights": episode_lighting.VERSION} if plain in (TRAINING, HELD_OUT) else {}),
+            **({"lights": episode_lighting.VERSION} if condition.lighting in (TRAINING, HELD_OUT) else {}),
             "photos": [digest_file(path) for path in photos],
             **({"untold": KNOWN_WEATHER_FRACTION} if photos and randomization else {}),
         }

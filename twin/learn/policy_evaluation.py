@@ -25,7 +25,8 @@ import numpy as np
 
 from twin import runtime
 from twin.cli import signals_held, signals_kept
-from twin.env.domain_randomization import Ranges, lighting_options
+from twin.config import Condition
+from twin.env.domain_randomization import Ranges, condition_options
 from twin.env.suite import EnvFactory
 from twin.env.vector_env import ProcessVectorEnv, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
@@ -54,9 +55,8 @@ class EpisodeChunk:
     source: str
     """See `load_policy`."""
     trust: bool
-    lighting: str
-    """See `env/episode_lighting.py`; or `drawn_<number>`, see `with_sampled_lighting`. With `+randomised`, robot,
-    weather and distractor objects are randomized as far as they are not known, see `env/domain_randomization.py`."""
+    condition: Condition
+    """Its lighting may be `drawn_<number>`, see `with_sampled_lighting`."""
     seeds: tuple[int, ...]
 
 
@@ -80,7 +80,7 @@ def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:
 
     Raises InputError: the policy, scene, task or lighting does not exist.
     """
-    envs = _vector_env(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting)
+    envs = _vector_env(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.condition)
     return run_episodes(_policy(chunk.source, chunk.trust), envs, chunk.seeds)
 
 
@@ -182,13 +182,13 @@ def _factory(scene: str, task: str, source: str, trust: bool, randomise: Ranges 
 
 
 @lru_cache(maxsize=1)
-def _vector_env(scene: str, task: str, source: str, trust: bool, lighting: str) -> LocalVectorEnv:
-    options = lighting_options(lighting)
+def _vector_env(scene: str, task: str, source: str, trust: bool, condition: Condition) -> LocalVectorEnv:
+    options = condition_options(condition)
     factory = _factory(scene, task, source, trust, options["randomise"])
-    sampled = _SAMPLED_LIGHTING.fullmatch(options["lighting"])
+    sampled = _SAMPLED_LIGHTING.fullmatch(condition.lighting)
     if sampled:
         factory = with_sampled_lighting(factory, int(sampled[1]))
-    lit = dataclasses.replace(factory.options, lighting=options["lighting"])
+    lit = dataclasses.replace(factory.options, lighting=condition.lighting)
     return LocalVectorEnv(dataclasses.replace(factory, options=lit), [None] * _ENVS)
 
 

@@ -29,7 +29,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin.cli import StopNotice, Stopped, stop_noted
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
@@ -109,7 +109,7 @@ def train(
             `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
-    road = fingerprint(twin, config.task, config.lighting + (RANDOMIZED if config.randomise else ""))
+    road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
     settings = json.loads(json.dumps({**dataclasses.asdict(config), "road": road}))  # as they are read again
     resume = has_state(folder / "state")
     if resume:
