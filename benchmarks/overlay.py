@@ -24,9 +24,9 @@ from record import add_record_options, save
 
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
-from twin.env.mujoco_renderer import camera_pose
 from twin.env.obstacle_models import ObstacleModel, add_obstacle_geoms
 from twin.env.obstacles import add_obstacles, place
+from twin.env.physics import camera_pose
 from twin.geometry.cameras import Cameras, opencv_to_mujoco
 from twin.geometry.poses import Similarity
 from twin.loading import load_scene

@@ -8,8 +8,9 @@ from test_baked import LOW, baked, wall
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraNoise, CameraOptions, soft_clip
 from twin.env.compositor import Compositor, ObjectRenderer
-from twin.env.mujoco_renderer import camera_intrinsics, camera_pose
+from twin.env.mujoco_renderer import camera_intrinsics
 from twin.env.obstacles import add_obstacles
+from twin.env.physics import camera_pose
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints
 from twin.mjcf.husky import ZED2, PixelCamera, add_husky

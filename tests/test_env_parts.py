@@ -96,8 +96,8 @@ def test_training_and_held_out_lights_never_mix(field):
     sets, rng = LightingSets(field), np.random.default_rng(5)
     for which in (TRAINING, HELD_OUT):
         for _ in range(20):
-            assert sets.set_of(sets.sample(which, rng)) == which
-    assert all(sets.set_of(field.embedding(name)) == TRAINING for name in field.lightings)
+            assert sets.set_and_anchor(sets.sample(which, rng))[0] == which
+    assert all(sets.set_and_anchor(field.embedding(name))[0] == TRAINING for name in field.lightings)
     # Nearer to each other than to their own set is nobody.
     train, held = ([sets._probe_colors(sets.sample(w, rng)) for _ in range(15)] for w in (TRAINING, HELD_OUT))
     gap = min(float(np.sqrt(((a - b) ** 2).mean())) for a in train for b in held)
@@ -121,8 +121,9 @@ def test_between_training_and_held_out_lights_is_a_gap(field):
             assert far[other] > 1.2 * far[which]
     (start, *_), (end, *_) = anchors.embeddings[~anchors.held_out], anchors.embeddings[anchors.held_out]
     way = [start + share * (end - start) for share in np.linspace(0.0, 1.0, 200).astype(np.float32)]
-    between = [light for light in way if sets.set_of(light) is None]
-    assert len(between) > 5 and sets.set_of(way[0]) == TRAINING and sets.set_of(way[-1]) == HELD_OUT
+    between = [light for light in way if sets.set_and_anchor(light)[0] is None]
+    ends = sets.set_and_anchor(way[0])[0], sets.set_and_anchor(way[-1])[0]
+    assert len(between) > 5 and ends == (TRAINING, HELD_OUT)
     assert all(max(far.values()) < 1.3 * min(far.values()) for far in map(distances, between))
 
 
@@ -141,7 +142,7 @@ def test_a_photo_added_later_moves_no_set():
     lights = [plain.sample_lighting(rng) for _ in range(30)]
     added.add_lightings({"photo": np.array([0.4, 0.5, 0.3, 0.0], np.float32)})
     before, after = LightingSets(plain), LightingSets(added)
-    assert [before.set_of(light) for light in lights] == [after.set_of(light) for light in lights]
+    assert [before.set_and_anchor(light)[0] for light in lights] == [after.set_and_anchor(light)[0] for light in lights]
 
 
 def test_sampled_lightings_follow_the_option(field):

@@ -12,8 +12,9 @@ from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
 from twin.env.domain_randomization import NominalModel, RandomizationSample, Ranges
-from twin.env.mujoco_renderer import SceneRenderer, camera_pose
+from twin.env.mujoco_renderer import SceneRenderer
 from twin.env.options import NERF, SIMULATOR
+from twin.env.physics import camera_pose
 from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.geometry.cameras import Viewpoints
 

@@ -38,7 +38,7 @@ _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px
 
 @dataclass(frozen=True)
 class RenderedObjects:
-    """A window of the picture with the objects in it. Arrays of shape (height, width), color (height, width, 3)."""
+    """Objects in a window of the picture; arrays (height, width), color (height, width, 3)."""
 
     window: tuple[int, int, int, int]
     """Left, top, width, height [px]."""
@@ -53,9 +53,9 @@ class RenderedObjects:
 class ObjectRenderer:
     """Draws obstacles and robots of one model, one env at a time. Not for two threads at once.
 
-    A small model of their geoms alone is cast, only with rays of pixels that some geom's box may cover: one each, and
-    four each at edges, for smooth outlines. Its lights make the drawn color the surface's normal; the object's color is
-    then its own times the irradiance of that normal.
+    It casts rays into a model of these geoms alone, for pixels that some geom's bounding box covers: one per pixel, and
+    four at edges, for smooth outlines. That model is lit such that the drawn color encodes the surface's normal. An
+    object's shaded color is its own color times the irradiance of the normal.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
@@ -103,18 +103,13 @@ class ObjectRenderer:
         self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
 
     def visible_mask(self, data: mujoco.MjData, pose: Array) -> NDArray[np.bool_] | None:
-        """Pixels that some geom may cover, shape (height, width); None where nothing is in view.
-
-        Args:
-            data: Current poses of the geoms.
-            pose: camera_to_world, OpenCV axes, shape (4, 4).
-        """
+        """Pixels that some geom may cover from an OpenCV pose, shape (height, width); None if no geom is in view."""
         if len(self.geoms) == 0:
             return None
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         middles = data.geom_xpos[self.geoms] - pose[:3, 3] + np.einsum("nij,nj->ni", turns, self._centers)
         planes = self._planes @ pose[:3, :3].T
-        # How far a box reaches into a half space: its center, plus its half sides projected onto the normal.
+        # Distance that a box reaches into a half space: its center, plus its half sides projected onto the normal.
         reach = middles @ planes.T + np.einsum("npj,nj->np", np.abs(planes @ turns), self._halves)
         reach[:, -1] -= _NEAR_PLANE
         seen = np.flatnonzero((reach > 0.0).all(1))
@@ -139,13 +134,9 @@ class ObjectRenderer:
     def render(
         self, data: mujoco.MjData, pose: Array, mask: NDArray[np.bool_], irradiance: Irradiance | None
     ) -> RenderedObjects | None:
-        """Draws the pixels of a mask from `visible_mask`; None where nothing covers them.
+        """Draws the pixels of a mask from `visible_mask`; None if no geom covers them.
 
-        Args:
-            data: Current poses of the geoms.
-            pose: camera_to_world, OpenCV axes, shape (4, 4).
-            mask: Shape (height, width).
-            irradiance: Irradiance that shades the objects; None: their own plain colors.
+        `irradiance` shades the objects; None: their own plain colors.
         """
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         camera = opencv_to_mujoco(pose)
@@ -203,7 +194,7 @@ class ObjectRenderer:
     def _shader(
         self, data: mujoco.MjData, irradiance: Irradiance | None
     ) -> Callable[[NDArray[np.int32], Array32], Array32]:
-        """A function that colors drawn geoms (n,) with normals (n, 3), shape (n, 3); 0 where there is none."""
+        """A function from drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 where the geom is −1."""
         ground = irradiance.ground(data.xpos[self._bodies, :2]) if irradiance else None
 
         def shade(geom: NDArray[np.int32], normals: Array32) -> Array32:
@@ -312,11 +303,10 @@ class Compositor:
         self.size, self.max_envs, self._field = size, max_envs, field
         self._camera = model.camera(FRONT_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
-        # Warp's default device is global to the process and worker threads change it, so it is set to the CPU here.
-        # On a GPU all threads share one CUDA stream, so one worker is enough.
+        # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
-        # One after the other, as Warp compiles kernels at their first use.
+        # In sequence, as Warp compiles kernels at their first use. On a GPU all threads share one CUDA stream.
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)
@@ -334,8 +324,7 @@ class Compositor:
         """Renders the front camera of every env.
 
         Args:
-            datas: State of every env when the picture is taken, with its time and the poses of geoms and cameras
-                (`mj_forward` or `mj_kinematics` and `mj_camlight` after the last step; `HuskyPhysics.delayed_data`).
+            datas: State of every env, with poses of geoms and cameras (after `mj_kinematics` and `mj_camlight`).
             lighting: As for `BakedField.render`: one, or one per env.
             noise: Camera imperfections of each env; None: perfect cameras.
             weather: Weather of each env; None: that of the film.
@@ -350,7 +339,7 @@ class Compositor:
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
         lightings: list[Lighting] = [lighting] * len(datas) if one else list(lighting)  # type: ignore[list-item]
 
-        todo = iter(range(len(datas)))  # shared: each idle worker takes the next env, because cores differ in speed
+        todo = iter(range(len(datas)))  # shared: each idle worker takes the next env
 
         def composite_all(worker: _CompositorWorker) -> None:
             for k in todo:
@@ -406,7 +395,7 @@ class _CompositorWorker:
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
-        # One field per window size, since a field keeps render targets of few sizes.
+        # One per window size, since a field keeps render targets of few sizes.
         if (across, down) not in self._fields:
             self._fields[across, down] = self._field.single_threaded()
         view = Viewpoints.of(pose, self._intrinsics - np.array([0.0, 0.0, left, top]), (across, down))
@@ -422,8 +411,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index of the window in its arrays.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`, arrays (height, width): color (not premultiplied), depth and opacity of
-            the field alone.
+        front: The field up to `drawn.depth`, with colors not premultiplied, arrays (height, width).
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

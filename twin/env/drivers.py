@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,38 +132,31 @@ def follow_route(
     timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
     physics.reset()
 
-    times, bases, cameras, positions, commands, errors, feet = [], [], [], [], [], [], []
+    rows: list[dict[str, Any]] = []
     touched: set[str] = set()
     driver = PurePursuit(world.route, speed, physics.params.max_yaw_rate)
-    while True:
+    outcome = ""
+    while not outcome:
         pose = physics.planar_pose
         foot, error = driver.update(pose)
-        times.append(physics.time)
-        bases.append(physics.base_to_world)
-        cameras.append(physics.camera_to_world)
-        positions.append(physics.data.qpos.copy())
-        errors.append(error)
-        feet.append(foot)
         outcome = _outcome(world, pose, driver.s, length, abs(error), touched, physics.time > timeout)
-        if outcome:
-            commands.append((0.0, 0.0))
-            break
-        command = driver.command(pose)
-        commands.append(command)
-        physics.command(*command)
-        physics.step()
-        touched |= set(physics.touched)
-    return RecordedDrive(
-        times=np.array(times),
-        base_to_world=np.array(bases),
-        camera_to_world=np.array(cameras),
-        qpos=np.array(positions),
-        commands=np.array(commands),
-        cross_track=np.array(errors),
-        progress=np.array(feet),
-        touched=tuple(sorted(touched)),
-        outcome=outcome,
-    )
+        rows.append(
+            {
+                "times": physics.time,
+                "base_to_world": physics.base_to_world,
+                "camera_to_world": physics.camera_to_world,
+                "qpos": physics.data.qpos.copy(),
+                "commands": (0.0, 0.0) if outcome else driver.command(pose),
+                "cross_track": error,
+                "progress": foot,
+            }
+        )
+        if not outcome:
+            physics.command(*rows[-1]["commands"])
+            physics.step()
+            touched |= set(physics.touched)
+    arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return RecordedDrive(**arrays, touched=tuple(sorted(touched)), outcome=outcome)
 
 
 def _outcome(world: World, pose: Array, s: float, length: float, error: float, touched: set[str], late: bool) -> str:

@@ -3,8 +3,8 @@
     gymnasium.make("twin:twin/Drive-v0", scene="scenes/demo", task="right_turn", lighting="night")
     gymnasium.make_vec("twin:twin/Drive-v0", 8, vectorization_mode="vector_entry_point", scene="scenes/demo")
 
-`twin:` makes Gymnasium import `twin`, which registers the environment. Processes that have not imported it need this:
-`make_vec_env("twin:twin/Drive-v0", vec_env_cls=SubprocVecEnv, ...)` of stable-baselines3 starts such processes.
+`twin:` makes Gymnasium import `twin`, which registers the environment; new processes, such as those of
+stable-baselines3's SubprocVecEnv, need this.
 
 Actions in [-1, 1] span the action range of the dm_control environment. Observations are images, uint8, shape
 (3 · stack, height, width), the newest three channels last; with `pixels=False` the privileged state, float32, see
@@ -138,9 +138,9 @@ class DriveEnv(gymnasium.Env):
     def render(self) -> NDArray | None:
         """A picture, uint8 (height, width, 3).
 
-        By default it is the newest image of the observation; None without pixels. With `render_size`, it is what the
-        robot's camera sees at that instant, with the episode's lighting, obstacles and weather, but without camera
-        noise. The chase view is of the present instant. Rendering changes no observation and no random draw.
+        By default it is the newest image of the observation; None without pixels. With `render_size`, it is the robot's
+        view at that instant, with the episode's lighting, obstacles and weather, but without camera noise. The chase
+        view shows the present. Rendering changes no observation and no random draw.
         """
         if self.render_mode is None:
             return None

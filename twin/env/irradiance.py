@@ -1,4 +1,4 @@
-"""Irradiance on objects in a radiance field, estimated from the field itself for any lighting.
+"""Light on objects in a radiance field: irradiance, estimated from the field for any lighting, and contact shadows.
 
 A field stores colors, not light. *Irradiance* is the color, in the film under a lighting, of a perfectly white surface
 of a given normal: an object's own color times the irradiance is its color in the picture. The irradiance of a
@@ -30,10 +30,9 @@ from twin.nerf.baked import BakedField
 from twin.types import Array
 
 GROUND_ALBEDO = 0.37
-"""Reflectance assumed for the ground along the route, in film colors: worn asphalt reflects about 11 %, which the tone
-curve of a film (exponent 1 / 2.2) shows as 0.37. The value was tuned on the known-truth world: it was 0.38 (12 %), and
-became 0.37 when obstacles at night failed the threshold of `benchmarks/overlay.py` (6 dB better than unshaded),
-which they meet with 0.37. So that benchmark's figures are not independent of the value."""
+"""Assumed reflectance of the ground along the route, in film colors: worn asphalt reflects about 11 %, which the tone
+curve of a film (exponent 1 / 2.2) shows as 0.37. It was lowered from 0.38 (12 %) so that obstacles at night pass the
+threshold of `benchmarks/overlay.py` (6 dB better than unshaded); that benchmark is not independent of it."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 """Horizontal directions that light is resolved into, shape (4, 3)."""
@@ -65,12 +64,11 @@ class Irradiance:
     up: Array
     """Ground irradiance at them, shape (k, 3)."""
     constant: Array
-    """Constant part of the light on normals that do not face up, and of that from each of `SIDE_DIRECTIONS`, shape
-    (5, 3)."""
+    """Constant part of the light on normals that do not face up, and from each of `SIDE_DIRECTIONS`, (5, 3)."""
     proportional: Array
     """The same per unit of ground irradiance, shape (5, 3)."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
-    """Ground irradiance at recent positions, as most objects stand still."""
+    """Ground irradiance at recent positions; most objects stand still."""
 
     def ground(self, xy: Array) -> Array:
         """Ground irradiance at positions (n, 2) [m], shape (n, 3)."""
@@ -291,8 +289,8 @@ BOX_CORNERS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).resha
 """Corners of a box around the origin, in half sides, shape (8, 3)."""
 
 _PENUMBRA = 0.03, 0.10
-"""Half width of the penumbra at the foot [m], and its growth per metre behind the foot; includes the sun's disk, its
-halo and the error of the estimated direction."""
+"""Half width of the penumbra at the foot [m], and its growth per metre behind the foot; covers the sun's disk and halo,
+and the error of the estimated direction."""
 _FILL = 0.85  # fraction of a box's sides that an obstacle really fills
 _SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
 _SKY_REACH = 1.2  # [m] from an obstacle's side up to which it hides the sky
@@ -304,11 +302,10 @@ _MAX_DISTANCE = 25.0  # [m] from the camera, beyond which shadows are not drawn
 class ContactShadows:
     """Soft shadows of a model's obstacles on the reconstructed ground.
 
-    The sky is taken as uniform except for one sun, whose direction and share of the light `Irradiance.sun` estimates.
-    The ground beside an obstacle loses the part of the sky that the obstacle hides; the ground behind it loses the sun
-    within the obstacle's outline, with a penumbra that widens with the distance. So under clouds the ground darkens
-    around the foot alone, and in sunshine on the far side. An obstacle is approximated by two upright boxes, around its
-    lower and its upper geoms.
+    The light is that of a uniform sky and one sun, whose direction and share `Irradiance.sun` estimates. The ground
+    beside an obstacle loses the part of the sky that the obstacle hides; the ground behind it loses the sun within the
+    obstacle's outline, with a penumbra that widens with the distance. An obstacle is approximated by two upright boxes,
+    around its lower and its upper geoms.
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: NDArray[np.int64]):
@@ -329,15 +326,15 @@ class ContactShadows:
     def darken(
         self, rgb: NDArray, depth: NDArray, rays: Array, pose: Array, data: mujoco.MjData, irradiance: Irradiance
     ) -> None:
-        """Multiplies the colors of shadowed ground, in place.
+        """Darkens shadowed ground in a picture (height, width, 3) of the field, in place.
 
         Args:
-            rgb: Colors of the field, shape (height, width, 3).
-            depth: z-depth of the field [m], shape (height, width).
+            rgb: The picture.
+            depth: Its z-depth [m], shape (height, width).
             rays: Rays of the pixels in the camera frame, with z = 1, shape (height, width, 3).
             pose: camera_to_world, OpenCV axes, shape (4, 4).
-            data: Current poses of the bodies.
-            irradiance: Irradiance of the lighting.
+            data: Poses of the bodies.
+            irradiance: Of the lighting.
         """
         for body, boxes in self._boxes.items():
             foot = data.xpos[body]

@@ -18,6 +18,7 @@ from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraNoise
 from twin.env.obstacle_models import OBSTACLE_GROUP
 from twin.env.obstacles import add_obstacles, place
+from twin.env.physics import camera_pose
 from twin.env.weather import Weather
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.poses import look_at
@@ -52,14 +53,6 @@ def camera_intrinsics(model: mujoco.MjModel, camera: int, size: tuple[int, int])
     return np.array([focal, focal, width / 2, height / 2])
 
 
-def camera_pose(data: mujoco.MjData, camera: int) -> Array:
-    """camera_to_world of a camera, OpenCV axes, shape (4, 4)."""
-    pose = np.eye(4)
-    pose[:3, :3] = data.cam_xmat[camera].reshape(3, 3)
-    pose[:3, 3] = data.cam_xpos[camera]
-    return opencv_to_mujoco(pose)
-
-
 def camera_poses(datas: Sequence[mujoco.MjData], camera: int, noise: Sequence[CameraNoise] | None) -> Array:
     """camera_to_world of a camera in n envs, with the vibration of `noise` if given, shape (n, 4, 4)."""
     poses = np.stack([camera_pose(data, camera) for data in datas])
@@ -92,7 +85,7 @@ class RayCaster:
     def set_rays(self, rays: Array32) -> None:
         """Sets the unit rays (k, 3) in MuJoCo's camera axes; k is at most `max_rays`."""
         self._context.ray.numpy()[: len(rays)] = rays
-        # The context's own rays are those of a whole picture; it casts only the first `total_rays`.
+        # The context has rays of a whole picture; only the first `total_rays` are cast.
         self._context.total_rays = len(rays)
 
     def cast(self) -> tuple[Array32, Array32]:
@@ -119,10 +112,9 @@ def mujoco_rays(rays: Array) -> Array32:
 
 
 class SceneRenderer:
-    """Renders envs as MuJoCo itself shows them to their front cameras; takes the arguments of `Compositor`.
+    """Renders envs as MuJoCo shows them to their front cameras; has the interface of `Compositor`.
 
-    The extracted mesh in its filmed colors, the ground, obstacles and the robot are drawn through the same camera as
-    the field's pictures, under the model's own lights, whatever lighting is requested.
+    It draws the visual mesh in its filmed colors, the ground, obstacles and the robot, under the model's own lights.
     """
 
     def __init__(self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int) -> None:
@@ -145,7 +137,7 @@ class SceneRenderer:
         noise: Sequence[CameraNoise] | None = None,
         weather: Sequence[Weather | None] = (),
     ) -> Rendering:
-        """Renders the front camera of every env; arguments as of `Compositor.render`, `lighting` has no effect."""
+        """See `Compositor.render`; `lighting` has no effect."""
         poses = camera_poses(datas, self._camera, noise)
         width, height = self.size
         rgb = np.empty((len(datas), height, width, 3), np.float32)
@@ -204,8 +196,7 @@ _SMOOTHING = 0.15  # low-pass gain of the camera heading per control step (0.1 s
 _PART_GROUPS = [3]
 _PART_ALPHA = 0.45
 _EDGE_RGB = (20, 20, 30)
-# Parts lie close to the visual mesh; a part up to this far behind the visible surface counts as visible.
-_OCCLUSION_TOLERANCE = 0.6  # [m]
+_OCCLUSION_TOLERANCE = 0.6  # [m] behind the visible surface, up to which a part counts as visible
 
 
 class SceneCamera:
@@ -217,10 +208,7 @@ class SceneCamera:
         size: tuple[int, int],
         obstacles: Sequence[ObstacleConfig] = (),
     ) -> None:
-        """Compiles the scene with obstacles and a free camera for pictures of `size` (width, height) [px].
-
-        `obstacles` may then be set to some of them; the others are not shown.
-        """
+        """`size`: width, height [px]. The attribute `obstacles` may be set to a subset; the others are not shown."""
         spec = mujoco.MjSpec.from_file(str(world.model_path))
         self.obstacles = tuple(obstacles)
         add_obstacles(spec, self.obstacles, world)
@@ -236,13 +224,13 @@ class SceneCamera:
             self._casters.append(
                 RayCaster(self.model, self.data, **view, enabled_geom_groups=_PART_GROUPS, render_seg=True)
             )
-        # Warp compiles kernels at first launch. Compiling two at once in two threads of a process corrupts them
-        # (observed: pictures without ground), so each caster runs once here, in sequence.
+        # Warp compiles kernels at their first launch; compiling in two threads at once corrupts them (observed:
+        # pictures without ground). So each caster runs once here.
         for caster in self._casters:
             self._cast(caster)
 
     def render(self, qpos: Array, camera_to_world: Array, time: float = 0.0) -> Image:
-        """Renders the scene with the robot at `qpos` at a time [s] from an OpenCV camera pose, shape (h, w, 3)."""
+        """The scene at a time [s], with the robot at `qpos`, from an OpenCV camera pose; shape (h, w, 3)."""
         self.data.qpos[:] = qpos
         place(self.obstacles, self.data, time)
         mujoco.mj_kinematics(self.model, self.data)

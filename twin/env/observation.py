@@ -46,9 +46,9 @@ class PixelObserver:
         """
         Args:
             renderer: Renders the envs.
-            field: Field of the place, with its lightings; None where MuJoCo renders the mesh under its own lights.
-            trust: Trust of pictures, from the filmed frames.
-            options: Size, stack, lighting.
+            field: Contains the lightings; None: MuJoCo renders the mesh under its own lights.
+            trust: From the filmed frames.
+            options: Of the envs.
             envs: Physics and task of every env.
         """
         self._renderer, self.options, self.envs = renderer, options, list(envs)
@@ -75,7 +75,7 @@ class PixelObserver:
             if o.camera:
                 self._noise[i] = CameraNoise(o.camera, task.rng(CAMERA))
             fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
-            # Clear air in a photo is known weather, too.
+            # A photo without fog determines the weather, too.
             if fog is not None and o.randomise and o.randomise.hold_known:
                 task.set_weather(task.sample.for_known_weather())
             has_weather = fog is not None or o.randomise
@@ -132,8 +132,11 @@ def _push_frames(
     stacks: wp.array4d(dtype=wp.uint8),
     below: wp.array2d(dtype=float),
 ):
-    """Adds frames to the stacks of some envs, or fills the stacks with them. Sums over the lower halves, from pixel
-    `lower` on: opacity, and the number of pixels whose opacity is below `sky`."""
+    """Adds frames to the stacks of some envs, or fills the stacks with them.
+
+    `below` sums up, over the lower halves (from pixel `lower` on), opacity and the number of pixels with less than
+    `sky`.
+    """
     k, pixel = wp.tid()
     env, depth = which[k], stacks.shape[1]
     for channel in range(3):
@@ -153,14 +156,12 @@ def _push_frames(
 class GpuPixelObserver(PixelObserver):
     """Renders n envs and keeps their frame stacks on the field's device, for policies that learn there.
 
-    It shows the field alone. Envs with obstacles, weather or camera noise need `PixelObserver`, which composites on the
-    host.
+    It shows the field alone. Obstacles, weather and camera noise need `PixelObserver`, which composites on the host.
     """
 
     def __init__(
         self, field: BakedField, trust: Trust, options: Options, envs: Sequence[tuple[DrivePhysics, DriveTask]]
     ) -> None:
-        """Arguments as of `PixelObserver`; options have no camera noise, randomization or lighting of a hazy photo."""
         self.options, self.envs, self._field = options, list(envs), field
         self._trust, self._sets = trust, LightingSets(field)
         model, (width, height), n = envs[0][0].robot.model, options.size, len(envs)
@@ -170,7 +171,7 @@ class GpuPixelObserver(PixelObserver):
         self.trust = np.zeros(n)
         self._noise, self._weather = [None] * n, [None] * n
         self.camera_poses: CameraPoses = self._camera_poses
-        """Returns the cameras' OpenCV poses (k, 4, 4) and times (k,) [s] at the newest frames of some envs."""
+        """Function from indices of k envs to OpenCV poses (k, 4, 4) and times (k,) [s] of their newest frames."""
 
     @property
     def stacks(self) -> Image:  # type: ignore[override]

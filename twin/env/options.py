@@ -1,4 +1,7 @@
-"""Options of an environment. Defaults are those of DriveEnv-NeRF (arXiv 2403.15791) where the paper states them."""
+"""Options of an environment, their checks, and the check of actions.
+
+Defaults are those of DriveEnv-NeRF (arXiv 2403.15791) where the paper states them.
+"""
 
 import dataclasses
 import difflib
@@ -39,11 +42,9 @@ class Rewards:
     progress: float = 0.0
     """Reward per meter along the route; backward motion counts negative."""
     cross_track: float = 0.0
-    """Reward per step, times the distance from the route as a fraction of the corridor's half width; a penalty if
-    negative."""
+    """Reward per step, times the distance from the route as a fraction of the corridor's half width."""
     steering: float = 0.0
-    """Reward per step, times the square of the commanded yaw rate as a fraction of the largest; a penalty if
-    negative."""
+    """Reward per step, times the square of the commanded yaw rate as a fraction of the largest."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Options:
     stack: int = 4
     """Number of images in an observation, the newest last."""
     pixels: bool = True
-    """Observe images; otherwise the state of `DriveTask.get_observation`, which is fast and needs no field."""
+    """Observe images; otherwise the state of `RewardAndTermination.state`, which needs no field."""
     action: str = TWIST
     """twist (v [m/s], ω [rad/s]) or steering (ω [rad/s] at fixed speed)."""
     speed: float = 1.0
@@ -86,10 +87,9 @@ class Options:
     camera: CameraOptions | None = None
     """Camera noise: vibration, exposure, blur. None: no noise."""
     randomise: Ranges | None = None
-    """Ranges of robot, weather and distractor objects from episode to episode; None: no randomization. `True` means the
-    default ranges."""
+    """Ranges of robot, weather and distractor objects; True: the default ones; None or False: no randomization."""
     device: str = CPU
-    """cpu or cuda. cuda renders fields on the GPU, and steps vector environments there."""
+    """cpu or cuda, which renders fields and steps vector environments on the GPU."""
 
 
 # ---- checks

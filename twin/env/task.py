@@ -1,4 +1,4 @@
-"""Driving along a route segment as a dm_control task: reward, termination, start, state; poses and contacts, no images.
+"""Driving along a route segment in dm_control: physics and task, with start, state, reward and termination; no images.
 
 An *episode* starts at rest near the segment's start and ends with one of `CAUSES`. The discount at the end is 0; at a
 timeout it is 1, as the episode is only truncated. An episode's seed determines all its randomness. Start, robot,
@@ -81,9 +81,9 @@ class Motion:
 class RewardAndTermination:
     """Reward, termination and state of n drives along one route segment.
 
-    A task uses it for one drive, a GPU vector environment for all of its drives, so both compute the same numbers.
-    `which` selects k of the n drives. The *foot* is the arc length of the route's point nearest to the robot's base;
-    progress is the distance of the foot from the segment's start.
+    A task uses it for one drive, a GPU vector environment for all of its drives. `which` selects k of the n drives. The
+    *foot* is the arc length of the route's point nearest to the robot's base; progress is the foot's distance from the
+    segment's start.
     """
 
     def __init__(self, world: World, segment: RouteSegment, options: Options, count: int = 1) -> None:
@@ -161,8 +161,8 @@ class RewardAndTermination:
         `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] left positive, `heading_error` [rad] of the robot against
         the route, `turns` [rad]: change of the route's heading 1, 2 and 4 m ahead.
 
-        The state is clipped to `state_bounds`. Angles cannot leave them; the others do only if the robot moves ten
-        times as fast as its controller allows, as in a fall.
+        The state is clipped to `state_bounds`, which matters only if the robot moves ten times as fast as its
+        controller allows, as in a fall.
         """
         foot = self.foot[which]
         heading = heading_at(self._route, foot)
@@ -179,13 +179,13 @@ class RewardAndTermination:
 
 
 class DrivePhysics(dm_mujoco.Physics):
-    """A dm_control Physics of one robot in one episode's model, with the quantities of `HuskyPhysics`."""
+    """A dm_control Physics of one robot, with quantities of `HuskyPhysics`."""
 
     _params = HuskyParams()
 
     @staticmethod
     def of(model: mujoco.MjModel, params: HuskyParams) -> "DrivePhysics":
-        """Returns physics of a model that `episode_spec` made for a robot; keeps the model, without a copy."""
+        """Returns physics that steps this model, without a copy, which `episode_spec` made for the robot."""
         physics = DrivePhysics(wrapper.MjData(wrapper.MjModel(model)))
         physics.set_robot(params)
         return physics
@@ -256,13 +256,13 @@ class DriveTask(control.Task):
     ) -> None:
         """
         Args:
-            world: Route and corridor.
+            world: Route, corridor and robot.
             segment: Route segment to drive.
-            options: Start, action, limits, rewards, randomization.
+            options: Of the environment.
             obstacles: Samples an episode's obstacles; the model contains its pool.
-            model: The unmodified compiled model; physics may step a copy.
+            model: The unmodified compiled model; physics steps a copy.
             seed: Seed of the sequence of episodes; None: unpredictable.
-            evaluator: Shared reward and termination of many drives, and the index of this drive; None: its own.
+            evaluator: Reward and termination of many drives, and the index of this drive; None: its own.
         """
         self.world, self.segment, self.options = world, segment, options
         self._evaluator, self._index = evaluator or (RewardAndTermination(world, segment, options), 0)
@@ -349,7 +349,8 @@ class DriveTask(control.Task):
 
     def action_spec(self, physics: DrivePhysics) -> specs.BoundedArray:
         low, high = self._bounds()
-        return specs.BoundedArray(low.shape, np.float64, low, high, name="\t".join(self.action_names))
+        name = "yaw_rate" if self.options.action == STEERING else "speed\tyaw_rate"
+        return specs.BoundedArray(low.shape, np.float64, low, high, name=name)
 
     # ---- state of the episode
 
@@ -357,10 +358,6 @@ class DriveTask(control.Task):
     def state_bounds(self) -> NDArray[np.float32]:
         """See `RewardAndTermination.state_bounds`."""
         return self._evaluator.state_bounds
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        return ("yaw_rate",) if self.options.action == STEERING else ("speed", "yaw_rate")
 
     @property
     def cause(self) -> str:
@@ -385,7 +382,7 @@ class DriveTask(control.Task):
         return actions
 
     def info(self, physics: DrivePhysics) -> dict[str, Any]:
-        """Returns the episode's info so far, JSON-able."""
+        """Returns the episode's info so far, see `twin.env.gym_env`; JSON-able."""
         return self.episode_info(physics.speed, physics.touched)
 
     def episode_info(self, speed: float, touched: Sequence[str]) -> dict[str, Any]:
