@@ -83,8 +83,8 @@ def route_views(bench: Bench) -> Path:
     """
     file = bench.work / "views.npz"
     if not file.exists():
+        from twin.env.drivers import follow_route
         from twin.env.physics import HuskyPhysics
-        from twin.env.route_follower import follow_route
         from twin.loading import load_scene
 
         world = load_scene(bench.scene).world()

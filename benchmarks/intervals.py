@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import expit
 
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.evaluation.bootstrap import PairedCells, Rates, bootstrap_interval, observed_rates, resample
 from twin.evaluation.statistics import (
     LinearCorrection,
@@ -68,7 +68,7 @@ def read_experiment(path: Path) -> PairedCells:
     for run in read_json(path)["runs"]:
         for policy in run["policies"]:
             twin, real = policy["validate_by_photo"]["by_lighting"], policy["real"]["by_lighting"]
-            sides = [[twin[f"{day}{RANDOMIZED}"], real[day]] for day in real]
+            sides = [[twin[str(Condition(day, True))], real[day]] for day in real]
             read.append((run["task"], [[c["trials"] for c in s] + [c["successes"] for c in s] for s in sides]))
     counts = np.array([cells for _, cells in read])
     task = np.array([name for name, _ in read])

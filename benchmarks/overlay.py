@@ -24,9 +24,9 @@ from record import add_record_options, save
 
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
-from twin.env.mujoco_renderer import camera_pose
 from twin.env.obstacle_models import ObstacleModel, add_obstacle_geoms
 from twin.env.obstacles import add_obstacles, place
+from twin.env.physics import camera_pose
 from twin.geometry.cameras import Cameras, opencv_to_mujoco
 from twin.geometry.poses import Similarity
 from twin.loading import load_scene
@@ -232,8 +232,8 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
 def visual_vs_collision(scene_path: Path) -> dict[str, Any]:
     """`seen_touched.*` of `twin.report.visual_vs_collision`, along a drive of the scripted follower."""
     from twin.assets.ground import Ground
+    from twin.env.drivers import follow_route
     from twin.env.physics import HuskyPhysics
-    from twin.env.route_follower import follow_route
     from twin.mjcf.scene_xml import Parts
     from twin.report.visual_vs_collision import compare_geometry, render_views, view_poses
 

@@ -1,4 +1,4 @@
-"""Random weather over pictures: alike within a stack, another in every sample, and none at strength 0."""
+"""Color augmentation: equal within a stack, different between samples, absent at strength 0."""
 
 from itertools import pairwise
 
@@ -12,12 +12,12 @@ def stacks(count: int = 6) -> np.ndarray:
     return np.repeat(np.tile(picture, (4, 1, 1))[None], count, 0)
 
 
-def test_strength_nought_changes_nothing():
+def test_strength_zero_changes_nothing():
     before = stacks()
     np.testing.assert_array_equal(augment_colors(before, 0.0, np.random.default_rng(1)), before)
 
 
-def test_pictures_of_a_stack_change_alike_and_samples_do_not():
+def test_augmentation_is_shared_within_a_stack():
     before = stacks()
     after = augment_colors(before, 1.0, np.random.default_rng(1))
     assert after.shape == before.shape and after.dtype == np.uint8
@@ -28,7 +28,7 @@ def test_pictures_of_a_stack_change_alike_and_samples_do_not():
     assert len({stack.tobytes() for stack in after}) == len(after)
 
 
-def test_drawn_around_what_was_there_and_by_the_seed():
+def test_augmentation_is_unbiased_and_repeats_with_the_seed():
     before = stacks(200)
     after = augment_colors(before, 1.0, np.random.default_rng(2))
     np.testing.assert_array_equal(after, augment_colors(before, 1.0, np.random.default_rng(2)))
@@ -39,7 +39,7 @@ def test_drawn_around_what_was_there_and_by_the_seed():
 
 
 def test_rectangles_of_one_colour_cover_some():
-    """In noise no colour comes twice, so what does is covered."""
+    """Noise has no color twice, so repeated colors are rectangles."""
     picture = np.random.default_rng(3).integers(60, 190, (3, 45, 80), np.uint8)
     before = np.repeat(np.tile(picture, (4, 1, 1))[None], 200, 0)
     shares = []

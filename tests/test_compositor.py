@@ -1,4 +1,4 @@
-"""The overlay against exact cases: walls before and behind, half-transparent layers, edges, depth, batches."""
+"""The compositor against exact cases: walls before and behind, half-transparent layers, edges, depth, batches."""
 
 import mujoco
 import numpy as np
@@ -7,9 +7,10 @@ from test_baked import LOW, baked, wall
 
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraNoise, CameraOptions, soft_clip
-from twin.env.compositor import Compositor
-from twin.env.mujoco_renderer import ObjectRenderer, camera_intrinsics, camera_pose
+from twin.env.compositor import Compositor, ObjectRenderer
+from twin.env.mujoco_renderer import camera_intrinsics
 from twin.env.obstacles import add_obstacles
+from twin.env.physics import camera_pose
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints
 from twin.mjcf.husky import ZED2, PixelCamera, add_husky
@@ -63,7 +64,7 @@ def box():
 @pytest.mark.parametrize(
     "depth", [2.5, 1.25]
 )  # small, sampled in one go; and large, where only edges are sampled again
-def test_before_an_opaque_wall_the_obstacle_is_itself(box, depth):
+def test_obstacle_before_an_opaque_wall(box, depth):
     model, data = box
     put(model, data, depth - 2.5, 0.0, -0.5)
     field = baked(BEHIND)
@@ -79,7 +80,7 @@ def test_before_an_opaque_wall_the_obstacle_is_itself(box, depth):
     assert np.array_equal(out.depth[outside], alone.depth[outside])
 
 
-def test_behind_an_opaque_wall_nothing_of_it_is_seen(box):
+def test_obstacle_behind_an_opaque_wall(box):
     model, data = box
     put(model, data, 0.0, 0.0, -0.5)
     field = baked(BEFORE)
@@ -88,7 +89,7 @@ def test_behind_an_opaque_wall_nothing_of_it_is_seen(box):
     assert np.abs(out.depth - alone.depth).max() < 1e-3
 
 
-def test_depth_is_right_to_a_centimetre_at_ten_metres(box):
+def test_depth_error_at_ten_metres(box):
     model, data = box
     put(model, data, 7.5, 0.3, -0.4)
     out = Compositor(model, baked(nothing), SIZE, shaded=False).render([data], "day")
@@ -98,7 +99,7 @@ def test_depth_is_right_to_a_centimetre_at_ten_metres(box):
 
 
 @pytest.mark.parametrize("raw", [0.0, 0.7, 1.6])
-def test_through_a_half_transparent_layer_the_rest_of_the_light_comes(box, raw):
+def test_obstacle_behind_a_half_transparent_layer(box, raw):
     model, data = box
     put(model, data, 1.0, 0.0, -0.5)
     field = baked(lambda p: np.where(np.abs(p[..., 0] + 1.0) < 0.501, raw, LOW))
@@ -114,7 +115,7 @@ def test_through_a_half_transparent_layer_the_rest_of_the_light_comes(box, raw):
 
 
 @pytest.mark.parametrize(("share", "covers"), [(0.1, 0.0), (0.5, 0.5), (0.9, 1.0)])
-def test_at_an_edge_it_covers_its_share_of_a_pixel(share, covers):
+def test_coverage_of_edge_pixels(share, covers):
     # The right edge of a face at depth 2 lies `share` into pixel 37.
     edge = (37.0 + share - 32.0) * 2.0 / FOCAL
     model, data = scene((1.0, 1.0, 1.0))
@@ -128,8 +129,8 @@ def test_at_an_edge_it_covers_its_share_of_a_pixel(share, covers):
     assert np.array_equal(out.rgb[0, 18, 38], alone.rgb[0, 18, 38])
 
 
-def test_half_a_pixel_more_covers_half_a_pixel_more():
-    """Sums over an edge's row tell sub-pixel sizes to a quarter of a pixel."""
+def test_coverage_of_subpixel_sizes():
+    """Sums over an edge's row resolve sizes to a quarter of a pixel."""
     field = baked(BEHIND)
     widths = []
     for edge in (0.30, 0.325, 0.35):
@@ -141,7 +142,7 @@ def test_half_a_pixel_more_covers_half_a_pixel_more():
     assert widths == pytest.approx([2 * edge * FOCAL / 2.0 for edge in (0.30, 0.325, 0.35)], abs=0.6)
 
 
-def test_out_of_view_it_is_the_field_alone(box):
+def test_obstacle_out_of_view_changes_nothing(box):
     model, data = box
     field = baked(hall)
     overlay = Compositor(model, field, SIZE)
@@ -151,12 +152,12 @@ def test_out_of_view_it_is_the_field_alone(box):
         assert np.array_equal(out.rgb, alone.rgb) and np.array_equal(out.depth, alone.depth)
 
 
-def test_without_ground_there_is_nothing_to_tell_the_light_from(box):
+def test_irradiance_without_ground_is_refused(box):
     with pytest.raises(InputError, match="no ground"):
         Compositor(box[0], baked(nothing), SIZE)
 
 
-def test_many_worlds_are_as_each_alone(box):
+def test_batch_equals_single_renderings(box):
     model, _ = box
     datas = [put(model, mujoco.MjData(model), x, y, -0.5) for x, y in ((0.0, 0.0), (1.0, 0.6), (-9.0, 0.0))]
     field = baked(hall)

@@ -1,4 +1,4 @@
-"""The controllers of many robots make of commands what each robot's own makes of them."""
+"""The vectorized controller equals the controllers of single robots."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ PARAMS = HuskyParams(max_acceleration=1.0, max_wheel_speed=0.8)
 
 
 @pytest.mark.parametrize("period", [0.1, 0.06, 0.24])
-def test_many_controllers_do_what_each_does_alone(period):
+def test_vector_controller_equals_single_controllers(period):
     rng = np.random.default_rng(0)
     model = on_a_plane().model
     latencies = np.array([0.0, 0.013, 0.1, 0.237, 0.05, 0.4])

@@ -1,4 +1,4 @@
-"""The environment: what dm_env, Gymnasium and stable-baselines3 may expect of it, and what an episode is."""
+"""Environments: interfaces of dm_env, Gymnasium and stable-baselines3, rewards, starts and rendering."""
 
 import gc
 import json
@@ -19,10 +19,10 @@ import twin
 from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraOptions
-from twin.env.chase_camera import chase_poses
 from twin.env.domain_randomization import Ranges
 from twin.env.drivers import BlindDriver, RouteDriver
 from twin.env.gym_env import DriveEnv
+from twin.env.mujoco_renderer import chase_poses
 from twin.env.options import CAUSES
 from twin.env.suite import EnvFactory
 from twin.env.task import Motion
@@ -120,34 +120,34 @@ def test_gymnasium_and_sb3_accept_it(scene, name):
 
 
 @pytest.mark.parametrize("name", OPTION_SETS)
-def test_one_world_of_many_is_the_single_environment(scene, name):
+def test_vector_environment_equals_single_environments(scene, name):
     """Step for step, pixels and all, through the ends of episodes."""
     options = OPTION_SETS[name] | {"time_limit": 1.5}
-    worlds = LocalVectorEnv(EnvFactory.open(scene, "bend", options), [5, 6, 7])
+    envs = LocalVectorEnv(EnvFactory.open(scene, "bend", options), [5, 6, 7])
     single = twin.load(scene, "bend", seed=6, **options)
     rng = np.random.default_rng(0)
     spec = single.action_spec()
-    worlds.begin(range(3))
+    envs.begin(range(3))
     step = single.reset()
     for _ in range(40):
-        if worlds.pixels:
-            np.testing.assert_array_equal(worlds.pixels.stacks[1].transpose(0, 2, 3, 1), step.observation["pixels"])
+        if envs.pixels:
+            np.testing.assert_array_equal(envs.pixels.stacks[1].transpose(0, 2, 3, 1), step.observation["pixels"])
         else:
-            np.testing.assert_array_equal(worlds.observation()[1], np.concatenate(list(step.observation.values())))
-        actions = rng.uniform(-1, 1, (3, worlds.action_size))
-        out = worlds.step(actions)
+            np.testing.assert_array_equal(envs.observation()[1], np.concatenate(list(step.observation.values())))
+        actions = rng.uniform(-1, 1, (3, envs.action_size))
+        out = envs.step(actions)
         step = single.step(spec.minimum + (actions[1] + 1) / 2 * (spec.maximum - spec.minimum))
         assert out.reward[1] == step.reward and out.over[1] == step.last()
         assert out.truncated[1] == (step.last() and step.discount == 1.0)
-        np.testing.assert_array_equal(worlds.physics[1].data.qpos, single.physics.data.qpos)
+        np.testing.assert_array_equal(envs.physics[1].data.qpos, single.physics.data.qpos)
         if out.over.any():
-            worlds.begin(np.flatnonzero(out.over).tolist())
+            envs.begin(np.flatnonzero(out.over).tolist())
         if step.last():
             step = single.reset()
-    worlds.close()
+    envs.close()
 
 
-def test_vectors_begin_anew_by_themselves(scene):
+def test_vector_environments_reset_in_the_same_step(scene):
     from stable_baselines3 import SAC
 
     from twin.learn.sb3_env import DriveVecEnv
@@ -212,7 +212,7 @@ def test_every_cause_ends_an_episode_with_its_reward_and_discount(scene, tmp_pat
 
 
 @pytest.mark.parametrize("action, act", [("twist", [1.0, 0.25]), ("steering", [0.25])])
-def test_steering_and_being_off_the_route_cost_what_is_said(scene, action, act):
+def test_rewards_of_steering_and_cross_track(scene, action, act):
     """A quarter of the way to one side of [-0.5, 0.5] rad/s is half of what can be asked for."""
     terms = {"step": 1.0, "steering": -0.5, "cross_track": -0.2}
     options = {"pixels": False, "action": action, "yaw_rate": 0.5, "rewards": terms, "start_offset": 0.3}
@@ -229,7 +229,7 @@ def test_steering_and_being_off_the_route_cost_what_is_said(scene, action, act):
     assert straight == pytest.approx(1.0 - 0.2 * off)
 
 
-def test_a_driver_told_the_poses_arrives_and_a_blind_one_does_not(scene):
+def test_route_driver_arrives_and_blind_driver_does_not(scene):
     environment = twin.load(scene, "bend", pixels=False, randomise=True)
     causes = []
     for seed in range(10):
@@ -257,7 +257,7 @@ def test_starts_are_spread_as_stated(scene):
     assert np.allclose(along, 0.5, atol=0.1)
 
 
-def test_every_second_episode_may_start_on_the_way(scene):
+def test_start_along_moves_half_of_the_starts(scene):
     plain = twin.load(scene, "route", pixels=False)
     environment = twin.load(scene, "route", pixels=False, start_along=0.6)
     length = environment.task.segment.length
@@ -279,7 +279,7 @@ def test_every_second_episode_may_start_on_the_way(scene):
         twin.load(scene, "route", pixels=False, start_along=1.0)
 
 
-def test_light_and_robot_do_not_move_the_start(scene):
+def test_lighting_and_robot_do_not_change_the_start(scene):
     """Two policies, or two lightings, can be compared on the same episodes."""
     poses = []
     for options in ({}, {"lighting": "night"}, {"randomise": Ranges(payload=(0.0, 0.0))}, {"obstacles": 1}):
@@ -290,7 +290,7 @@ def test_light_and_robot_do_not_move_the_start(scene):
         np.testing.assert_allclose(pose, poses[0], atol=0.02)
 
 
-def test_scene_obstacles_are_there_and_move(tmp_path):
+def test_scene_obstacles_exist_and_move(tmp_path):
     more = '[[obstacle]]\nname = "walker"\nkind = "pedestrian"\nstation = 5.0\nlateral = -0.8\nto = [5.0, 0.8]\n'
     environment = twin.load(tiny_twin(tmp_path, more=more), "bend", seed=0, pixels=False)
     environment.reset()
@@ -305,7 +305,7 @@ def test_scene_obstacles_are_there_and_move(tmp_path):
     assert none.task.obstacles == ()
 
 
-def test_what_cannot_be_had_is_an_input_error(scene):
+def test_unknown_tasks_and_options_are_refused(scene):
     with pytest.raises(InputError, match=r"'straight': the route .* no such segment of 30 m; .* there are .*bend \(10"):
         twin.load(scene, "straight")
     with pytest.raises(InputError, match="did you mean 'lighting'"):
@@ -325,22 +325,20 @@ def test_the_environment_needs_no_torch():
 @pytest.mark.slow
 def test_twenty_thousand_steps(scene):
     """No NaN, no memory growth; `benchmarks/env.py --only soak` takes five times as many, with pictures."""
-    worlds = LocalVectorEnv(
-        EnvFactory.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1]
-    )
+    envs = LocalVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1])
     rng = np.random.default_rng(0)
-    worlds.begin([0, 1])
+    envs.begin([0, 1])
     process, sizes = psutil.Process(), []
     for k in range(10_000):
-        out = worlds.step(rng.uniform(-1, 1, (2, 2)))
-        assert np.isfinite(out.reward).all() and np.isfinite(worlds.observation()).all()
+        out = envs.step(rng.uniform(-1, 1, (2, 2)))
+        assert np.isfinite(out.reward).all() and np.isfinite(envs.observation()).all()
         if out.over.any():
-            worlds.begin(np.flatnonzero(out.over).tolist())
+            envs.begin(np.flatnonzero(out.over).tolist())
         if k % 2_000 == 1_999:
             gc.collect()
             sizes.append(process.memory_info().rss)
     assert sizes[-1] < sizes[0] + 8 * 2**20
-    worlds.close()
+    envs.close()
 
 
 def test_the_sampled_lighting_is_named(scene):
@@ -485,7 +483,7 @@ def test_a_fresh_process_makes_it_by_its_full_name(scene):
     assert done.stdout.strip() == "(7,)", done.stderr
 
 
-def test_what_gymnasium_is_asked_wrongly(scene):
+def test_wrong_gymnasium_arguments_are_refused(scene):
     with pytest.raises(InputError, match="render_mode = 'human'; expected None or 'rgb_array'"):
         DriveEnv(scene, "bend", render_mode="human", pixels=False)
     with pytest.raises(InputError, match="lighting 'noon'"):

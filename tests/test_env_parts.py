@@ -18,11 +18,10 @@ from twin.env.domain_randomization import EVALUATION_RANGES, NominalModel, Rando
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import Episode, record_episode
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
-from twin.env.episode_model import episode_spec
 from twin.env.options import parse_options
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import find_task, scene_tasks
-from twin.env.suite import EnvFactory
+from twin.env.suite import EnvFactory, episode_spec
 from twin.env.trust import Trust
 from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
@@ -62,7 +61,7 @@ def route_world(*pieces: tuple[float, float]) -> World:
     return World(np.column_stack([points, np.zeros(len(points))]), 1.0, (0, 0, 0, 0), Path())
 
 
-def test_standard_tasks_are_found_where_they_are():
+def test_standard_tasks_are_located_on_the_route():
     world = route_world((20.0, 1.2), (40.0, 0.0), (12.0, -np.pi / 2), (40.0, 0.0))
     found = scene_tasks(world)
     assert set(found) == {"route", "straight", "right_turn"}
@@ -72,7 +71,7 @@ def test_standard_tasks_are_found_where_they_are():
     assert found["route"].length == pytest.approx(112.0, abs=0.1)
 
 
-def test_a_left_turn_is_no_right_turn_and_it_says_what_there_is():
+def test_missing_task_lists_those_that_exist():
     world = route_world((20.0, 0.0), (12.0, np.pi / 2), (40.0, 0.0))
     with pytest.raises(InputError, match=r"'right_turn': .*no such segment of 60 m; there are .*straight \(30.0 m"):
         find_task("right_turn", world)
@@ -82,7 +81,7 @@ def test_a_left_turn_is_no_right_turn_and_it_says_what_there_is():
     assert find_task("straight", route_world((29.0, 0.0))).length == pytest.approx(29.0, abs=0.01)
 
 
-def test_own_tasks_are_named_in_the_scene_and_must_fit():
+def test_configured_tasks_must_fit_the_route():
     world = route_world((17.0, 0.0))
     assert find_task("mine", world, (TaskConfig("mine", 3.0, 5.0),)).end == 8.0
     assert find_task("straight", world, (TaskConfig("straight", 1.0, 9.0),)).start == 1.0
@@ -97,8 +96,8 @@ def test_training_and_held_out_lights_never_mix(field):
     sets, rng = LightingSets(field), np.random.default_rng(5)
     for which in (TRAINING, HELD_OUT):
         for _ in range(20):
-            assert sets.set_of(sets.sample(which, rng)) == which
-    assert all(sets.set_of(field.embedding(name)) == TRAINING for name in field.lightings)
+            assert sets.set_and_anchor(sets.sample(which, rng))[0] == which
+    assert all(sets.set_and_anchor(field.embedding(name))[0] == TRAINING for name in field.lightings)
     # Nearer to each other than to their own set is nobody.
     train, held = ([sets._probe_colors(sets.sample(w, rng)) for _ in range(15)] for w in (TRAINING, HELD_OUT))
     gap = min(float(np.sqrt(((a - b) ** 2).mean())) for a in train for b in held)
@@ -122,12 +121,13 @@ def test_between_training_and_held_out_lights_is_a_gap(field):
             assert far[other] > 1.2 * far[which]
     (start, *_), (end, *_) = anchors.embeddings[~anchors.held_out], anchors.embeddings[anchors.held_out]
     way = [start + share * (end - start) for share in np.linspace(0.0, 1.0, 200).astype(np.float32)]
-    between = [light for light in way if sets.set_of(light) is None]
-    assert len(between) > 5 and sets.set_of(way[0]) == TRAINING and sets.set_of(way[-1]) == HELD_OUT
+    between = [light for light in way if sets.set_and_anchor(light)[0] is None]
+    ends = sets.set_and_anchor(way[0])[0], sets.set_and_anchor(way[-1])[0]
+    assert len(between) > 5 and ends == (TRAINING, HELD_OUT)
     assert all(max(far.values()) < 1.3 * min(far.values()) for far in map(distances, between))
 
 
-def test_lights_of_rare_anchors_are_drawn_as_often_as_others(field):
+def test_anchors_are_sampled_equally_often(field):
     sets, rng = LightingSets(field), np.random.default_rng(3)
     for which, held_out in ((TRAINING, False), (HELD_OUT, True)):
         own = set(np.flatnonzero(sets.anchors.held_out == held_out))
@@ -142,10 +142,10 @@ def test_a_photo_added_later_moves_no_set():
     lights = [plain.sample_lighting(rng) for _ in range(30)]
     added.add_lightings({"photo": np.array([0.4, 0.5, 0.3, 0.0], np.float32)})
     before, after = LightingSets(plain), LightingSets(added)
-    assert [before.set_of(light) for light in lights] == [after.set_of(light) for light in lights]
+    assert [before.set_and_anchor(light)[0] for light in lights] == [after.set_and_anchor(light)[0] for light in lights]
 
 
-def test_lights_are_drawn_as_asked(field):
+def test_sampled_lightings_follow_the_option(field):
     sets, rng = LightingSets(field), np.random.default_rng(1)
     assert np.array_equal(sample_lighting("day", False, 1.0, sets, rng).at(9.0), field.embedding("day"))
     mixed = sample_lighting("day:night:0.25", False, 1.0, sets, rng).at(0.0)
@@ -162,7 +162,7 @@ def test_lights_are_drawn_as_asked(field):
 # ---- randomisation
 
 
-def test_a_draw_does_to_the_model_what_it_says(scene):
+def test_randomization_sample_changes_the_model_as_stated(scene):
     stage = EnvFactory.open(scene, "bend", {"pixels": False})
     physics, _ = stage.make_env(0)
     model, nominal = physics.model.ptr, NominalModel(stage.model)
@@ -229,7 +229,7 @@ def test_larger_wheels_on_the_right_turn_it_to_the_left(scene):
     assert 0.02 * way / (2.5 * TRACK) < left - straight < 0.02 * way / TRACK
 
 
-def test_ranges_that_make_no_sense_are_refused():
+def test_invalid_ranges_are_refused():
     wrong = [
         {"wheel_difference": (-0.1, 3.0)},
         {"friction": (0.0, 1.0)},
@@ -242,7 +242,7 @@ def test_ranges_that_make_no_sense_are_refused():
             Ranges(**ranges)
 
 
-def test_what_is_known_of_the_robot_is_held_where_policies_are_judged():
+def test_measured_parameters_are_held_in_evaluation():
     robot = HuskyParams(friction=0.6, wheel_radius=(0.162, 0.163), center_of_mass=(-0.05, 0.0, 0.06))
     draws = [EVALUATION_RANGES.for_robot(robot).sample(np.random.default_rng(k)) for k in range(9)]
     assert {(d.friction, d.wheel_radius, d.wheel_difference, d.payload) for d in draws} == {(1.0, 1.0, 0.0, 0.0)}
@@ -262,7 +262,7 @@ def test_what_is_known_of_the_robot_is_held_where_policies_are_judged():
 # ---- the model of an episode
 
 
-def test_leaving_out_what_is_out_of_reach_changes_no_number(tmp_path):
+def test_parts_out_of_reach_change_no_result(tmp_path):
     world = tiny_world(tmp_path)
     whole = HuskyPhysics(world.model())
     spec = episode_spec(world, 0.0, 3.0, 0.5)
@@ -313,7 +313,7 @@ def test_trust_falls_with_distance_turn_and_missing_road():
 # ---- episodes, drivers, films
 
 
-def test_an_episode_comes_back_from_its_files(scene, tmp_path):
+def test_episode_round_trip(scene, tmp_path):
     environment = twin.load(scene, "ahead", 0, obstacles=0, lighting="night", **SMALL)
     episode = record_episode(environment, RouteDriver())
     assert episode.success and episode.lighting == "night" and episode.progress[-1] == pytest.approx(3.5, abs=0.15)
@@ -366,7 +366,7 @@ def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
         (["--lighting", "day:night:30"], "share 30 is not from 0 to 1"),
     ],
 )
-def test_a_film_of_nothing_possible_is_one_line(scene, capsys, option, words):
+def test_impossible_films_are_refused_in_one_line(scene, capsys, option, words):
     assert main([str(scene.scene.root), "--task", "ahead", "--quiet", *option]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and words in error and error.count("\n") == 1
@@ -375,7 +375,7 @@ def test_a_film_of_nothing_possible_is_one_line(scene, capsys, option, words):
 # ---- audit
 
 
-def test_the_audit_finds_holes_and_finds_none_where_there_are_none(scene, tmp_path):
+def test_audit_finds_holes_only_where_they_are(scene, tmp_path):
     stage = EnvFactory.open(scene, "bend", {"pixels": False})
     found = audit(stage, hours=0.02)
     assert found.seconds >= 72.0 and found.touching > 0
@@ -393,7 +393,7 @@ def test_the_audit_finds_holes_and_finds_none_where_there_are_none(scene, tmp_pa
     assert holes.events["episode_gap"] > 0 and holes.false_successes == holes.episodes["goal"] > 0
 
 
-def test_the_examiner_knows_tunnelling_climbing_and_sliding(scene):
+def test_audit_detects_tunnelling_climbing_and_sliding(scene):
     from audit import EventDetector
 
     stage = EnvFactory.open(scene, "bend", {"pixels": False})
@@ -418,7 +418,7 @@ _NO_ACTIONS = [
 
 
 @pytest.mark.parametrize("action", _NO_ACTIONS, ids=str)
-def test_what_is_no_action_is_a_clear_error_and_the_episode_goes_on(scene, action):
+def test_invalid_action_raises_and_the_episode_continues(scene, action):
     environments = []
     for _ in range(2):
         environments.append(twin.load(scene, "ahead", seed=3, pixels=False))
@@ -432,13 +432,13 @@ def test_what_is_no_action_is_a_clear_error_and_the_episode_goes_on(scene, actio
         np.testing.assert_array_equal(value, good[1].observation[name])
 
 
-def test_what_is_no_action_of_many_worlds(scene):
-    worlds = make_vector_env(scene, "ahead", {"pixels": False, "action": "steering"}, [1, 2], 1)
-    worlds.begin([0, 1])
+def test_invalid_actions_of_a_vector_environment(scene):
+    envs = make_vector_env(scene, "ahead", {"pixels": False, "action": "steering"}, [1, 2], 1)
+    envs.begin([0, 1])
     for actions in (np.zeros((2, 2)), np.zeros(2), np.zeros((1, 1)), np.full((2, 1), np.nan), np.zeros((2, 1), bool)):
         with pytest.raises(ValueError, match=r"expected finite numbers of shape \(2, 1\)"):
-            worlds.step(actions)
-    assert np.isfinite(worlds.step(np.zeros((2, 1), int)).reward).all()
+            envs.step(actions)
+    assert np.isfinite(envs.step(np.zeros((2, 1), int)).reward).all()
 
 
 @pytest.mark.parametrize(
@@ -472,7 +472,7 @@ def test_what_is_no_action_of_many_worlds(scene):
         ],
     ],
 )
-def test_options_of_another_kind_are_refused(name, value):
+def test_invalid_options_are_refused(name, value):
     with pytest.raises(InputError, match=name):
         parse_options({name: value})
 

@@ -8,7 +8,7 @@ import pytest
 from test_review import ChequeredField, make_cameras
 from tqdm import tqdm
 
-from twin.env.route_follower import RecordedDrive
+from twin.env.drivers import RecordedDrive
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.report.review_chapters import drive_metrics, drive_trace, frame_timing, smoothed_speed, write_drive_chapter

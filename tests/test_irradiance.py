@@ -1,4 +1,4 @@
-"""Light estimated from a field, and the shadows it makes."""
+"""Irradiance estimated from a field, and contact shadows."""
 
 import mujoco
 import numpy as np
@@ -8,8 +8,14 @@ from test_baked import baked
 from test_compositor import SIZE, K, nothing
 
 from twin.config import ObstacleConfig
-from twin.env.compositor import Compositor, ContactShadows
-from twin.env.irradiance import SIDE_DIRECTIONS, Irradiance, IrradianceEstimator, spherical_harmonics_numpy
+from twin.env.compositor import Compositor
+from twin.env.irradiance import (
+    SIDE_DIRECTIONS,
+    ContactShadows,
+    Irradiance,
+    IrradianceEstimator,
+    spherical_harmonics_numpy,
+)
 from twin.env.obstacles import add_obstacles
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.poses import look_at
@@ -30,13 +36,13 @@ def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Irradiance:
     return Irradiance(spots, np.full((200, 3), level), np.zeros((5, 3)), growing)
 
 
-def test_harmonics_are_the_networks_own():
+def test_spherical_harmonics_equal_the_networks():
     d = np.random.default_rng(0).normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     assert np.allclose(spherical_harmonics_numpy(d), spherical_harmonics(torch.as_tensor(d)).numpy())
 
 
-def test_what_faces_up_has_the_level_of_its_place():
+def test_irradiance_facing_up_is_that_of_the_ground():
     mine = light(share=0.4)
     level = mine.ground(np.array([[0.0, 0.0], [50.0, 0.0]]))
     assert np.allclose(level, 0.8)
@@ -110,7 +116,7 @@ def ground_and_wall(p):
     return np.where((p[..., 2] < -1.0) | (p[..., 1] > 2.0), 9.0, -6.0)
 
 
-def test_a_darker_lighting_is_darker_light():
+def test_darker_lighting_has_less_irradiance():
     field = baked(ground_and_wall)
     dim = dict(field._arrays)
     head = dim["network.head.0"].copy()

@@ -1,4 +1,4 @@
-"""What policies get to see: pictures of the right instant, and never the inside of the camera's own housing."""
+"""Observations: images of the right instant, without the camera's own housing."""
 
 from dataclasses import replace
 
@@ -12,8 +12,9 @@ from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
 from twin.env.domain_randomization import NominalModel, RandomizationSample, Ranges
-from twin.env.mujoco_renderer import SceneRenderer, camera_pose
+from twin.env.mujoco_renderer import SceneRenderer
 from twin.env.options import NERF, SIMULATOR
+from twin.env.physics import camera_pose
 from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.geometry.cameras import Viewpoints
 
@@ -46,8 +47,8 @@ def film(scene, latency: float, steps: int, **options) -> np.ndarray:
 
 @pytest.mark.parametrize("observe", [NERF, SIMULATOR])
 @pytest.mark.parametrize(("period", "late"), [(0.1, 1), (0.1, 3), (0.05, 3), (0.014, 5)])
-def test_a_late_picture_is_the_picture_of_then(scene, observe, period, late):
-    """Bit for bit: the robot's camera, its body, what moves in view, and the light."""
+def test_camera_latency_shows_the_past_state(scene, observe, period, late):
+    """Bit-identical in camera pose, robot, moving obstacles and lighting."""
     options = {"observe": observe, "control_timestep": period, "obstacles": (WALKER,)}
     options |= {"lighting": LIGHT, "lighting_drift": True}
     steps = late + round(0.8 / period)

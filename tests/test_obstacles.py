@@ -1,4 +1,4 @@
-"""Obstacles: where they stand, how they move, and that MuJoCo knows them."""
+"""Obstacles: poses, motion, and contact in MuJoCo."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def flat_spec(slope: float = 0.02) -> mujoco.MjSpec:
     return spec
 
 
-def test_an_obstacle_stands_where_it_is_told_to_on_the_ground(world):
+def test_obstacle_pose_is_on_the_ground(world):
     told = (ObstacleConfig("a", "cone", 12.0, -0.5), ObstacleConfig("b", "box", 3.0, 1.5, yaw=30.0))
     spec = flat_spec()
     add_obstacles(spec, told, world)
@@ -69,7 +69,7 @@ def test_the_ground_is_as_high_as_a_ray_finds_it(world):
         assert ground_height(model, x, y) == pytest.approx(50.0 - drop, abs=1e-5)
 
 
-def test_it_walks_to_and_fro_at_its_speed():
+def test_moving_obstacle_returns_at_its_speed():
     across = ObstacleConfig("p", "pedestrian", 5.0, -2.0, to=(5.0, 2.0), speed=1.25, delay=0.4)
     poses = np.array([obstacle_pose(across, ROUTE, t) for t in np.arange(0.0, 8.0, 0.1)])
     assert np.abs(poses[:, 0] - 5.0).max() < 0.01
@@ -113,7 +113,7 @@ def _corners(model, data, i) -> np.ndarray:
     return data.geom_xpos[i] + (center + signs * half) @ data.geom_xmat[i].reshape(3, 3).T
 
 
-def test_what_an_episode_does_without_is_parked(world):
+def test_unused_obstacles_are_parked(world):
     pool = (ObstacleConfig("a", "cone", 3.0), ObstacleConfig("b", "cone", 4.0))
     spec = flat_spec()
     add_obstacles(spec, pool, world)
@@ -126,7 +126,7 @@ def test_what_an_episode_does_without_is_parked(world):
         place((ObstacleConfig("c", "cone"),), data, 0.0)
 
 
-def test_random_ones_leave_a_way_past_and_repeat_with_the_seed(world):
+def test_random_obstacles_leave_room_and_repeat(world):
     drawn = random_obstacles(world, np.random.default_rng(3), 4)
     assert drawn == random_obstacles(world, np.random.default_rng(3), 4)
     assert drawn != random_obstacles(world, np.random.default_rng(4), 4)
@@ -142,7 +142,7 @@ def test_random_ones_leave_a_way_past_and_repeat_with_the_seed(world):
         random_obstacles(world, np.random.default_rng(0), 500)
 
 
-def test_bystanders_stand_where_no_robot_in_the_corridor_can_touch_them(world):
+def test_distractors_are_out_of_reach_of_the_corridor(world):
     bend = np.linspace(0.0, np.pi, 60)
     tight = np.column_stack([3.0 * np.sin(bend), 3.0 - 3.0 * np.cos(bend), 0.0 * bend])  # the inside has no room
     for route in (world.route, tight):
@@ -160,7 +160,7 @@ def test_bystanders_stand_where_no_robot_in_the_corridor_can_touch_them(world):
                 assert there.half_width + 0.6 <= free + 1e-9 and free < there.half_width + 3.2
 
 
-def test_scene_toml_names_them(tmp_path):
+def test_obstacles_of_scene_toml(tmp_path):
     path = tmp_path / "scene.toml"
     head = '[[source]]\npath = "a.mp4"\n[metric]\ncamera_height = 1.2\n'
     path.write_text(head + '[[obstacle]]\nkind = "pedestrian"\nstation = 12\nlateral = -2.5\nto = [12.0, 2.5]\n')

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from tiny_world import tiny_config, tiny_scene, tiny_world
 
-from twin.env.chase_camera import SceneCamera, blend_parts, chase_poses
+from twin.env.drivers import follow_route, pursuit_curvature
+from twin.env.mujoco_renderer import SceneCamera, blend_parts, chase_poses
 from twin.env.physics import HuskyPhysics
-from twin.env.route_follower import follow_route, pursuit_curvature
 from twin.geometry.cameras import project
 from twin.geometry.poses import inverse_pose
 from twin.mjcf.husky import add_husky, set_options
@@ -156,7 +156,7 @@ def test_every_touch_is_seen_once_and_named():
     assert physics.touched == () and physics.time == 0.0
 
 
-def test_overlay_hides_what_is_hidden():
+def test_hidden_parts_are_not_blended():
     rgb = np.full((4, 6, 3), 100, np.uint8)
     part = np.full((4, 6, 3), 200, np.uint8)
     depth = np.full((4, 6), 5.0)
@@ -233,8 +233,8 @@ def test_camera_latency_shows_the_past():
     assert np.linalg.norm(delayed[:3, 3] - positions[-1]) > 0.05
 
 
-def test_all_that_is_seen_is_of_the_same_past():
-    """To the small step; between two looks, which are 10 ms apart, to a hair."""
+def test_delayed_poses_belong_to_one_instant():
+    """Exactly at contact checks, which are 10 ms apart, and closely between them."""
     latency, step = 0.026, 0.002
     prompt, fine, coarse = on_a_plane(), *(on_a_plane(HuskyParams(camera_latency=latency)) for _ in range(2))
     past = [prompt.data.qpos.copy()]
@@ -256,7 +256,7 @@ def test_all_that_is_seen_is_of_the_same_past():
 
 
 @pytest.mark.parametrize("latency", [0.03, 0.113])
-def test_what_moves_is_seen_where_it_was(latency):
+def test_delayed_poses_of_moving_obstacles(latency):
     spec = mujoco.MjSpec()
     set_options(spec)
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1))
@@ -278,7 +278,7 @@ def test_what_moves_is_seen_where_it_was(latency):
         np.testing.assert_allclose(physics.delayed_data.body("walker").xpos, [3.0 + 2.0 * time, 1.0, 0.0])
 
 
-def test_no_latency_is_now():
+def test_zero_latency_shows_the_present():
     physics = on_a_plane()
     for _ in range(3):
         physics.command(1.0, 0.5)

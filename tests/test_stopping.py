@@ -75,7 +75,7 @@ def cases(tmp_path_factory) -> dict[str, Case]:
     train = ("--task", "ahead", "--lighting", "day", "--run", "new", "--steps", steps, "--processes", "2")
     return {
         "build": Case((str(filmed), "--until", "metric"), "twin.capture.worker"),
-        "train": Case((str(driven), *train), "twin.env.vector_env_child", 2),
+        "train": Case((str(driven), *train), "twin.env.vector_env import serve", 2),
         "validate": Case((str(driven), *validate), "multiprocessing.spawn", 2),
         "relight": Case((str(corridor), str(corridor / "photo.png"), "--name", "new"), "twin.capture.worker"),
     }

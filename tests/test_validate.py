@@ -13,8 +13,9 @@ from tiny_runs import SMALL, tiny_runs
 from tiny_twin import tiny_twin
 
 from twin import load_scene, runtime, validate
+from twin.config import Condition
 from twin.env import episode_lighting
-from twin.env.domain_randomization import EVALUATION_RANGES, lighting_options
+from twin.env.domain_randomization import EVALUATION_RANGES, condition_options
 from twin.env.suite import EnvFactory, fingerprint
 from twin.errors import InputError
 from twin.evaluation.trials import Trial, read_trials
@@ -46,7 +47,7 @@ def fresh(scene):
 
 
 def chunk(scene: Path, seeds, lighting="day", name="ahead") -> EpisodeChunk:
-    return EpisodeChunk(str(scene), "ahead", str(scene / "runs" / name), False, lighting, tuple(seeds))
+    return EpisodeChunk(str(scene), "ahead", str(scene / "runs" / name), False, Condition.parse(lighting), tuple(seeds))
 
 
 def test_an_episode_does_not_depend_on_others(scene):
@@ -98,22 +99,30 @@ def test_randomized_episodes_differ_and_repeat(scene, monkeypatch):
     assert [one.seed for one in drawn] == list(seeds)
     assert [one.progress for one in plain] != [one.progress for one in drawn]
     assert run_chunk(chunk(scene, [2], "day+randomised")) == [drawn[2]]
-    assert fingerprint(load_scene(scene), "ahead", "day") != fingerprint(load_scene(scene), "ahead", "day+randomised")
-    said = [fingerprint(load_scene(scene), "ahead", name) for name in ("day", "any", "held-out", "training+randomised")]
+    day, drawn_day = (fingerprint(load_scene(scene), "ahead", Condition("day", drawn)) for drawn in (False, True))
+    assert day != drawn_day
+    said = [
+        fingerprint(load_scene(scene), "ahead", Condition.parse(name))
+        for name in ("day", "any", "held-out", "training+randomised")
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(episode_lighting, "VERSION", -1)
-        other = [fingerprint(load_scene(scene), "ahead", n) for n in ("day", "any", "held-out", "training+randomised")]
+        other = [
+            fingerprint(load_scene(scene), "ahead", Condition.parse(n))
+            for n in ("day", "any", "held-out", "training+randomised")
+        ]
     assert [a == b for a, b in zip(said, other, strict=True)] == [True, True, False, False]
     assert run_chunk(chunk(scene, seeds)) == plain
     stage = EnvFactory.open(
-        scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **lighting_options("day+randomised")}
+        scene, "ahead", {**load_policy(scene / "runs" / "ahead").options(), **condition_options(Condition("day", True))}
     )
     assert stage.options.lighting == "day" and stage.options.randomise == EVALUATION_RANGES
     fitted = dataclasses.replace(load_scene(scene).world(), robot=HuskyParams(friction=0.6))
     monkeypatch.setattr(Twin, "world", lambda self: fitted)
     options = load_policy(scene / "runs" / "ahead").options()
     stages = [
-        EnvFactory.open(scene, "ahead", {**options, **lighting_options(f"day{what}")}) for what in ("+randomised", "")
+        EnvFactory.open(scene, "ahead", {**options, **condition_options(Condition("day", drawn))})
+        for drawn in (True, False)
     ]
     assert stages[0].options.randomise.friction == (1.0, 1.0) and stages[1].options.randomise is None
     with pytest.raises(InputError, match="randomized"):

@@ -1,4 +1,4 @@
-"""Many worlds stepped by mujoco_warp go through what MuJoCo makes them go through. Here on the CPU: GPUs are rare."""
+"""Environments stepped by mujoco_warp agree with those stepped by MuJoCo; tested on the CPU device."""
 
 from dataclasses import replace
 
@@ -12,10 +12,10 @@ import twin
 from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraOptions
-from twin.env.dm import control
 from twin.env.domain_randomization import Ranges
 from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.suite import EnvFactory
+from twin.env.task import control
 from twin.env.vector_env_gpu import GpuVectorEnv
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
@@ -35,13 +35,13 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
-    """Robots of different make under different commands, one world after the other and all at once."""
+def test_gpu_physics_agrees_with_mujoco(scene):
+    """Different robots under different commands, step by step and all at once."""
     stage = EnvFactory.open(scene, "bend", OPTIONS)
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
     plain, device = LocalVectorEnv(stage, [1, 2, 3]), GpuVectorEnv(stage, [1, 2, 3], "cpu")
-    for worlds in (plain, device):
-        worlds.begin(range(3))
+    for envs in (plain, device):
+        envs.begin(range(3))
     rng = np.random.default_rng(0)
     actions = np.array([[1.0, 0.0], [0.6, 0.5], [0.2, -0.4]])
     for k in range(8):
@@ -50,7 +50,7 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
         a, b = plain.step(given, which), device.step(given, which)
         np.testing.assert_array_equal(a.over, b.over)
         np.testing.assert_allclose(a.reward, b.reward, atol=0.02)
-        # What is known of all worlds at once is what each of them says.
+        # Vectorized results equal those of each environment.
         poses, times = device._simulation.camera_poses(np.arange(3))
         motion = device._simulation.motion(np.arange(3))
         for i, (physics, task) in enumerate(zip(device.physics, device.tasks, strict=True)):
@@ -76,11 +76,11 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
         assert one.speed > 0.1
     assert all(task.progress > 0.1 for task in device.tasks)
     # One begins anew while it moves, and stands.
-    for worlds in (plain, device):
-        worlds.begin([0])
-        worlds.begin([])
+    for envs in (plain, device):
+        envs.begin([0])
+        envs.begin([])
         for _ in range(2):
-            worlds.step(np.array([[-1.0, 0.0], [1.0, 0.2]]), [0, 2])
+            envs.step(np.array([[-1.0, 0.0], [1.0, 0.2]]), [0, 2])
     for i in (0, 2):
         one, other = plain.physics[i], device.physics[i]
         np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=6e-3)
@@ -90,8 +90,8 @@ def test_worlds_on_a_device_drive_as_mujoco_has_them_drive(scene):
 
 
 @pytest.mark.parametrize("obstacles", [(), (WALKER,)])
-def test_what_worlds_on_a_device_see(scene, obstacles):
-    """Bare pictures that stay there, and such that the host puts something into; nobody asks for the worlds between."""
+def test_gpu_observations_agree_with_the_cpu(scene, obstacles):
+    """Images of the field alone, and images with obstacles, without access to the physics in between."""
     stage = EnvFactory.open(scene, "bend", {"obstacles": obstacles, "lighting": "day", **SMALL})
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
     plain = LocalVectorEnv(stage, [1, 2])
@@ -99,11 +99,11 @@ def test_what_worlds_on_a_device_see(scene, obstacles):
     device = GpuVectorEnv(stage, [1, 2], "cpu")
     assert type(device.pixels) is (PixelObserver if obstacles else GpuPixelObserver)
     before = None
-    for worlds in (plain, device):
-        worlds.begin([0, 1])
+    for envs in (plain, device):
+        envs.begin([0, 1])
     for k in range(3):
-        for worlds in (plain, device):
-            worlds.step(np.array([[1.0, 0.4], [1.0, -0.4]])[: 2 - k % 2], [0, 1][: 2 - k % 2])
+        for envs in (plain, device):
+            envs.step(np.array([[1.0, 0.4], [1.0, -0.4]])[: 2 - k % 2], [0, 1][: 2 - k % 2])
         off = np.abs(plain.observation().astype(int) - device.observation())
         assert off.mean() < 1.0 and np.quantile(off, 0.99) < 20
         assert before is None or np.abs(before.astype(int) - device.observation()).mean() > 2 * off.mean()
@@ -112,44 +112,44 @@ def test_what_worlds_on_a_device_see(scene, obstacles):
     plain.close(), device.close()
 
 
-def test_what_goes_wrong_on_a_device_is_said(scene):
-    worlds = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
-    worlds.begin([0])  # the other world lies where the model has it, and is nobody's concern
-    device = worlds._simulation
+def test_gpu_overflow_and_divergence_raise(scene):
+    envs = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
+    envs.begin([0])  # the other environment keeps the model's initial state
+    device = envs._simulation
     device._advance = lambda: None
     device._data.overflow.assign([0, int(mjw.OverflowType.NEFC)])
     device._upload = lambda: None
-    worlds.step(np.zeros((1, 2)), [0])
+    envs.step(np.zeros((1, 2)), [0])
     device._data.overflow.assign([int(mjw.OverflowType.NEFC), 0])
     with pytest.raises(RuntimeError, match=r"environments \[0\]: more than .* no room; use device='cpu'"):
-        worlds.step(np.zeros((1, 2)), [0])
+        envs.step(np.zeros((1, 2)), [0])
     device._data.overflow.zero_()
     device._data.qvel.assign(np.full(device._data.qvel.shape, np.nan, np.float32))
     with pytest.raises(control.PhysicsError, match=r"environments \[0\]"):
-        worlds.step(np.zeros((1, 2)), [0])
-    worlds.close()
+        envs.step(np.zeros((1, 2)), [0])
+    envs.close()
 
 
-def test_what_is_touched_on_a_device_ends_the_episode(scene):
+def test_gpu_contact_ends_the_episode(scene):
     wall = ObstacleConfig("in_the_way", "box", station=1.5, lateral=0.0)
     stage = EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": (wall,)})
-    worlds = GpuVectorEnv(stage, [4, 5], "cpu")
-    worlds.begin(range(2))
+    envs = GpuVectorEnv(stage, [4, 5], "cpu")
+    envs.begin(range(2))
     for _ in range(30):
-        out = worlds.step(np.array([[1.0, 0.0], [-1.0, 0.0]]))
+        out = envs.step(np.array([[1.0, 0.0], [-1.0, 0.0]]))
         if out.over.any():
             break
     assert out.terminated.tolist() == [True, False]
-    assert worlds.tasks[0].cause == "collision" and any("in_the_way" in name for name in worlds.physics[0].touched)
-    assert worlds.physics[1].touched == ()
-    worlds.begin([0])
-    assert worlds.physics[0].time() == 0.0 and not worlds.step(np.zeros((1, 2)), [0]).over.any()
-    worlds.close()
+    assert envs.tasks[0].cause == "collision" and any("in_the_way" in name for name in envs.physics[0].touched)
+    assert envs.physics[1].touched == ()
+    envs.begin([0])
+    assert envs.physics[0].time() == 0.0 and not envs.step(np.zeros((1, 2)), [0]).over.any()
+    envs.close()
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.1])
-def test_pictures_on_a_device_are_those_on_the_host(scene, latency, monkeypatch):
-    """Through the ends of episodes, some worlds at a time, and as a tensor that shares the memory."""
+def test_gpu_frame_stacks_equal_those_on_the_host(scene, latency, monkeypatch):
+    """Across episode ends, for subsets of environments, and as a tensor that shares memory."""
     stage = EnvFactory.open(
         scene, "bend", {"obstacles": (), "lighting": ("day", "night"), "lighting_drift": True, **SMALL}
     )
@@ -176,7 +176,7 @@ def test_pictures_on_a_device_are_those_on_the_host(scene, latency, monkeypatch)
         before = device.stacks
 
 
-def test_only_bare_pictures_stay_on_the_device(scene):
+def test_gpu_observer_is_used_only_without_objects(scene):
     def kind(**options) -> type:
         stage = EnvFactory.open(scene, "bend", {"obstacles": (), **SMALL, **options})
         stage = replace(stage, options=replace(stage.options, device="cuda"))  # the field stays on the CPU
@@ -186,7 +186,7 @@ def test_only_bare_pictures_stay_on_the_device(scene):
     assert kind(randomise=True) is kind(obstacles=1) is kind(camera=CameraOptions(vibration=0.1)) is PixelObserver
 
 
-def test_no_gpu_is_one_clear_line(scene):
+def test_missing_gpu_is_refused_in_one_line(scene):
     with pytest.MonkeyPatch.context() as patch, pytest.raises(InputError, match="device = 'cuda': no CUDA device"):
         patch.setattr(wp, "is_cuda_available", lambda: False)
         twin.load(scene, "bend", device="cuda")

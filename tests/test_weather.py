@@ -1,4 +1,4 @@
-"""Weather that the film did not have, and what stands beside the corridor of randomised episodes."""
+"""Weather and distractor objects of randomized episodes."""
 
 from dataclasses import replace
 
@@ -8,12 +8,13 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import runtime
+from twin.config import Condition
 from twin.env.domain_randomization import (
     EVALUATION_RANGES,
     KNOWN_WEATHER_FRACTION,
     RandomizationSample,
     Ranges,
-    lighting_options,
+    condition_options,
 )
 from twin.env.episode_lighting import LightingSets, sample_lighting
 from twin.env.suite import EnvFactory, fingerprint
@@ -33,7 +34,7 @@ def scene(tmp_path_factory):
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
-def test_haze_hides_by_distance_and_spares_what_is_near():
+def test_fog_increases_with_distance():
     distance = np.array([[1500.0, 1500.0], [30.0, 3.0]], np.float32)
     rgb = np.array([[[0.8] * 3, [0.6] * 3], [[0.1] * 3, [0.1] * 3]], np.float32)
     np.testing.assert_array_equal(FogSample(0.0).apply(rgb, distance), rgb)
@@ -58,7 +59,7 @@ def _pose(x: float, turned: float) -> np.ndarray:
     return pose
 
 
-def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
+def test_cast_shadows_are_fixed_in_the_world():
     rays = unproject(pixel_grid(32, 32), np.array([20.0, 20.0, 16.0, 16.0]))
     rgb, depth = np.ones((32, 32, 3), np.float32), np.full((32, 32), 2.0, np.float32)
     covers = []
@@ -75,7 +76,7 @@ def test_shadows_lie_still_in_the_place_and_take_no_more_than_stated():
     assert 0.1 < np.mean(covers) < 0.6 and np.std(covers) > 0.1
 
 
-def test_randomised_episodes_have_weather_and_bystanders(scene):
+def test_randomized_episodes_have_weather_and_distractors(scene):
     still = dict.fromkeys(("friction", "wheel_radius", "airlight"), (1.0, 1.0))
     robot = ("payload", "latency", "wheel_difference", "camera_shift", "camera_turn")
     still |= dict.fromkeys((*robot, "sunlight", "shade", "bystanders"), (0.0, 0.0))
@@ -121,7 +122,7 @@ def photos(tmp_path_factory):
     return twin.load_scene(scene.root)
 
 
-def test_a_picture_under_a_photos_light_is_seen_through_its_air(photos):
+def test_fog_of_a_photo_is_applied(photos):
     built = photos
 
     def first(lighting: str, **options):
@@ -147,7 +148,7 @@ def test_a_picture_under_a_photos_light_is_seen_through_its_air(photos):
     assert not EnvFactory.open(built, "ahead", {"lighting": ("day", "foggy"), **SMALL})._field_only
 
 
-def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
+def test_fog_is_applied_after_relighting_and_shadows(photos):
     strong = {"sunlight": (0.7, 0.7), "shade": (0.75, 0.75), "extinction": (0.3, 0.3), "bystanders": (0, 0)}
     still = dict.fromkeys(("friction", "wheel_radius", "airlight"), (1.0, 1.0))
     still |= dict.fromkeys(("payload", "latency", "wheel_difference", "camera_shift", "camera_turn"), (0.0, 0.0))
@@ -165,7 +166,7 @@ def test_sun_and_shadows_fall_on_the_place_and_air_lies_before_both(photos):
     assert np.abs(255.0 * expected - 255.0 * FOG.apply(seen.rgb[0], distance)).max() > 10.0  # it shows
 
 
-def test_the_air_drifts_with_the_light(photos):
+def test_fog_drifts_with_the_lighting(photos):
     sets = LightingSets(photos.field())
 
     def light(wanted, seed: int = 0):
@@ -192,7 +193,7 @@ def test_the_air_drifts_with_the_light(photos):
 
 
 @pytest.mark.parametrize("lighting", ["foggy", "clear"])
-def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows_are_weaker(photos, lighting):
+def test_known_weather_weakens_the_randomization(photos, lighting):
     def draw(lighting: str, ranges: Ranges) -> RandomizationSample:
         environment = twin.load(photos, "ahead", 5, lighting=lighting, **SMALL, randomise=ranges)
         environment.reset()
@@ -207,11 +208,11 @@ def test_on_a_day_that_a_photo_told_its_air_is_not_drawn_and_its_sun_and_shadows
     assert draw(lighting, replace(EVALUATION_RANGES, hold_known=False)) == unknown  # as in training
 
 
-def test_validations_know_how_much_a_photo_leaves_to_be_drawn(photos, monkeypatch):
+def test_fingerprint_covers_the_known_weather_fraction(photos, monkeypatch):
     names = ("foggy", "foggy+randomised", "day+randomised")
-    before = [fingerprint(photos, "ahead", name) for name in names]
+    before = [fingerprint(photos, "ahead", Condition.parse(name)) for name in names]
     monkeypatch.setattr("twin.env.suite.KNOWN_WEATHER_FRACTION", 0.5)
-    after = [fingerprint(photos, "ahead", name) for name in names]
+    after = [fingerprint(photos, "ahead", Condition.parse(name)) for name in names]
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, True]
 
 
@@ -233,7 +234,7 @@ def test_solid_shadows_have_straight_edges_and_no_seam():
 RAYS = unproject(pixel_grid(96, 54), np.array([50.0, 50.0, 48.0, 27.0]))
 LOW = np.deg2rad(15.0)
 LEFT = np.array([0.0, np.cos(LOW), np.sin(LOW)])
-"""A sun to the left of who looks along x: the right side of a street faces it."""
+"""A sun to the left of a camera that looks along x: the right side of a street faces it."""
 
 
 def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
@@ -254,10 +255,10 @@ def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]
     return depth.astype(np.float32), points.astype(np.float32), masks
 
 
-def test_days_of_an_evaluation_are_never_as_mild_as_those_of_training():
+def test_evaluation_weather_is_never_mild():
     """The road never has the film's sun: every draw of an evaluation shows another one, and shadows not filmed. Those
     of training begin at none."""
-    ranges, rng = lighting_options("day+randomised")["randomise"], np.random.default_rng(0)
+    ranges, rng = condition_options(Condition("day", True))["randomise"], np.random.default_rng(0)
     tried, trained = ([one.sample(rng) for _ in range(300)] for one in (ranges, Ranges()))
     for strength in ("sunlight", "shade"):
         least, first = (min(getattr(one, strength) for one in many) for many in (tried, trained))
@@ -288,7 +289,7 @@ def test_a_shadow_lies_on_the_side_away_from_the_sun():
 
 
 @pytest.mark.parametrize("ground", [1.0, 0.15])  # the latter is high enough to be lit
-def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
+def test_relighting_brightens_surfaces_that_face_the_sun(ground):
     depth, points, masks = street(ground)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
     lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).apply(rgb, depth, points)
@@ -305,7 +306,7 @@ def test_another_sun_lights_what_faces_it_and_leaves_the_ground(ground):
     )
 
 
-def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
+def test_relighting_blends_near_and_far():
     ahead = np.tile(np.linspace(20.0, 45.0, 251, dtype=np.float32), (3, 1))
     points = np.stack([np.minimum(ahead, 40.0), 0.0 * ahead, 0.0 * ahead - 1.0], -1)  # the ground, 1 m below
     rgb = np.full((*ahead.shape, 3), 0.5, np.float32)
@@ -315,7 +316,7 @@ def test_the_light_of_what_stands_passes_into_that_of_what_is_far():
     assert np.abs(steps).max() < 0.02 * abs(lit[-1]) and (np.sign(lit[-1]) * steps > -1e-3).all()
 
 
-def test_what_is_low_keeps_its_light_and_skies_differ():
+def test_relighting_keeps_low_surfaces_and_varies_the_sky():
     depth, points, masks = street(1.0)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
     lit = DirectionalRelighting(0.7, LEFT, np.random.default_rng(0)).apply(rgb, depth, points)[..., 1] / 0.5
@@ -330,8 +331,8 @@ def test_what_is_low_keeps_its_light_and_skies_differ():
     assert np.std(np.log(skies)) > 0.2
 
 
-def test_the_sun_stays_where_it_is_when_the_robot_turns_and_its_shadows_are_its_own():
-    """A wall is lit alike from wherever it is seen, and shadows are carried along the same sun's rays."""
+def test_sun_is_fixed_in_the_world_and_casts_the_shadows():
+    """A wall's brightness does not depend on the view, and shadows follow the same sun's rays."""
     rgb = np.full((54, 96, 3), 0.5, np.float32)
     up = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera axes to x ahead, y left, z up
     ratios = []

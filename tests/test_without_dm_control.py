@@ -1,4 +1,4 @@
-"""Where dm_control cannot be had, everything but driving works, and driving says what it wants."""
+"""Without dm_control everything but driving works, and driving names the cure."""
 
 import subprocess
 import sys
@@ -15,6 +15,6 @@ def test_scenes_are_built_without_dm_control():
     assert done.returncode == 0, done.stderr
 
 
-def test_driving_without_dm_control_says_what_it_needs():
+def test_driving_without_dm_control_names_the_cure():
     done = _run("import twin\ntry: twin.load('x')\nexcept twin.InputError as e: print(e)")
     assert "needs dm_control, which installs on Python 3.11 and 3.12" in done.stdout, done.stderr

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from twin import cli
-from twin.config import HELD_OUT, RANDOMIZED
+from twin.config import HELD_OUT, Condition
 from twin.scene import STAGES
 
 
@@ -203,7 +203,7 @@ def _validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lightings",
         nargs="+",
-        default=[HELD_OUT, HELD_OUT + RANDOMIZED],
+        default=[HELD_OUT, str(Condition(HELD_OUT, True))],
         help="names, mixtures a:b:0.3, held-out, any; any of them with +randomised",
     )
     parser.add_argument("--episodes", type=int, default=100, help="per policy and lighting")
@@ -257,7 +257,9 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
     )
-    command.add_argument("--twin-lighting", default=HELD_OUT + RANDOMIZED, help="the twin's lighting to compare with")
+    command.add_argument(
+        "--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with"
+    )
     command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
     command = add("log", "a drive log of the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")

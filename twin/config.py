@@ -12,7 +12,7 @@ TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 """Not allowed as names of lightings."""
 RANDOMIZED = "+randomised"
-"""Suffix that tables add to a lighting's name for episodes driven with domain randomization."""
+"""Suffix of randomized conditions in tables, see `Condition`; not allowed at the end of a lighting's name."""
 
 KINDS = ("auto", "video", "images", "colmap", "transforms")
 MAPPERS = ("auto", "global", "incremental")
@@ -47,6 +47,24 @@ MARKER_FAMILIES = {
     **{f"DICT_APRILTAG_36{h}11": 587 for h in "hH"},
 }
 """OpenCV's marker dictionaries and their numbers of markers."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Condition of an episode. Tables write it as `night` or `night+randomised`; only this class converts that text."""
+
+    lighting: str
+    """A name, a mixture, or one of `RESERVED_LIGHTINGS`; see `twin/env/episode_lighting.py`."""
+    randomised: bool = False
+    """Robot, weather and distractor objects are randomized; see `twin/env/domain_randomization.py`."""
+
+    @staticmethod
+    def parse(text: str) -> "Condition":
+        lighting = text.removesuffix(RANDOMIZED)
+        return Condition(lighting, lighting != text)
+
+    def __str__(self) -> str:
+        return self.lighting + RANDOMIZED * self.randomised
 
 
 @dataclass(frozen=True)

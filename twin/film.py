@@ -113,9 +113,10 @@ def command(given: argparse.Namespace) -> None:
         "obstacles": _obstacles(given.obstacles),
     }
     if given.lighting:
-        from twin.env.domain_randomization import lighting_options
+        from twin.config import Condition
+        from twin.env.domain_randomization import condition_options
 
-        options |= {name: value for name, value in lighting_options(given.lighting).items() if value}
+        options |= {name: value for name, value in condition_options(Condition.parse(given.lighting)).items() if value}
     path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
     if not given.quiet:
         print(f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}")

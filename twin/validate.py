@@ -16,8 +16,8 @@ from typing import Any
 from zlib import crc32
 
 from twin import commands, runtime
-from twin.config import HELD_OUT, RANDOMIZED
-from twin.env.domain_randomization import lighting_options, measured_parameters
+from twin.config import HELD_OUT, Condition
+from twin.env.domain_randomization import condition_options, measured_parameters
 from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes, training_summaries
@@ -31,7 +31,7 @@ from twin.report.validation_summary import failure_map, summarize, summary_lines
 from twin.runtime import exclusive_lock
 from twin.scene import SceneDir
 
-DEFAULT_LIGHTINGS = (HELD_OUT, HELD_OUT + RANDOMIZED)
+DEFAULT_LIGHTINGS = (HELD_OUT, str(Condition(HELD_OUT, True)))
 """Unseen light alone, and unseen light with domain randomization, which is closer to a real road."""
 
 _FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # see `lighting_seeds`
@@ -75,7 +75,9 @@ class Campaign:
             left = [seed for seed in seeds if (name, self.task, lighting, seed) not in self._done]
             for k in range(0, len(left), CHUNK):
                 source, trust = self._policies[name]
-                chunk = EpisodeChunk(self._scene, self.task, source, trust, lighting, tuple(left[k : k + CHUNK]))
+                chunk = EpisodeChunk(
+                    self._scene, self.task, source, trust, Condition.parse(lighting), tuple(left[k : k + CHUNK])
+                )
                 chunks.append((name, chunk))
         with runtime.bar(what, len(keys), "episode") as bar:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
@@ -85,7 +87,7 @@ class Campaign:
                     Trial(
                         name,
                         self.task,
-                        chunk.lighting,
+                        str(chunk.condition),
                         o.seed,
                         o.cause,
                         round(o.progress, 3),
@@ -198,7 +200,9 @@ def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Seq
         path = folder / "films" / trial.policy / film_name(trial.task, trial.lighting, trial.seed)
         poster = path.with_suffix(".jpg")
         if not poster.exists():
-            episode = film(root, trial.task, source, trial.seed, path, trust, **lighting_options(trial.lighting))[1]
+            episode = film(
+                root, trial.task, source, trial.seed, path, trust, **condition_options(Condition.parse(trial.lighting))
+            )[1]
             if (episode.cause, len(episode.times) - 1) != (trial.cause, trial.steps):
                 path.unlink()
                 raise InputError(
@@ -290,7 +294,7 @@ def _check_same(
     trials = [trial for table in tables if table.exists() and _has_rows(table) for trial in read_trials(table)]
     driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}
     for lighting in lightings:
-        road, digest = _road(task, lighting), fingerprint(twin, task, lighting)
+        road, digest = _road(task, lighting), fingerprint(twin, task, Condition.parse(lighting))
         if road in driven and recorded["roads"].get(road) != digest:
             raise InputError(
                 f"{folder} has episodes of {task} under {lighting} from before its scene, task, obstacles or photo, "

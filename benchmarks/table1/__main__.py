@@ -32,7 +32,7 @@ from results import HELD_OUT_FORECAST, collect, table
 from scores import RESULTS, tables
 
 import twin
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.reality.lighting import WEATHER
 
 sys.path.append(str(Path(__file__).parents[1]))
@@ -99,7 +99,7 @@ def forecast(scene: Path) -> None:
     _forecast(scene, "results.csv", rows)
     episodes = _rows(scene / "validation" / "episodes.csv")
     validated = {(row["policy"], row["task"], row["lighting"]) for row in episodes}
-    by_photo = [row | {"twin_lighting": row["lighting"] + RANDOMIZED} for row in rows]
+    by_photo = [row | {"twin_lighting": str(Condition(row["lighting"], True))} for row in rows]
     by_photo = [row for row in by_photo if (row["policy"], row["task"], row["twin_lighting"]) in validated]
     if by_photo:
         shutil.copytree(scene / "forecast", scene / HELD_OUT_FORECAST, dirs_exist_ok=True)

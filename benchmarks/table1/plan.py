@@ -8,7 +8,7 @@ The selection is fixed here, before any result is known.
 from dataclasses import dataclass
 from pathlib import Path
 
-from twin.config import HELD_OUT, RANDOMIZED
+from twin.config import HELD_OUT, Condition
 from twin.evaluation.statistics import MIN_TRIALS
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.files import read_json
@@ -27,9 +27,9 @@ SHARES = (0.25, 0.5)
 """Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50
 """Episodes in the twin per policy and held-out lighting."""
-LIGHTINGS = {"final": (HELD_OUT, HELD_OUT + RANDOMIZED), "checkpoint": (HELD_OUT + RANDOMIZED,)}
+LIGHTINGS = {"final": (HELD_OUT, str(Condition(HELD_OUT, True))), "checkpoint": (str(Condition(HELD_OUT, True)),)}
 """Lightings of the twin. Forecasts use the randomised one; the paper's table, of finished policies, the other."""
-PHOTOS = tuple(f"{name}{RANDOMIZED}" for name in WEATHER)
+PHOTOS = tuple(str(Condition(name, True)) for name in WEATHER)
 """Lightings of the twin from a photo of each test day, for forecasts per weather."""
 PHOTO_EPISODES = 5
 """Episodes in the twin per policy and weather."""

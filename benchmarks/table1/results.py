@@ -7,7 +7,7 @@ from typing import Any
 from plan import PAPER, PHOTOS, SETUPS, TASKS, Run
 from scores import counts, over_days
 
-from twin.config import HELD_OUT, RANDOMIZED
+from twin.config import HELD_OUT, Condition
 from twin.evaluation.statistics import wilson
 from twin.evaluation.training_curves import CHOICE_FILE, read_episodes
 from twin.evaluation.trials import RECENT_EPISODES, Trial, read_trials
@@ -102,7 +102,10 @@ def _training(folder: Path) -> dict[str, Any]:
 
 def _evaluations(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
     out: dict[str, Any] = {"policy": name}
-    parts = [[t for t in twin if t.lighting == HELD_OUT], [t for t in twin if t.lighting == HELD_OUT + RANDOMIZED]]
+    parts = [
+        [t for t in twin if t.lighting == HELD_OUT],
+        [t for t in twin if t.lighting == str(Condition(HELD_OUT, True))],
+    ]
     photos = [trial for trial in twin if trial.lighting in PHOTOS]
     for where, trials in zip(_EVALUATIONS, (*parts, photos, real), strict=True):
         mine = [trial for trial in trials if trial.policy == name]

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from plan import SETUPS, SHARES, STEPS, TASKS
 
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.evaluation.statistics import (
     MIN_POLICIES,
     UndefinedStatistic,
@@ -85,7 +85,7 @@ def policy_records(results: dict[str, Any]) -> list[PolicyRecord]:
                     setup=run["setup"],
                     task=run["task"],
                     trained=int(step) / STEPS[names[run["task"]]] if step else 1.0,
-                    twin={k.removesuffix(RANDOMIZED): v for k, v in counts(policy["validate_by_photo"]).items()},
+                    twin={Condition.parse(k).lighting: v for k, v in counts(policy["validate_by_photo"]).items()},
                     held_out=held_out["successes"] / held_out["trials"] if held_out["trials"] else float("nan"),
                     real=counts(policy["real"]),
                 )

@@ -1,7 +1,4 @@
-"""Imperfections of a real camera: vibration, drifting exposure and motion blur. All are off by default.
-
-The robot's motion on the ground is part of the physics; delays of pictures and commands are part of the environment.
-"""
+"""Imperfections of a real camera: vibration, drifting exposure and motion blur. All are off by default."""
 
 from dataclasses import dataclass
 

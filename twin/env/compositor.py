@@ -6,155 +6,272 @@ blended in with the remaining transmittance. Uncovered pixels, and uncovered par
 """
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.env.camera_noise import CameraNoise, soft_clip
-from twin.env.irradiance import Irradiance, IrradianceEstimator
-from twin.env.mujoco_renderer import (
-    FRONT_CAMERA,
-    ObjectRenderer,
-    RenderedObjects,
-    camera_intrinsics,
-    camera_poses,
-)
-from twin.env.obstacles import PREFIX, stored_route
+from twin.env.irradiance import BOX_CORNERS, ContactShadows, Irradiance, IrradianceEstimator
+from twin.env.mujoco_renderer import FRONT_CAMERA, RayCaster, camera_intrinsics, camera_poses, mujoco_rays
+from twin.env.obstacle_models import OBSTACLE_GROUP
+from twin.env.obstacles import stored_route
 from twin.env.weather import Weather
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
+from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, pixel_grid, unproject
+from twin.mjcf.husky_visuals import ROBOT_VISUAL_GROUP, camera_mount_geoms
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
 from twin.runtime import available_cores
-from twin.types import Array
+from twin.types import Array, Array32
 from twin.warp_runtime import wp
 
-# ---- contact shadows
+# ---- objects
 
-_PENUMBRA = 0.03, 0.10
-"""Half width of the penumbra at the foot [m], and its growth per metre behind the foot; includes the sun's disk, its
-halo and the error of the estimated direction."""
-_FILL = 0.85  # fraction of a box's sides that an obstacle really fills
-_SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
-_SKY_REACH = 1.2  # [m] from an obstacle's side up to which it hides the sky
-_MAX_SHADOW = 4.0  # [m] length of a shadow behind the foot
-_GROUND_TOLERANCE = 0.15  # [m] above or below the foot within which a surface counts as ground
-_MAX_DISTANCE = 25.0  # [m] from the camera, beyond which shadows are not drawn
+_NEAR_PLANE = 0.02  # [m] z-depth before which nothing is drawn
+_SMALL_MASK = 800  # [px] masks up to here are supersampled throughout: a first cast would cost more than it saves
+_SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of the samples at edges
 
 
-class ContactShadows:
-    """Soft shadows of a model's obstacles on the reconstructed ground.
+@dataclass(frozen=True)
+class RenderedObjects:
+    """Objects in a window of the picture; arrays (height, width), color (height, width, 3)."""
 
-    The sky is taken as uniform except for one sun, whose direction and share of the light `Irradiance.sun` estimates.
-    The ground beside an obstacle loses the part of the sky that the obstacle hides; the ground behind it loses the sun
-    within the obstacle's outline, with a penumbra that widens with the distance. So under clouds the ground darkens
-    around the foot alone, and in sunshine on the far side. An obstacle is approximated by two upright boxes, around its
-    lower and its upper geoms.
+    window: tuple[int, int, int, int]
+    """Left, top, width, height [px]."""
+    coverage: Array32
+    """Fraction of a pixel that objects cover."""
+    rgb: Array32
+    """Shaded color in film colors; 0 where nothing covers the pixel."""
+    depth: Array32
+    """z-depth of the covered part [m]; 0 where nothing covers the pixel."""
+
+
+class ObjectRenderer:
+    """Draws obstacles and robots of one model, one env at a time. Not for two threads at once.
+
+    It casts rays into a model of these geoms alone, for pixels that some geom's bounding box covers: one per pixel, and
+    four at edges, for smooth outlines. That model is lit such that the drawn color encodes the surface's normal. An
+    object's shaded color is its own color times the irradiance of the normal.
     """
 
-    def __init__(self, model: mujoco.MjModel, geoms: NDArray[np.int64]):
-        """`geoms` are those that are drawn; only obstacles among them throw shadows."""
-        self._boxes: dict[int, Array] = {}
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        roots = model.body_rootid[model.geom_bodyid[geoms]]
-        for body in np.unique(roots):
-            if model.body(int(body)).name.startswith(PREFIX):
-                self._boxes[int(body)] = _bounding_boxes(model, data, geoms[roots == body], int(body))
-
-    @property
-    def bodies(self) -> tuple[int, ...]:
-        """The obstacles' bodies."""
-        return tuple(self._boxes)
-
-    def darken(
-        self, rgb: NDArray, depth: NDArray, rays: Array, pose: Array, data: mujoco.MjData, irradiance: Irradiance
-    ) -> None:
-        """Multiplies the colors of shadowed ground, in place.
-
-        Args:
-            rgb: Colors of the field, shape (height, width, 3).
-            depth: z-depth of the field [m], shape (height, width).
-            rays: Rays of the pixels in the camera frame, with z = 1, shape (height, width, 3).
-            pose: camera_to_world, OpenCV axes, shape (4, 4).
-            data: Current poses of the bodies.
-            irradiance: Irradiance of the lighting.
+    def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
         """
-        for body, boxes in self._boxes.items():
-            foot = data.xpos[body]
-            away = float((foot - pose[:3, 3]) @ pose[:3, 2])
-            if not (0.0 < away < _MAX_DISTANCE) or abs(foot[2] - pose[2, 3]) > _MAX_DISTANCE:
-                continue
-            share, sun = irradiance.sun(foot[:2])
-            size = float(np.abs(boxes[:, :, :2]).max() * np.sqrt(2.0))
-            length = min(float(boxes[:, 1, 2].max() * np.linalg.norm(sun[:2]) / sun[2]), _MAX_SHADOW)
-            reach = size + max(length, _SKY_REACH)
-            index = np.flatnonzero(np.abs(depth - away) < reach)
-            points = (rays.reshape(-1, 3)[index] * depth.ravel()[index, None]) @ pose[:3, :3].T + (pose[:3, 3] - foot)
-            on = (np.abs(points[:, 2]) < _GROUND_TOLERANCE) & ((points[:, :2] ** 2).sum(1) < reach**2)
-            if on.any():
-                lost = _light_loss(boxes, points[on, :2], data.xmat[body].reshape(3, 3)[:2, :2], share, sun)
-                rgb.reshape(-1, 3)[index[on]] *= (1.0 - lost)[:, None].astype(rgb.dtype)
+        Args:
+            model: Its geoms of the obstacles' group and of the robot's visual group are drawn.
+            camera: Index of the camera in the model.
+            size: Width, height of the picture [px].
+        """
+        self.size = size
+        self._intrinsics = camera_intrinsics(model, camera, size)
+        colors = _geom_rgba(model)
+        drawn = np.isin(model.geom_group, (OBSTACLE_GROUP, ROBOT_VISUAL_GROUP)) & (colors[:, 3] > 0.0)
+        drawn[camera_mount_geoms(model, camera)] = False
+        self.geoms = np.flatnonzero(drawn)
+        owners = model.body_rootid[model.geom_bodyid[self.geoms]]
+        self._bodies, self._owner = np.unique(owners, return_inverse=True)
+        self._colors = colors[self.geoms, :3]
+        self._centers, self._halves = model.geom_aabb[self.geoms, :3], model.geom_aabb[self.geoms, 3:]
+        fx, fy, cx, cy = self._intrinsics
+        # Inward normals of the view frustum's planes in the camera frame; the last plane lies `_NEAR_PLANE` ahead.
+        self._planes = np.array([[fx, 0, cx], [-fx, 0, size[0] - cx], [0, fy, cy], [0, -fy, size[1] - cy], [0, 0, 1.0]])
+        if len(self.geoms) == 0:
+            return
+        small = _geoms_only_model(model, self.geoms)
+        self._offset, self._turn = _mesh_frames(small)
+        # Distances are cut off at a multiple of the model's extent.
+        small.stat.extent, small.vis.map.zfar = 1.0, 1.0e4
+        width, height = size
+        data = mujoco.MjData(small)
+        mujoco.mj_forward(small, data)
+        self._caster = RayCaster(
+            small,
+            data,
+            cam_res=(2 * width, 2 * height),
+            render_seg=True,
+            enabled_geom_groups=[0],
+            use_textures=False,
+            enable_specular=False,
+            enable_emission=False,
+        )
+        self._cast(self._rays(pixel_grid(2, 2).reshape(-1, 2)))  # compiles
+        pixels = pixel_grid(*size).reshape(-1, 2)
+        self._center_rays = self._rays(pixels)
+        self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
+
+    def visible_mask(self, data: mujoco.MjData, pose: Array) -> NDArray[np.bool_] | None:
+        """Pixels that some geom may cover from an OpenCV pose, shape (height, width); None if no geom is in view."""
+        if len(self.geoms) == 0:
+            return None
+        turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
+        middles = data.geom_xpos[self.geoms] - pose[:3, 3] + np.einsum("nij,nj->ni", turns, self._centers)
+        planes = self._planes @ pose[:3, :3].T
+        # Distance that a box reaches into a half space: its center, plus its half sides projected onto the normal.
+        reach = middles @ planes.T + np.einsum("npj,nj->np", np.abs(planes @ turns), self._halves)
+        reach[:, -1] -= _NEAR_PLANE
+        seen = np.flatnonzero((reach > 0.0).all(1))
+        if len(seen) == 0:
+            return None
+        local = self._halves[seen, None] * BOX_CORNERS
+        corners = np.matmul(local, turns[seen].transpose(0, 2, 1)) + middles[seen, None]
+        x, y, z = np.moveaxis(corners @ pose[:3, :3], -1, 0)
+        width, height = self.size
+        mask = np.zeros((height, width), bool)
+        if (z < _NEAR_PLANE).any():
+            mask[:] = True
+            return mask
+        fx, fy, cx, cy = self._intrinsics
+        u, v = fx * x / z + cx, fy * y / z + cy
+        sides = np.stack([u.min(1) - 1, u.max(1) + 2, v.min(1) - 1, v.max(1) + 2], 1)
+        sides = np.clip(sides, 0, [width, width, height, height]).astype(int)
+        for left, right, top, bottom in sides.tolist():
+            mask[top:bottom, left:right] = True
+        return mask if mask.any() else None
+
+    def render(
+        self, data: mujoco.MjData, pose: Array, mask: NDArray[np.bool_], irradiance: Irradiance | None
+    ) -> RenderedObjects | None:
+        """Draws the pixels of a mask from `visible_mask`; None if no geom covers them.
+
+        `irradiance` shades the objects; None: their own plain colors.
+        """
+        turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
+        camera = opencv_to_mujoco(pose)
+        self._caster.set_poses(
+            geom_xpos=data.geom_xpos[self.geoms] + np.einsum("nij,nj->ni", turns, self._offset),
+            geom_xmat=turns @ self._turn,
+            cam_xpos=camera[:3, 3],
+            cam_xmat=camera[:3, :3],
+        )
+        shade = self._shader(data, irradiance)
+        pixels = np.flatnonzero(mask)
+        width, height = self.size
+        coverage, color, z = (np.zeros((height, width, *rest), np.float32) for rest in ((), (3,), ()))
+        edges = pixels
+        if len(pixels) > _SMALL_MASK:
+            geom, normals, depth = self._cast(self._center_rays[pixels])
+            coverage.ravel()[pixels] = geom >= 0
+            color.reshape(-1, 3)[pixels], z.ravel()[pixels] = shade(geom, normals), depth
+            ids = np.full((height, width), -1, np.int32)
+            ids.ravel()[pixels] = geom
+            edges = np.flatnonzero(_edge_mask(ids) & mask)
+        if len(edges):
+            geom, normals, depth = self._cast(self._subpixel_rays[edges].reshape(-1, 3))
+            hits = (geom >= 0).reshape(-1, 4)
+            share = hits.sum(1) / 4.0
+            over = 1.0 / np.maximum(4.0 * share, 1.0)
+            coverage.ravel()[edges] = share
+            color.reshape(-1, 3)[edges] = shade(geom, normals).reshape(-1, 4, 3).sum(1) * over[:, None]
+            z.ravel()[edges] = depth.reshape(-1, 4).sum(1) * over
+        rows, columns = np.flatnonzero(coverage.any(1)), np.flatnonzero(coverage.any(0))
+        if len(rows) == 0:
+            return None
+        top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
+        inner = np.s_[top:bottom, left:right]
+        window = int(left), int(top), int(right - left), int(bottom - top)
+        return RenderedObjects(window, coverage[inner], color[inner], z[inner])
+
+    def _rays(self, pixels: Array) -> Array32:
+        """Unit rays through (u, v) [px] in MuJoCo's camera axes, shapes (n, 2) → (n, 3)."""
+        return mujoco_rays(unproject(pixels, self._intrinsics))
+
+    def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
+        """Drawn geom (−1: none), unit normal and z-depth [m] (0: none) that rays (n, 3) hit."""
+        count, most = len(rays), self._caster.max_rays
+        if count > most:  # more edges than fit: in batches
+            parts = [self._cast(rays[k : k + most]) for k in range(0, count, most)]
+            geom, normals, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
+            return geom, normals, depth
+        self._caster.set_rays(rays)
+        rgb, depth = self._caster.cast()
+        normals = rgb / 127.5 - 1.0
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+        return self._caster.hit_geoms(), normals, depth
+
+    def _shader(
+        self, data: mujoco.MjData, irradiance: Irradiance | None
+    ) -> Callable[[NDArray[np.int32], Array32], Array32]:
+        """A function from drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 where the geom is −1."""
+        ground = irradiance.ground(data.xpos[self._bodies, :2]) if irradiance else None
+
+        def shade(geom: NDArray[np.int32], normals: Array32) -> Array32:
+            out = np.zeros((len(geom), 3), np.float32)
+            hit = np.flatnonzero(geom >= 0)
+            mine = geom[hit]
+            color = self._colors[mine]
+            if irradiance is not None and ground is not None:
+                color = color * irradiance.irradiance(ground[self._owner[mine]], normals[hit].astype(np.float64))
+            out[hit] = color
+            return out
+
+        return shade
 
 
-def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Array) -> Array:
-    """Fraction of the light that points of the ground lose, shape (n,).
-
-    Args:
-        boxes: Lowest and highest corners in the body frame, shape (2, 2, 3) [m].
-        points: Points relative to the foot in world axes, shape (n, 2) [m].
-        turn: Rotation of the body in the plane, shape (2, 2).
-        share: The sun's share of the light.
-        sun: Direction to the sun, shape (3,).
-    """
-    local = points @ turn
-    azimuth = sun[:2] / max(float(np.linalg.norm(sun[:2])), 1e-9)
-    slope = float(np.linalg.norm(sun[:2])) / float(sun[2])
-    behind, beside = -points @ azimuth, points @ np.array([-azimuth[1], azimuth[0]])
-    spread = _PENUMBRA[0] + _PENUMBRA[1] * np.maximum(behind, 0.0)
-    sunlit = np.ones(len(points))
-    hidden = np.zeros(len(points))
-    for low, high in boxes:
-        center, half = 0.5 * (low + high)[:2], 0.5 * _FILL * (high - low)[:2]
-        # Sky, weighted with the cosine: an endless wall hides half of it, a box a part by its width and height.
-        gap = np.linalg.norm(np.maximum(np.abs(local - center) - half, 0.0), axis=1)
-        wide = np.arctan2(float(half.mean()), gap) / np.pi
-        gap2 = gap**2 + 1e-6
-        rise = high[2] ** 2 / (high[2] ** 2 + gap2) - low[2] ** 2 / (low[2] ** 2 + gap2)
-        hidden = np.maximum(hidden, np.where(gap > 0.0, wide, _SKY_LOSS_BELOW) * rise)
-        # Sun: the box projected onto the ground.
-        middle = turn @ center
-        axes = turn * half  # columns: half sides in the world
-        across = float(np.abs(np.array([-azimuth[1], azimuth[0]]) @ axes).sum())
-        along = float(np.abs(azimuth @ axes).sum())
-        start, end = low[2] * slope - along, min(high[2] * slope, _MAX_SHADOW) + along
-        u, v = behind + middle @ azimuth, beside - middle @ np.array([-azimuth[1], azimuth[0]])
-        shadow = _smooth_step((across - v) / spread) + _smooth_step((across + v) / spread) - 1.0
-        shadow *= _smooth_step((u - start) / spread) + _smooth_step((end - u) / spread) - 1.0
-        sunlit *= 1.0 - np.clip(shadow, 0.0, 1.0)
-    return share * (1.0 - sunlit) + (1.0 - share) * hidden
+def _geom_rgba(model: mujoco.MjModel) -> Array:
+    """Color of every geom, shape (ngeom, 4)."""
+    out = model.geom_rgba.copy()
+    has = model.geom_matid >= 0
+    out[has] = model.mat_rgba[model.geom_matid[has]]
+    return out
 
 
-def _smooth_step(x: Array) -> Array:
-    """A smooth step from 0 to 1 around x = 0, over about ±2."""
-    return 0.5 + 0.5 * np.tanh(x)
+def _geoms_only_model(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> mujoco.MjModel:
+    """A model of these geoms alone, in its world body, with a camera; lit so that colors are (1 + normal) / 2."""
+    spec = mujoco.MjSpec()
+    spec.visual.headlight.active = 0
+    meshes: set[int] = set()
+    for i in geoms:
+        settings = {}
+        mesh = int(model.geom_dataid[i]) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH else -1
+        if mesh >= 0:
+            settings["meshname"] = f"mesh_{mesh}"
+            if mesh not in meshes:
+                _copy_mesh(spec, model, mesh)
+            meshes.add(mesh)
+        spec.worldbody.add_geom(type=int(model.geom_type[i]), size=model.geom_size[i], rgba=(1, 1, 1, 1), **settings)
+    spec.worldbody.add_camera(name="view")
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            direction = np.eye(3)[axis]
+            spec.worldbody.add_light(
+                type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+                dir=-sign * direction,
+                diffuse=0.5 * sign * direction,  # negative from the opposite side
+                ambient=(0.5, 0.5, 0.5) if axis == 0 and sign > 0 else (0, 0, 0),
+                specular=(0, 0, 0),
+                castshadow=False,
+            )
+    return spec.compile()
 
 
-def _bounding_boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int64], body: int) -> Array:
-    """Boxes around an obstacle's lower and upper geoms, in its frame: lowest and highest corners, shape (2, 2, 3)."""
-    signs = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
-    local = model.geom_aabb[geoms, None, :3] + signs * model.geom_aabb[geoms, None, 3:]
-    turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
-    world = local @ turns.transpose(0, 2, 1) + data.geom_xpos[geoms, None]
-    corners = (world - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
-    corners[..., 2] = np.maximum(corners[..., 2], 0.0)
-    middle = corners[..., 2].mean(1)
-    lower = middle <= 0.5 * corners[..., 2].max()
-    boxes = [corners[part].reshape(-1, 3) for part in (lower, ~lower) if part.any()]
-    return np.array([[box.min(0), box.max(0)] for box in (boxes[0], boxes[-1])])
+def _copy_mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> None:
+    added = spec.add_mesh(name=f"mesh_{mesh}")
+    start, faces = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    added.uservert = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].ravel()
+    added.userface = model.mesh_face[faces : faces + model.mesh_facenum[mesh]].ravel()
+    added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+
+
+def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
+    """Position and rotation of each geom in its mesh's original frame, as MuJoCo moves meshes to their inertial one."""
+    turns = np.empty((small.ngeom, 9))
+    for i in range(small.ngeom):
+        mujoco.mju_quat2Mat(turns[i], small.geom_quat[i])
+    return small.geom_pos.copy(), turns.reshape(-1, 3, 3)
+
+
+def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Pixels with a neighbor of another id."""
+    edge = np.zeros(ids.shape, bool)
+    across, down = ids[:, 1:] != ids[:, :-1], ids[1:] != ids[:-1]
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge
 
 
 # ---- compositing
@@ -186,11 +303,10 @@ class Compositor:
         self.size, self.max_envs, self._field = size, max_envs, field
         self._camera = model.camera(FRONT_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
-        # Warp's default device is global to the process and worker threads change it, so it is set to the CPU here.
-        # On a GPU all threads share one CUDA stream, so one worker is enough.
+        # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
-        # One after the other, as Warp compiles kernels at their first use.
+        # In sequence, as Warp compiles kernels at their first use. On a GPU all threads share one CUDA stream.
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)
@@ -208,8 +324,7 @@ class Compositor:
         """Renders the front camera of every env.
 
         Args:
-            datas: State of every env when the picture is taken, with its time and the poses of geoms and cameras
-                (`mj_forward` or `mj_kinematics` and `mj_camlight` after the last step; `HuskyPhysics.delayed_data`).
+            datas: State of every env, with poses of geoms and cameras (after `mj_kinematics` and `mj_camlight`).
             lighting: As for `BakedField.render`: one, or one per env.
             noise: Camera imperfections of each env; None: perfect cameras.
             weather: Weather of each env; None: that of the film.
@@ -224,7 +339,7 @@ class Compositor:
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
         lightings: list[Lighting] = [lighting] * len(datas) if one else list(lighting)  # type: ignore[list-item]
 
-        todo = iter(range(len(datas)))  # shared: each idle worker takes the next env, because cores differ in speed
+        todo = iter(range(len(datas)))  # shared: each idle worker takes the next env
 
         def composite_all(worker: _CompositorWorker) -> None:
             for k in todo:
@@ -280,7 +395,7 @@ class _CompositorWorker:
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
-        # One field per window size, since a field keeps render targets of few sizes.
+        # One per window size, since a field keeps render targets of few sizes.
         if (across, down) not in self._fields:
             self._fields[across, down] = self._field.single_threaded()
         view = Viewpoints.of(pose, self._intrinsics - np.array([0.0, 0.0, left, top]), (across, down))
@@ -296,8 +411,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index of the window in its arrays.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`, arrays (height, width): color (not premultiplied), depth and opacity of
-            the field alone.
+        front: The field up to `drawn.depth`, with colors not premultiplied, arrays (height, width).
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

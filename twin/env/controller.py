@@ -24,12 +24,9 @@ _TIME_TOLERANCE = 1e-9  # [s] below which two times are equal
 
 
 def limit_command(command: Array, previous: Array, params: HuskyParams, period: float = CONTROL_PERIOD) -> Array:
-    """Returns a command after the limits of speed and acceleration: v [m/s], ω [rad/s].
+    """Returns commands after the limits of speed and acceleration, shape (..., 2).
 
-    Args:
-        command: Requested v, ω, shape (..., 2).
-        previous: The limited command one `period` [s] ago, shape (..., 2).
-        params: Contains the limits.
+    `previous` are the limited commands one `period` [s] ago, shape (..., 2).
     """
     limit = np.array([params.max_speed, params.max_yaw_rate])
     step = np.array([params.max_acceleration, params.max_yaw_acceleration]) * period
@@ -105,8 +102,8 @@ class Controller:
 class SubstepSchedules:
     """Wheel speeds of n robots over one control step of `steps` physics substeps, in at most p segments per robot.
 
-    A segment is a run of substeps with constant wheel speeds. Contacts are checked at its end. Robots whose controllers
-    have different phases have different segments.
+    A segment is a run of substeps with constant wheel speeds; contacts are checked at its end. Segments differ between
+    robots whose controllers have different phases.
     """
 
     speeds: Array
@@ -125,10 +122,10 @@ class VectorController:
     def __init__(self, params: HuskyParams, count: int, period: float, timestep: float, check_steps: int) -> None:
         """
         Args:
-            params: Parameters shared by all robots.
+            params: Shared by all robots.
             count: Number of robots n.
             period: Time between two commands [s].
-            timestep: Physics timestep [s].
+            timestep: Of the physics [s].
             check_steps: Substeps between two contact checks.
         """
         self._params, self.timestep, self._check_steps = params, timestep, check_steps
@@ -143,12 +140,9 @@ class VectorController:
         self._limited, self._speeds = np.zeros((count, 2)), np.zeros((count, 2))
 
     def begin(self, which: NDArray[np.int64], latency: Array, steps_to_update: NDArray[np.int64]) -> None:
-        """Resets robots to rest, without pending commands.
+        """Resets k robots to rest, without pending commands.
 
-        Args:
-            which: Indices of the robots, shape (k,).
-            latency: Their `command_latency` [s], shape (k,).
-            steps_to_update: Substeps until their first update, shape (k,).
+        `latency` is their `command_latency` [s], `steps_to_update` the substeps until their first update, shape (k,).
         """
         self._latency[which], self._steps_to_update[which], self.time[which] = latency, steps_to_update, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._commands)

@@ -12,12 +12,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from twin.config import RANDOMIZED
-from twin.env.episode_model import PAYLOAD
+from twin.config import Condition
 from twin.errors import InputError, short_repr
 from twin.robot import HuskyParams
 
 Range = tuple[float, float]
+
+PAYLOAD = "payload"
+"""Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
 """Version of what a sample does. Raise it when fog, relighting, shadows or distractors of the same sample change."""
@@ -25,16 +27,24 @@ VERSION = 4
 KNOWN_WEATHER_FRACTION = 0.6
 """Fraction of the sun and shadow randomization kept when a photo of the day is available.
 
-It was measured on the known-truth world's own pictures of ten days of the real test (the five stated weathers and days
-1 to 5), with the twelve finished policies that are forecast there: a forecast for these days and policies is not
-independent of it. Days 6 to 15 were not used. The change of steering between the twin under a photo's appearance and
-fog and the pictures of that day is 0.8 times that of the full randomization (0.6 to 0.96). With this fraction it is
-1.1 times in the part that lasts for the day (0.8 to 1.4), and 1.2 times in the part that differs from place to place
-(1.0 to 1.4); see `benchmarks/day.py`."""
+Measured by `benchmarks/day.py` with the twelve finished policies that are forecast on the known-truth world, on ten of
+its days (the five stated weathers and days 1 to 5, not 6 to 15): a forecast for these is not independent of it. The
+change of steering between the twin under a photo's appearance and fog and the pictures of that day is 0.8 (0.6 to 0.96)
+times that under the full randomization. With this fraction it is 1.1 (0.8 to 1.4) times in the part that is constant
+over a day, and 1.2 (1.0 to 1.4) times in the part that varies along the route."""
 
 _PAYLOAD_SIDE = 0.3  # [m] of the cube whose inertia the payload gets
 _TIRE_SUFFIX = "_tyre"
+_PER_AXIS = ("camera_shift", "camera_turn")  # sampled for each axis, and may be held at a value per axis
 _MAX_BOUND = 1e6
+_ABOVE_ZERO = float(np.nextafter(0.0, 1.0))
+_BOUNDS = {
+    **dict.fromkeys(("friction", "wheel_radius"), (_ABOVE_ZERO, _MAX_BOUND)),
+    **dict.fromkeys(("payload", "latency", "extinction", "airlight", "sunlight", "shade"), (0.0, _MAX_BOUND)),
+    "bystanders": (0.0, _MAX_BOUND),
+    "wheel_difference": (-0.5, 0.5),
+}
+"""Allowed values of ranges; others are within ±`_MAX_BOUND`."""
 _RANGES_BY_PARAMETER = {
     "friction": ("friction",),
     "center_of_mass": ("payload",),
@@ -44,8 +54,8 @@ _RANGES_BY_PARAMETER = {
     "camera_height": ("camera_shift",),
     "camera_yaw": ("camera_turn",),
 }
-"""Ranges that are held fixed when a parameter of `HuskyParams` was measured. Only a film by the camera itself shows its
-yaw, and such a film shows pitch and roll as well; when the height was measured, the given offset is taken as exact."""
+"""Ranges held fixed when a parameter of `HuskyParams` was measured. The yaw comes from a film by the camera itself,
+which determines pitch and roll as well. With a measured height, the whole offset of the camera is taken as exact."""
 _MODEL_FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
 
 
@@ -78,30 +88,25 @@ class Ranges:
     bystanders: Range = (0, 4)
     """Number of distractor objects beside the corridor: cones, boxes, bollards in any color."""
     hold_known: bool = False
-    """Samples only what is unknown: robot parameters that the scene has not measured (see `for_robot`), and weather
-    unless the episode's lighting, or a part of its mixture, was fitted to a photo (see
-    `RandomizationSample.for_known_weather`)."""
+    """Holds measured parameters of the robot fixed (see `for_robot`), and weakens the weather in lightings fitted to a
+    photo (see `RandomizationSample.for_known_weather`)."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value is not a range, or lies outside the allowed bounds."""
         for name, pair in self.by_name().items():
+            least, most = _BOUNDS.get(name, (-_MAX_BOUND, _MAX_BOUND))
             try:
-                low, high = np.asarray(pair, float)  # a fixed range may have a value per axis
-                valid = bool((np.abs([low, high]) < _MAX_BOUND).all())
+                low, high = np.asarray(pair, float)
+                valid = (low.ndim == 0 or name in _PER_AXIS) and bool(
+                    np.all((least <= low) & (low <= high) & (high <= most))
+                )
             except (TypeError, ValueError, OverflowError):
                 valid = False
             if not valid:
-                raise InputError(f"randomise: {name} = {short_repr(pair)}; expected (lowest, highest), finite numbers")
-            if not np.all(low <= high):
-                raise InputError(f"randomise: {name} = {short_repr(pair)}; expected (lowest, highest)")
-        for name in ("friction", "wheel_radius"):
-            if not getattr(self, name)[0] > 0.0:
-                raise InputError(f"randomise: {name} = {getattr(self, name)}; expected more than 0")
-        if max(map(abs, self.wheel_difference)) > 0.5:
-            raise InputError(f"randomise: wheel_difference = {self.wheel_difference}; expected at most ±0.5")
-        for name in ("payload", "latency", "extinction", "airlight", "sunlight", "shade", "bystanders"):
-            if not getattr(self, name)[0] >= 0.0:
-                raise InputError(f"randomise: {name} = {getattr(self, name)}; expected at least 0")
+                expected = "more than 0" if least == _ABOVE_ZERO else f"{least:,g}"
+                raise InputError(
+                    f"randomise: {name} = {short_repr(pair)}; expected (lowest, highest), from {expected} to {most:,g}"
+                )
 
     def by_name(self) -> dict[str, Range]:
         """Every range by its name."""
@@ -110,9 +115,8 @@ class Ranges:
     def for_robot(self, robot: HuskyParams) -> "Ranges":
         """These ranges for a scene's robot. With `hold_known`, measured parameters are held at the robot's values.
 
-        A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. One
-        robot drives the real trials: rates over many robots would measure the robustness of a policy, not its success
-        on that robot.
+        A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. Real
+        trials are driven by one robot; rates over many robots would measure robustness, not success on that robot.
         """
         if not self.hold_known:
             return self
@@ -122,21 +126,16 @@ class Ranges:
         return replace(self, **held)
 
     def sample(self, rng: np.random.Generator) -> "RandomizationSample":
-        """One episode's values."""
-        return RandomizationSample(
-            friction=float(rng.uniform(*self.friction)),
-            payload=float(rng.uniform(*self.payload)),
-            latency=float(rng.uniform(*self.latency)),
-            camera_shift=tuple(rng.uniform(*self.camera_shift, 3).tolist()),
-            camera_turn=tuple(rng.uniform(*self.camera_turn, 3).tolist()),
-            wheel_radius=float(rng.uniform(*self.wheel_radius)),
-            wheel_difference=float(rng.uniform(*self.wheel_difference)),
-            extinction=float(rng.uniform(*self.extinction)),
-            airlight=float(rng.uniform(*self.airlight)),
-            sunlight=float(rng.uniform(*self.sunlight)),
-            shade=float(rng.uniform(*self.shade)),
-            bystanders=int(rng.integers(round(self.bystanders[0]), round(self.bystanders[1]) + 1)),
-        )
+        """One episode's values, sampled in the order of the fields."""
+        values: dict[str, Any] = {}
+        for name, pair in self.by_name().items():
+            if name == "bystanders":
+                values[name] = int(rng.integers(round(pair[0]), round(pair[1]) + 1))
+            elif name in _PER_AXIS:
+                values[name] = tuple(rng.uniform(*pair, 3).tolist())
+            else:
+                values[name] = float(rng.uniform(*pair))
+        return RandomizationSample(**values)
 
 
 @dataclass(frozen=True)
@@ -167,9 +166,8 @@ class RandomizationSample:
 
 
 EVALUATION_RANGES = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75), hold_known=True)
-"""Ranges for evaluating policies: weather surely different from the film's, and the scene's robot as far as measured.
-Training samples sun and shadows from zero up, to ease learning; in a forecast, such mild days would overestimate
-success on the road, where the sun never equals the film's."""
+"""Ranges for evaluating policies: the scene's robot as far as measured, and never the film's sun. Training samples sun
+and shadows from zero up, to ease learning; in a forecast, such mild days would overestimate success on the road."""
 
 
 def measured_parameters(robot: HuskyParams) -> list[str]:
@@ -178,10 +176,9 @@ def measured_parameters(robot: HuskyParams) -> list[str]:
     return [name for name in _RANGES_BY_PARAMETER if getattr(robot, name) != getattr(published, name)]
 
 
-def lighting_options(lighting: str) -> dict[str, Any]:
-    """Environment options for a lighting's name in tables, such as `held-out+randomised`."""
-    plain = lighting.removesuffix(RANDOMIZED)
-    return {"lighting": plain, "randomise": EVALUATION_RANGES if plain != lighting else None}
+def condition_options(condition: Condition) -> dict[str, Any]:
+    """Environment options for the evaluation of a policy under a condition."""
+    return {"lighting": condition.lighting, "randomise": EVALUATION_RANGES if condition.randomised else None}
 
 
 class NominalModel:

@@ -1,25 +1,196 @@
-"""Drivers: they convert an episode's observations to actions.
+"""Drivers: they convert poses or images to commands or actions.
 
-A *driver* receives the environment and the newest `dm_env.TimeStep`, and returns an action within the environment's
-`action_spec`. Drivers that use poses serve as references; a policy uses images only.
+`PurePursuit` (Coulter 1992) follows a route from poses alone; `follow_route` records such a drive, without images and
+without dm_control. It steers on the circle through a point of the route ahead. A skid-steered robot turns faster or
+slower than commanded, by a factor that depends on ground and load: the gain of the commanded yaw rate follows the
+measured ratio.
+
+The *drivers of an environment* receive it and its newest `dm_env.TimeStep`, and return an action within its
+`action_spec`. Those that use poses serve as references; a policy uses images only.
 """
 
 import importlib
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.dm import control
-from twin.env.options import STEERING
-from twin.env.route_follower import PurePursuit
-from twin.env.task import check_actions
+from twin.env.controller import CONTROL_PERIOD
+from twin.env.options import STEERING, check_actions
+from twin.env.physics import HuskyPhysics
 from twin.errors import InputError, short_repr
+from twin.mjcf.world import World, arc_lengths, heading_error, nearest_on_route, point_at
 from twin.types import Array
+
+if TYPE_CHECKING:  # without dm_control, route followers still work
+    import dm_env
+    from dm_control.rl import control
+
+# ---- pure pursuit
+
+GOAL_RADIUS = 1.0  # [m]
+
+_LOOKAHEAD = 1.0  # [m] along the route
+_GAIN_RATE = 0.15  # fraction of the gain's error corrected per control step
+_GAIN_RANGE = (0.5, 2.5)
+_GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; below this the ratio is noise
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] behind and ahead of the last foot point
+
+
+@dataclass(frozen=True)
+class RecordedDrive:
+    """A recorded drive of k instants, one per control step of 0.1 s, the first at rest at the start."""
+
+    times: Array
+    """[s], shape (k,)."""
+    base_to_world: Array
+    """Shape (k, 4, 4)."""
+    camera_to_world: Array
+    """Poses of the front camera, OpenCV axes, shape (k, 4, 4)."""
+    qpos: Array
+    """MuJoCo's positions, shape (k, nq), for rendering the drive again."""
+    commands: Array
+    """v [m/s], ω [rad/s] commanded at each instant (the last row is zero), shape (k, 2)."""
+    cross_track: Array
+    """Distance from the route, left positive [m], shape (k,)."""
+    progress: Array
+    """Arc length of the nearest point of the route [m], shape (k,)."""
+    touched: tuple[str, ...]
+    """Names of the touched geoms, without the ground, sorted."""
+    outcome: str
+    """goal, touched, off_corridor or timeout."""
+
+    @property
+    def reached_goal(self) -> bool:
+        return self.outcome == "goal"
+
+    @property
+    def max_cross_track(self) -> float:
+        """[m]"""
+        return float(np.abs(self.cross_track).max())
+
+    @property
+    def mean_cross_track(self) -> float:
+        """[m]"""
+        return float(np.abs(self.cross_track).mean())
+
+
+def pursuit_curvature(pose: Array, target: Array) -> float:
+    """Curvature [1/m] of the circle that leaves `pose` (x, y, yaw) along its heading and passes `target` (x, y)."""
+    ahead = target - pose[:2]
+    lateral = np.cos(pose[2]) * ahead[1] - np.sin(pose[2]) * ahead[0]
+    return float(2.0 * lateral / max(ahead @ ahead, 1e-9))
+
+
+class PurePursuit:
+    """Converts a sequence of poses to commands that follow the route."""
+
+    def __init__(self, route: Array, speed: float, max_yaw_rate: float, start: float = 0.0) -> None:
+        """Route [m], shape (m, ≥2); speed [m/s]; largest yaw rate [rad/s]; arc length of the start [m]."""
+        self._route, self._speed, self._max_yaw_rate = route[:, :2], speed, max_yaw_rate
+        self._length = float(arc_lengths(route)[-1])
+        self.s = start
+        """Largest arc length reached so far [m]."""
+        self._gain = 1.0
+        self._last: tuple[Array, tuple[float, float]] | None = None
+
+    def update(self, pose: Array) -> tuple[float, float]:
+        """Updates `s` from a pose (x, y, yaw); returns its foot point's arc length and cross-track error [m]."""
+        foot, error = nearest_on_route(self._route, pose[:2], (self.s - _SEARCH_WINDOW[0], self.s + _SEARCH_WINDOW[1]))
+        self.s = max(self.s, float(foot))
+        return float(foot), float(error)
+
+    def command(self, pose: Array) -> tuple[float, float]:
+        """Returns v [m/s] and ω [rad/s] for the control step that begins at a pose (x, y, yaw)."""
+        if self._last is not None:
+            self._gain = _updated_gain(self._gain, self._last[0], pose, self._last[1])
+        target = _pursuit_target(self._route, self.s + _LOOKAHEAD, self._length)
+        limit = self._max_yaw_rate
+        wanted = np.clip(self._speed * pursuit_curvature(pose, target), -limit, limit)
+        command = (self._speed, float(np.clip(self._gain * wanted, -limit, limit)))
+        self._last = (pose, command)
+        return command
+
+
+def follow_route(
+    world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: float | None = None
+) -> RecordedDrive:
+    """Drives along the route until the goal, a contact, the corridor's edge or the time limit.
+
+    Args:
+        world: Route, goal and corridor.
+        physics: Physics of the world's model; it is reset.
+        speed: [m/s]; wheels reach at most 1 m/s, so turns are slower.
+        timeout: [s]; None: three times the duration of the route, plus 10 s.
+    """
+    speed = min(speed, physics.params.max_speed)
+    length = float(arc_lengths(world.route)[-1])
+    timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
+    physics.reset()
+
+    rows: list[dict[str, Any]] = []
+    touched: set[str] = set()
+    driver = PurePursuit(world.route, speed, physics.params.max_yaw_rate)
+    outcome = ""
+    while not outcome:
+        pose = physics.planar_pose
+        foot, error = driver.update(pose)
+        outcome = _outcome(world, pose, driver.s, length, abs(error), touched, physics.time > timeout)
+        rows.append(
+            {
+                "times": physics.time,
+                "base_to_world": physics.base_to_world,
+                "camera_to_world": physics.camera_to_world,
+                "qpos": physics.data.qpos.copy(),
+                "commands": (0.0, 0.0) if outcome else driver.command(pose),
+                "cross_track": error,
+                "progress": foot,
+            }
+        )
+        if not outcome:
+            physics.command(*rows[-1]["commands"])
+            physics.step()
+            touched |= set(physics.touched)
+    arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return RecordedDrive(**arrays, touched=tuple(sorted(touched)), outcome=outcome)
+
+
+def _outcome(world: World, pose: Array, s: float, length: float, error: float, touched: set[str], late: bool) -> str:
+    """The drive's outcome; empty while it goes on."""
+    if touched:
+        return "touched"
+    # A route may pass its goal long before its end.
+    if np.linalg.norm(pose[:2] - world.goal[:2]) < GOAL_RADIUS and s > length - 2 * GOAL_RADIUS:
+        return "goal"
+    if error > world.half_width:
+        return "off_corridor"
+    return "timeout" if late else ""
+
+
+def _pursuit_target(route: Array, s: float, length: float) -> Array:
+    """The point of the route at arc length s [m]; past its end the route continues straight."""
+    if s <= length:
+        return point_at(route, s)
+    direction = route[-1] - point_at(route, length - 1.0)
+    return route[-1] + direction / max(float(np.linalg.norm(direction)), 1e-9) * (s - length)
+
+
+def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
+    """The gain moved towards the ratio of commanded to achieved curvature, which differs from 1 for skid steering."""
+    turned = float(heading_error(pose[2], previous[2])) / CONTROL_PERIOD
+    moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
+    v, yaw_rate = command
+    if abs(yaw_rate) < _GAIN_MIN_YAW_RATE or abs(turned) < _GAIN_MIN_YAW_RATE or yaw_rate * turned < 0 or moved < 0.2:
+        return gain
+    ratio = (yaw_rate / v) / (turned / moved)
+    return float(np.clip(gain + _GAIN_RATE * (ratio - gain), *_GAIN_RANGE))
+
+
+# ---- drivers of an environment
 
 Policy = Callable[[NDArray[np.uint8]], NDArray]
 """Maps images (3 · stack, height, width), the newest three channels last, to one number in [-1, 1] per action."""
@@ -28,13 +199,13 @@ Policy = Callable[[NDArray[np.uint8]], NDArray]
 class Driver(Protocol):
     """Called once per control step; `step.first()` is true at the start of an episode."""
 
-    def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array: ...
+    def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array: ...
 
 
 class RouteDriver:
     """Follows the route by `PurePursuit` from poses, at the environment's speed."""
 
-    def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
+    def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array:
         task, pose = environment.task, environment.physics.planar_pose
         if step.first():
             self._pursuit = PurePursuit(task.world.route, task.options.speed, task.options.yaw_rate, task.segment.start)
@@ -46,7 +217,7 @@ class RouteDriver:
 class BlindDriver:
     """Drives straight at full speed, regardless of the images."""
 
-    def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
+    def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array:
         spec = environment.action_spec()
         return np.array([0.0]) if spec.shape == (1,) else np.array([spec.maximum[0], 0.0])
 
@@ -57,7 +228,7 @@ class PolicyDriver:
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
 
-    def __call__(self, environment: control.Environment, step: dm_env.TimeStep) -> Array:
+    def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array:
         pixels = step.observation["pixels"]
         stack, height, width, channels = pixels.shape
         answer = self._policy(pixels.transpose(0, 3, 1, 2).reshape(stack * channels, height, width))

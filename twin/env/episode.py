@@ -10,8 +10,8 @@ import numpy as np
 
 from twin.config import ObstacleConfig
 from twin.config_file import parse_table
-from twin.env.dm import control
 from twin.env.drivers import Driver
+from twin.env.task import control
 from twin.files import read_json, write_json
 from twin.types import Array
 
@@ -89,36 +89,32 @@ def record_episode(
         max_steps: Control steps after which the episode is cut off; None: no limit.
     """
     task, physics, pixels = environment.task, environment.physics, getattr(environment, "pixels", None)
-    rows: list[tuple] = []
-    actions: list[Array] = []
-    step, info = environment.reset(), {"trust": np.nan, "lighting": ""}
-    while True:
+    rows: list[dict[str, Any]] = []
+    step, info, end = environment.reset(), {"trust": np.nan, "lighting": ""}, False
+    while not end:
         if on_step:
             on_step(step)
         if pixels:
             info = pixels.info(0)
-        position = np.array(physics.data.qpos)
+        end = step.last() or len(rows) == max_steps
         rows.append(
-            (
-                *(physics.time(), physics.base_to_world, position, step.reward or 0.0, physics.speed),
-                *(task.cross_track, task.progress, info["trust"]),
-            )
+            {
+                "times": physics.time(),
+                "base_to_world": physics.base_to_world,
+                "qpos": np.array(physics.data.qpos),
+                "rewards": step.reward or 0.0,
+                "speed": physics.speed,
+                "cross_track": task.cross_track,
+                "progress": task.progress,
+                "trust": info["trust"],
+            }
         )
-        if step.last() or len(actions) == max_steps:
-            break
-        actions.append(np.asarray(driver(environment, step), float))
-        step = environment.step(actions[-1])
-    times, bases, qpos, rewards, speed, cross_track, progress, trust = (np.array(c) for c in zip(*rows, strict=True))
+        action = np.zeros(environment.action_spec().shape) if end else np.asarray(driver(environment, step), float)
+        rows[-1]["actions"] = action
+        if not end:
+            step = environment.step(action)
     return Episode(
-        times=times,
-        base_to_world=bases,
-        qpos=qpos,
-        actions=np.array([*actions, np.zeros(environment.action_spec().shape)]),
-        rewards=rewards,
-        speed=speed,
-        cross_track=cross_track,
-        progress=progress,
-        trust=trust,
+        **{name: np.array([row[name] for row in rows]) for name in _ARRAY_FIELDS},
         cause=task.cause,
         touched=physics.touched,
         task=task.segment.name,

@@ -36,7 +36,7 @@ _MAX_TRIES = 60  # proposals per sample, of which about every tenth is near the 
 
 @dataclass(frozen=True)
 class EpisodeLighting:
-    """Lighting of one episode: an appearance embedding, or a drift between two."""
+    """Lighting of one episode: an appearance embedding with its fog, or a drift between two."""
 
     name: str
     """The requested name, or how it was sampled."""
@@ -47,9 +47,9 @@ class EpisodeLighting:
     duration: float = 0.0
     """[s]"""
     fog: Fog | None = None
-    """Fog at the beginning, where a photo determines it; None: the film's."""
+    """Fog at the beginning, if fitted to a photo; None: the film's."""
     end_fog: Fog | None = None
-    """Fog after `duration`, likewise."""
+    """The same after `duration`."""
 
     def at(self, time: float) -> Array32:
         """The embedding after `time` [s], shape (dim,)."""
@@ -81,11 +81,11 @@ class Anchors:
 class LightingSets:
     """Training and held-out lightings of one field: disjoint regions of the space of lightings, whatever the seed.
 
-    The distance of two lightings is the rms difference of the probes' colors (see `nerf/appearance_prior.py`). Anchors
-    are chosen among random lightings of a fixed seed, each as far as possible from those before, starting with the
-    filmed lightings. The filmed ones are anchors of the training set; of the others, every second, from the first on,
-    belongs to the held-out set. A lighting belongs to the set of its nearest anchor; if an anchor of the other set is
-    nearly as near, to neither. All anchors of a set are sampled equally often, since night would be rare otherwise.
+    The distance of two lightings is the rms difference of the probes' colors (see `nerf/appearance_prior.py`). The
+    filmed lightings are the first anchors and belong to the training set. Further anchors are chosen among random
+    lightings of a fixed seed, each as far as possible from those before; the first, third, fifth and so on are held
+    out. A lighting belongs to the set of its nearest anchor, or to neither if an anchor of the other set is nearly as
+    near. All anchors of a set are sampled equally often, since night would be rare otherwise.
     """
 
     def __init__(self, field: BakedField) -> None:
@@ -110,10 +110,6 @@ class LightingSets:
         extra = np.arange(len(chosen)) - len(self._filmed.vectors)
         return Anchors(np.stack(chosen), np.stack(chosen_colors), (extra >= 0) & (extra % 2 == 0))
 
-    def set_of(self, embedding: Array32) -> str | None:
-        """`TRAINING`, `HELD_OUT`, or None for a lighting (dim,) of neither set."""
-        return self._set_and_anchor(embedding)[0]
-
     def sample(self, which: str, rng: np.random.Generator) -> Array32:
         """A random lighting of a set, shape (dim,): near one of its anchors, which are equally likely.
 
@@ -126,15 +122,15 @@ class LightingSets:
         # The anchor itself is the fallback where samples are rare, such as at the edge of the filmed lightings.
         for embedding in chain((prior.propose(rng) for _ in range(_MAX_TRIES)), [self.anchors.embeddings[anchor]]):
             # Few are near the anchor, while most are plausible: so the former is tested first.
-            if self._set_and_anchor(embedding) == (which, anchor) and not prior.violations(embedding):
+            if self.set_and_anchor(embedding) == (which, anchor) and not prior.violations(embedding):
                 return embedding
         raise InputError(
             f"lighting {which!r}: none among those sampled; this place was filmed in too few lightings: film another, "
             "or name the lightings to drive in"
         )
 
-    def _set_and_anchor(self, embedding: Array32) -> tuple[str | None, int]:
-        """The set of a lighting and the index of its nearest anchor."""
+    def set_and_anchor(self, embedding: Array32) -> tuple[str | None, int]:
+        """The set of a lighting (dim,), `TRAINING`, `HELD_OUT` or None, and the index of its nearest anchor."""
         distance = _distance(self.anchors.probe_colors, self._probe_colors(embedding))
         held_out, nearest = self.anchors.held_out, int(distance.argmin())
         to_training, to_held_out = float(distance[~held_out].min()), float(distance[held_out].min())
@@ -160,9 +156,9 @@ def check_lighting_names(lighting: str | Sequence[str], field: BakedField) -> No
 def sample_lighting(
     lighting: str | Sequence[str], drift: bool, duration: float, sets: LightingSets, rng: np.random.Generator
 ) -> EpisodeLighting:
-    """Samples the lighting of an episode.
+    """Samples the lighting of an episode; with `drift` it changes over `duration` [s].
 
-    With `drift` it changes over `duration` [s]; a single named lighting then drifts into another filmed one.
+    A single named lighting drifts into another filmed one.
 
     Raises:
         InputError: an unknown lighting, or none that fits.

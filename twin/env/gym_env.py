@@ -3,8 +3,8 @@
     gymnasium.make("twin:twin/Drive-v0", scene="scenes/demo", task="right_turn", lighting="night")
     gymnasium.make_vec("twin:twin/Drive-v0", 8, vectorization_mode="vector_entry_point", scene="scenes/demo")
 
-`twin:` makes Gymnasium import `twin`, which registers the environment. Processes that have not imported it need this:
-`make_vec_env("twin:twin/Drive-v0", vec_env_cls=SubprocVecEnv, ...)` of stable-baselines3 starts such processes.
+`twin:` makes Gymnasium import `twin`, which registers the environment; new processes, such as those of
+stable-baselines3's SubprocVecEnv, need this.
 
 Actions in [-1, 1] span the action range of the dm_control environment. Observations are images, uint8, shape
 (3 · stack, height, width), the newest three channels last; with `pixels=False` the privileged state, float32, see
@@ -25,12 +25,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from twin.env.chase_camera import ChaseCamera, SceneCamera
+from twin.env.mujoco_renderer import ChaseCamera, SceneCamera
 from twin.env.observation import PixelObserver
-from twin.env.options import parse_options
-from twin.env.vector_env import make_vector_env
+from twin.env.options import IMAGE_SIZE, check_option, parse_options
+from twin.env.vector_env import ProcessVectorEnv, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
-from twin.env.vector_env_processes import ProcessVectorEnv
 from twin.errors import InputError, short_repr
 from twin.loading import Twin
 from twin.warp_runtime import wp
@@ -38,7 +37,6 @@ from twin.warp_runtime import wp
 ROBOT, CHASE = "robot", "chase"
 
 _RENDER_SIZE = 640, 360  # [px] default width and height of a chase view
-_MIN_SIDE, _MAX_SIDE = 8, 4096  # [px]
 
 
 def make_spaces(envs: LocalVectorEnv | ProcessVectorEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -69,13 +67,7 @@ def _check_view(size: Any, view: str, pixels: bool) -> tuple[int, int] | None:
         raise InputError(f"render_view = {short_repr(view)}; expected {ROBOT!r} or {CHASE!r}")
     if size is None:
         return _RENDER_SIZE if view == CHASE else None
-    valid = isinstance(size, Sequence) and not isinstance(size, str) and len(size) == 2
-    if not valid or not all(
-        isinstance(n, int | np.integer) and not isinstance(n, bool) and _MIN_SIDE <= n <= _MAX_SIDE for n in size
-    ):
-        raise InputError(
-            f"render_size = {short_repr(size)}; expected (width, height), whole numbers from {_MIN_SIDE} to {_MAX_SIDE}"
-        )
+    check_option("render_size", size, IMAGE_SIZE)
     if view == ROBOT and not pixels:
         raise InputError(
             f"render_size = {short_repr(size)} with pixels=False: no field is loaded; expected pixels=True, or "
@@ -146,9 +138,9 @@ class DriveEnv(gymnasium.Env):
     def render(self) -> NDArray | None:
         """A picture, uint8 (height, width, 3).
 
-        By default it is the newest image of the observation; None without pixels. With `render_size`, it is what the
-        robot's camera sees at that instant, with the episode's lighting, obstacles and weather, but without camera
-        noise. The chase view is of the present instant. Rendering changes no observation and no random draw.
+        By default it is the newest image of the observation; None without pixels. With `render_size`, it is the robot's
+        view at that instant, with the episode's lighting, obstacles and weather, but without camera noise. The chase
+        view shows the present. Rendering changes no observation and no random draw.
         """
         if self.render_mode is None:
             return None

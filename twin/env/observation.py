@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.env.camera_noise import CameraNoise
 from twin.env.compositor import Compositor
-from twin.env.dm import DrivePhysics
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.mujoco_renderer import FRONT_CAMERA, SceneRenderer, camera_intrinsics
 from twin.env.options import SIMULATOR, Options
-from twin.env.task import CAMERA, LIGHTING, WEATHER, DriveTask
+from twin.env.task import CAMERA, LIGHTING, WEATHER, DrivePhysics, DriveTask
 from twin.env.trust import SKY_OPACITY, Trust
 from twin.env.weather import Weather
 from twin.geometry.cameras import Viewpoints
@@ -47,9 +46,9 @@ class PixelObserver:
         """
         Args:
             renderer: Renders the envs.
-            field: Field of the place, with its lightings; None where MuJoCo renders the mesh under its own lights.
-            trust: Trust of pictures, from the filmed frames.
-            options: Size, stack, lighting.
+            field: Contains the lightings; None: MuJoCo renders the mesh under its own lights.
+            trust: From the filmed frames.
+            options: Of the envs.
             envs: Physics and task of every env.
         """
         self._renderer, self.options, self.envs = renderer, options, list(envs)
@@ -76,7 +75,7 @@ class PixelObserver:
             if o.camera:
                 self._noise[i] = CameraNoise(o.camera, task.rng(CAMERA))
             fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
-            # Clear air in a photo is known weather, too.
+            # A photo without fog determines the weather, too.
             if fog is not None and o.randomise and o.randomise.hold_known:
                 task.set_weather(task.sample.for_known_weather())
             has_weather = fog is not None or o.randomise
@@ -92,7 +91,7 @@ class PixelObserver:
     def info(self, i: int) -> dict[str, Any]:
         """Entries of env i's info: `lighting`, by its name in tables, and `trust`."""
         lighting = self.lightings[i]
-        name = lighting.name + (RANDOMIZED if self.options.randomise else "") if lighting else ""
+        name = str(Condition(lighting.name, bool(self.options.randomise))) if lighting else ""
         return {"lighting": name, "trust": float(self.trust[i])}
 
     def _add_frames(self, which: Sequence[int], fill: bool) -> None:
@@ -133,8 +132,11 @@ def _push_frames(
     stacks: wp.array4d(dtype=wp.uint8),
     below: wp.array2d(dtype=float),
 ):
-    """Adds frames to the stacks of some envs, or fills the stacks with them. Sums over the lower halves, from pixel
-    `lower` on: opacity, and the number of pixels whose opacity is below `sky`."""
+    """Adds frames to the stacks of some envs, or fills the stacks with them.
+
+    `below` sums up, over the lower halves (from pixel `lower` on), opacity and the number of pixels with less than
+    `sky`.
+    """
     k, pixel = wp.tid()
     env, depth = which[k], stacks.shape[1]
     for channel in range(3):
@@ -154,14 +156,12 @@ def _push_frames(
 class GpuPixelObserver(PixelObserver):
     """Renders n envs and keeps their frame stacks on the field's device, for policies that learn there.
 
-    It shows the field alone. Envs with obstacles, weather or camera noise need `PixelObserver`, which composites on the
-    host.
+    It shows the field alone. Obstacles, weather and camera noise need `PixelObserver`, which composites on the host.
     """
 
     def __init__(
         self, field: BakedField, trust: Trust, options: Options, envs: Sequence[tuple[DrivePhysics, DriveTask]]
     ) -> None:
-        """Arguments as of `PixelObserver`; options have no camera noise, randomization or lighting of a hazy photo."""
         self.options, self.envs, self._field = options, list(envs), field
         self._trust, self._sets = trust, LightingSets(field)
         model, (width, height), n = envs[0][0].robot.model, options.size, len(envs)
@@ -171,7 +171,7 @@ class GpuPixelObserver(PixelObserver):
         self.trust = np.zeros(n)
         self._noise, self._weather = [None] * n, [None] * n
         self.camera_poses: CameraPoses = self._camera_poses
-        """Returns the cameras' OpenCV poses (k, 4, 4) and times (k,) [s] at the newest frames of some envs."""
+        """Function from indices of k envs to OpenCV poses (k, 4, 4) and times (k,) [s] of their newest frames."""
 
     @property
     def stacks(self) -> Image:  # type: ignore[override]

@@ -40,13 +40,7 @@ class ObstacleModel:
     """Adds geoms to one body, all in one group, and either all solid or all visual-only."""
 
     def __init__(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, group: int = OBSTACLE_GROUP, solid: bool = True):
-        """
-        Args:
-            spec: The model that contains the body.
-            body: Its geoms are named `<body>_<number>`.
-            group: Group of the geoms.
-            solid: False: visual-only, without contacts.
-        """
+        """Geoms are named `<body>_<number>`; with `solid=False` they have no contacts."""
         self.spec, self.body, self.group, self.solid, self.count = spec, body, group, solid, 0
 
     def add(self, kind: mujoco.mjtGeom, color: Color, **settings: Any) -> None:
@@ -205,14 +199,7 @@ _BUILDERS: dict[str, Callable[..., None]] = {
 def add_obstacle_geoms(
     shape: ObstacleModel, kind: str, color: Sequence[float] = (), size: Sequence[float] = ()
 ) -> None:
-    """Adds the geoms of an obstacle to a body.
-
-    Args:
-        shape: The body's builder.
-        kind: One of `twin.config.OBSTACLE_KINDS`.
-        color: Red, green, blue of its main color, 0 to 1; empty: the kind's default.
-        size: Length, width, height of a box [m]; empty: the default.
-    """
+    """Adds the geoms of an obstacle to a body; see `ObstacleConfig` for kind, color and size."""
     red, green, blue = color or _COLORS[kind]
     build = partial(_BUILDERS[kind], size=size) if kind == "box" else _BUILDERS[kind]
     build(shape, (red, green, blue))

@@ -42,12 +42,7 @@ def body_name(obstacle: ObstacleConfig, number: int) -> str:
 
 
 def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], world: World) -> None:
-    """Adds the bodies of obstacles to a scene, parked.
-
-    Args:
-        spec: The scene (`World.model_path`), not compiled yet.
-        obstacles: Their poses can be changed later by `place`; kind, color and size cannot.
-        world: Contains the route.
+    """Adds the bodies of obstacles to a scene, parked; `place` moves them in the compiled model.
 
     Raises:
         InputError: an unknown kind, or two obstacles of one name.
@@ -65,15 +60,9 @@ def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], worl
 
 
 def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float) -> None:
-    """Sets the poses of an episode's obstacles at a time, and parks the model's other obstacles.
+    """Sets the mocap poses of an episode's obstacles at a time [s], and parks the model's other obstacles.
 
-    Call it before every step if an obstacle moves, and otherwise once after a reset: `mj_resetData` moves mocap bodies
-    back to their compiled, parked poses.
-
-    Args:
-        obstacles: The episode's obstacles, named as in the model.
-        data: Its `mocap_pos` and `mocap_quat` are set.
-        time: Time since the episode began [s].
+    Call it before every step if an obstacle moves, and once after each `mj_resetData`, which parks all of them.
 
     Raises:
         InputError: the model has no such obstacle.
@@ -93,11 +82,6 @@ def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float)
             data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
     if wanted:
         raise InputError(f"the model has no {', '.join(wanted)}; name it in [[obstacle]], or add it with add_obstacles")
-
-
-def any_moving(obstacles: Sequence[ObstacleConfig]) -> bool:
-    """True if any obstacle moves, so that `place` is needed before every step."""
-    return any(one.to for one in obstacles)
 
 
 def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:
@@ -151,15 +135,7 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 def random_obstacles(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples static obstacles along the route, apart from each other, with room to pass each within the corridor.
-
-    Names are `random_<number>`.
-
-    Args:
-        world: Contains route and corridor.
-        rng: Determines the obstacles.
-        count: Number of obstacles.
-        kinds: Kinds to sample from.
+    """Samples static obstacles `random_<number>` along the route, with spacing, and room to pass within the corridor.
 
     Raises:
         InputError: the route is too short for that many.
@@ -186,9 +162,9 @@ def random_obstacles(
 def random_distractors(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples distractor objects beside the corridor, where no robot within it can touch them.
+    """Samples distractor objects beside the corridor, out of reach of a robot within it.
 
-    Arguments and names as of `random_obstacles`. A winding route may leave room for fewer than `count`.
+    Names as of `random_obstacles`. A winding route may leave room for fewer than `count`.
     """
     route, out = world.route[:, :2], []
     length = float(arc_lengths(world.route)[-1])
@@ -214,7 +190,7 @@ _ROUTE_STEP = 0.25  # [m] between points of a segment's route
 class EpisodeObstacles:
     """Obstacles of a task's episodes: given ones, random ones along the segment, and distractor objects.
 
-    A compiled model cannot gain bodies, so it contains a *pool*: of every kind, as many as an episode may have.
+    A compiled model cannot gain bodies, so it contains a *pool* with the largest number of every kind.
     """
 
     def __init__(
@@ -223,9 +199,9 @@ class EpisodeObstacles:
         """
         Args:
             wanted: Number of random obstacles per episode, or the obstacles of all episodes.
-            world: Contains the route.
-            segment: Route segment on which random obstacles stand.
-            beside: Largest number of distractor objects beside the corridor.
+            world: Contains route and corridor.
+            segment: Random obstacles stand on it.
+            beside: Largest number of distractor objects.
         """
         self._count = wanted if isinstance(wanted, int) else 0
         self._given = () if isinstance(wanted, int) else tuple(wanted)
@@ -271,11 +247,11 @@ def _static_obstacle(kind: str, number: int) -> ObstacleConfig:
 
 
 class ObstacleMotion:
-    """Sets the poses of an episode's obstacles."""
+    """Moves an episode's obstacles; for `HuskyPhysics.move_obstacles`."""
 
     def __init__(self, obstacles: Sequence[ObstacleConfig], data: mujoco.MjData) -> None:
         self.obstacles, self._data = tuple(obstacles), data
-        self.moving = any_moving(self.obstacles)
+        self.moving = any(one.to for one in self.obstacles)
 
     def __call__(self, time: float) -> None:
         """Moves obstacles to their poses at a time [s]; static ones are set only at time 0."""

@@ -46,9 +46,9 @@ class HuskyPhysics:
     ) -> None:
         """
         Args:
-            model: A model made by `twin.mjcf.scene_xml`, or any with `add_husky`; its keyframe `spawn` is the start.
-            params: The robot in the model (`World.robot`): controller and latencies; None: the published robot.
-            data: Data of the model, stepped from its present state; None: new data, at the start.
+            model: A model with `add_husky`; its keyframe `spawn`, if any, is the start.
+            params: The robot in the model; None: the published one.
+            data: Stepped from its present state; None: new data, at the start.
         """
         self.model = model
         self.params = params or HuskyParams()
@@ -60,10 +60,10 @@ class HuskyPhysics:
         self._wheel_angles = np.array([wheel.qposadr[0] for wheel in wheels])
         self._wheel_dofs = np.array([wheel.dofadr[0] for wheel in wheels])
         self.is_robot = model.body_rootid[model.geom_bodyid] == self._body
-        """True for the robot's geoms, shape (ngeom,)."""
+        """Mask of the robot's geoms, shape (ngeom,)."""
         self._ground = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground")
         self.is_collidable = ~self.is_robot & (np.arange(model.ngeom) != self._ground)
-        """True for geoms that are neither the robot's nor the ground, shape (ngeom,)."""
+        """Mask of all other geoms except for the ground, shape (ngeom,)."""
         self._spawn = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "spawn")
         self._steps_per_update = round(CONTROL_PERIOD / model.opt.timestep)
         self.check_steps = max(1, round(_CHECK_PERIOD / model.opt.timestep))
@@ -96,7 +96,7 @@ class HuskyPhysics:
         self.begin()
 
     def begin(self) -> None:
-        """Starts an episode in the present state: no command is pending, only geoms in contact now count as touched."""
+        """Starts an episode in the present state: drops commands and forgets earlier contacts."""
         self.controller = Controller(self.params)
         phase_steps = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6))
         self.steps_to_update = phase_steps % self._steps_per_update
@@ -136,8 +136,8 @@ class HuskyPhysics:
     def schedule(self, period: float) -> list[tuple[int, Array]]:
         """Runs the controller for the next `period` [s].
 
-        Returns segments up to the next contact check or update: number of substeps, and speeds of the left and right
-        wheels [rad/s], shape (2,).
+        Returns segments that end with a contact check or an update of the controller: their numbers of substeps, and
+        speeds of the left and right wheels [rad/s], shape (2,).
         """
         out, time = [], self.time
         left = round(period / self.model.opt.timestep)
@@ -153,14 +153,11 @@ class HuskyPhysics:
         return out
 
     def load_state(self, touched: set[int], snapshots: list[tuple[float, Array, Array, Array]]) -> None:
-        """Completes a state computed by another engine; `data` already contains its positions, velocities and time.
-
-        The controller does not receive the commands given meanwhile.
+        """Completes a state that another engine computed and wrote to `data`. The controller's state is not updated.
 
         Args:
             touched: Geoms touched during the last control step.
-            snapshots: Time [s], `qpos`, `mocap_pos` and `mocap_quat` of the last contact checks, if the camera has a
-                latency.
+            snapshots: Time [s], `qpos`, `mocap_pos`, `mocap_quat` of the last contact checks, for a delayed camera.
         """
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -229,15 +226,15 @@ class HuskyPhysics:
     @property
     def camera_to_world(self) -> Array:
         """Present pose of the front camera, OpenCV axes, shape (4, 4)."""
-        return self._camera_pose(self.data)
+        return camera_pose(self.data, self._camera)
 
     @property
     def delayed_data(self) -> mujoco.MjData:
-        """Time and poses when the newest image was taken, `camera_latency` ago, but not before the episode's start.
+        """State when the newest image was taken: `camera_latency` ago, but not before the episode's start.
 
-        Without latency, it is the present data. With latency, only `qpos`, the mocap bodies and the results of
-        `mj_kinematics` and `mj_camlight` are valid, until the next access. Poses are interpolated linearly between
-        contact checks, which are 10 ms apart.
+        Without latency, it is the present data. With latency, it contains only time, positions and the results of
+        `mj_kinematics` and `mj_camlight`, valid until the next access; positions are interpolated linearly between
+        contact checks.
         """
         if not self.params.camera_latency:
             return self.data
@@ -256,11 +253,8 @@ class HuskyPhysics:
 
     @property
     def delayed_camera_to_world(self) -> Array:
-        """Pose of the front camera when the newest image was taken, `camera_latency` ago, shape (4, 4)."""
-        return self._camera_pose(self.delayed_data)
-
-    def _camera_pose(self, data: mujoco.MjData) -> Array:
-        return opencv_to_mujoco(_pose(data.cam_xpos[self._camera], data.cam_xmat[self._camera]))
+        """Pose of the front camera when the newest image was taken, shape (4, 4)."""
+        return camera_pose(self.delayed_data, self._camera)
 
     @property
     def wheel_position(self) -> Array:
@@ -296,6 +290,11 @@ class HuskyPhysics:
     def orientation(self) -> Array:
         """The IMU's attitude: quaternion w, x, y, z of base to world, shape (4,)."""
         return self.data.sensor("imu_orientation").data.copy()
+
+
+def camera_pose(data: mujoco.MjData, camera: int) -> Array:
+    """camera_to_world of a camera, OpenCV axes, shape (4, 4)."""
+    return opencv_to_mujoco(_pose(data.cam_xpos[camera], data.cam_xmat[camera]))
 
 
 def _pose(position: Array, matrix: Array) -> Array:

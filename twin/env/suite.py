@@ -1,7 +1,7 @@
 """`twin.load`: a task in a built scene as a dm_control environment.
 
-`EnvFactory` reads the scene once and makes any number of environments. Physics and task do not depend on images;
-`DriveEnvironment` adds them.
+`EnvFactory` reads the scene once and makes any number of environments. `episode_spec` makes their model: ground, robot,
+and the solid parts within the robot's reach. `DriveEnvironment` adds images to physics and task.
 """
 
 import copy
@@ -9,32 +9,36 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import dm_env
 import mujoco
 import numpy as np
 from dm_env import specs
+from scipy.spatial import cKDTree
 
-from twin.config import HELD_OUT, RANDOMIZED, TRAINING
+from twin.config import HELD_OUT, TRAINING, Condition
 from twin.config_file import load_config
 from twin.env import episode_lighting
-from twin.env.compositor import Compositor
-from twin.env.dm import DrivePhysics, control
-from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, VERSION, Ranges
-from twin.env.episode_model import episode_spec
-from twin.env.mujoco_renderer import ObjectRenderer, SceneRenderer, camera_pose
+from twin.env.compositor import Compositor, ObjectRenderer
+from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, PAYLOAD, VERSION, Ranges
+from twin.env.mujoco_renderer import SceneRenderer
 from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.obstacles import EpisodeObstacles, add_obstacles
 from twin.env.options import CPU, NERF, Options, parse_options
+from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
-from twin.env.task import DriveTask, RewardAndTermination
+from twin.env.task import DrivePhysics, DriveTask, RewardAndTermination, control
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import digest_file, digest_json
 from twin.loading import Twin, load_scene
-from twin.mjcf.world import World
+from twin.mjcf.husky import disable_fluid_drag
+from twin.mjcf.world import World, point_at
 from twin.nerf.baked import BakedField
 from twin.scene import require_stage, stage_result
+from twin.types import Array
 
 
 @dataclass(frozen=True)
@@ -82,13 +86,13 @@ class EnvFactory:
     def make_env(
         self, seed: int | None, evaluator: tuple[RewardAndTermination, int] | None = None
     ) -> tuple[DrivePhysics, DriveTask]:
-        """Returns physics, with its own copy of the model, and the task of a new environment; see `DriveTask`."""
+        """Returns physics, with a copy of the model, and task of a new environment; arguments as of `DriveTask`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
         return physics, DriveTask(self.world, self.segment, self.options, self.obstacles, self.model, seed, evaluator)
 
     @property
     def _field_only(self) -> bool:
-        """True if nothing is composited into the images of the field, not even the robot itself."""
+        """True if nothing is added to the field's images: no object, weather or noise, and no part of the robot."""
         lighting = self.options.lighting
         names = (lighting,) if isinstance(lighting, str) else tuple(lighting)
         fogs = [self.field.fog(name) for name in names] if self.field else []
@@ -102,7 +106,7 @@ class EnvFactory:
         return renderer.visible_mask(data, camera_pose(data, camera)) is None
 
     def make_observer(self, envs: list[tuple[DrivePhysics, DriveTask]]) -> PixelObserver | None:
-        """Returns the observer that renders the images of environments; None without images."""
+        """Returns the observer of environments; None without images."""
         if self.trust is None:
             return None
         size, count = self.options.size, len(envs)
@@ -117,27 +121,28 @@ class EnvFactory:
         return PixelObserver(SceneRenderer(spec.compile(), size, count), None, self.trust, self.options, envs)
 
 
-def fingerprint(twin: Twin, task: str, lighting: str) -> str:
-    """Returns a digest of everything that determines an episode, except for its seed and driver.
+def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
+    """Returns a digest of everything that determines an episode, except for seed and driver.
 
     It covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`, photo
-    lightings that `lighting` names, the version of lighting sets, and the randomization of a `+randomised` lighting.
+    lightings that the condition names, the version of lighting sets, and the randomization of a randomized condition.
 
     Raises:
         InputError: see `EnvFactory.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
     ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
-    randomization = {"version": VERSION, "ranges": ranges} if lighting.endswith(RANDOMIZED) else {}
-    plain = lighting.removesuffix(RANDOMIZED)
-    photos = [path for name in plain.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()]
+    randomization = {"version": VERSION, "ranges": ranges} if condition.randomised else {}
+    photos = [
+        path for name in condition.lighting.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()
+    ]
     return digest_json(
         {
             "stages": [stage_result(twin.scene, factory) for factory in ("field", "mjcf")],
             "stretch": dataclasses.asdict(find_task(task, world, config.task)),
             "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
             **({"randomise": randomization} if randomization else {}),
-            **({"lights": episode_lighting.VERSION} if plain in (TRAINING, HELD_OUT) else {}),
+            **({"lights": episode_lighting.VERSION} if condition.lighting in (TRAINING, HELD_OUT) else {}),
             "photos": [digest_file(path) for path in photos],
             **({"untold": KNOWN_WEATHER_FRACTION} if photos and randomization else {}),
         }
@@ -192,3 +197,67 @@ def load(
     if pixels is None:
         return control.Environment(physics, drive_task, control_timestep=drive_task.options.control_timestep)
     return DriveEnvironment(physics, drive_task, pixels)
+
+
+# ---- model of an episode
+
+_REACH = 1.5  # [m] beyond the corridor's edge: the robot's half length plus its motion in a control step
+
+
+def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
+    """Returns the model of episodes between two arc lengths [m] of a scene's route.
+
+    An episode ends when the robot leaves the corridor, so parts beyond its reach are never touched. Removing them
+    changes no result and saves a fifth of the physics' time and most of its memory.
+
+    Args:
+        world: The scene.
+        start: Arc length of the start [m].
+        end: Arc length of the end [m].
+        half_width: Half width of the corridor [m].
+        visuals: Keep the visual mesh and textures, which only MuJoCo's renderer needs.
+    """
+    tree = ElementTree.parse(world.model_path)
+    root, assets = tree.getroot(), world.folder / "assets"
+    line = cKDTree(point_at(world.route[:, :2], np.arange(start, end + 0.1, 0.1)))
+
+    def wanted(geom: Element) -> bool:
+        if geom.get("contype") == "0":
+            return visuals
+        center, radius = _bounding_sphere(assets / f"{geom.get('mesh')}.obj")
+        return line.query(center[:2])[0] - radius <= half_width + _REACH
+
+    # Removed from the XML, as removing from a compiled MjSpec takes milliseconds per part.
+    worldbody, kept = root.find("worldbody"), root.find("asset")
+    assert worldbody is not None and kept is not None
+    for geom in [g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:
+        worldbody.remove(geom)
+        kept.remove(next(m for m in kept.findall("mesh") if m.get("name") == geom.get("mesh")))
+    if not visuals:
+        _strip_textures(root, kept)
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    spec.modelfiledir = str(world.folder.resolve())
+    base = spec.body(world.names["body"])
+    payload = base.add_body(name=PAYLOAD, pos=world.robot.payload_position)
+    payload.explicitinertial = True
+    payload.mass, payload.ipos, payload.inertia = 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    disable_fluid_drag(payload, PAYLOAD)
+    return spec
+
+
+def _bounding_sphere(path: Path) -> tuple[Array, float]:
+    """Center and radius [m] of a sphere around the vertices of an OBJ file."""
+    lines = path.read_text(encoding="ascii").splitlines()
+    vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
+    center = (vertices.min(0) + vertices.max(0)) / 2
+    return center, float(np.linalg.norm(vertices - center, axis=1).max())
+
+
+def _strip_textures(root: Element, assets: Element) -> None:
+    textured = {m.get("name") for m in assets.findall("material") if m.get("texture") or m.find("layer") is not None}
+    for geom in root.iter("geom"):
+        if geom.get("material") in textured:
+            del geom.attrib["material"]
+    for asset in list(assets):
+        if asset.tag == "texture" or (asset.tag == "material" and asset.get("name") in textured):
+            assets.remove(asset)

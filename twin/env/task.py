@@ -1,4 +1,4 @@
-"""Driving along a route segment as a dm_control task: reward, termination, start, state; poses and contacts, no images.
+"""Driving along a route segment in dm_control: physics and task, with start, state, reward and termination; no images.
 
 An *episode* starts at rest near the segment's start and ends with one of `CAUSES`. The discount at the end is 0; at a
 timeout it is 1, as the episode is only truncated. An episode's seed determines all its randomness. Start, robot,
@@ -6,9 +6,12 @@ lighting, obstacles, camera and weather have separate generators: changing one l
 can be compared on the same episodes.
 """
 
+import sys
+import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import mujoco
@@ -17,14 +20,28 @@ from dm_env import specs
 from numpy.typing import NDArray
 
 from twin.config import ObstacleConfig
-from twin.env.dm import DrivePhysics, control
 from twin.env.domain_randomization import NominalModel, RandomizationSample
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
-from twin.env.options import CAUSES, STEERING, Options
+from twin.env.options import CAUSES, STEERING, Options, check_actions
+from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import RouteSegment
-from twin.errors import InputError, short_repr
+from twin.errors import InputError
 from twin.mjcf.world import World, heading_at, heading_error, nearest_on_route, point_at
+from twin.robot import HuskyParams
 from twin.types import Array
+
+try:
+    with warnings.catch_warnings():
+        # On import, dm_control looks for a display and warns if there is none; nothing here needs one.
+        warnings.simplefilter("ignore")
+        from dm_control import mujoco as dm_mujoco
+        from dm_control.mujoco import wrapper
+        from dm_control.rl import control
+except ModuleNotFoundError as error:
+    raise InputError(
+        f"{error}: driving in a scene needs dm_control, which installs on Python 3.11 and 3.12; this is "
+        f"{sys.version_info.major}.{sys.version_info.minor}"
+    ) from None
 
 EnvIndices = Sequence[int] | NDArray[np.int64]
 
@@ -64,9 +81,9 @@ class Motion:
 class RewardAndTermination:
     """Reward, termination and state of n drives along one route segment.
 
-    A task uses it for one drive, a GPU vector environment for all of its drives, so both compute the same numbers.
-    `which` selects k of the n drives. The *foot* is the arc length of the route's point nearest to the robot's base;
-    progress is the distance of the foot from the segment's start.
+    A task uses it for one drive, a GPU vector environment for all of its drives. `which` selects k of the n drives. The
+    *foot* is the arc length of the route's point nearest to the robot's base; progress is the foot's distance from the
+    segment's start.
     """
 
     def __init__(self, world: World, segment: RouteSegment, options: Options, count: int = 1) -> None:
@@ -144,8 +161,8 @@ class RewardAndTermination:
         `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] left positive, `heading_error` [rad] of the robot against
         the route, `turns` [rad]: change of the route's heading 1, 2 and 4 m ahead.
 
-        The state is clipped to `state_bounds`. Angles cannot leave them; the others do only if the robot moves ten
-        times as fast as its controller allows, as in a fall.
+        The state is clipped to `state_bounds`, which matters only if the robot moves ten times as fast as its
+        controller allows, as in a fall.
         """
         foot = self.foot[which]
         heading = heading_at(self._route, foot)
@@ -158,28 +175,70 @@ class RewardAndTermination:
         return nearest_on_route(self._route, position, (foot - _SEARCH_WINDOW[0], foot + _SEARCH_WINDOW[1]))
 
 
-# ---- the task of one drive
+# ---- physics and task of one drive
+
+
+class DrivePhysics(dm_mujoco.Physics):
+    """A dm_control Physics of one robot, with quantities of `HuskyPhysics`."""
+
+    _params = HuskyParams()
+
+    @staticmethod
+    def of(model: mujoco.MjModel, params: HuskyParams) -> "DrivePhysics":
+        """Returns physics that steps this model, without a copy, which `episode_spec` made for the robot."""
+        physics = DrivePhysics(wrapper.MjData(wrapper.MjModel(model)))
+        physics.set_robot(params)
+        return physics
+
+    def _reload_from_data(self, data: Any) -> None:
+        mujoco.mj_forward(data.model.ptr, data.ptr)
+        # Before super(), which ends with `after_reset`.
+        self.robot = HuskyPhysics(data.model.ptr, self._params, data.ptr)
+        super()._reload_from_data(data)
+
+    def set_robot(self, params: HuskyParams) -> None:
+        """Replaces the robot's controller and latencies; drops pending commands."""
+        move_obstacles = self.robot.move_obstacles
+        self._params = params
+        self.robot = HuskyPhysics(self.model.ptr, params, self.data.ptr)
+        self.robot.move_obstacles = move_obstacles
+
+    def copy(self, share_model: bool = False) -> "DrivePhysics":
+        physics = super().copy(share_model)
+        physics.set_robot(self._params)
+        return physics
+
+    def __getstate__(self) -> Any:
+        return self.data, self._params
+
+    def __setstate__(self, state: Any) -> None:
+        data, self._params = state
+        super().__setstate__(data)
+
+    def after_reset(self) -> None:
+        super().after_reset()
+        self.robot.begin()
+
+    def step(self, nstep: int = 1) -> None:
+        """Runs `nstep` substeps, the time between two commands."""
+        with self.check_invalid_state():
+            self.robot.step(nstep * self.timestep())
+
+    # Quantities of `HuskyPhysics`; the camera's pose is that of the newest image.
+    planar_pose = property(attrgetter("robot.planar_pose"))
+    base_to_world = property(attrgetter("robot.base_to_world"))
+    delayed_data = property(attrgetter("robot.delayed_data"))
+    camera_to_world = property(attrgetter("robot.delayed_camera_to_world"))
+    speed = property(attrgetter("robot.speed"))
+    yaw_rate = property(attrgetter("robot.yaw_rate"))
+    uprightness = property(attrgetter("robot.uprightness"))
+    touched = property(attrgetter("robot.touched"))
+
 
 START, ROBOT, LIGHTING, OBSTACLES, CAMERA, WEATHER = range(6)
 """Random streams of an episode: `numpy.random.default_rng([seed, stream])`."""
 
 _START_TRIES = 50
-
-
-def check_actions(actions: Any, shape: tuple[int, ...]) -> Array:
-    """Returns actions as float64.
-
-    Raises:
-        ValueError: wrong shape, not real numbers (booleans are not accepted), or not finite.
-    """
-    try:
-        given = np.asarray(actions)
-    except (TypeError, ValueError):  # ragged lists
-        given = np.empty(0, object)
-    if given.dtype.kind not in "iuf" or given.shape != shape or not np.isfinite(given).all():
-        kind = f"{given.dtype} of shape {given.shape}"
-        raise ValueError(f"action {short_repr(actions)} ({kind}); expected finite numbers of shape {shape}")
-    return given.astype(np.float64, copy=False)
 
 
 class DriveTask(control.Task):
@@ -197,13 +256,13 @@ class DriveTask(control.Task):
     ) -> None:
         """
         Args:
-            world: Route and corridor.
+            world: Route, corridor and robot.
             segment: Route segment to drive.
-            options: Start, action, limits, rewards, randomization.
+            options: Of the environment.
             obstacles: Samples an episode's obstacles; the model contains its pool.
-            model: The unmodified compiled model; physics may step a copy.
+            model: The unmodified compiled model; physics steps a copy.
             seed: Seed of the sequence of episodes; None: unpredictable.
-            evaluator: Shared reward and termination of many drives, and the index of this drive; None: its own.
+            evaluator: Reward and termination of many drives, and the index of this drive; None: its own.
         """
         self.world, self.segment, self.options = world, segment, options
         self._evaluator, self._index = evaluator or (RewardAndTermination(world, segment, options), 0)
@@ -290,7 +349,8 @@ class DriveTask(control.Task):
 
     def action_spec(self, physics: DrivePhysics) -> specs.BoundedArray:
         low, high = self._bounds()
-        return specs.BoundedArray(low.shape, np.float64, low, high, name="\t".join(self.action_names))
+        name = "yaw_rate" if self.options.action == STEERING else "speed\tyaw_rate"
+        return specs.BoundedArray(low.shape, np.float64, low, high, name=name)
 
     # ---- state of the episode
 
@@ -298,10 +358,6 @@ class DriveTask(control.Task):
     def state_bounds(self) -> NDArray[np.float32]:
         """See `RewardAndTermination.state_bounds`."""
         return self._evaluator.state_bounds
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        return ("yaw_rate",) if self.options.action == STEERING else ("speed", "yaw_rate")
 
     @property
     def cause(self) -> str:
@@ -326,7 +382,7 @@ class DriveTask(control.Task):
         return actions
 
     def info(self, physics: DrivePhysics) -> dict[str, Any]:
-        """Returns the episode's info so far, JSON-able."""
+        """Returns the episode's info so far, see `twin.env.gym_env`; JSON-able."""
         return self.episode_info(physics.speed, physics.touched)
 
     def episode_info(self, speed: float, touched: Sequence[str]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ _CANDIDATES = 32  # nearest filmed frames that are compared
 
 
 class Trust:
-    """Computes the trust of pictures from the poses of the filmed frames."""
+    """Computes the trust of pictures."""
 
     def __init__(self, cameras: PosedCameras) -> None:
         """`cameras` are the filmed frames."""

@@ -1,18 +1,298 @@
-"""Vector environments: `make_vector_env` steps them in one process, in several processes, or on a GPU."""
+"""Vector environments: `make_vector_env` steps n environments in one process, in several processes, or on a GPU.
 
-from collections.abc import Sequence
+Much of a step is Python (visibility, contacts, reward), which the interpreter's lock confines to one core per process.
+So a `ProcessVectorEnv` starts *child* processes. Each child has a `LocalVectorEnv` and executes its parent's requests,
+which are exchanged as pickles over a socket. The number of processes does not change any result.
+"""
+
+import contextlib
+import copy
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+import weakref
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from twin.env.options import CPU, parse_options
+import numpy as np
+from numpy.typing import NDArray
+
+from twin import runtime
+from twin.env.options import CPU, check_actions, parse_options
 from twin.env.suite import EnvFactory
-from twin.env.vector_env_local import LocalVectorEnv
-from twin.env.vector_env_processes import ProcessVectorEnv
+from twin.env.vector_env_local import LocalVectorEnv, StepResult, frame_stack
 from twin.errors import InputError
 from twin.loading import Twin
 from twin.runtime import available_cores
 
 _MIN_ENVS, _MAX_PROCESSES = 2, 8  # defaults: environments per process, and processes, as each needs its own memory
+_CHILD_CODE = "from twin.env.vector_env import serve; serve()"  # not -m: classes would be pickled as those of __main__
+_PARENT_CHECK_PERIOD = 2.0  # [s] between two checks that the parent runs
+
+
+@dataclass(frozen=True)
+class StepMessage:
+    """A child's reply to `begin` and `step` for k environments."""
+
+    images: NDArray[np.uint8] | None
+    """The newest image of each, shape (k, 3, height, width)."""
+    trust: NDArray[np.float64]
+    states: NDArray[np.float32]
+    infos: list[dict[str, Any]]
+    result: StepResult | None = None
+
+
+@dataclass(frozen=True)
+class StackedImages:
+    """Frame stacks and trust of all environments; see `PixelObserver`."""
+
+    stacks: NDArray[np.uint8]
+    trust: NDArray[np.float64]
+
+
+class ProcessVectorEnv:
+    """n environments of one scene and task in several processes.
+
+    The interface is that of `LocalVectorEnv`, without `physics`, `tasks` and most of `pixels`.
+    """
+
+    def __init__(
+        self,
+        scene: str | Path | Twin,
+        task: str,
+        options: dict[str, Any],
+        seeds: Sequence[int | None],
+        processes: int,
+    ) -> None:
+        """Arguments as of `make_vector_env`; `processes` is at most the number of environments."""
+        self.options, self.processes, count = parse_options(options), processes, len(seeds)
+        parts = np.array_split(np.arange(count), processes)
+        self._location = [(c, k) for c, part in enumerate(parts) for k in range(len(part))]
+        self._lock = threading.Lock()
+        self._children: list[_Child] = []
+        self._end = weakref.finalize(self, _kill, self._children)
+        try:
+            for _ in parts:
+                self._children.append(_Child(max(1, available_cores() // processes)))
+            quiet = [runtime.is_quiet() or c > 0 for c in range(processes)]  # only one shows progress
+            mine = [[seeds[i] for i in part] for part in parts]
+            opened = self._request({c: ("open", quiet[c], scene, task, options, mine[c]) for c in range(processes)})
+        except BaseException:
+            self.close()
+            raise
+        self.action_size, self.state_size = opened[0]
+        width, height = self.options.size
+        shape = count, self.options.stack, 3, height, width
+        self.pixels = StackedImages(np.zeros(shape, np.uint8), np.zeros(count)) if self.options.pixels else None
+        self._states = np.zeros((count, self.state_size), np.float32)
+        self._infos: list[dict[str, Any] | None] = [None] * count
+        """The last received info; None where it may have changed since."""
+
+    def __len__(self) -> int:
+        return len(self._location)
+
+    def seed(self, i: int, seed: int | None) -> None:
+        self._call_child(i, "seed", seed)
+
+    def begin(self, which: Sequence[int]) -> None:
+        some = np.asarray(which, int)
+        parts = list(self._split(some))
+        messages = self._request({c: ("begin", local) for c, _, local in parts})
+        for c, at, _ in parts:
+            self._store(some[at], messages[c], fill=True)
+
+    def step(self, actions: NDArray, which: Sequence[int] | None = None) -> StepResult:
+        some = np.arange(len(self)) if which is None else np.asarray(which, int)
+        actions = check_actions(actions, (len(some), self.action_size))
+        parts = list(self._split(some))
+        messages = self._request({c: ("step", actions[at], local) for c, at, local in parts})
+        out = StepResult(np.zeros(len(some)), np.zeros(len(some), bool), np.zeros(len(some), bool))
+        for c, at, _ in parts:
+            self._store(some[at], messages[c], fill=False)
+            part = messages[c].result
+            out.reward[at], out.terminated[at], out.truncated[at] = part.reward, part.terminated, part.truncated
+        return out
+
+    def observation(self) -> NDArray:
+        return frame_stack(self.pixels.stacks) if self.pixels else self._states.copy()
+
+    def state(self, i: int) -> NDArray[np.float32]:
+        return self._states[i].copy()
+
+    def info(self, i: int) -> dict[str, Any]:
+        known = self._infos[i]
+        return self._call_child(i, "info") if known is None else copy.deepcopy(known)
+
+    def get(self, i: int, name: str) -> Any:
+        return self._call_child(i, "get", name)
+
+    def set(self, i: int, name: str, value: Any) -> None:
+        self._infos[i] = None
+        self._call_child(i, "set", name, value)
+
+    def call(self, i: int, name: str, *args: Any, **kwargs: Any) -> Any:
+        self._infos[i] = None
+        return self._call_child(i, "call", name, *args, **kwargs)
+
+    def close(self) -> None:
+        self._end()
+
+    def _split(self, some: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], list[int]]]:
+        """Yields each child that has some of these environments, their positions in `some`, and their indices there."""
+        locations = np.array([self._location[i] for i in some.tolist()]).reshape(-1, 2)
+        for c in np.unique(locations[:, 0]).tolist():
+            at = np.flatnonzero(locations[:, 0] == c)
+            yield c, at, locations[at, 1].tolist()
+
+    def _call_child(self, i: int, method: str, *args: Any, **kwargs: Any) -> Any:
+        c, local = self._location[i]
+        return self._request({c: (method, local, *args)}, kwargs)[c]
+
+    def _request(self, requests: dict[int, tuple[Any, ...]], keywords: dict[str, Any] | None = None) -> dict[int, Any]:
+        """Sends requests to children, waits for all replies, and returns their results."""
+        messages = {c: serialize((*request, keywords or {})) for c, request in requests.items()}
+        with self._lock:
+            if not self._end.alive:
+                raise InputError(
+                    "the vector environment is closed: by close(), by an interrupted step, or because one of its "
+                    "processes ended; expected an open one, so make a new one"
+                )
+            try:
+                for c, message in messages.items():
+                    self._children[c].send(message)
+                replies = {c: self._children[c].receive() for c in requests}  # of all, even if one failed
+            except BaseException:  # some requests may be sent, or replies pending
+                self.close()
+                raise
+        for error, _ in replies.values():
+            if error:
+                raise error
+        return {c: result for c, (_, result) in replies.items()}
+
+    def _store(self, which: NDArray[np.int64], message: StepMessage, fill: bool) -> None:
+        """Stores a reply; `fill` repeats the new image in the whole stack."""
+        if self.pixels and message.images is not None:
+            stacks, new = self.pixels.stacks, message.images[:, None]
+            stacks[which] = new if fill else np.concatenate([stacks[which][:, 1:], new], 1)
+            self.pixels.trust[which] = message.trust
+        self._states[which] = message.states
+        for i, info in zip(which.tolist(), message.infos, strict=True):
+            self._infos[i] = info
+
+
+class _Child:
+    """A child process and the parent's end of its socket."""
+
+    def __init__(self, share: int) -> None:
+        self.pipe, theirs = Pipe()
+        path = os.pathsep.join(str(folder or Path.cwd()) for folder in sys.path)
+        with theirs:
+            self.process = subprocess.Popen(
+                # -P: imports are those of this process, not modules of the current folder.
+                [sys.executable, "-P", "-c", _CHILD_CODE, *map(str, (theirs.fileno(), os.getpid(), share))],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=(theirs.fileno(),),
+                process_group=0,  # Ctrl-C reaches only the parent, which may save first
+                env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": str(share)},
+            )
+
+    def send(self, message: bytes) -> None:
+        with contextlib.suppress(OSError):  # `receive` reports the cause
+            self.pipe.send_bytes(message)
+
+    def receive(self) -> tuple[Exception | None, Any]:
+        try:
+            return pickle.loads(self.pipe.recv_bytes())
+        except (EOFError, OSError):
+            code = self.process.wait()
+            raise InputError(
+                f"a process of the vector environment ended with exit status {code}; expected it to run. "
+                + ("If memory ran out, use fewer processes (1: none)" if code == -9 else "See its messages above")
+            ) from None
+
+
+def _kill(children: list[_Child]) -> None:
+    """Kills children, which have nothing to save."""
+    for child in children:
+        child.pipe.close()
+        child.process.kill()
+    for child in children:
+        child.process.wait()
+
+
+def serialize(value: Any) -> bytes:
+    return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+
+
+# ---- in a child process
+
+
+class VectorEnvServer:
+    """Executes requests: name and arguments of a method of this class or of its `LocalVectorEnv`."""
+
+    envs: LocalVectorEnv
+
+    def answer(self, request: bytes) -> bytes:
+        """Executes a request and returns an exception or None, and the result."""
+        try:
+            method, *args, kwargs = pickle.loads(request)
+            owner = self if method in ("open", "begin", "step") else self.envs
+            return serialize((None, getattr(owner, method)(*args, **kwargs)))
+        except Exception as error:
+            error.add_note(f"in a process of the vector environment:\n{traceback.format_exc()}")
+            with contextlib.suppress(Exception):
+                reply = serialize((error, None))
+                pickle.loads(reply)  # fails for some exceptions
+                return reply
+            return serialize((RuntimeError(error.__notes__[-1]), None))
+
+    def open(
+        self, quiet: bool, scene: Any, task: str, options: dict[str, Any], seeds: list[int | None]
+    ) -> tuple[int, int]:
+        runtime.set_quiet(quiet)
+        self.envs = LocalVectorEnv(EnvFactory.open(scene, task, options), seeds)
+        return self.envs.action_size, self.envs.state_size
+
+    def begin(self, which: list[int]) -> StepMessage:
+        self.envs.begin(which)
+        return self._message(which)
+
+    def step(self, actions: NDArray, which: list[int]) -> StepMessage:
+        return self._message(which, self.envs.step(actions, which))
+
+    def _message(self, which: list[int], result: StepResult | None = None) -> StepMessage:
+        envs, pixels = self.envs, self.envs.pixels
+        images = pixels.stacks[which, -1] if pixels else None
+        trust = pixels.trust[which] if pixels else np.zeros(len(which))
+        states = np.stack([envs.state(i) for i in which])
+        return StepMessage(images, trust, states, [envs.info(i) for i in which], result)
+
+
+def serve() -> None:
+    """Serves a parent's requests; the arguments of the process are socket, process id of the parent, and cores."""
+    socket, parent, share = map(int, sys.argv[1:])
+    os.set_inheritable(socket, False)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # may reach all processes; the parent saves first and ends this one
+    runtime.limit_cores(share)
+    server = VectorEnvServer()
+    with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent closed it
+        while True:
+            while not pipe.poll(_PARENT_CHECK_PERIOD):
+                if os.getppid() != parent:  # ended, though a process that it forked may keep the socket open
+                    return
+            pipe.send_bytes(server.answer(pipe.recv_bytes()))
+
+
+# ---- the choice between them
 
 
 def make_vector_env(

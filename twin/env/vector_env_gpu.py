@@ -1,7 +1,8 @@
 """Vector environment on a GPU: `mujoco_warp` steps all environments at once.
 
-Episodes start on the host, one by one. After that, reward and termination are computed for all environments together,
-and images stay on the device where only the field is in view (`GpuPixelObserver`).
+Episodes start on the host, one by one. Then reward and termination are computed for all environments together, and
+images that show the field alone stay on the device (`GpuPixelObserver`). Tests use a CPU device, where this is slower
+than MuJoCo.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
@@ -16,12 +17,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from twin.env.controller import SubstepSchedules, VectorController
-from twin.env.dm import DrivePhysics, control
 from twin.env.observation import GpuPixelObserver
 from twin.env.obstacles import ObstacleMotion
 from twin.env.physics import TIME_TOLERANCE
 from twin.env.suite import EnvFactory
-from twin.env.task import DriveTask, Motion, RewardAndTermination
+from twin.env.task import DrivePhysics, DriveTask, Motion, RewardAndTermination, control
 from twin.env.vector_env_local import LocalVectorEnv, StepResult
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.types import Array, Indices
@@ -51,7 +51,7 @@ def _apply_commands(
     mocap_pos: wp.array2d(dtype=wp.vec3),
     mocap_quat: wp.array2d(dtype=wp.quat),
 ):
-    """Commands of small step k, and device what moves by itself is in it."""
+    """Sets wheel speeds and poses of moving obstacles for substep k."""
     env = wp.tid()
     s = segment[k, env]
     for i in range(ctrl.shape[1]):
@@ -99,12 +99,11 @@ def _mark_contacts(
 class GpuSimulation:
     """Steps the physics of n environments of one compiled scene; their models may differ in randomized fields.
 
-    Episodes start on the host. Afterwards the state (positions, velocities, the solver's last accelerations) is kept in
-    arrays over all environments. A control step uploads it, runs the substeps under the controllers' schedules, and
-    downloads it with the touched geoms. The environments' own `MjData` are updated only on request (`sync`), as that
-    takes far longer. The device computes in single precision with another solver: episodes resemble those of MuJoCo but
-    are not bit-identical, and on a GPU the varying order of contacts makes them not repeatable. Tests use a CPU device,
-    where this is slower than MuJoCo.
+    The state (positions, velocities, the solver's last accelerations) is kept in arrays over all environments. A
+    control step uploads it, runs the substeps under the controllers' schedules, and downloads it with the touched
+    geoms. The environments' own `MjData` are updated only by `sync`, which takes far longer. The device computes in
+    single precision with another solver: episodes resemble those of MuJoCo but are not bit-identical, and on a GPU the
+    varying order of contacts makes them not repeatable.
     """
 
     def __init__(self, envs: Sequence[DrivePhysics], period: float, device: str) -> None:

@@ -1,10 +1,8 @@
 """Vector environment in one process: physics on a thread pool, images of all environments in one call of the renderer.
 
-Each environment has its own model and sequence of episodes. It is the dm_control environment of `twin.load`, stepped by
-the same code: on a CPU, one environment of many is bit-identical to it alone. `mujoco.batch.Batch` would need less
-Python between contact checks, but it supports neither contact checks nor a controller between substeps; so threads step
-the environments, outside the interpreter's lock. See `vector_env_processes.py` for several processes and
-`vector_env_gpu.py` for a GPU.
+Each environment has its own model and sequence of episodes, and is stepped by the code of `twin.load`: on a CPU it is
+bit-identical to a single environment. Threads are used because `mujoco.batch.Batch` supports neither contact checks nor
+a controller between substeps. See `vector_env.py` for several processes and `vector_env_gpu.py` for a GPU.
 """
 
 import dataclasses
@@ -18,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.config import RESERVED_LIGHTINGS
-from twin.env.dm import DrivePhysics, control
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.observation import PixelObserver
+from twin.env.options import check_actions
 from twin.env.suite import EnvFactory
-from twin.env.task import DriveTask, check_actions
+from twin.env.task import DrivePhysics, DriveTask, control
 from twin.nerf.lightings import Lightings
 from twin.runtime import available_cores
 from twin.types import Array, Array32
@@ -53,7 +51,7 @@ class LocalVectorEnv:
         envs = self._make_envs(factory, seeds)
         self.factory = factory
         self._mixtures: list[tuple[EpisodeLighting, str] | None] = [None] * len(envs)
-        """Lighting of which the mixture was last computed, and its text."""
+        """The last lighting of each environment and the text of its mixture."""
         self._physics, self.tasks = [p for p, _ in envs], [t for _, t in envs]
         self.pixels = factory.make_observer(envs)
         self.options = factory.options
@@ -139,8 +137,8 @@ class LocalVectorEnv:
     def info(self, i: int) -> dict[str, Any]:
         """Info of environment i's episode so far, JSON-able.
 
-        With images, `lighting` is the lighting's name in tables, such as `training`, and `sampled_lighting` adds what
-        was sampled: `training: sun 0.62, night 0.38`, see `mixture_text`.
+        With images, `lighting` is the condition's name in tables, such as `training`, and `sampled_lighting` appends
+        the sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
         """
         return self.tasks[i].info(self._physics[i]) | self._pixel_info(i)
 
@@ -166,8 +164,7 @@ class LocalVectorEnv:
     def make_view(self, size: tuple[int, int]) -> PixelObserver:
         """Returns an observer that renders the present episodes at another size (width, height), without camera noise.
 
-        It has stacks of one image, and shares lighting and weather with `pixels`, which must exist. Its images change
-        neither the observations nor any random draw.
+        Its stacks have one image. It changes neither the observations nor any random draw; `pixels` must exist.
         """
         options = dataclasses.replace(self.options, size=size, stack=1, camera=None)
         factory = dataclasses.replace(self.factory, options=options)

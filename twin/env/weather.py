@@ -59,12 +59,11 @@ _SMOOTHING = 3  # [px] side of the window over which points are averaged before 
 class DirectionalRelighting:
     """Brightens surfaces that face a hypothetical sun and darkens the others, for one episode.
 
-    A surface of normal n under a sun in direction s gets a gain of exp(strength · (n · s − s_z)), more of it in red
-    than in blue, as a low sun is warm. The ground is the reference and keeps its brightness. Normals come from the
-    picture's own depth; within three pixels of an outline they are the outline's. Surfaces lower than 0.4 m below the
-    lens, curbs included, keep their brightness, as a field's ground is rough; those above the lens get the full gain.
-    Far surfaces and the sky get one gain of random brightness and color, higher towards the sun; the two blend between
-    25 and 40 m.
+    A surface of normal n under a sun in direction s gets the gain exp(strength · (n · s − s_z)), more of it in red than
+    in blue, as a low sun is warm. Horizontal ground keeps its brightness. Normals come from the picture's depth, and
+    are inaccurate within three pixels of an outline. Surfaces more than 0.4 m below the lens, curbs included, are not
+    relit, as a field's ground is rough; those above the lens get the full gain. Far surfaces and the sky get one gain
+    of random brightness and color, higher towards the sun; the two blend between 25 and 40 m.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
@@ -121,10 +120,9 @@ _SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # a shadow keeps the sky
 class CastShadows:
     """Random cast shadows that were not filmed, fixed in the world, for one episode.
 
-    The objects that throw them do not exist. A periodic pattern fills the plane z = 0 and is projected through space
-    along the rays of the episode's sun, so it crosses ground, curbs and walls as a shadow does. It consists of patches,
-    some of them dappled as under leaves; of solids with straight edges, as of houses and posts, which a policy can
-    mistake for curbs and lines; or of both. The lower the sun, the longer they are.
+    A periodic pattern in the plane z = 0 is projected along the rays of the episode's sun onto ground, curbs and walls.
+    It consists of patches, some of them dappled as under leaves; of solids with straight edges, as of houses and posts,
+    which a policy can mistake for curbs and lines; or of both. A lower sun makes it longer.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:

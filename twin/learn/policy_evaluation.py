@@ -20,10 +20,11 @@ from multiprocessing import active_children, get_context
 import numpy as np
 
 from twin.cli import signals_held, signals_kept
-from twin.env.domain_randomization import Ranges, lighting_options
+from twin.config import Condition
+from twin.env.domain_randomization import Ranges, condition_options
 from twin.env.suite import EnvFactory
+from twin.env.vector_env import ProcessVectorEnv
 from twin.env.vector_env_local import LocalVectorEnv
-from twin.env.vector_env_processes import ProcessVectorEnv
 from twin.errors import InputError
 from twin.learn.policy import Policy, load_policy
 from twin.loading import load_scene
@@ -45,9 +46,8 @@ class EpisodeChunk:
     source: str
     """See `load_policy`."""
     trust: bool
-    lighting: str
-    """See `env/episode_lighting.py`; or `drawn_<number>`, see `with_sampled_lighting`. `+randomised` randomizes robot,
-    weather and distractor objects, except what is known of them (`env/domain_randomization.py`)."""
+    condition: Condition
+    """Its lighting may be `drawn_<number>`, see `with_sampled_lighting`."""
     seeds: tuple[int, ...]
 
 
@@ -65,7 +65,7 @@ class EpisodeResult:
 
 def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:
     """Results of a chunk, in the order of its seeds. Raises InputError: unknown policy, scene, task or lighting."""
-    envs = _vector_env(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.lighting)
+    envs = _vector_env(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.condition)
     return run_episodes(_policy(chunk.source, chunk.trust), envs, chunk.seeds)
 
 
@@ -159,13 +159,13 @@ def _factory(scene: str, task: str, source: str, trust: bool, randomise: Ranges 
 
 
 @lru_cache(maxsize=1)
-def _vector_env(scene: str, task: str, source: str, trust: bool, lighting: str) -> LocalVectorEnv:
-    options = lighting_options(lighting)
+def _vector_env(scene: str, task: str, source: str, trust: bool, condition: Condition) -> LocalVectorEnv:
+    options = condition_options(condition)
     factory = _factory(scene, task, source, trust, options["randomise"])
-    sampled = _SAMPLED_LIGHTING.fullmatch(options["lighting"])
+    sampled = _SAMPLED_LIGHTING.fullmatch(condition.lighting)
     if sampled:
         factory = with_sampled_lighting(factory, int(sampled[1]))
-    lit = dataclasses.replace(factory.options, lighting=options["lighting"])
+    lit = dataclasses.replace(factory.options, lighting=condition.lighting)
     return LocalVectorEnv(dataclasses.replace(factory, options=lit), [None] * _ENVS)
 
 

@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin import runtime
 from twin.cli import StopNotice, Stopped, stop_noted
-from twin.config import RANDOMIZED
+from twin.config import Condition
 from twin.env.suite import fingerprint
 from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
@@ -116,7 +116,7 @@ def train(
             an error of `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
-    road = fingerprint(twin, config.task, config.lighting + (RANDOMIZED if config.randomise else ""))
+    road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
     settings = json.loads(json.dumps({**dataclasses.asdict(config), "road": road}))  # as read from a file
     pictures = folder / "state" / "pictures.bin"
     resume = has_state(folder / "state")

@@ -15,11 +15,10 @@ from scipy.spatial import cKDTree
 
 from twin.config import MjcfConfig
 from twin.env.camera_noise import CameraNoise, CameraOptions
-from twin.env.dm import DrivePhysics
 from twin.env.obstacles import EpisodeObstacles
 from twin.env.options import Options
 from twin.env.route_segments import RouteSegment, find_task
-from twin.env.task import DriveTask
+from twin.env.task import DrivePhysics, DriveTask
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.passes import path_length, smooth_path
 from twin.mjcf import husky

@@ -16,10 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.config import HELD_OUT, RANDOMIZED
-from twin.env.dm import control
+from twin.config import HELD_OUT, Condition
 from twin.env.options import STEERING, parse_options
-from twin.env.task import CAMERA
+from twin.env.task import CAMERA, control
 from twin.errors import InputError
 from twin.evaluation.trials import (
     EPISODE_COLUMNS,
@@ -119,7 +118,7 @@ def run(
     lightings: Sequence[str],
     trials: int,
     out: Path,
-    twin_lighting: str = HELD_OUT + RANDOMIZED,
+    twin_lighting: str = str(Condition(HELD_OUT, True)),
     films: Path | None = None,
 ) -> list[Trial]:
     """Drives the trials that are not in the table yet, and writes the table and its summary.

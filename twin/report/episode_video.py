@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from twin.assets.ground import Ground
-from twin.env.chase_camera import SceneCamera, chase_poses
 from twin.env.episode import Episode
+from twin.env.mujoco_renderer import SceneCamera, chase_poses
 from twin.env.obstacles import obstacle_pose
 from twin.errors import join_names
 from twin.mjcf.world import World, point_at

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.config import RANDOMIZED
+from twin.config import RANDOMIZED, Condition
 from twin.evaluation.forecasting import Candidate, CellPair, Estimate, Forecast
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.files import write_text
@@ -178,8 +178,9 @@ def legend_below(axes: Axes, columns: int, height: float) -> None:
 
 def lighting_labels(lightings: Sequence[str]) -> tuple[list[str], str]:
     """Column names of lightings without a suffix common to all, and an axis label that names that suffix."""
-    if all(name.endswith(RANDOMIZED) for name in lightings):
-        return [shorten_name(name.removesuffix(RANDOMIZED)) for name in lightings], f"lights, all of them {RANDOMIZED}"
+    conditions = [Condition.parse(name) for name in lightings]
+    if all(one.randomised for one in conditions):
+        return [shorten_name(one.lighting) for one in conditions], f"lights, all of them {RANDOMIZED}"
     return [shorten_name(name) for name in lightings], ""
 
 

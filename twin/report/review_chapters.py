@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from twin.env.route_follower import RecordedDrive
+from twin.env.drivers import RecordedDrive
 from twin.errors import join_names
 from twin.geometry.cameras import nearest_frame
 from twin.mjcf.world import World, arc_lengths

@@ -13,8 +13,8 @@ import numpy as np
 
 from twin.assets.ground import Ground
 from twin.config import SceneConfig
+from twin.env.drivers import RecordedDrive, follow_route
 from twin.env.physics import HuskyPhysics
-from twin.env.route_follower import RecordedDrive, follow_route
 from twin.files import write_json
 from twin.geometry.cameras import Cameras
 from twin.mjcf.scene_xml import Parts

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from twin.env.chase_camera import SceneCamera, chase_poses
-from twin.env.route_follower import RecordedDrive
+from twin.env.drivers import RecordedDrive
+from twin.env.mujoco_renderer import SceneCamera, chase_poses
 from twin.geometry.cameras import Cameras
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World, arc_lengths, point_at

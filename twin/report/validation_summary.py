@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from twin.config import ANY, HELD_OUT, RANDOMIZED, TRAINING
+from twin.config import ANY, HELD_OUT, TRAINING, Condition
 from twin.errors import join_names
 from twin.evaluation.forecasting import Estimate
 from twin.evaluation.statistics import rate_summary
@@ -60,8 +60,9 @@ def failure_text(cell: dict[str, Any]) -> str:
 
 
 def lighting_text(lighting: str) -> str:
-    if lighting.endswith(RANDOMIZED):
-        plain = lighting_text(lighting.removesuffix(RANDOMIZED))
+    condition = Condition.parse(lighting)
+    if condition.randomised:
+        plain = lighting_text(condition.lighting)
         return (
             f"{plain}; and for every episode another sun, other shadows, haze unless a photo determines it, objects "
             "beside the corridor, and other robot parameters except for the identified ones"
@@ -155,7 +156,7 @@ def limitations(results: dict[str, Any]) -> list[Caution]:
                 "run the same command with more --episodes; earlier episodes are kept.",
             )
         )
-    drawn = dict.fromkeys(c["lighting"] for c in results["cells"] if c["lighting"].endswith(RANDOMIZED))
+    drawn = dict.fromkeys(c["lighting"] for c in results["cells"] if Condition.parse(c["lighting"]).randomised)
     if drawn and not results.get("robot_known"):
         out.append(
             Caution(

@@ -1,4 +1,4 @@
-"""Worlds in several processes go through what they would in one, and tell what goes wrong there."""
+"""Vector environments in several processes: results equal those of one process, and errors reach the parent."""
 
 import gc
 import os
@@ -14,9 +14,8 @@ from tiny_twin import tiny_twin
 import twin
 from twin import runtime
 from twin.env.suite import EnvFactory
-from twin.env.vector_env import make_vector_env
+from twin.env.vector_env import ProcessVectorEnv, _Child, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
-from twin.env.vector_env_processes import ProcessVectorEnv, _Child
 from twin.errors import InputError
 
 PICTURES = {"size": (32, 18), "randomise": True, "time_limit": 1.5}
@@ -31,25 +30,25 @@ def scene(tmp_path_factory):
 
 @pytest.fixture
 def spread(scene):
-    worlds = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2, 3], 2)
-    yield worlds
-    worlds.close()
+    envs = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2, 3], 2)
+    yield envs
+    envs.close()
 
 
 @pytest.mark.parametrize("options", [PICTURES, STATES], ids=["pictures", "states"])
-def test_they_are_as_in_one_process(scene, options):
-    """Rewards, ends, pictures, states, infos, bit by bit; with some of the worlds left out, in any order."""
+def test_processes_change_no_result(scene, options):
+    """Rewards, ends, images, states and infos are bit-identical, also for subsets of the environments in any order."""
     seeds = [5, 6, 7]
     here = LocalVectorEnv(EnvFactory.open(scene, "bend", options), seeds)
     there = ProcessVectorEnv(scene, "bend", options, seeds, 2)
     assert (len(there), there.action_size, there.state_size) == (len(here), here.action_size, here.state_size)
     rng, over = np.random.default_rng(0), 0
-    for worlds in (here, there):
-        worlds.begin(range(3))
+    for envs in (here, there):
+        envs.begin(range(3))
     for k in range(30):
         which = [[2, 1, 0], [1], [0, 2]][k % 3]
         actions = rng.uniform(-1, 1, (len(which), here.action_size))
-        a, b = (worlds.step(actions, which) for worlds in (here, there))
+        a, b = (envs.step(actions, which) for envs in (here, there))
         for name in ("reward", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
         np.testing.assert_array_equal(here.observation(), there.observation())
@@ -60,15 +59,15 @@ def test_they_are_as_in_one_process(scene, options):
         ended = [i for i, end in zip(which, a.over, strict=True) if end]
         over += len(ended)
         if ended:
-            for worlds in (here, there):
-                worlds.seed(ended[0], 40 + k)
-                worlds.begin(ended)
+            for envs in (here, there):
+                envs.seed(ended[0], 40 + k)
+                envs.begin(ended)
     assert over > 1
-    for worlds in (here, there):
-        worlds.close()
+    for envs in (here, there):
+        envs.close()
 
 
-def test_tasks_are_asked_where_they_are(spread):
+def test_attributes_of_tasks_are_read_and_set_in_children(spread):
     spread.begin(range(3))
     before = spread.get(2, "time_limit")
     spread.set(2, "time_limit", before + 1.0)
@@ -86,7 +85,7 @@ class _Foreign:
     """A class that no child can import: it is of this process's `__main__`."""
 
 
-def test_what_a_child_cannot_read_is_told(spread, monkeypatch):
+def test_unpicklable_requests_and_replies_raise(spread, monkeypatch):
     monkeypatch.setattr(_Foreign, "__module__", "__main__")
     monkeypatch.setattr(sys.modules["__main__"], "_Foreign", _Foreign, raising=False)
     with pytest.raises(AttributeError, match="_Foreign"):
@@ -94,7 +93,7 @@ def test_what_a_child_cannot_read_is_told(spread, monkeypatch):
     spread.begin(range(3))  # and it goes on
 
 
-def test_bad_input_is_told_in_one_line(scene):
+def test_input_errors_pass_to_the_parent(scene):
     with pytest.raises(InputError, match="nowhere"):
         ProcessVectorEnv(scene, "nowhere", {"pixels": False}, [1, 2], 2)
     with pytest.raises(InputError, match="processes = 0"):
@@ -112,8 +111,8 @@ def test_a_process_that_dies_is_an_error_with_a_cure(spread):
         spread.begin(range(3))
 
 
-def test_a_step_that_was_interrupted_is_never_heard_later(spread):
-    """As by Ctrl-C in a notebook: what children then say would answer the next request."""
+def test_interrupted_step_closes_the_environment(spread):
+    """As by Ctrl-C in a notebook: a pending reply would be taken for that to the next request."""
     spread.begin(range(3))
     receive = _Child.receive
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -125,8 +124,8 @@ def test_a_step_that_was_interrupted_is_never_heard_later(spread):
     spread.close()
 
 
-def test_interrupts_are_the_parents(spread):
-    """Who saves at Ctrl-C, which reaches the whole group of processes, or SIGTERM needs the worlds for it."""
+def test_children_ignore_interrupts(spread):
+    """A parent that saves its state on Ctrl-C or SIGTERM needs the environments for it."""
     spread.begin(range(3))
     for child in spread._children:
         assert os.getpgid(child.process.pid) != os.getpgid(0)
@@ -134,19 +133,19 @@ def test_interrupts_are_the_parents(spread):
     assert np.isfinite(spread.step(np.zeros((3, spread.action_size))).reward).all()
 
 
-def test_they_end_with_their_parent(scene):
+def test_children_end_with_their_parent(scene):
     """However it ends, and though its script has no `if __name__ == "__main__"`."""
     script = f"""
         import os, signal
-        from twin.env.vector_env_processes import ProcessVectorEnv
-        worlds = ProcessVectorEnv({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
-        worlds.begin([0, 1])
+        from twin.env.vector_env import ProcessVectorEnv
+        envs = ProcessVectorEnv({str(scene.scene.root)!r}, "bend", {{"pixels": False}}, [1, 2], 2)
+        envs.begin([0, 1])
         fork = os.fork()
         if not fork:  # has the sockets, too, and outlives us
             os.close(1)
             os.close(2)
             signal.pause()
-        print(fork, *(child.process.pid for child in worlds._children), flush=True)
+        print(fork, *(child.process.pid for child in envs._children), flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True)
@@ -159,7 +158,7 @@ def test_they_end_with_their_parent(scene):
     assert not alive
 
 
-def test_closing_does_not_wait_for_who_else_has_the_sockets(spread):
+def test_close_does_not_wait_for_inherited_sockets(spread):
     """As a process forked meanwhile has them."""
     held = [os.dup(child.pipe.fileno()) for child in spread._children]
     spread.close()
@@ -168,15 +167,15 @@ def test_closing_does_not_wait_for_who_else_has_the_sockets(spread):
         os.close(one)
 
 
-def test_nobody_is_left_when_they_are_dropped(scene):
-    worlds = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2], 2)
-    processes = [child.process for child in worlds._children]
-    del worlds
+def test_children_end_when_the_environment_is_deleted(scene):
+    envs = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2], 2)
+    processes = [child.process for child in envs._children]
+    del envs
     gc.collect()
     assert all(process.poll() is not None for process in processes)
 
 
-def test_few_worlds_stay_here(scene, monkeypatch):
+def test_default_number_of_processes(scene, monkeypatch):
     monkeypatch.setattr("twin.env.vector_env.available_cores", lambda: 4)
     options = {"pixels": False}
     for count, processes, kind in (
@@ -185,8 +184,8 @@ def test_few_worlds_stay_here(scene, monkeypatch):
         (4, None, ProcessVectorEnv),
         (4, 1, LocalVectorEnv),
     ):
-        worlds = make_vector_env(scene, "bend", options, list(range(count)), processes)
-        assert type(worlds) is kind, (count, processes)
-        if isinstance(worlds, ProcessVectorEnv):
-            assert len(worlds._children) == 2
-        worlds.close()
+        envs = make_vector_env(scene, "bend", options, list(range(count)), processes)
+        assert type(envs) is kind, (count, processes)
+        if isinstance(envs, ProcessVectorEnv):
+            assert len(envs._children) == 2
+        envs.close()
