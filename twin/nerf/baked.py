@@ -25,11 +25,10 @@ from twin.nerf.appearance_prior import Probes
 from twin.nerf.brick_layout import BrickLayout, brick_indices, density_codes, stored_skips
 from twin.nerf.fog import Fog
 from twin.nerf.kernels import march as kernels
-from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bytes
+from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
 from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
-from twin.nerf.kernels.lookup import Bricks
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import Rendering
 from twin.runtime import available_cores, bar

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS
-from twin.nerf.kernels.lookup import HALF_CORNERS
+from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS
 
 _MAX_EMPTY_OPACITY = 0.03  # a cell that blocks at most this share of light counts as empty
 

@@ -10,15 +10,15 @@ count, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
-_SIDE = wp.constant(5)
+_SIDE = 5
 _PIXELS = 25
 
 Window = wp.types.vector(length=_PIXELS, dtype=wp.float32)
 
-_WORST_COST = wp.constant(2.0)  # cost in a source that does not contain the window
-_GRAY_SIGMA = wp.constant(0.08)  # gray difference at which a window pixel has weight 1/e
-_MAX_RETURN_ERROR = wp.constant(2.0)  # [px] of a point mapped to a source and back
-_MIN_VARIANCE = wp.constant(1e-5)  # of gray, below which a window has no texture to match
+_WORST_COST = 2.0  # cost in a source that does not contain the window
+_GRAY_SIGMA = 0.08  # gray difference at which a window pixel has weight 1/e
+_MAX_RETURN_ERROR = 2.0  # [px] of a point mapped to a source and back
+_MIN_VARIANCE = 1e-5  # of gray, below which a window has no texture to match
 
 
 @wp.struct
