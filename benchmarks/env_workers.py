@@ -230,10 +230,10 @@ def host(scene: Path, count: int) -> dict[str, Any]:
         blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
 
     def show(field: BakedField, cameras: Any, lighting: Any, take: Any) -> None:
-        field._head_biases(lighting, len(cameras.camera_to_world))  # as `render_on_device` does, on the host
+        field.head_biases(lighting, len(cameras.camera_to_world))  # as `render_on_device` does, on the host
         take(*blank)
 
-    GpuSimulation._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]
+    GpuSimulation._advance, BakedField.render_on_device = lambda self: None, show  # type: ignore[method-assign]
     stage = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
     options = dataclasses.replace(stage.options, device="cuda")  # pictures that stay; the field itself is on the CPU
     worlds = GpuVectorEnv(dataclasses.replace(stage, options=options), list(range(count)), "cpu")

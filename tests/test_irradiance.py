@@ -112,7 +112,7 @@ def ground_and_wall(p):
 
 def test_a_darker_lighting_is_darker_light():
     field = baked(ground_and_wall)
-    dim = dict(field._arrays)
+    dim = dict(field.arrays)
     head = dim["network.head.0"].copy()
     bias = dim["network.head.2.bias"]
     # The second appearance number darkens everything by way of a unit that is otherwise unused.

@@ -35,7 +35,7 @@ class Twin:
         Args:
             device: cpu or cuda.
         """
-        from twin.nerf.added_lightings import added_lightings
+        from twin.nerf.lightings import added_lightings
         from twin.nerf.baked import BakedField
 
         field = BakedField.load(self._folder("field"), device)
@@ -48,7 +48,7 @@ class Twin:
         Args:
             device: cpu or cuda; None: cuda where it is usable.
         """
-        from twin.nerf.added_lightings import added_lightings
+        from twin.nerf.lightings import added_lightings
         from twin.nerf.field import RadianceField
 
         field = RadianceField.load(self._folder("field"), device)

@@ -98,7 +98,7 @@ class RadianceField:
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """See `Appearance.embedding`."""
-        return self.appearance.embedding(lighting)
+        return self.appearance.named().embedding(lighting)
 
     def add_lightings(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> None:
         """See `Lightings.added`."""

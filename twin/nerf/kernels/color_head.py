@@ -27,10 +27,10 @@ Vec8 = wp.types.vector(length=8, dtype=wp.float32)
 _INPUTS = FEATURES + HARMONICS
 
 
-def harmonics(x: Any, y: Any, z: Any):
-    """Real spherical harmonics of degree 1 to 3 of unit vectors (x, y, z), up to constant factors, a tuple of 15.
+def harmonics_of(x: Any, y: Any, z: Any):
+    """The 15 real spherical harmonics of degree 1 to 3 of unit vectors (x, y, z), up to constant factors.
 
-    Takes floats and arrays of NumPy or torch, and is compiled by Warp below. Harmonic 0 is the constant 1.
+    Evaluates arrays of NumPy and torch, and is compiled by Warp. The harmonic of degree 0 is the constant 1.
     """
     xx = x * x
     yy = y * y
@@ -54,7 +54,7 @@ def harmonics(x: Any, y: Any, z: Any):
     )
 
 
-warp_harmonics = wp.func(harmonics)
+_compiled_harmonics = wp.func(harmonics_of)
 
 
 @wp.func
@@ -85,7 +85,7 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
             u = (float(pixel % image.width) + 0.5 - k[2]) / k[0]
             v = (float(pixel // image.width) + 0.5 - k[3]) / k[1]
             d = rotation * wp.normalize(wp.vec3f(u, v, 1.0))
-            h = warp_harmonics(d[0], d[1], d[2])
+            h = _compiled_harmonics(d[0], d[1], d[2])
             x[15, j] = 1.0
             x[16, j] = h[0]
             x[17, j] = h[1]
@@ -162,8 +162,8 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
                 for n in range(background_hidden):
                     a += g[n] * weights.backdrop_1[n * FEATURES + i]
                 x[i] = a
-        # Eight units at a time: each input is read once for all, and eight sums keep the processor's units busy. The two
-        # layers are written out: one function for both gives the same bits, but copies its inputs and is 30 % slower.
+        # Eight units at a time: each input is read once for all, and eight sums keep the processor's units busy. Both
+        # layers are written out, as one function for both, though equal to the bit, copies its inputs: 30 % slower.
         h = Hidden()
         for q in range(hidden // 8):
             w = bias[camera, q]

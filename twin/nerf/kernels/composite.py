@@ -18,7 +18,6 @@ RAW_LIMIT = 14.0
 """Raw densities are clamped to this, which is opaque at any sampling distance."""
 
 
-
 @wp.func
 def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
     """Density [1/contracted m] of a raw output; `unit` is the density at 0."""

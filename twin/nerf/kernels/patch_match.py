@@ -197,7 +197,7 @@ def sweep(
     state = wp.rand_init(seed + 7919 * round_number, row * columns + column)
     best = planes[row, column]
     lowest = costs[row, column]
-    trials = int(6)
+    trials = 6
     if round_number == 0:
         best = wp.vec3(low * wp.pow(high / low, wp.randf(state)), 0.0, 0.0)
         lowest = matching_cost(frames, views, window, best)
