@@ -1,8 +1,8 @@
 """Devices, threads, layout and arrays of a radiance field; terms as in `kernels/space.py` and `kernels/sampler.py`.
 
 Warp runs a CPU launch on one thread but releases the interpreter lock meanwhile, as torch does in a matrix product: two
-Python threads keep two cores busy. A *shard* is a fixed part of a batch, whatever the number of cores. Shards are summed
-in order, so results do not depend on the number of cores either.
+Python threads keep two cores busy. A *shard* is a fixed part of a batch, whatever the number of cores. Shards are
+summed in order, so results do not depend on the number of cores either.
 """
 
 import threading
@@ -64,6 +64,17 @@ class single_threaded_torch:
 
     def __exit__(self, *_: Any) -> None:
         torch.set_num_threads(self._threads)
+
+
+def in_batches(work: Callable[[slice], None], n: int, size: int, device: str) -> None:
+    """Calls `work` on batches of `size` of n rows, in parallel and without gradients."""
+
+    @torch.no_grad()
+    def one(start: int) -> None:
+        work(slice(start, min(start + size, n)))
+
+    with single_threaded_torch():
+        parallel(one, range(0, n, size), device)
 
 
 def load_training_kernels(device: str) -> None:
@@ -208,7 +219,7 @@ class Workspace:
             return tensor, warp_view(tensor, dtype)
 
         def by_ray(tensor: torch.Tensor, dtype: Any) -> Any:
-            return warp_view(tensor[: rays * samples].view(rays, samples, -1), dtype)
+            return warp_view(tensor[: rays * samples].view(rays, samples, *tensor.shape[1:]), dtype)
 
         self.camera = torch.zeros(rays, dtype=torch.int32, device=device)
         self.w_camera = warp_view(self.camera, wp.int32)
