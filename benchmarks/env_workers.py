@@ -232,10 +232,10 @@ def host(scene: Path, count: int) -> dict[str, Any]:
         blank = warp.zeros((count, 64), dtype=warp.vec3), warp.ones((count, 64), dtype=float)
 
     def show(field: BakedField, cameras: Any, lighting: Any, take: Any) -> None:
-        field._head_biases(lighting, len(cameras.camera_to_world))  # the host's part of `render_on_device`
+        field.head_biases(lighting, len(cameras.camera_to_world))  # the host's part of `render_on_device`
         take(*blank)
 
-    GpuSimulation._advance, BakedField.show = lambda self: None, show  # type: ignore[method-assign]
+    GpuSimulation._advance, BakedField.render_on_device = lambda self: None, show  # type: ignore[method-assign]
     factory = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
     # Images stay on the device; the field itself is on the CPU.
     options = dataclasses.replace(factory.options, device="cuda")

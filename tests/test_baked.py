@@ -10,8 +10,7 @@ from twin import runtime
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
-from twin.nerf.baked import BakedField
-from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked import BakedField, BrickLayout, brick_indices, skip_distances
 from twin.nerf.kernels import bricks
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import FAR
@@ -118,8 +117,8 @@ def test_the_march_stops_at_what_else_stands_there(distance, opacity):
 
 def slow_march(field: BakedField, eye: np.ndarray, directions: np.ndarray, step: float) -> np.ndarray:
     """Opacity and features along rays (k, 3) by small equal steps through the near box, shape (k, 16)."""
-    near = brick_indices(field.layout, field._arrays["near"], field._arrays["far"])[0]
-    low, scale = field._arrays["low"].astype(float), field._arrays["step"].astype(float)
+    near = brick_indices(field.layout, field.arrays["near"], field.arrays["far"])[0]
+    low, scale = field.arrays["low"].astype(float), field.arrays["step"].astype(float)
     total, transmittance = np.zeros((len(directions), 16)), np.ones(len(directions))
     for t in np.arange(field.layout.near_plane + step / 2, 12.0, step):
         b = ((eye + directions * t - field.layout.centre) / field.layout.half + 1) / 2
@@ -132,7 +131,7 @@ def slow_march(field: BakedField, eye: np.ndarray, directions: np.ndarray, step:
         for corner in np.ndindex(2, 2, 2):
             x, y, z = (cell + corner).T
             weight = np.prod(np.where(np.array(corner) == 1, c - cell, 1 - (c - cell)), axis=1)
-            code = field._arrays["features"][slot, (x * bricks.CORNERS + y) * bricks.CORNERS + z]
+            code = field.arrays["features"][slot, (x * bricks.CORNERS + y) * bricks.CORNERS + z]
             value += weight[:, None] * (low + scale * code)
         optical = np.where(inside, field.layout.density_unit * np.exp(value[:, 0]) * step, 0.0)
         weight = transmittance * -np.expm1(-optical)
@@ -152,8 +151,8 @@ def test_the_march_equals_a_slow_one():
 
     field = baked(blobs)
     pose = looking((-3.5, 0.5, 0.3))
-    out = field.render(Viewpoints.of(pose, K[None], SIZE), "day")
-    features = field._target(1, *SIZE, False).features.numpy()[0].T
+    out, features = field.render_features(Viewpoints.of(pose, K[None], SIZE), "day")
+    features = features[0].reshape(16, -1).T
     directions = unproject(pixel_grid(*SIZE), K).reshape(-1, 3)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ pose[0, :3, :3].T
     slow = slow_march(field, pose[0, :3, 3], directions, 0.005)
@@ -165,7 +164,7 @@ def test_the_march_equals_a_slow_one():
 
 def test_a_leap_never_passes_a_filled_block():
     rng = np.random.default_rng(2)
-    sparse = dict(baked(wall(1.0, 11.0))._arrays)
+    sparse = dict(baked(wall(1.0, 11.0)).arrays)
     sparse["features"] = np.zeros_like(sparse["features"])
     for _ in range(6):
         sparse["features"][rng.integers(len(sparse["near"])), rng.integers(729), 0] = 255
@@ -252,7 +251,7 @@ def test_random_lightings_come_back_from_its_files(tmp_path):
         bare.sample_lighting(np.random.default_rng(0))
     rng = np.random.default_rng(3)
     rays = rng.normal(size=(50, 15)).astype(np.float32), rng.normal(size=(50, 16)).astype(np.float32)
-    arrays = {**bare._arrays, "probes.features": rays[0], "probes.harmonics": rays[1]}
+    arrays = {**bare.arrays, "probes.features": rays[0], "probes.harmonics": rays[1]}
     field = BakedField(LAYOUT, bare.lightings_by_name, arrays)
     field.save(tmp_path)
     again = BakedField.load(tmp_path)

@@ -14,7 +14,7 @@ from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, project
 from twin.geometry.images import psnr, write_image
 from twin.geometry.poses import look_at
 from twin.nerf import buffers
-from twin.nerf.appearance_fit import fit_appearance
+from twin.nerf.appearance import fit_appearance
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
 from twin.nerf.buffers import CameraArrays, single_threaded_torch
@@ -215,7 +215,7 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
     pixels = np.stack([column.ravel() + 0.5 for column in np.mgrid[:HEIGHT, :WIDTH][::-1]], -1)
     features, harmonics, _, _ = field.trace(one, np.zeros(len(pixels), int), pixels)
     colours = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
-    fitted, _ = fit_appearance(field, features, harmonics, colours, field.embedding("day"))
+    fitted, _ = fit_appearance(field.parameters, features, harmonics, colours, field.embedding("day"))
     seen = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), fitted).rgb[0]
     assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
 

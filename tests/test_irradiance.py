@@ -118,7 +118,7 @@ def ground_and_wall(p):
 
 def test_darker_lighting_has_less_irradiance():
     field = baked(ground_and_wall)
-    dim = dict(field._arrays)
+    dim = dict(field.arrays)
     head = dim["network.head.0"].copy()
     bias = dim["network.head.2.bias"]
     # The second appearance number darkens everything by way of a unit that is otherwise unused.

@@ -19,7 +19,7 @@ _MADE = {
     "color head of one lane": lambda: color_head.color_head_kernel(color_head.LANES["cuda"], 64, 32)[0].module,
 }
 """Those elsewhere; and kernels that are made for a number of lanes, which are in modules of their own."""
-_NO_KERNEL = {"lookup", "color_head", "vectorized"}
+_NO_KERNEL = {"color_head"}
 
 
 @pytest.mark.parametrize(

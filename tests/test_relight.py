@@ -14,16 +14,15 @@ from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
-from twin.nerf.added_lightings import AddedLighting, added_lightings, check_name, field_result
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.fog import Fog, mixed
-from twin.nerf.lightings import Lightings
+from twin.nerf.lightings import AddedLighting, Lightings, added_lightings, check_name
 from twin.relight import PhotoFit, comparison, fit_photo, main
 from twin.report import video_layout
 from twin.report.video_layout import draw_label
-from twin.scene import SceneDir, write_stamp
+from twin.scene import SceneDir, stage_result, write_stamp
 
 
 def small_field(seed: int = 0) -> RadianceField:
@@ -166,7 +165,7 @@ def _without_gaps(picture: np.ndarray) -> np.ndarray:
 
 
 def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
-    AddedLighting("old", [0.0] * 8, Fog(), field_result(scene), "photo.png", {}).save(scene)
+    AddedLighting("old", [0.0] * 8, Fog(), stage_result(scene, "field"), "photo.png", {}).save(scene)
     assert "old" in added_lightings(scene, 8)[0]
     another = scene.stage("field") / "another"
     another.touch()

@@ -21,9 +21,9 @@ from twin.env.suite import EnvFactory, fingerprint
 from twin.env.task import WEATHER, DriveTask
 from twin.env.weather import CastShadows, DirectionalRelighting, FogSample, Weather, _solid_shadows
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
-from twin.nerf.added_lightings import AddedLighting, field_result
 from twin.nerf.fog import Fog
-from twin.scene import SceneDir
+from twin.nerf.lightings import AddedLighting
+from twin.scene import SceneDir, stage_result
 
 SMALL = {"size": (32, 18)}
 
@@ -118,7 +118,7 @@ def photos(tmp_path_factory):
     scene = SceneDir(tiny_twin(tmp_path_factory.mktemp("photos")))
     day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
     for name, air in (("clear", Fog()), ("foggy", FOG)):
-        AddedLighting(name, day, air, field_result(scene), "photo.png", {}).save(scene)
+        AddedLighting(name, day, air, stage_result(scene, "field"), "photo.png", {}).save(scene)
     return twin.load_scene(scene.root)
 
 

@@ -20,9 +20,9 @@ from twin import commands
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
-from twin.nerf.added_lightings import AddedLighting, check_name, field_result
 from twin.nerf.fog import Fog
-from twin.scene import SceneDir, require_stage
+from twin.nerf.lightings import AddedLighting, check_name
+from twin.scene import SceneDir, require_stage, stage_result
 
 _CLEAR = Fog()
 _MAX_WIDTH = 480  # [px] longer side of the fitted image, as for training frames
@@ -70,7 +70,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     """
     import torch
 
-    from twin.nerf.appearance_fit import fit_appearance
+    from twin.nerf.appearance import fit_appearance
     from twin.nerf.buffers import CameraArrays, single_threaded_torch
 
     height, width = photo.shape[:2]
@@ -88,7 +88,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     def fit(pixels: NDArray, start: NDArray, with_fog: bool) -> tuple[NDArray, Fog]:
         some = torch.as_tensor(pixels[:: max(1, len(pixels) // _RAYS)], device=field.device)
-        rays = field, features[some], harmonics[some], colors[some]
+        rays = field.parameters, features[some], harmonics[some], colors[some]
         return fit_appearance(*rays, start, _STEPS, distances[some] if with_fog else None)
 
     filmed = {name: render(field.embedding(name)) for name in field.lightings}
@@ -142,7 +142,7 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
     scene = SceneDir(root)
     if not scene.config_file.exists():
         raise InputError(f"no scene.toml in {root}; give the scene's folder, such as scenes/demo")
-    result = field_result(scene)
+    result = stage_result(scene, "field")
 
     from twin.capture.camera_models import undistorted
     from twin.capture.localize import register_photo

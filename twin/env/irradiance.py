@@ -27,6 +27,7 @@ from twin.geometry.poses import look_at
 from twin.mjcf.world import arc_lengths, heading_at, point_at
 from twin.nerf.appearance_prior import Probes
 from twin.nerf.baked import BakedField
+from twin.nerf.kernels.color_head import harmonics_of
 from twin.types import Array
 
 GROUND_ALBEDO = 0.37
@@ -250,10 +251,7 @@ def _surface_points(field: BakedField, route: Array) -> _SurfacePoints:
 def spherical_harmonics_numpy(d: Array) -> Array:
     """`twin.nerf.network.spherical_harmonics` without torch: unit vectors (n, 3) → (n, 16)."""
     x, y, z = np.moveaxis(d, -1, 0)
-    xx, yy, zz = x * x, y * y, z * z
-    first = [np.ones_like(x), x, y, z, x * y, y * z, 3.0 * zz - 1.0, x * z, xx - yy]
-    third = [y * (3.0 * xx - yy), x * y * z, y * (5.0 * zz - 1.0), z * (5.0 * zz - 3.0)]
-    return np.stack([*first, *third, x * (5.0 * zz - 1.0), z * (xx - yy), x * (xx - 3.0 * yy)], -1)
+    return np.stack([np.ones_like(x), *harmonics_of(x, y, z)], -1)
 
 
 def _height_above(points: Array, route: Array) -> tuple[Array, Array]:

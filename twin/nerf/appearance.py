@@ -1,14 +1,19 @@
-"""Appearance embeddings in training: a vector per lighting plus a small residual per frame.
+"""Appearance embeddings in torch: those that training learns, and the fit of one to a photo.
 
-The per-frame residual captures gradual changes within a film, such as exposure. `lightings.py` looks embeddings up by
-name.
+Training learns a vector per lighting plus a small residual per frame, which captures gradual changes within a film,
+such as exposure. `lightings.py` looks embeddings up by name.
 """
+
+import math
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from twin.nerf import network
+from twin.nerf.fog import REACH, Fog
 from twin.nerf.lightings import Lightings
+from twin.types import Array32
 
 
 class Appearance:
@@ -45,11 +50,7 @@ class Appearance:
             vectors, frame_vectors = self.vectors.detach().cpu().numpy(), self.of_frames(every).cpu().numpy()
         return Lightings(self.lightings, vectors, self.frames, frame_vectors, stale=self.stale)
 
-    def embedding(self, lighting: str) -> NDArray[np.float32]:
-        """See `Lightings.embedding`."""
-        return self.named().embedding(lighting)
-
-    def added(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> "Appearance":
+    def added(self, more: dict[str, Array32], stale: tuple[str, ...] = ()) -> "Appearance":
         """See `Lightings.added`."""
         new = [torch.as_tensor(vector, device=self.vectors.device)[None] for vector in more.values()]
         return Appearance(
@@ -65,3 +66,62 @@ def initial_appearance(
     rng = np.random.default_rng([seed, 1])
     vectors = torch.as_tensor(rng.normal(0.0, 0.3, (len(lightings), dim)).astype(np.float32))
     return Appearance(lightings, frames, frame_lighting, vectors, torch.zeros(len(frames), dim))
+
+
+# ---- fit to a photo
+
+_STEPS = 40
+_RATE = 0.05  # of the embedding
+_PRIOR = 1e-3  # weight of the distance from the initial embedding, as of residuals in training
+_INITIAL_EXTINCTION = 2.5e-3  # [1/m]
+_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.3, 0.05  # the first of the logarithm of extinction
+_MAX_EXTINCTION = 0.1  # [1/m], a visibility of 30 m: a denser veil is probably on the lens
+_FARTHEST_SHARE = 0.25  # share of the rays, the farthest, whose mean color initializes the airlight
+
+
+def fit_appearance(
+    parameters: dict[str, torch.Tensor],
+    features: torch.Tensor,
+    harmonics: torch.Tensor,
+    colors: torch.Tensor,
+    start: Array32,
+    steps: int = _STEPS,
+    distances: torch.Tensor | None = None,
+) -> tuple[Array32, Fog]:
+    """Fits the embedding (dim,) and the fog under which traced rays have given colors (n, 3) in [0, 1].
+
+    `parameters` are those of the field's networks, which stay as they are. Features (n, CHANNELS − 1) and harmonics
+    (n, 16) come from `RadianceField.trace`. The embedding starts at `start`, the mean of its prior. Fog is fitted only
+    with distances along the rays [m], shape (n,).
+    """
+    origin = torch.as_tensor(start, device=features.device)
+    embedding = origin.clone().requires_grad_(True)
+    fitted, rates = [embedding], [_RATE]
+    if distances is not None:
+        distances = distances.clamp(max=REACH)
+        farthest = distances.topk(max(1, int(_FARTHEST_SHARE * len(distances)))).indices
+        log_extinction = torch.tensor(math.log(_INITIAL_EXTINCTION), device=features.device, requires_grad=True)
+        airlight = colors[farthest].mean(0).clone().requires_grad_(True)
+        fitted += [log_extinction, airlight]
+        rates += [_EXTINCTION_RATE, _AIRLIGHT_RATE]
+    optimizer = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(fitted, rates, strict=True)])
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 - step / steps)
+    for _ in range(steps):
+        rgb = network.head(parameters, features, harmonics, embedding)
+        if distances is not None:
+            kept = torch.exp(-torch.exp(log_extinction) * distances)[:, None]
+            rgb = kept * rgb + (1.0 - kept) * airlight
+        loss = ((rgb - colors) ** 2).mean() + _PRIOR * ((embedding - origin) ** 2).mean()
+        for parameter, gradient in zip(fitted, torch.autograd.grad(loss, fitted), strict=True):
+            parameter.grad = gradient
+        optimizer.step()
+        schedule.step()
+        if distances is not None:
+            with torch.no_grad():
+                log_extinction.clamp_(max=math.log(_MAX_EXTINCTION))
+                airlight.clamp_(0.0, 1.0)
+    fog = Fog()
+    if distances is not None:
+        red, green, blue = airlight.tolist()
+        fog = Fog(float(log_extinction.detach().exp()), (red, green, blue))
+    return embedding.detach().cpu().numpy(), fog

@@ -1,10 +1,10 @@
 """Prior of plausible appearance embeddings: samples random ones and rejects those that could not have been filmed.
 
-DriveEnv-NeRF samples embeddings and a person picks those that look right. Here a rule decides, on the *picture* of an
-embedding: the colors of *probes*, rays through the training frames with known features. The rule has two parts.
-*Light adds*: in linear light the picture must be nearly a non-negative sum of the filmed lightings' pictures. More sun,
-street lamps at noon and longer exposure are such sums; green walls are not. *Exposed as filmed*: statistics of
-brightness, contrast and color must lie in the slightly widened range of the filmed lightings and frames.
+DriveEnv-NeRF samples embeddings and a person picks those that look right. Here a rule of two parts decides, on the
+*picture* of an embedding: the colors of *probes*, rays through the training frames with known features. First, light
+adds: in linear light the picture must be nearly a non-negative sum of the filmed lightings' pictures. More sun, street
+lamps at noon and longer exposure are such sums; green walls are not. Second, statistics of brightness, contrast and
+color must lie in the slightly widened range of the filmed lightings and frames.
 """
 
 from dataclasses import dataclass
@@ -67,7 +67,9 @@ class AppearancePrior:
         low, high = filmed.min(0), filmed.max(0)
         margin = _RANGE_MARGIN[0] + _RANGE_MARGIN[1] * (high - low)
         self._low, self._high = low - margin, high + margin
-        self._vectors, self._residuals = vectors, frame_residuals(vectors, frame_vectors)
+        # The nearest lighting is the frame's, as training keeps residuals small.
+        nearest = np.linalg.norm(frame_vectors[:, None] - vectors, axis=-1).argmin(1)
+        self._vectors, self._residuals = vectors, frame_vectors - vectors[nearest]
 
     def propose(self, rng: np.random.Generator) -> Array32:
         """Samples an embedding (dim,) like the learned ones, not yet checked.
@@ -89,8 +91,21 @@ class AppearancePrior:
         nearest = np.minimum(self._lights @ weights, 1.0) ** (1.0 / _GAMMA)
         return np.sqrt(((nearest.reshape(-1, 3) - picture) ** 2).mean(1))
 
+    def sample(self, rng: np.random.Generator) -> Array32:
+        """Samples a plausible embedding (dim,) by rejection; raises InputError after `_MAX_TRIES` proposals."""
+        violations: list[str] = []
+        for _ in range(_MAX_TRIES):
+            embedding = self.propose(rng)
+            violations = self.violations(embedding)
+            if not violations:
+                return embedding
+        raise InputError(
+            f"no plausible lighting among {_MAX_TRIES} sampled; the last is {'; '.join(violations)}; "
+            "train the field longer (nerf.steps), or render the filmed lightings and their mixtures"
+        )
+
     def violations(self, embedding: NDArray) -> list[str]:
-        """The parts of the rule that an embedding (dim,) violates, in words; empty if it is plausible."""
+        """Descriptions of the parts of the rule that an embedding (dim,) violates; empty if it is plausible."""
         picture = self.probes.picture(embedding)
         error = self.color_error(picture)
         misfit, wrong = float(np.sqrt((error**2).mean())), float((error > _OUTLIER_ERROR).mean())
@@ -113,24 +128,3 @@ def picture_statistics(picture: NDArray) -> NDArray[np.float64]:
     black, burnt = (high < _CLIPPED[0]).mean(), (low > _CLIPPED[1]).mean()
     saturation = ((high - low) / np.maximum(high, 1e-3)).mean()
     return np.array([gray.mean(), gray.std(), saturation, red - green, blue - green, black, burnt], np.float64)
-
-
-def frame_residuals(vectors: Array32, frame_vectors: Array32) -> Array32:
-    """Embeddings of frames (frames, dim) minus those of their lightings (lightings, dim), shape (frames, dim)."""
-    # The nearest lighting is the frame's, as training keeps residuals small.
-    nearest = np.linalg.norm(frame_vectors[:, None] - vectors, axis=-1).argmin(1)
-    return frame_vectors - vectors[nearest]
-
-
-def sample_plausible(rng: np.random.Generator, prior: AppearancePrior) -> Array32:
-    """Samples a plausible embedding (dim,) by rejection; raises InputError after `_MAX_TRIES` proposals."""
-    violations: list[str] = []
-    for _ in range(_MAX_TRIES):
-        embedding = prior.propose(rng)
-        violations = prior.violations(embedding)
-        if not violations:
-            return embedding
-    raise InputError(
-        f"no plausible lighting among {_MAX_TRIES} sampled; the last is {'; '.join(violations)}; "
-        "train the field longer (nerf.steps), or render the filmed lightings and their mixtures"
-    )

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.nerf import network
-from twin.nerf.baked import BakedField
-from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
-from twin.nerf.buffers import CameraArrays, Workspace, parallel, single_threaded_torch, warp_view
+from twin.nerf.baked import BakedField, BrickLayout, brick_indices, skip_distances
+from twin.nerf.buffers import CameraArrays, Workspace, in_batches, parallel, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import QUERY_POINTS, RadianceField
 from twin.nerf.kernels import bricks as kernels
@@ -159,16 +158,14 @@ def _sample_bricks(field: RadianceField, layout: BrickLayout, slots: tuple[NDArr
     positions = np.concatenate([near.reshape(-1, 3), far.reshape(-1, 3)]).astype(np.float32).clip(0.0, 1.0 - 1e-6)
     values = torch.empty(len(positions), volume.CHANNELS, device=field.device)
 
-    @torch.no_grad()
-    def one(start: int) -> None:
-        n = min(QUERY_POINTS, len(positions) - start)
+    def query(rows: slice) -> None:
+        n = rows.stop - rows.start
         with field.workspace(0, 1, QUERY_POINTS) as ws:
-            ws.positions[:n] = torch.as_tensor(positions[start : start + n], device=field.device)
+            ws.positions[:n] = torch.as_tensor(positions[rows], device=field.device)
             field.query(ws, 0, n)
-            values[start : start + n] = ws.outputs[:n]
+            values[rows] = ws.outputs[:n]
 
-    with single_threaded_torch():
-        parallel(one, range(0, len(positions), QUERY_POINTS), field.device)
+    in_batches(query, len(positions), QUERY_POINTS, field.device)
     values[:, 0].clamp_(*_RAW_RANGE)
     return values.view(-1, kernels.SAMPLES, volume.CHANNELS)
 

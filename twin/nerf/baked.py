@@ -9,7 +9,7 @@ import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,22 +22,114 @@ from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
-from twin.nerf.brick_layout import BrickLayout, brick_indices, density_codes, stored_skips
 from twin.nerf.fog import Fog
 from twin.nerf.kernels import march as kernels
-from twin.nerf.kernels.bricks import BLOCKS, CELLS, Bytes
+from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
 from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
-from twin.nerf.kernels.lookup import Bricks
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import Rendering
 from twin.runtime import available_cores, bar
 from twin.types import Array32
 from twin.warp_runtime import wp
 
+# ---- layout of the bricks
+
+_MAX_EMPTY_OPACITY = 0.03  # a cell that blocks at most this share of light counts as empty
+
+
+@dataclass(frozen=True)
+class BrickLayout:
+    """Sizes and bounds of a baked field. `baked.json` stores these names as keys."""
+
+    centre: tuple[float, float, float]
+    """Center of the near box [m]."""
+    half: tuple[float, float, float]
+    """Half sides of the near box [m]."""
+    near_plane: float
+    """Distance at which rays start [m]."""
+    density_unit: float
+    """Density at raw value 0 [1/contracted m]."""
+    near_shape: tuple[int, int, int]
+    """Bricks over the near box."""
+    far_shape: tuple[int, int, int]
+    """Bricks over the contracted cube."""
+
+    @property
+    def near_side(self) -> NDArray[np.float64]:
+        """Sides of a brick in the near box [m]."""
+        return 2.0 * np.array(self.half) / np.array(self.near_shape)
+
+    @property
+    def near_cell(self) -> float:
+        """Smallest side of a near cell [m]."""
+        return float(self.near_side.min()) / CELLS
+
+    @property
+    def far_cell(self) -> float:
+        """Smallest side of a far cell [contracted m]."""
+        return float((4.0 * np.array(self.half) / np.array(self.far_shape)).min()) / CELLS
+
+
+def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Near and far index (see `kernels/bricks.py`) of bricks (s, 3), whose slots count the near ones first."""
+    out = []
+    for shape, slots, first in ((layout.near_shape, near, 0), (layout.far_shape, far, len(near))):
+        index = np.full(shape, -1, np.int32)
+        index[tuple(slots.T)] = np.arange(first, first + len(slots))
+        out.append(index)
+    return out[0], out[1]
+
+
+def _density_codes(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Reorders density bytes of bricks (s, 729) as `bricks.DENSITIES` says, shape (s · 810 + 8,)."""
+    cube = samples.reshape(-1, *[CORNERS] * 3)
+    halves = np.stack([cube[..., :HALF_CORNERS], cube[..., HALF_CORNERS - 1 :]], 2)
+    return np.concatenate([halves.ravel(), np.zeros(8, np.uint8)])  # padding, as eight bytes are read at a time
+
+
+def _stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """Compresses a grid's skip distances per block, shape 4 · that of the brick index, to what the march reads: the
+    index with −d for bricks without a slot (d: least distance in it), and the stored bricks' distances (slots, 64)."""
+    n0, n1, n2 = index.shape
+    blocks = distance.reshape(n0, BLOCKS, n1, BLOCKS, n2, BLOCKS).transpose(0, 2, 4, 1, 3, 5).reshape(*index.shape, -1)
+    stored = index >= 0
+    by_slot = blocks[stored][np.argsort(index[stored])]
+    return np.where(stored, index, -blocks.min(-1).astype(np.int32)), by_slot
+
+
+def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
+    """Skip distances of all blocks of the near and the far grid, as arrays `near_leap` and `far_leap`.
+
+    A block is occupied if a cell at one of its corners blocks more than `_MAX_EMPTY_OPACITY`.
+    """
+    from scipy.ndimage import distance_transform_cdt
+
+    split = len(arrays["near"])
+    codes = arrays["features"][..., 0].reshape(-1, *[CORNERS] * 3)
+    cell = np.where(np.arange(len(codes)) < split, layout.near_cell, layout.far_cell)
+    threshold = (np.log(_MAX_EMPTY_OPACITY / (cell * layout.density_unit)) - arrays["low"][0]) / arrays["step"][0]
+    occupied = codes > threshold[:, None, None, None]
+    for axis in (1, 2, 3):
+        first, second, third = (np.take(occupied, np.arange(k, k + CELLS - 1, 2), axis) for k in (0, 1, 2))
+        occupied = first | second | third
+    out = {}
+    for name, shape, slots, mine in (
+        ("near_leap", layout.near_shape, arrays["near"], occupied[:split]),
+        ("far_leap", layout.far_shape, arrays["far"], occupied[split:]),
+    ):
+        bricks = np.zeros((*shape, BLOCKS, BLOCKS, BLOCKS), bool)
+        bricks[tuple(slots.T)] = mine
+        blocks = bricks.transpose(0, 3, 1, 4, 2, 5).reshape(np.multiply(shape, BLOCKS))
+        distance = distance_transform_cdt(~blocks, "chessboard") if blocks.any() else np.full(blocks.shape, 255)
+        out[name] = np.minimum(distance, 255).astype(np.uint8)
+    return out
+
+
+# ---- field
+
 _FORMAT = 2
-_BANDS_PER_CORE = 3  # more bands than cores, as bands with sky in them finish sooner
 _MAX_TARGETS = 4  # image sizes kept: a vector env renders all its envs, and those that are being reset
 
 
@@ -58,18 +150,16 @@ class BakedField:
             lightings: Appearance embeddings by name.
             arrays: `near` and `far` (grid positions of the stored bricks, (s, 3)), `features` (s, 729, CHANNELS) bytes,
                 near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
-                `brick_layout.skip_distances`), `network.*`, and for random lightings `probes.*` (see
-                `appearance_prior.Probes`).
+                `skip_distances`), `network.*`, and for random lightings `probes.*` (see `appearance_prior.Probes`).
             device: `cpu` or `cuda`.
             about: JSON-able metadata stored with the field.
         """
         self.layout, self.lightings_by_name, self.about, self.device = layout, lightings, about or {}, device
-        self._arrays = arrays
+        self.arrays = arrays
         p = self.network
         if "probes.features" in arrays:
             probes = Probes(arrays["probes.features"], arrays["probes.harmonics"], p)
             self.lightings_by_name = replace(lightings, probes=probes)
-        near, far = brick_indices(layout, arrays["near"], arrays["far"])
 
         def on_device(array: NDArray, dtype: Any) -> Any:
             if device == "cpu":  # NumPy allocates large arrays on huge pages, where random reads cost less
@@ -79,26 +169,28 @@ class BakedField:
             return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
 
         b: Any = Bricks()
-        near, near_skips = stored_skips(near, arrays["near_leap"])
-        far, far_skips = stored_skips(far, arrays["far_leap"])
-        b.near_index, b.far_index = on_device(near.ravel(), wp.int32), on_device(far.ravel(), wp.int32)
+        near_index, far_index = brick_indices(layout, arrays["near"], arrays["far"])
+        near_index, near_skips = _stored_skips(near_index, arrays["near_leap"])
+        far_index, far_skips = _stored_skips(far_index, arrays["far_leap"])
+        b.near_index, b.far_index = on_device(near_index.ravel(), wp.int32), on_device(far_index.ravel(), wp.int32)
         b.skips = on_device(np.concatenate([near_skips, far_skips]).ravel(), wp.uint8)
         b.near_blocks = wp.vec3i(*(BLOCKS * n for n in layout.near_shape))
         b.far_blocks = wp.vec3i(*(BLOCKS * n for n in layout.far_shape))
-        b.densities = on_device(density_codes(arrays["features"][..., 0]), wp.uint8)
+        b.densities = on_device(_density_codes(arrays["features"][..., 0]), wp.uint8)
         b.features = on_device(arrays["features"].reshape(-1, CHANNELS), Bytes)
         b.low, b.step = Channels(*arrays["low"].tolist()), Channels(*arrays["step"].tolist())
         b.center = wp.vec3f(*layout.centre)
         b.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        b.near_cell, b.far_cell = float(layout.near_side.min()) / CELLS, layout.far_cell
+        b.near_cell, b.far_cell = layout.near_cell, layout.far_cell
         b.unit, b.near_plane = layout.density_unit, layout.near_plane
         self._bricks = b
         self._lock = threading.Lock()
         self._targets: dict[tuple[int, int, int, bool], _RenderTarget] = {}
 
-        hidden, background_hidden = p["head.1"].shape[0], p["backdrop.0"].shape[1]
         self._march = kernels.march_kernel(kernels.LANES[device])
-        self._shade, weights = color_head_kernel(HEAD_LANES[device], hidden, background_hidden)
+        self._color_head, weights = color_head_kernel(
+            HEAD_LANES[device], p["head.1"].shape[0], p["backdrop.0"].shape[1]
+        )
         rows = CHANNELS - 1 + HARMONICS
         w: Any = weights()
 
@@ -112,7 +204,12 @@ class BakedField:
             setattr(w, name.replace(".", "_"), on_device(p[name].ravel(), wp.float32))
         self._weights = w
         self._first_bias = p["head.0.bias"], p["head.0"][rows:]
-        load_kernels([kernels.cone_march, self._march, self._shade], device)
+        needed = kernels.cone_march, self._march, self._color_head
+        # Loaded here, so that no two threads do it at once.
+        with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
+            for kernel in needed:
+                kernel.module.load(wp.get_device(device))
+                progress.update()
         self._threads = available_cores()
         self._pool = ThreadPoolExecutor(self._threads) if device == "cpu" and self._threads > 1 else None
 
@@ -124,19 +221,18 @@ class BakedField:
     @property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the near box [m], shape (2, 3)."""
-        return np.stack(
-            [np.subtract(self.layout.centre, self.layout.half), np.add(self.layout.centre, self.layout.half)]
-        )
+        center, half = np.array(self.layout.centre), np.array(self.layout.half)
+        return np.stack([center - half, center + half])
 
     @property
     def network(self) -> dict[str, NDArray]:
         """Arrays of the color head and the background network, by name."""
-        return {k.removeprefix("network."): v for k, v in self._arrays.items() if k.startswith("network.")}
+        return {k.removeprefix("network."): v for k, v in self.arrays.items() if k.startswith("network.")}
 
     @property
     def bytes(self) -> int:
         """Size of the stored arrays [bytes]."""
-        return sum(array.nbytes for array in self._arrays.values())
+        return sum(array.nbytes for array in self.arrays.values())
 
     def embedding(self, lighting: str) -> Array32:
         """See `Lightings.embedding`."""
@@ -191,7 +287,7 @@ class BakedField:
         (n, height · width), which are reused after it returns.
         """
         with self._lock:
-            target = self._render(cameras, lighting, None, None)
+            target = self._render(cameras, lighting)
             consume(target.rgb, target.opacity)
 
     def render_features(self, cameras: PosedCameras, lighting: str | NDArray) -> tuple[Rendering, Array32]:
@@ -201,7 +297,7 @@ class BakedField:
             The rendering, and a copy of opacity (channel 0) and features, shape (n, CHANNELS, height, width).
         """
         with self._lock:
-            target = self._render(cameras, lighting, None, None)
+            target = self._render(cameras, lighting)
             n, height, width = target.shape
             return target.result(), target.features.numpy().reshape(n, -1, height, width).copy()
 
@@ -218,13 +314,17 @@ class BakedField:
         self,
         cameras: PosedCameras,
         lighting: str | NDArray | Sequence[str | NDArray],
-        size: tuple[int, int] | None,
-        stop: NDArray | None,
+        size: tuple[int, int] | None = None,
+        stop: NDArray | None = None,
     ) -> "_RenderTarget":
         intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         pose = np.asarray(cameras.camera_to_world, np.float64)
-        target = self._target(len(pose), width, height, stop is not None)
-        target.set_cameras(pose, intrinsics, self._head_biases(lighting, len(pose)), stop)
+        key = len(pose), width, height, stop is not None
+        target = self._targets.pop(key, None) or _RenderTarget(self, *key)
+        self._targets[key] = target
+        while len(self._targets) > _MAX_TARGETS:
+            del self._targets[next(iter(self._targets))]
+        target.set_cameras(pose, intrinsics, self.head_biases(lighting, len(pose)), stop)
         if self._pool is None:
             for band in target.bands:
                 target.render_band(band)
@@ -232,8 +332,8 @@ class BakedField:
             list(self._pool.map(target.render_band, target.bands))
         return target
 
-    def _head_biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Array32:
-        """Bias of the head's first layer including the appearance, shape (n, hidden)."""
+    def head_biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Array32:
+        """Bias of the head's first layer including the appearance, for n cameras, shape (n, hidden)."""
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
         vectors = np.stack(
             [self.embedding(v) if isinstance(v, str) else np.asarray(v) for v in ([lighting] if one else lighting)]
@@ -244,21 +344,12 @@ class BakedField:
         # One product per vector: for a matrix BLAS sums in another order, and an image must not depend on the others.
         return np.broadcast_to(bias + np.stack([vector @ matrix for vector in vectors]), (n, len(bias)))
 
-    def _target(self, n: int, width: int, height: int, stopped: bool) -> "_RenderTarget":
-        """The render target of this image size; the last `_MAX_TARGETS` are kept."""
-        key = n, width, height, stopped
-        target = self._targets.pop(key, None) or _RenderTarget(self, *key)
-        self._targets[key] = target
-        while len(self._targets) > _MAX_TARGETS:
-            del self._targets[next(iter(self._targets))]
-        return target
-
     # ---- files
 
     def save(self, folder: Path) -> None:
         """Writes `baked.safetensors` and `baked.json`."""
         names = self.lightings_by_name
-        stored = {**self._arrays, "lightings.vectors": names.vectors, "lightings.frames": names.frame_vectors}
+        stored = {**self.arrays, "lightings.vectors": names.vectors, "lightings.frames": names.frame_vectors}
         (folder / "baked.safetensors").write_bytes(to_bytes({k: np.ascontiguousarray(v) for k, v in stored.items()}))
         write_json(
             folder / "baked.json",
@@ -289,12 +380,8 @@ class BakedField:
         with wrap_read_errors(folder / "baked.safetensors", "build the scene again"):
             vectors, frame_vectors = arrays.pop("lightings.vectors"), arrays.pop("lightings.frames")
             dim = vectors.shape[1]
-            check_shapes(
-                {
-                    "lightings.vectors": (vectors, (len(names), dim), "f"),
-                    "lightings.frames": (frame_vectors, (len(frames), dim), "f"),
-                }
-            )
+            shapes = {"lightings.vectors": (vectors, (len(names), dim), "f")}
+            check_shapes(shapes | {"lightings.frames": (frame_vectors, (len(frames), dim), "f")})
             return BakedField(bricks, Lightings(names, vectors, frames, frame_vectors), arrays, device, about)
 
 
@@ -317,7 +404,8 @@ class _RenderTarget:
         self.depth, self.opacity, self.rgb = new((n, pixels)), new((n, pixels)), new((n, pixels), wp.vec3f)
         self.features = new((n, CHANNELS, pixels))
         start = new((n, across * down))
-        bands = _BANDS_PER_CORE * field._threads if field._pool else 1
+        # More bands than cores, as bands with sky in them finish sooner.
+        bands = 3 * field._threads if field._pool else 1
         edges = np.unique(np.linspace(0, down, bands + 1).round().astype(int)).tolist()
         self.bands = range(len(edges) - 1)
         self.launches = []
@@ -335,7 +423,7 @@ class _RenderTarget:
                         [self.features, self.depth],
                     ),
                     recorded(
-                        *(field._shade, (n, runs), [field._weights, self.bias, image, top, bottom, self.features]),
+                        *(field._color_head, (n, runs), [field._weights, self.bias, image, top, bottom, self.features]),
                         [self.depth, self.rgb, self.opacity],
                     ),
                 ]
@@ -351,7 +439,6 @@ class _RenderTarget:
             image.stop.assign(np.asarray(stop, np.float32).reshape(image.stop.shape))
 
     def render_band(self, band: int) -> None:
-        """Marches one band and colors it."""
         for launch in self.launches[band]:
             launch.launch()
 
@@ -362,11 +449,3 @@ class _RenderTarget:
             self.depth.numpy().reshape(self.shape).copy(),
             self.opacity.numpy().reshape(self.shape).copy(),
         )
-
-
-def load_kernels(needed: list[Any], device: str) -> None:
-    """Compiles or loads kernels, so that no two threads do it at once."""
-    with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
-        for kernel in needed:
-            kernel.module.load(wp.get_device(device))
-            progress.update()

@@ -1,8 +1,8 @@
 """Devices, threads, layout and arrays of a radiance field; terms as in `kernels/space.py` and `kernels/sampler.py`.
 
-Warp runs a CPU launch on one thread but releases the interpreter lock meanwhile, and so does torch in a matrix product:
-two Python threads keep two cores busy. A *shard* is a fixed part of a batch. The shards of a batch do not depend on the
-number of cores and are summed in order, so results do not depend on it either.
+Warp runs a CPU launch on one thread but releases the interpreter lock meanwhile, as torch does in a matrix product: two
+Python threads keep two cores busy. A *shard* is a fixed part of a batch, whatever the number of cores. Shards are
+summed in order, so results do not depend on the number of cores either.
 """
 
 import threading
@@ -23,13 +23,12 @@ from twin.warp_runtime import wp
 
 T = TypeVar("T")
 
-
 _pool: ThreadPoolExecutor | None = None
 _lock = threading.Lock()
 
 
 def resolve_device(device: str | None) -> str:
-    """`cpu` or `cuda`: the device asked for; None: CUDA if both torch and Warp see it, else the CPU.
+    """The device asked for, `cpu` or `cuda`; for None CUDA if both torch and Warp see it, else the CPU.
 
     Raises InputError for another name, and for CUDA where there is none.
     """
@@ -67,8 +66,19 @@ class single_threaded_torch:
         torch.set_num_threads(self._threads)
 
 
+def in_batches(work: Callable[[slice], None], n: int, size: int, device: str) -> None:
+    """Calls `work` on batches of `size` of n rows, in parallel and without gradients."""
+
+    @torch.no_grad()
+    def one(start: int) -> None:
+        work(slice(start, min(start + size, n)))
+
+    with single_threaded_torch():
+        parallel(one, range(0, n, size), device)
+
+
 def load_training_kernels(device: str) -> None:
-    """Compiles or loads all training kernels, as two threads that first need one would each compile it."""
+    """Compiles or loads the training kernels before threads need them, each of which would compile its own."""
     for module in ("space", "sampler", "hashgrid", "composite"):
         wp.load_module(f"twin.nerf.kernels.{module}", device=device)
     if device == "cuda":  # torch and Warp exchange arrays without synchronizing, so they must share a stream
@@ -196,57 +206,50 @@ class Layout:
 class Workspace:
     """Arrays of `rays` rays with `samples` samples each and of `extra` points after them, reused by all batches.
 
-    Names with `w_` are Warp views of the torch tensors.
+    Names with `w_` are Warp views of the torch tensors; `w_ray_` those of the samples on rays, by ray.
     """
 
     def __init__(self, layout: Layout, rays: int, samples: int, device: str, extra: int = 0, training: bool = False):
         self.rays, self.samples, self.extra, self.device = rays, samples, extra, device
         rows, channels = rays * samples + extra, volume.CHANNELS
-        width = layout.levels * hashgrid.FEATURES
+        levels, width = layout.levels, layout.levels * hashgrid.FEATURES
 
-        def new(*shape: int) -> torch.Tensor:
-            return torch.zeros(shape, device=device)
+        def new(dtype: Any, *shape: int) -> tuple[torch.Tensor, Any]:
+            tensor = torch.zeros(shape, device=device)
+            return tensor, warp_view(tensor, dtype)
+
+        def by_ray(tensor: torch.Tensor, dtype: Any) -> Any:
+            return warp_view(tensor[: rays * samples].view(rays, samples, *tensor.shape[1:]), dtype)
 
         self.camera = torch.zeros(rays, dtype=torch.int32, device=device)
-        self.pixel, self.targets, self.cosines = new(rays, 2), new(rays), new(rays)
-        self.origins, self.directions = new(rays, 3), new(rays, 3)
-        self.edges, self.distances = new(rays, samples + 1), new(rays, samples)
-        self.positions, self.features = new(rows, 3), new(rows, width)
-        self.hidden, self.outputs = new(rows, layout.hidden), new(rows, channels)
-        self.lengths = new(rays, samples)
-        self.weights, self.composited = new(rays, samples), new(rays, channels)
-        self.inverse_distance, self.median_distance = new(rays), new(rays)
-
-        on_rays = rays * samples
         self.w_camera = warp_view(self.camera, wp.int32)
-        self.w_pixel = warp_view(self.pixel, wp.vec2f)
-        self.w_targets, self.w_cosines = warp_view(self.targets, wp.float32), warp_view(self.cosines, wp.float32)
-        self.w_origins, self.w_directions = warp_view(self.origins, wp.vec3f), warp_view(self.directions, wp.vec3f)
-        self.w_edges, self.w_distances = warp_view(self.edges, wp.float32), warp_view(self.distances, wp.float32)
-        self.w_lengths = warp_view(self.lengths, wp.float32)
-        self.w_positions = warp_view(self.positions, wp.vec3f)
-        self.w_ray_positions = warp_view(self.positions[:on_rays].view(rays, samples, 3), wp.vec3f)
-        self.w_features = warp_view(self.features.view(rows, layout.levels, hashgrid.FEATURES), hashgrid.Feature)
-        self.w_outputs = warp_view(self.outputs, volume.Channels)
-        self.w_ray_outputs = warp_view(self.outputs[:on_rays].view(rays, samples, channels), volume.Channels)
-        self.w_weights = warp_view(self.weights, wp.float32)
-        self.w_composited = warp_view(self.composited, volume.Channels)
-        self.w_inverse = warp_view(self.inverse_distance, wp.float32)
-        self.w_median = warp_view(self.median_distance, wp.float32)
+        self.pixel, self.w_pixel = new(wp.vec2f, rays, 2)
+        self.targets, self.w_targets = new(wp.float32, rays)
+        self.cosines, self.w_cosines = new(wp.float32, rays)
+        self.origins, self.w_origins = new(wp.vec3f, rays, 3)
+        self.directions, self.w_directions = new(wp.vec3f, rays, 3)
+        self.edges, self.w_edges = new(wp.float32, rays, samples + 1)
+        self.distances, self.w_distances = new(wp.float32, rays, samples)
+        self.lengths, self.w_lengths = new(wp.float32, rays, samples)
+        self.positions, self.w_positions = new(wp.vec3f, rows, 3)
+        self.w_ray_positions = by_ray(self.positions, wp.vec3f)
+        self.features = torch.zeros(rows, width, device=device)
+        self.w_features = warp_view(self.features.view(rows, levels, -1), hashgrid.Feature)
+        self.hidden = torch.zeros(rows, layout.hidden, device=device)
+        self.outputs, self.w_outputs = new(volume.Channels, rows, channels)
+        self.w_ray_outputs = by_ray(self.outputs, volume.Channels)
+        self.weights, self.w_weights = new(wp.float32, rays, samples)
+        self.composited, self.w_composited = new(volume.Channels, rays, channels)
+        self.inverse_distance, self.w_inverse = new(wp.float32, rays)
+        self.median_distance, self.w_median = new(wp.float32, rays)
         if training:
-            self.densities = new(rows)
-            self.outputs_grad, self.hidden_grad = new(rows, channels), new(rows, layout.hidden)
-            self.features_grad = new(rows, width)
-            self.composited_grad, self.inverse_grad = new(rays, channels), new(rays)
-            self.w_densities = warp_view(self.densities, wp.float32)
-            self.w_ray_outputs_grad = warp_view(
-                self.outputs_grad[:on_rays].view(rays, samples, channels), volume.Channels
-            )
-            self.w_features_grad = warp_view(
-                self.features_grad.view(rows, layout.levels, hashgrid.FEATURES), hashgrid.Feature
-            )
-            self.w_composited_grad = warp_view(self.composited_grad, volume.Channels)
-            self.w_inverse_grad = warp_view(self.inverse_grad, wp.float32)
+            self.densities, self.w_densities = new(wp.float32, rows)
+            self.outputs_grad, self.w_outputs_grad = new(volume.Channels, rows, channels)
+            self.w_ray_outputs_grad = by_ray(self.outputs_grad, volume.Channels)
+            self.hidden_grad, self.features_grad = torch.zeros_like(self.hidden), torch.zeros_like(self.features)
+            self.w_features_grad = warp_view(self.features_grad.view(rows, levels, -1), hashgrid.Feature)
+            self.composited_grad, self.w_composited_grad = new(volume.Channels, rays, channels)
+            self.inverse_grad, self.w_inverse_grad = new(wp.float32, rays)
 
 
 class CameraArrays:
@@ -258,7 +261,7 @@ class CameraArrays:
         self.intrinsics: Any = wp.array(np.asarray(intrinsics, np.float32), dtype=wp.vec4f, device=device)
 
     def set_poses(self, camera_to_world: NDArray) -> None:
-        """Sets camera-to-world poses, shape (n, 4, 4)."""
+        """Sets poses, shape (n, 4, 4)."""
         pose = np.asarray(camera_to_world, np.float64)
         self.rotation: Any = wp.array(pose[:, :3, :3].astype(np.float32), dtype=wp.mat33f, device=self._device)
         self.position: Any = wp.array(pose[:, :3, 3].astype(np.float32), dtype=wp.vec3f, device=self._device)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from twin.geometry.cameras import Cameras, nearest_frame
 from twin.geometry.images import psnr, ssim
-from twin.nerf.appearance_fit import fit_appearance
+from twin.nerf.appearance import fit_appearance
 from twin.nerf.baked import BakedField
 from twin.nerf.buffers import CameraArrays, single_threaded_torch
 from twin.nerf.dataset import load_frame
@@ -53,7 +53,7 @@ def score_frame(
         if not len(fit_on) or not score_on.any():
             continue
         some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // _FIT_RAYS)], device=field.device)
-        shown = picture(fit_appearance(field, features[some], harmonics[some], colors[some], start)[0])
+        shown = picture(fit_appearance(field.parameters, features[some], harmonics[some], colors[some], start)[0])
         psnrs.append(psnr(shown, image, score_on))
         # Masked pixels are made equal, which affects SSIM only in windows that contain them.
         shown[~mask] = image[~mask]

@@ -1,8 +1,8 @@
 """Radiance field: density and color of a place under every lighting it was filmed in.
 
-Hash grid → trunk → density and features per sample; the features are composited along the ray and the head turns them
-into a color (`network.py`). Points and distances are in meters, in the world frame of the cameras; `kernels/space.py`
-defines the other terms.
+Hash grid and trunk give density and features per sample; the features are composited along the ray, and the head turns
+them into a color (`network.py`). Points and distances are in meters, in the world frame of the cameras;
+`kernels/space.py` defines the other terms.
 """
 
 import math
@@ -27,17 +27,17 @@ from twin.nerf.buffers import (
     CameraArrays,
     Layout,
     Workspace,
+    in_batches,
     level_cells,
     level_shapes,
     load_training_kernels,
     opacity_grids,
-    parallel,
     resolve_device,
-    single_threaded_torch,
     warp_view,
 )
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler, space
+from twin.nerf.kernels.color_head import HARMONICS
 from twin.nerf.rendering import FAR, Rendering
 from twin.warp_runtime import wp
 
@@ -66,9 +66,9 @@ class RadianceField:
         """
         Args:
             layout: Sizes and bounds.
-            appearance: Embeddings, on the same device as the tensors below.
+            appearance: Embeddings, on the device of the tensors.
             table: Hash tables, shape (levels, 2**log2_table, FEATURES).
-            parameters: Weights, see `network.initial_parameters`.
+            parameters: Weights of the networks, see `network.initial_parameters`.
             grids: Near and far opacity grid, see `kernels/sampler.py`.
             about: JSON-able metadata stored with the field.
         """
@@ -85,7 +85,7 @@ class RadianceField:
         self.center = wp.vec3f(*layout.centre)
         self.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
         self.grid_sizes = opacity_grids(layout.near_box)
-        self._spare: list[Workspace] = []
+        self._spare: dict[tuple[int, int, int], list[Workspace]] = {}
 
     @property
     def lightings(self) -> tuple[str, ...]:
@@ -98,7 +98,7 @@ class RadianceField:
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """See `Appearance.embedding`."""
-        return self.appearance.embedding(lighting)
+        return self.appearance.named().embedding(lighting)
 
     def add_lightings(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> None:
         """See `Lightings.added`."""
@@ -119,7 +119,7 @@ class RadianceField:
     def sample(
         self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int | None = None
     ) -> None:
-        """Rays → samples, see `kernels/sampler.py`. A seed jitters them; None takes the middles of the strata."""
+        """Rays → samples, see `sampler.sample_rays`. A seed jitters them; None takes the middles of the strata."""
         jitter = -1 if seed is None else seed & _MAX_SEED
         wp.launch(
             sampler.sample_rays,
@@ -162,10 +162,9 @@ class RadianceField:
         points = np.ascontiguousarray(points, np.float32)
         result = np.empty(len(points), np.float32)
 
-        @torch.no_grad()
-        def one(start: int) -> None:
-            n = min(QUERY_POINTS, len(points) - start)
-            meters = torch.as_tensor(points[start : start + n], device=self.device)
+        def query(rows: slice) -> None:
+            n = rows.stop - rows.start
+            meters = torch.as_tensor(points[rows], device=self.device)
             with self.workspace(0, 1, QUERY_POINTS) as ws:
                 wp.launch(
                     space.contract_points,
@@ -176,12 +175,11 @@ class RadianceField:
                 )
                 self.query(ws, 0, n)
                 raw = ws.outputs[:n, 0].clamp(max=volume.RAW_LIMIT)
-                result[start : start + n] = (torch.exp(raw) * self.layout.density_unit).cpu().numpy()
-            u = np.abs((points[start : start + n] - self.layout.centre) / self.layout.half).max(1)
-            result[start : start + n] /= np.maximum(u, 1.0) ** 2
+                result[rows] = (torch.exp(raw) * self.layout.density_unit).cpu().numpy()
+            u = np.abs((points[rows] - self.layout.centre) / self.layout.half).max(1)
+            result[rows] /= np.maximum(u, 1.0) ** 2
 
-        with single_threaded_torch():
-            parallel(one, range(0, len(points), QUERY_POINTS), self.device)
+        in_batches(query, len(points), QUERY_POINTS, self.device)
         return result
 
     def trace(
@@ -192,16 +190,14 @@ class RadianceField:
         Returns:
             Features (n, CHANNELS − 1), spherical harmonics of the directions (n, 16), z-depth [m] (n,), opacity (n,).
         """
-        n, batch = len(camera), _RENDER_RAYS
+        n = len(camera)
         features = torch.empty(n, volume.CHANNELS - 1, device=self.device)
-        harmonics = torch.empty(n, 16, device=self.device)
+        harmonics = torch.empty(n, HARMONICS, device=self.device)
         depth, opacity = torch.empty(n, device=self.device), torch.empty(n, device=self.device)
 
-        @torch.no_grad()
-        def one(start: int) -> None:
-            stop = min(start + batch, n)
-            k, rows = stop - start, slice(start, stop)
-            with self.workspace(batch, samples) as ws:
+        def march(rows: slice) -> None:
+            k = rows.stop - rows.start
+            with self.workspace(_RENDER_RAYS, samples) as ws:
                 ws.camera[:k] = torch.as_tensor(camera[rows].astype(np.int32), device=self.device)
                 ws.pixel[:k] = torch.as_tensor(pixel[rows].astype(np.float32), device=self.device)
                 self.cast(ws, cameras, 0, k)
@@ -214,23 +210,18 @@ class RadianceField:
                 depth[rows] = torch.where(median > 0.0, median * ws.cosines[:k], FAR).clamp(max=FAR)
                 opacity[rows] = ws.composited[:k, 0]
 
-        with single_threaded_torch():
-            parallel(one, range(0, n, batch), self.device)
+        in_batches(march, n, _RENDER_RAYS, self.device)
         return features, harmonics, depth, opacity
 
     def color(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: NDArray) -> NDArray[np.float32]:
         """Colors in [0, 1], shape (n, 3), of traced rays under one embedding (dim,)."""
-        n, batch = len(features), _HEAD_RAYS
-        rgb = torch.empty(n, 3, device=self.device)
+        rgb = torch.empty(len(features), 3, device=self.device)
         vector = torch.as_tensor(np.asarray(embedding, np.float32), device=self.device)
 
-        @torch.no_grad()
-        def one(start: int) -> None:
-            rows = slice(start, start + batch)
+        def head(rows: slice) -> None:
             rgb[rows] = network.head(self.parameters, features[rows], harmonics[rows], vector)
 
-        with single_threaded_torch():
-            parallel(one, range(0, n, batch), self.device)
+        in_batches(head, len(features), _HEAD_RAYS, self.device)
         return rgb.cpu().numpy()
 
     def render(self, cameras: PosedCameras, lighting: str | NDArray, size: tuple[int, int] | None = None) -> Rendering:
@@ -250,20 +241,14 @@ class RadianceField:
 
     @contextmanager
     def workspace(self, rays: int, samples: int, extra: int = 0) -> Iterator[Workspace]:
-        """Lends a spare workspace of this size, or a new one. Thread-safe, as list operations are atomic."""
-        shape = rays, samples, extra
-        ws = None
-        for spare in self._spare:
-            if (spare.rays, spare.samples, spare.extra) == shape:
-                try:
-                    self._spare.remove(spare)
-                except ValueError:  # another thread took it
-                    continue
-                ws = spare
-                break
-        ws = ws or Workspace(self.layout, rays, samples, self.device, extra)
+        """Lends a spare workspace of this size, or a new one. Thread-safe, as each list operation is atomic."""
+        spares = self._spare.setdefault((rays, samples, extra), [])
+        try:
+            ws = spares.pop()
+        except IndexError:
+            ws = Workspace(self.layout, rays, samples, self.device, extra)
         yield ws
-        self._spare.append(ws)
+        spares.append(ws)
 
     # ---- files
 
@@ -288,14 +273,14 @@ class RadianceField:
 
     @staticmethod
     def load(folder: Path, device: str | None = None) -> "RadianceField":
-        """Loads a field on to a device, see `buffers.resolve_device`.
+        """Loads a field to a device, see `buffers.resolve_device`.
 
         Raises InputError if the folder has no field, or one of another format.
         """
         device = resolve_device(device)
-        if not (folder / "field.json").exists():
-            raise InputError(f"{folder}: contains no field.json; build the scene's field first")
         path = folder / "field.json"
+        if not path.exists():
+            raise InputError(f"{folder}: contains no field.json; build the scene's field first")
         head = read_json(path)
         with wrap_read_errors(path, "build the scene again"):
             if head.get("format") != _FORMAT:
@@ -321,9 +306,9 @@ def untrained_field(layout: Layout, appearance: Appearance, seed: int, device: s
     parameters = network.initial_parameters(
         layout.levels * hashgrid.FEATURES, layout.hidden, layout.appearance_dim, seed
     )
-    stop = opacity_grids(layout.near_box)
-    near = torch.full(stop.near_shape, -math.expm1(-layout.density_unit * stop.near_cell), device=device)
-    far = torch.full(stop.far_shape, -math.expm1(-layout.density_unit * stop.far_cell), device=device)
+    sizes = opacity_grids(layout.near_box)
+    near = torch.full(sizes.near_shape, -math.expm1(-layout.density_unit * sizes.near_cell), device=device)
+    far = torch.full(sizes.far_shape, -math.expm1(-layout.density_unit * sizes.far_cell), device=device)
     moved = Appearance(
         appearance.lightings,
         appearance.frames,

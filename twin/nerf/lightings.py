@@ -1,20 +1,26 @@
-"""Lightings by name, as NumPy arrays, for rendering without torch.
+"""Lightings by name, as NumPy arrays, for rendering without torch; and lightings added to a built scene.
 
 A lighting is requested by its name, by a frame (`day/000012`), or as a mixture `day:night:0.3`, 30 % of the way from
-day to night. Random lightings come from `appearance_prior.py`; lightings fitted to photos (`added_lightings.py`) can be
-added to those that the field was trained on.
+day to night. Random lightings come from `appearance_prior.py`. `python -m twin.relight` fits a lighting to a photo and
+stores it in `<scene>/lightings/<name>.json`, outside `build/`, which may be deleted at any time. An embedding is valid
+for one field only, so each file stores the content digest of its field stage; with another build it is *stale*.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
+from twin.files import read_json, wrap_read_errors, write_json
 from twin.nerf import appearance_prior
 from twin.nerf.fog import Fog, mixed
+from twin.scene import SceneDir, stage_result
+from twin.scene import check_name as check_scene_name
+from twin.types import Array32
 
 
 @dataclass(frozen=True)
@@ -22,21 +28,21 @@ class Lightings:
     """Appearance embeddings of lightings and of the frames filmed under them."""
 
     names: tuple[str, ...]
-    vectors: NDArray[np.float32]
+    vectors: Array32
     """Shape (lightings, dim)."""
     frames: tuple[str, ...]
-    frame_vectors: NDArray[np.float32]
+    frame_vectors: Array32
     """Shape (frames, dim)."""
     probes: appearance_prior.Probes | None = None
     """Rays on which random lightings are checked; a baked field has them."""
     stale: tuple[str, ...] = ()
-    """Added lightings that are refused, as they were fitted to another build of the field or by an older twin."""
+    """Added lightings that are refused: fitted to another build of the field or by an older twin."""
     count_added: int = 0
     """Number of added lightings, the last ones of `names`."""
     fogs: Mapping[str, Fog] = field(default_factory=dict)
     """Fog in the photos of the added lightings, by name."""
 
-    def embedding(self, lighting: str) -> NDArray[np.float32]:
+    def embedding(self, lighting: str) -> Array32:
         """The embedding of a lighting, a frame or a mixture, shape (dim,).
 
         Raises:
@@ -63,9 +69,9 @@ class Lightings:
         mixture = None if lighting in self.names else _mixture(lighting)
         return mixed(self.fog(mixture[0]), self.fog(mixture[1]), mixture[2]) if mixture else None
 
-    def sample(self, rng: np.random.Generator) -> NDArray[np.float32]:
+    def sample(self, rng: np.random.Generator) -> Array32:
         """Samples the embedding (dim,) of a plausible lighting; raises InputError without probes or success."""
-        return appearance_prior.sample_plausible(rng, self.prior)
+        return self.prior.sample(rng)
 
     @cached_property
     def prior(self) -> appearance_prior.AppearancePrior:
@@ -77,17 +83,13 @@ class Lightings:
         return appearance_prior.AppearancePrior(self.probes, self.vectors, self.frame_vectors)
 
     def added(
-        self,
-        more: Mapping[str, NDArray[np.float32]],
-        stale: tuple[str, ...] = (),
-        fogs: Mapping[str, Fog] | None = None,
+        self, more: Mapping[str, Array32], stale: tuple[str, ...] = (), fogs: Mapping[str, Fog] | None = None
     ) -> "Lightings":
         """A copy with more lightings: embeddings (dim,) by name, stale names (see `stale`), and fog by name."""
-        vectors = np.concatenate([self.vectors, *(vector[None] for vector in more.values())])
         return replace(
             self,
             names=(*self.names, *more),
-            vectors=vectors,
+            vectors=np.concatenate([self.vectors, *(vector[None] for vector in more.values())]),
             stale=(*self.stale, *stale),
             count_added=self.count_added + len(more),
             fogs={**self.fogs, **(fogs or {})},
@@ -114,3 +116,70 @@ def _mixture(lighting: str) -> tuple[str, str, float] | None:
             f"way from {a} to {b}"
         )
     return a, b, s
+
+
+# ---- lightings added to a scene
+
+_FORMAT = 2  # 1 has no fog
+
+
+@dataclass(frozen=True)
+class AddedLighting:
+    """One added lighting and its origin. The file stores these names as keys."""
+
+    name: str
+    embedding: list[float]
+    """Length dim."""
+    air: Fog
+    """Fog in the photo."""
+    field: str
+    """Content digest of its field stage."""
+    photo: str
+    """Path of the photo, as given."""
+    figures: dict[str, Any]
+    """Numbers of the fit, JSON-able."""
+
+    def save(self, scene: SceneDir) -> None:
+        """Writes `lightings/<name>.json`, replacing an existing file."""
+        scene.lightings.mkdir(exist_ok=True)
+        write_json(scene.lightings / f"{self.name}.json", {"format": _FORMAT, **asdict(self)})
+
+
+def check_name(name: str, filmed: tuple[str, ...]) -> None:
+    """Raises InputError for a name that is reserved, filmed, or unfit for a file name or a part of a mixture."""
+    check_scene_name(name, "--name")
+    if name in RESERVED_LIGHTINGS:
+        raise InputError(f"--name {name!r}: reserved for random lightings; choose another, such as afternoon")
+    if name in filmed:
+        raise InputError(f"--name {name!r}: the place was filmed under a lighting of this name; choose another")
+
+
+def added_lightings(scene: SceneDir, dim: int) -> tuple[dict[str, Array32], tuple[str, ...], dict[str, Fog]]:
+    """Loads the lightings added to a scene's field: embeddings (dim,) by name, stale names, and fog by name.
+
+    Raises InputError if the field is not built, or if a file is damaged or has another format.
+    """
+    result = stage_result(scene, "field")
+    fresh: dict[str, Array32] = {}
+    fogs: dict[str, Fog] = {}
+    stale = []
+    for path in sorted(scene.lightings.glob("*.json")):
+        with wrap_read_errors(path, "fit it again or delete it"):
+            head = read_json(path)
+            if head["format"] == 1:  # without fog
+                stale.append(path.stem)
+                continue
+            if head["format"] != _FORMAT:
+                raise InputError(f"{path}: format {head['format']}, expected {_FORMAT}; fit it again or delete it")
+            made_by, vector = head["field"], np.array(head["embedding"], np.float32)
+            red, green, blue = map(float, head["air"]["airlight"])
+            fog = Fog(float(head["air"]["extinction"]), (red, green, blue))
+            if not (0.0 <= fog.extinction < np.inf and all(0.0 <= share <= 1.0 for share in fog.airlight)):
+                raise ValueError(f"air {fog.extinction}, {fog.airlight}")
+            if vector.ndim != 1 or not np.isfinite(vector).all() or (made_by == result and vector.shape != (dim,)):
+                raise ValueError(f"embedding of shape {vector.shape}, or not finite")
+        if made_by == result:
+            fresh[path.stem], fogs[path.stem] = vector, fog
+        else:
+            stale.append(path.stem)
+    return fresh, tuple(stale), fogs

@@ -1,16 +1,14 @@
 """The field's networks: trunk per sample, head and background per ray.
 
 The *trunk* maps hash features of a sample to raw density and features. The *head* maps the features composited along a
-ray, the ray's direction and an appearance embedding to a color, so samples do not depend on the lighting. Light that no
-surface blocks gets its features from the *background* network (`backdrop.*`) of the direction alone: sky needs no
-density.
+ray, the ray's direction and an appearance embedding to a color, so samples do not depend on the lighting. The
+*background* network (`backdrop.*`) maps the direction alone to the features of the sky, which needs no density.
 """
 
 import torch
 
+from twin.nerf.kernels.color_head import HARMONICS, harmonics_of
 from twin.nerf.kernels.composite import CHANNELS
-
-_HARMONICS = 16  # spherical harmonics up to degree 3
 
 
 def initial_parameters(inputs: int, hidden: int, appearance_dim: int, seed: int) -> dict[str, torch.Tensor]:
@@ -24,33 +22,22 @@ def initial_parameters(inputs: int, hidden: int, appearance_dim: int, seed: int)
     return {
         "trunk.0": he(inputs, hidden),
         "trunk.1": he(hidden, CHANNELS, 1.0),
-        "head.0": he(features + _HARMONICS + appearance_dim, hidden),
+        "head.0": he(features + HARMONICS + appearance_dim, hidden),
         "head.0.bias": torch.zeros(hidden),
         "head.1": he(hidden, hidden),
         "head.1.bias": torch.zeros(hidden),
         "head.2": he(hidden, 3, 1.0),
         "head.2.bias": torch.zeros(3),
-        "backdrop.0": he(_HARMONICS, hidden // 2),
+        "backdrop.0": he(HARMONICS, hidden // 2),
         "backdrop.0.bias": torch.zeros(hidden // 2),
         "backdrop.1": he(hidden // 2, features, 1.0),
     }
 
 
-# Also written in kernels/color_head.py: the Warp compiler fuses operations by context, so sharing may change bits.
 def spherical_harmonics(d: torch.Tensor) -> torch.Tensor:
-    """Real spherical harmonics of degree 0 to 3 of unit vectors, up to constant factors, shape (n, 3) → (n, 16)."""
+    """Spherical harmonics of unit vectors, shape (n, 3) → (n, 16), see `color_head.harmonics_of`."""
     x, y, z = d.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    return torch.stack(
-        [
-            torch.ones_like(x),
-            *(x, y, z),
-            *(x * y, y * z, 3.0 * zz - 1.0, x * z, xx - yy),
-            *(y * (3.0 * xx - yy), x * y * z, y * (5.0 * zz - 1.0), z * (5.0 * zz - 3.0)),
-            *(x * (5.0 * zz - 1.0), z * (xx - yy), x * (xx - 3.0 * yy)),
-        ],
-        -1,
-    )
+    return torch.stack([torch.ones_like(x), *harmonics_of(x, y, z)], -1)
 
 
 def trunk(p: dict[str, torch.Tensor], features: torch.Tensor, hidden: torch.Tensor, out: torch.Tensor) -> None:

@@ -15,7 +15,7 @@ import torch
 from twin.geometry.cameras import Cameras
 from twin.nerf.buffers import CameraArrays, Workspace, warp_view
 from twin.nerf.field import RadianceField
-from twin.nerf.kernels import rays
+from twin.nerf.kernels import hashgrid, space
 from twin.types import Array
 from twin.warp_runtime import wp
 
@@ -31,7 +31,6 @@ class PoseRefinement:
 
         The distance `near` of near surfaces [m] converts pixels to translations; `ws` is the training's workspace.
         """
-        wp.load_module(rays.__name__, device=ws.device)  # or two threads would each compile it
         n, device = len(camera_to_world), ws.device
         self.rotation = torch.zeros(n, 3, device=device, requires_grad=True)
         """Rotation vectors [rad], shape (n, 3)."""
@@ -57,7 +56,7 @@ class PoseRefinement:
         """Computes ray gradients of rays [start, start + count) from the gradients of their samples' features."""
         ws = self._ws
         wp.launch(
-            rays.encode_positions_backward,
+            hashgrid.encode_positions_backward,
             count * ws.samples,
             [
                 *(ws.w_positions, field.w_table, field.w_cells, field.w_shapes, field.mask, start * ws.samples),
@@ -67,7 +66,7 @@ class PoseRefinement:
             device=field.device,
         )
         wp.launch(
-            rays.rays_backward,
+            space.rays_backward,
             count,
             [
                 *(ws.w_origins, ws.w_directions, ws.w_distances, field.center, field.inverse_half, start),

@@ -19,12 +19,40 @@ BLOCKS = CELLS // 2
 CORNERS = CELLS + 1
 SAMPLES = CORNERS**3
 
+HALF_CORNERS = CORNERS // 2 + 1
+"""Samples along z of half a brick."""
+DENSITIES = CORNERS * 2 * CORNERS * HALF_CORNERS
+"""Bytes of a brick's densities: along x, then by halves along z (the sample between them twice), then y, then z. So
+the four corners of a cell's face across x lie within eight bytes, and a cache line holds many cells."""
+
 Bytes = wp.types.vector(length=CHANNELS, dtype=wp.uint8)
 
-_CELLS = wp.constant(CELLS)
-_CORNERS = wp.constant(CORNERS)
-_MIN_GRADIENT = wp.constant(1.0e-22)  # squared norm from which a sample takes part in a step
-_SIDE = wp.constant(float(CELLS))
+_MIN_GRADIENT = 1.0e-22  # squared norm from which a sample takes part in a step
+_SIDE = float(CELLS)
+
+
+@wp.struct
+class Bricks:
+    """A baked field in the layout of the march. Grids are flat, the last axis fastest."""
+
+    near_index: wp.array(dtype=wp.int32)
+    """Slot of a brick, or −d where none is stored, d being the least skip distance of its blocks."""
+    far_index: wp.array(dtype=wp.int32)
+    skips: wp.array(dtype=wp.uint8)
+    """Skip distances of the stored bricks' blocks, 64 per slot."""
+    near_blocks: wp.vec3i
+    far_blocks: wp.vec3i
+    densities: wp.array(dtype=wp.uint8)
+    """See `brick_layout.density_codes`."""
+    features: wp.array(dtype=Bytes)
+    low: Channels
+    step: Channels
+    center: wp.vec3f
+    inverse_half: wp.vec3f
+    near_cell: wp.float32
+    far_cell: wp.float32
+    unit: wp.float32
+    near_plane: wp.float32
 
 
 @wp.struct
@@ -40,7 +68,7 @@ class BrickPosition:
 
 @wp.func
 def corner_index(x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
-    return (x * _CORNERS + y) * _CORNERS + z
+    return (x * CORNERS + y) * CORNERS + z
 
 
 @wp.func
@@ -49,19 +77,15 @@ def locate(g: wp.vec3f, near_index: wp.array3d(dtype=wp.int32), far_index: wp.ar
     b = near_box_position(g)
     p = wp.vec3f(0.0, 0.0, 0.0)
     if inside_near_box(b):
-        p = wp.vec3f(
-            b[0] * float(near_index.shape[0]), b[1] * float(near_index.shape[1]), b[2] * float(near_index.shape[2])
-        )
+        p = wp.cw_mul(b, wp.vec3f(wp.vec3i(near_index.shape[0], near_index.shape[1], near_index.shape[2])))
         out.slot = near_index[int(p[0]), int(p[1]), int(p[2])]
     else:
-        p = wp.vec3f(
-            g[0] * float(far_index.shape[0]), g[1] * float(far_index.shape[1]), g[2] * float(far_index.shape[2])
-        )
+        p = wp.cw_mul(g, wp.vec3f(wp.vec3i(far_index.shape[0], far_index.shape[1], far_index.shape[2])))
         out.slot = far_index[int(p[0]), int(p[1]), int(p[2])]
     c = (p - wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))) * _SIDE
-    x = wp.min(int(c[0]), _CELLS - 1)
-    y = wp.min(int(c[1]), _CELLS - 1)
-    z = wp.min(int(c[2]), _CELLS - 1)
+    x = wp.min(int(c[0]), CELLS - 1)
+    y = wp.min(int(c[1]), CELLS - 1)
+    z = wp.min(int(c[2]), CELLS - 1)
     out.corner = corner_index(x, y, z)
     out.x = c[0] - float(x)
     out.y = c[1] - float(y)

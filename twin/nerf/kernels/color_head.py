@@ -9,12 +9,12 @@ from functools import cache
 from typing import Any
 
 from twin.nerf.kernels.composite import CHANNELS
-from twin.nerf.kernels.march import ImageBuffers
-from twin.nerf.kernels.vectorized import OPTIONS, fast_exp
+from twin.nerf.kernels.march import OPTIONS, ImageBuffers, fast_exp
 from twin.nerf.rendering import FAR
 from twin.warp_runtime import wp
 
 HARMONICS = 16
+"""Spherical harmonics of degree 0 to 3."""
 FEATURES = CHANNELS - 1
 LANES = {"cpu": 16, "cuda": 1}
 """Pixels per thread; see `march.py`."""
@@ -24,10 +24,37 @@ wp.set_module_options(OPTIONS)
 Vec8 = wp.types.vector(length=8, dtype=wp.float32)
 """Weights of eight hidden units."""
 
-_HARMONICS = wp.constant(HARMONICS)
-_FEATURES = wp.constant(FEATURES)
-_INPUTS = wp.constant(FEATURES + HARMONICS)
-_FAR = wp.constant(FAR)
+_INPUTS = FEATURES + HARMONICS
+
+
+def harmonics_of(x: Any, y: Any, z: Any):
+    """The 15 real spherical harmonics of degree 1 to 3 of unit vectors (x, y, z), up to constant factors.
+
+    Evaluates arrays of NumPy and torch, and is compiled by Warp. The harmonic of degree 0 is the constant 1.
+    """
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    return (
+        x,
+        y,
+        z,
+        x * y,
+        y * z,
+        3.0 * zz - 1.0,
+        x * z,
+        xx - yy,
+        y * (3.0 * xx - yy),
+        x * y * z,
+        y * (5.0 * zz - 1.0),
+        z * (5.0 * zz - 3.0),
+        x * (5.0 * zz - 1.0),
+        z * (xx - yy),
+        x * (xx - 3.0 * yy),
+    )
+
+
+_compiled_harmonics = wp.func(harmonics_of)
 
 
 @wp.func
@@ -47,41 +74,34 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
     Inputs = wp.types.matrix(shape=(FEATURES + HARMONICS, lanes), dtype=wp.float32)
     Hidden = wp.types.matrix(shape=(hidden, lanes), dtype=wp.float32)
     Background = wp.types.matrix(shape=(background_hidden, lanes), dtype=wp.float32)
-    count = wp.constant(lanes)
-    units = wp.constant(hidden)
-    background_units = wp.constant(background_hidden)
 
-    # Duplicates the torch version in network.py on purpose: a shared function may be compiled differently by Warp and
-    # change the last bits.
     @wp.func
-    def harmonics_of(image: ImageBuffers, camera: wp.int32, first: wp.int32, x: Inputs) -> Inputs:
-        """Appends spherical harmonics of the ray directions to the features."""
+    def add_harmonics(image: ImageBuffers, camera: wp.int32, first: wp.int32, x: Inputs) -> Inputs:
+        """Appends the harmonics of the ray directions to the features."""
         k = image.intrinsics[camera]
         rotation = image.rotation[camera]
-        for j in range(count):
+        for j in range(lanes):
             pixel = first + j
             u = (float(pixel % image.width) + 0.5 - k[2]) / k[0]
             v = (float(pixel // image.width) + 0.5 - k[3]) / k[1]
             d = rotation * wp.normalize(wp.vec3f(u, v, 1.0))
-            xx = d[0] * d[0]
-            yy = d[1] * d[1]
-            zz = d[2] * d[2]
+            h = _compiled_harmonics(d[0], d[1], d[2])
             x[15, j] = 1.0
-            x[16, j] = d[0]
-            x[17, j] = d[1]
-            x[18, j] = d[2]
-            x[19, j] = d[0] * d[1]
-            x[20, j] = d[1] * d[2]
-            x[21, j] = 3.0 * zz - 1.0
-            x[22, j] = d[0] * d[2]
-            x[23, j] = xx - yy
-            x[24, j] = d[1] * (3.0 * xx - yy)
-            x[25, j] = d[0] * d[1] * d[2]
-            x[26, j] = d[1] * (5.0 * zz - 1.0)
-            x[27, j] = d[2] * (5.0 * zz - 3.0)
-            x[28, j] = d[0] * (5.0 * zz - 1.0)
-            x[29, j] = d[2] * (xx - yy)
-            x[30, j] = d[0] * (xx - 3.0 * yy)
+            x[16, j] = h[0]
+            x[17, j] = h[1]
+            x[18, j] = h[2]
+            x[19, j] = h[3]
+            x[20, j] = h[4]
+            x[21, j] = h[5]
+            x[22, j] = h[6]
+            x[23, j] = h[7]
+            x[24, j] = h[8]
+            x[25, j] = h[9]
+            x[26, j] = h[10]
+            x[27, j] = h[11]
+            x[28, j] = h[12]
+            x[29, j] = h[13]
+            x[30, j] = h[14]
         return x
 
     @wp.struct
@@ -101,7 +121,7 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
         backdrop_1: wp.array(dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
-    def shade_rays(
+    def color_rays(
         weights: Weights,
         bias: wp.array2d(dtype=Vec8),
         image: ImageBuffers,
@@ -113,38 +133,39 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
         opacity: wp.array2d(dtype=wp.float32),
     ):
         camera, run = wp.tid()
-        start = first + run * count
+        start = first + run * lanes
         share = Floats()
         least = float(1.0)
-        for j in range(count):
+        for j in range(lanes):
             share[j] = features[camera, 0, wp.min(start + j, last - 1)]
             least = wp.min(least, share[j])
         x = Inputs()
-        for n in range(_FEATURES):
-            for j in range(count):
+        for n in range(FEATURES):
+            for j in range(lanes):
                 x[n, j] = features[camera, n + 1, wp.min(start + j, last - 1)]
-        x = harmonics_of(image, camera, start, x)
+        x = add_harmonics(image, camera, start, x)
         if image.stop.shape[0] > 0:
-            for n in range(_FEATURES):
-                for j in range(count):
+            for n in range(FEATURES):
+                for j in range(lanes):
                     x[n, j] = x[n, j] / wp.max(share[j], 1.0e-3)
         elif least < 0.999:
             g = Background()
-            for n in range(background_units):
+            for n in range(background_hidden):
                 a = Floats(weights.backdrop_0_bias[n])
-                for i in range(_HARMONICS):
-                    a += x[_FEATURES + i] * weights.backdrop_0[i * background_units + n]
-                for j in range(count):
+                for i in range(HARMONICS):
+                    a += x[FEATURES + i] * weights.backdrop_0[i * background_hidden + n]
+                for j in range(lanes):
                     a[j] = wp.max(a[j], 0.0) * (1.0 - share[j])
                 g[n] = a
-            for i in range(_FEATURES):
+            for i in range(FEATURES):
                 a = x[i]
-                for n in range(background_units):
-                    a += g[n] * weights.backdrop_1[n * _FEATURES + i]
+                for n in range(background_hidden):
+                    a += g[n] * weights.backdrop_1[n * FEATURES + i]
                 x[i] = a
-        # Eight outputs at a time: each input is read once for all, and eight sums keep the processor's units busy.
+        # Eight units at a time: each input is read once for all, and eight sums keep the processor's units busy. Both
+        # layers are written out, as one function for both, though equal to the bit, copies its inputs: 30 % slower.
         h = Hidden()
-        for q in range(units // 8):
+        for q in range(hidden // 8):
             w = bias[camera, q]
             s0 = Floats(w[0])
             s1 = Floats(w[1])
@@ -176,7 +197,7 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
         red = Floats(weights.head_2_bias[0])
         green = Floats(weights.head_2_bias[1])
         blue = Floats(weights.head_2_bias[2])
-        for q in range(units // 8):
+        for q in range(hidden // 8):
             w = weights.head_1_bias[q]
             s0 = Floats(w[0])
             s1 = Floats(w[1])
@@ -186,9 +207,9 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
             s5 = Floats(w[5])
             s6 = Floats(w[6])
             s7 = Floats(w[7])
-            for i in range(units):
+            for i in range(hidden):
                 row = h[i]
-                w = weights.head_1[q * units + i]
+                w = weights.head_1[q * hidden + i]
                 s0 += row * w[0]
                 s1 += row * w[1]
                 s2 += row * w[2]
@@ -214,12 +235,12 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
             w = weights.head_2[3 * q + 2]
             blue += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
             blue += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
-        for j in range(count):
+        for j in range(lanes):
             if start + j < last:
                 pixel = start + j
                 rgb[camera, pixel] = wp.vec3f(sigmoid(red[j]), sigmoid(green[j]), sigmoid(blue[j]))
                 opacity[camera, pixel] = share[j]
                 z = depth[camera, pixel]
-                depth[camera, pixel] = wp.where(z > 0.0, wp.min(z, _FAR), _FAR)
+                depth[camera, pixel] = wp.where(z > 0.0, wp.min(z, FAR), FAR)
 
-    return shade_rays, Weights
+    return color_rays, Weights

@@ -17,13 +17,11 @@ Channels = wp.types.vector(length=CHANNELS, dtype=wp.float32)
 RAW_LIMIT = 14.0
 """Raw densities are clamped to this, which is opaque at any sampling distance."""
 
-_RAW_LIMIT = wp.constant(RAW_LIMIT)
-
 
 @wp.func
 def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
     """Density [1/contracted m] of a raw output; `unit` is the density at 0."""
-    return unit * wp.exp(wp.min(raw, _RAW_LIMIT))
+    return unit * wp.exp(wp.min(raw, RAW_LIMIT))
 
 
 @wp.kernel(enable_backward=False)
@@ -140,7 +138,7 @@ def composite_backward(
         left += w  # Tᵢ
         slope = gw * (left - w) - behind
         behind += gw * w
-        if out[0] < _RAW_LIMIT:
+        if out[0] < RAW_LIMIT:
             grad[0] = slope * sigma * lengths[i, k]
         else:
             grad[0] = 0.0

@@ -2,7 +2,7 @@
 
 *Grid position*: see `kernels/space.py`. *Level*: one grid of vertices, from coarse to fine; levels that fit are stored
 densely, the others are hashed. *Table*: features of all levels, `FEATURES` floats per vertex. The backward pass is
-launched level by level, so that on a CPU one thread sums each level in a fixed order, whatever the number of threads.
+launched level by level: on a CPU one thread then sums each level in a fixed order, whatever the number of threads.
 """
 
 # Warp reads annotations as values.
@@ -14,16 +14,56 @@ FEATURES = 4
 
 Feature = wp.vec4f
 
-_PRIME_Y = wp.constant(wp.uint32(2654435761))
-_PRIME_Z = wp.constant(wp.uint32(805459861))
+Eight = wp.types.vector(length=8, dtype=wp.float32)
+
+_PRIME_Y = wp.uint32(2654435761)
+_PRIME_Z = wp.uint32(805459861)
+
+
+@wp.struct
+class Cell:
+    """Cell of a level: its lowest vertex, and the weights of the upper (b) and lower (a = 1 − b) vertices per axis."""
+
+    x: wp.int32
+    y: wp.int32
+    z: wp.int32
+    a: wp.vec3f
+    b: wp.vec3f
 
 
 @wp.func
-def vertex_index(x: wp.int32, y: wp.int32, z: wp.int32, shape: wp.vec4i, mask: wp.uint32) -> wp.int32:
-    """Row of a vertex in its level's table. `shape` is (nx, ny, nz, dense?). Müller et al. 2022, eq. 4."""
+def cell_at(position: wp.vec3f, cells: wp.vec3f) -> Cell:
+    s = wp.cw_mul(position, cells)
+    floor = wp.vec3f(wp.floor(s[0]), wp.floor(s[1]), wp.floor(s[2]))
+    cell = Cell()
+    cell.x = wp.int32(floor[0])
+    cell.y = wp.int32(floor[1])
+    cell.z = wp.int32(floor[2])
+    cell.b = s - floor
+    cell.a = wp.vec3f(1.0, 1.0, 1.0) - cell.b
+    return cell
+
+
+@wp.func
+def vertex_index(cell: Cell, n: wp.int32, shape: wp.vec4i, mask: wp.uint32) -> wp.int32:
+    """Row of a cell's vertex n = x + 2·y + 4·z in the level's table (Müller et al. 2022, eq. 4).
+
+    `shape` is (nx, ny, nz, dense?).
+    """
+    x = cell.x + (n & 1)
+    y = cell.y + ((n >> 1) & 1)
+    z = cell.z + (n >> 2)
     if shape[3] == 1:
         return x + shape[0] * (y + shape[1] * z)
     return wp.int32((wp.uint32(x) ^ (wp.uint32(y) * _PRIME_Y) ^ (wp.uint32(z) * _PRIME_Z)) & mask)
+
+
+@wp.func
+def vertex_weight(cell: Cell, n: wp.int32) -> wp.float32:
+    """Trilinear weight of a cell's vertex n."""
+    x = wp.where((n & 1) > 0, cell.b[0], cell.a[0])
+    y = wp.where((n & 2) > 0, cell.b[1], cell.a[1])
+    return x * y * wp.where((n & 4) > 0, cell.b[2], cell.a[2])
 
 
 @wp.kernel(enable_backward=False)
@@ -38,33 +78,15 @@ def encode(
 ):
     """Trilinear features of grid positions [start, start + dim), shape (n, levels).
 
-    Positions are vec3 in [0, 1]; `cells` the number of cells per axis and level; `shapes` as in `vertex_index`.
+    `cells` is the number of cells per axis and level; `shapes` is as in `vertex_index`.
     """
     i = start + wp.tid()
     p = positions[i]
     for level in range(cells.shape[0]):
-        s = wp.cw_mul(p, cells[level])
-        fx = wp.floor(s[0])
-        fy = wp.floor(s[1])
-        fz = wp.floor(s[2])
-        x = wp.int32(fx)
-        y = wp.int32(fy)
-        z = wp.int32(fz)
-        bx = s[0] - fx
-        by = s[1] - fy
-        bz = s[2] - fz
-        ax = 1.0 - bx
-        ay = 1.0 - by
-        az = 1.0 - bz
-        n = shapes[level]
-        value = table[level, vertex_index(x, y, z, n, mask)] * (ax * ay * az)
-        value += table[level, vertex_index(x + 1, y, z, n, mask)] * (bx * ay * az)
-        value += table[level, vertex_index(x, y + 1, z, n, mask)] * (ax * by * az)
-        value += table[level, vertex_index(x + 1, y + 1, z, n, mask)] * (bx * by * az)
-        value += table[level, vertex_index(x, y, z + 1, n, mask)] * (ax * ay * bz)
-        value += table[level, vertex_index(x + 1, y, z + 1, n, mask)] * (bx * ay * bz)
-        value += table[level, vertex_index(x, y + 1, z + 1, n, mask)] * (ax * by * bz)
-        value += table[level, vertex_index(x + 1, y + 1, z + 1, n, mask)] * (bx * by * bz)
+        cell = cell_at(p, cells[level])
+        value = Feature()
+        for n in range(8):
+            value += table[level, vertex_index(cell, n, shapes[level], mask)] * vertex_weight(cell, n)
         features[i, level] = value
 
 
@@ -81,29 +103,39 @@ def encode_backward(
     """Adds the gradient of `encode` to `table_grad`; launched over (levels, n) from `first_level` on."""
     k, i = wp.tid()
     level = first_level + k
-    s = wp.cw_mul(positions[i], cells[level])
-    fx = wp.floor(s[0])
-    fy = wp.floor(s[1])
-    fz = wp.floor(s[2])
-    x = wp.int32(fx)
-    y = wp.int32(fy)
-    z = wp.int32(fz)
-    bx = s[0] - fx
-    by = s[1] - fy
-    bz = s[2] - fz
-    ax = 1.0 - bx
-    ay = 1.0 - by
-    az = 1.0 - bz
-    n = shapes[level]
+    cell = cell_at(positions[i], cells[level])
     g = features_grad[i, level]
-    wp.atomic_add(table_grad, level, vertex_index(x, y, z, n, mask), g * (ax * ay * az))
-    wp.atomic_add(table_grad, level, vertex_index(x + 1, y, z, n, mask), g * (bx * ay * az))
-    wp.atomic_add(table_grad, level, vertex_index(x, y + 1, z, n, mask), g * (ax * by * az))
-    wp.atomic_add(table_grad, level, vertex_index(x + 1, y + 1, z, n, mask), g * (bx * by * az))
-    wp.atomic_add(table_grad, level, vertex_index(x, y, z + 1, n, mask), g * (ax * ay * bz))
-    wp.atomic_add(table_grad, level, vertex_index(x + 1, y, z + 1, n, mask), g * (bx * ay * bz))
-    wp.atomic_add(table_grad, level, vertex_index(x, y + 1, z + 1, n, mask), g * (ax * by * bz))
-    wp.atomic_add(table_grad, level, vertex_index(x + 1, y + 1, z + 1, n, mask), g * (bx * by * bz))
+    for n in range(8):
+        wp.atomic_add(table_grad, level, vertex_index(cell, n, shapes[level], mask), g * vertex_weight(cell, n))
+
+
+@wp.kernel(enable_backward=False)
+def encode_positions_backward(
+    positions: wp.array(dtype=wp.vec3f),
+    table: wp.array2d(dtype=Feature),
+    cells: wp.array(dtype=wp.vec3f),
+    shapes: wp.array(dtype=wp.vec4i),
+    mask: wp.uint32,
+    start: wp.int32,
+    features_grad: wp.array2d(dtype=Feature),
+    positions_grad: wp.array(dtype=wp.vec3f),
+):
+    """Gradient of `encode` with respect to grid positions [start, start + dim)."""
+    i = start + wp.tid()
+    p = positions[i]
+    total = wp.vec3f()
+    for level in range(cells.shape[0]):
+        cell = cell_at(p, cells[level])
+        a = cell.a
+        b = cell.b
+        v = Eight()
+        for n in range(8):
+            v[n] = wp.dot(features_grad[i, level], table[level, vertex_index(cell, n, shapes[level], mask)])
+        dx = ((v[1] - v[0]) * a[1] + (v[3] - v[2]) * b[1]) * a[2] + ((v[5] - v[4]) * a[1] + (v[7] - v[6]) * b[1]) * b[2]
+        dy = ((v[2] - v[0]) * a[0] + (v[3] - v[1]) * b[0]) * a[2] + ((v[6] - v[4]) * a[0] + (v[7] - v[5]) * b[0]) * b[2]
+        dz = ((v[4] - v[0]) * a[0] + (v[5] - v[1]) * b[0]) * a[1] + ((v[6] - v[2]) * a[0] + (v[7] - v[3]) * b[0]) * b[1]
+        total += wp.cw_mul(wp.vec3f(dx, dy, dz), cells[level])
+    positions_grad[i] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -135,4 +167,4 @@ def adam_step(
             m[2] / (wp.sqrt(v[2] * second_correction) + 1.0e-15),
             m[3] / (wp.sqrt(v[3] * second_correction) + 1.0e-15),
         )
-        table_grad[level, i] = Feature(0.0, 0.0, 0.0, 0.0)
+        table_grad[level, i] = Feature()

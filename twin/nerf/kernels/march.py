@@ -12,11 +12,9 @@ rays are empty before the tile's *start*. Bricks, blocks and grids: `bricks.py`;
 from functools import cache
 from typing import Any
 
-from twin.nerf.kernels.bricks import BLOCKS
-from twin.nerf.kernels.composite import CHANNELS
-from twin.nerf.kernels.lookup import Bricks, brick_at, density_at, features_at, skip_at
+from twin.nerf.kernels.bricks import BLOCKS, CORNERS, DENSITIES, HALF_CORNERS, SAMPLES, Bricks, Bytes
+from twin.nerf.kernels.composite import CHANNELS, RAW_LIMIT, Channels
 from twin.nerf.kernels.space import grid_position, max_norm
-from twin.nerf.kernels.vectorized import OPTIONS, fast_exp, fast_log, lowest_bit, nonzero
 from twin.warp_runtime import wp
 
 TILE = 8
@@ -24,20 +22,33 @@ TILE = 8
 LANES = {"cpu": 16, "cuda": 1}
 """Rays of a packet."""
 
+OPTIONS = {
+    "enable_backward": False,
+    # Loops over lanes must stay loops for the compiler to vectorize them.
+    "max_unroll": 0,
+    "optimization_level": 3,
+    "fast_math": False,
+    "cpu_compiler_flags": "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000",
+}
+"""Module options of kernels with such loops."""
+
 wp.set_module_options(OPTIONS)
 
-_TILE = wp.constant(TILE)
-_BLOCKS = wp.constant(BLOCKS)
-_FAR = wp.constant(100.0)  # unit positions beyond this count as the horizon
-_INFINITE = wp.constant(1.0e30)
-_STEP_CELLS = wp.constant(1.0)  # step inside a brick [cells]
-_MIN_STEP_PIXELS = wp.constant(1.0)  # least step [pixel widths]
-_OPAQUE = wp.constant(0.03)  # transmittance that counts as zero
-_MIN_WEIGHT = wp.constant(0.06)  # weight from which features are looked up
-_WAIT_RATIO = wp.constant(4)  # sampling waits while fewer than 1/4 of the live lanes need it
-_MAX_STEPS = wp.constant(1000)
-_MAX_CONE_STEPS = wp.constant(64)
-_MIN_CONE_STEP = wp.constant(0.5)  # least step of the cone march [cells]
+_FAR = 100.0  # unit positions beyond this count as the horizon
+_INFINITE = 1.0e30
+_STEP_CELLS = 1.0  # step inside a brick [cells]
+_MIN_STEP_PIXELS = 1.0  # least step [pixel widths]
+_OPAQUE = 0.03  # transmittance that counts as zero
+_MIN_WEIGHT = 0.06  # weight from which features are looked up
+_WAIT_RATIO = 4  # sampling waits while fewer than 1/4 of the live lanes need it
+_MAX_STEPS = 1000
+_MAX_CONE_STEPS = 64
+_MIN_CONE_STEP = 0.5  # least step of the cone march [cells]
+
+_ACROSS = 2 * CORNERS * HALF_CORNERS  # from one face to the next
+_NEXT_Y = 8 * HALF_CORNERS  # bits
+_X = CORNERS * CORNERS  # from one sample to the next along each axis
+_Z = 1
 
 
 @wp.struct
@@ -53,6 +64,132 @@ class ImageBuffers:
     height: wp.int32
     across: wp.int32
     """Tiles in a row of tiles."""
+
+
+# ---- arithmetic without calls and branches, so that the compiler vectorizes loops over lanes
+
+
+@wp.func
+def fast_exp(x: wp.float32) -> wp.float32:
+    """e^x with a relative error of 1e-4."""
+    y = wp.max(x, -80.0) * 1.4426950408889634
+    n = wp.floor(y)
+    f = y - n
+    p = 1.0 + f * (0.69550201 + f * (0.22626982 + f * 0.07822817))
+    return p * wp.cast((int(n) + 127) << 23, wp.float32)
+
+
+@wp.func
+def fast_log(x: wp.float32) -> wp.float32:
+    """Natural logarithm of x in [1, 2] with an error of 1e-5 (Abramowitz and Stegun 1964, 4.1.43)."""
+    y = x - 1.0
+    return y * (0.99949556 + y * (-0.49190896 + y * (0.28947478 + y * (-0.13606275 + y * 0.03215845))))
+
+
+@wp.func
+def lowest_bit(bits: wp.int32) -> wp.int32:
+    """Index of the lowest set bit below the sign, read from the exponent of that bit as a float."""
+    return (wp.cast(float(bits & -bits), wp.int32) >> 23) - 127
+
+
+@wp.func
+def nonzero(x: wp.float32) -> wp.float32:
+    return wp.where(wp.abs(x) < 1.0e-9, 1.0e-9, x)
+
+
+# ---- lookups, compact because memory access limits the march
+
+
+# Warp arrays may be strided; these are contiguous, and the compiler does better when it knows.
+@wp.func_native("return array.data[i];")
+def byte_of(array: wp.array(dtype=wp.uint8), i: wp.int32) -> wp.uint8: ...
+
+
+@wp.func_native("return array.data[i];")
+def slot_of(array: wp.array(dtype=wp.int32), i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("return array.data[i];")
+def sample_of(array: wp.array(dtype=Bytes), i: wp.int32) -> Bytes: ...
+
+
+@wp.func_native("unsigned long long eight; memcpy(&eight, array.data + i, 8); return eight;")
+def eight_of(array: wp.array(dtype=wp.uint8), i: wp.int32) -> wp.uint64: ...
+
+
+@wp.func
+def brick_at(index: wp.array(dtype=wp.int32), b1: wp.int32, b2: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
+    """Index entry of the brick that contains block (i0, i1, i2), for a grid of (.., b1, b2) blocks."""
+    return slot_of(index, ((i0 >> 2) * (b1 >> 2) + (i1 >> 2)) * (b2 >> 2) + (i2 >> 2))
+
+
+@wp.func
+def skip_at(bricks: Bricks, brick: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
+    """Skip distance of a block, or of its brick if that is not stored."""
+    at = wp.max(brick, 0) * 64 + ((i0 & 3) * 4 + (i1 & 3)) * 4 + (i2 & 3)
+    stored = int(byte_of(bricks.skips, at))
+    return wp.where(brick < 0, -brick, stored)
+
+
+@wp.func
+def density_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, p2: wp.float32):
+    """Density [1/contracted m] at a position [blocks]."""
+    i0 = int(2.0 * p0)
+    i1 = int(2.0 * p1)
+    i2 = int(2.0 * p2)
+    x = 2.0 * p0 - float(i0)
+    y = 2.0 * p1 - float(i1)
+    z = 2.0 * p2 - float(i2)
+    at = slot * DENSITIES + (((i0 & 7) * 2 + ((i2 & 4) >> 2)) * CORNERS + (i1 & 7)) * HALF_CORNERS + (i2 & 3)
+    near = eight_of(bricks.densities, at)
+    far = eight_of(bricks.densities, at + _ACROSS)
+    byte = wp.uint32(255)
+    az = 1.0 - z
+    a = wp.uint32(near)
+    b = wp.uint32(near >> wp.uint64(_NEXT_Y))
+    c = wp.uint32(far)
+    d = wp.uint32(far >> wp.uint64(_NEXT_Y))
+    v0 = az * float(a & byte) + z * float((a >> wp.uint32(8)) & byte)
+    v1 = az * float(b & byte) + z * float((b >> wp.uint32(8)) & byte)
+    v2 = az * float(c & byte) + z * float((c >> wp.uint32(8)) & byte)
+    v3 = az * float(d & byte) + z * float((d >> wp.uint32(8)) & byte)
+    code = (1.0 - x) * ((1.0 - y) * v0 + y * v1) + x * ((1.0 - y) * v2 + y * v3)
+    return bricks.unit * fast_exp(wp.min(bricks.low[0] + bricks.step[0] * code, RAW_LIMIT))
+
+
+@wp.func
+def as_floats(value: Bytes) -> Channels:
+    out = Channels()
+    for c in range(CHANNELS):
+        out[c] = float(value[c])
+    return out
+
+
+@wp.func
+def features_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, p2: wp.float32) -> Channels:
+    """Interpolated feature bytes at a position [blocks]."""
+    i0 = int(2.0 * p0)
+    i1 = int(2.0 * p1)
+    i2 = int(2.0 * p2)
+    x = 2.0 * p0 - float(i0)
+    y = 2.0 * p1 - float(i1)
+    z = 2.0 * p2 - float(i2)
+    at = slot * SAMPLES + ((i0 & 7) * CORNERS + (i1 & 7)) * CORNERS + (i2 & 7)
+    ax = 1.0 - x
+    ay = 1.0 - y
+    az = 1.0 - z
+    value = as_floats(sample_of(bricks.features, at)) * (ax * ay * az)
+    value += as_floats(sample_of(bricks.features, at + _Z)) * (ax * ay * z)
+    value += as_floats(sample_of(bricks.features, at + CORNERS)) * (ax * y * az)
+    value += as_floats(sample_of(bricks.features, at + CORNERS + _Z)) * (ax * y * z)
+    value += as_floats(sample_of(bricks.features, at + _X)) * (x * ay * az)
+    value += as_floats(sample_of(bricks.features, at + _X + _Z)) * (x * ay * z)
+    value += as_floats(sample_of(bricks.features, at + _X + CORNERS)) * (x * y * az)
+    value += as_floats(sample_of(bricks.features, at + _X + CORNERS + _Z)) * (x * y * z)
+    return value
+
+
+# ---- march
 
 
 @wp.func
@@ -95,7 +232,7 @@ def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.a
     camera, i = wp.tid()
     tile = first + i
     k = image.intrinsics[camera]
-    side = float(_TILE)
+    side = float(TILE)
     u = float(tile % image.across) * side
     v = float(tile // image.across) * side
     axis = unit_ray(k, u + 0.5 * side, v + 0.5 * side)
@@ -103,7 +240,7 @@ def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.a
         wp.max(wp.length(axis - unit_ray(k, u, v)), wp.length(axis - unit_ray(k, u + side, v))),
         wp.max(wp.length(axis - unit_ray(k, u, v + side)), wp.length(axis - unit_ray(k, u + side, v + side))),
     )
-    blocks = wp.vec3f(float(bricks.near_blocks[0]), float(bricks.near_blocks[1]), float(bricks.near_blocks[2]))
+    blocks = wp.vec3f(bricks.near_blocks)
     unit = wp.cw_mul(image.position[camera] - bricks.center, bricks.inverse_half)
     o = wp.cw_mul(unit * 0.5 + wp.vec3f(0.5, 0.5, 0.5), blocks)
     per_meter = wp.cw_mul(bricks.inverse_half, blocks) * 0.5
@@ -118,7 +255,7 @@ def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.a
         i2 = int(p[2])
         brick = brick_at(bricks.near_index, bricks.near_blocks[1], bricks.near_blocks[2], i0, i1, i2)
         skip = skip_at(bricks, brick, i0, i1, i2)
-        size = wp.where(brick < 0, _BLOCKS, 1)
+        size = wp.where(brick < 0, BLOCKS, 1)
         margin_blocks = float(skip - 1)
         q = p - wp.vec3f(float(i0 & -size), float(i1 & -size), float(i2 & -size))
         whole = float(size)
@@ -143,9 +280,7 @@ def march_kernel(lanes: int) -> Any:
     QueueBits = wp.types.vector(length=32, dtype=wp.int32)
     QueueFloats = wp.types.matrix(shape=(32, lanes), dtype=wp.float32)
     QueueInts = wp.types.matrix(shape=(32, lanes), dtype=wp.int32)
-    queue_capacity = wp.constant(32)
-    count = wp.constant(lanes)
-    per_tile = wp.constant(TILE * TILE // lanes)
+    per_tile = TILE * TILE // lanes
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
     def march_packets(
@@ -158,15 +293,15 @@ def march_kernel(lanes: int) -> Any:
     ):
         camera, packet = wp.tid()
         tile = first + packet // per_tile
-        corner = (packet % per_tile) * count  # of the packet in its tile
-        column = (tile % image.across) * _TILE + corner % _TILE
-        row = (tile // image.across) * _TILE + corner // _TILE
+        corner = (packet % per_tile) * lanes  # of the packet in its tile
+        column = (tile % image.across) * TILE + corner % TILE
+        row = (tile // image.across) * TILE + corner // TILE
         if row >= image.height:
             return
         k = image.intrinsics[camera]
         rotation = image.rotation[camera]
-        near_blocks = wp.vec3f(float(bricks.near_blocks[0]), float(bricks.near_blocks[1]), float(bricks.near_blocks[2]))
-        far_blocks = wp.vec3f(float(bricks.far_blocks[0]), float(bricks.far_blocks[1]), float(bricks.far_blocks[2]))
+        near_blocks = wp.vec3f(bricks.near_blocks)
+        far_blocks = wp.vec3f(bricks.far_blocks)
         n0 = bricks.near_blocks[0]
         n1 = bricks.near_blocks[1]
         n2 = bricks.near_blocks[2]
@@ -190,7 +325,7 @@ def march_kernel(lanes: int) -> Any:
         t = Floats()
         transmittance = Floats()
         median = Floats()
-        for j in range(count):
+        for j in range(lanes):
             x = (float(column + (j & 7)) + 0.5 - k[2]) / k[0]
             y = (float(row + (j >> 3)) + 0.5 - k[3]) / k[1]
             c = 1.0 / wp.sqrt(x * x + y * y + 1.0)
@@ -221,7 +356,7 @@ def march_kernel(lanes: int) -> Any:
                 column + (j & 7) < image.width, wp.where(row + (j >> 3) < image.height, _INFINITE, 0.0), 0.0
             )
         if image.stop.shape[0] > 0:
-            for j in range(count):
+            for j in range(lanes):
                 pixel = wp.min(row + (j >> 3), image.height - 1) * image.width + wp.min(
                     column + (j & 7), image.width - 1
                 )
@@ -251,7 +386,7 @@ def march_kernel(lanes: int) -> Any:
             alive_count = int(0)
             outside_count = int(0)
             sampling_count = int(0)
-            for j in range(count):
+            for j in range(lanes):
                 tj = t[j]
                 alive = wp.where(tj < limit[j], 1, 0) * wp.where(transmittance[j] > _OPAQUE, 1, 0)
                 near = alive * wp.where(tj >= enter[j], 1, 0) * wp.where(tj < leave[j], 1, 0)
@@ -266,7 +401,7 @@ def march_kernel(lanes: int) -> Any:
                 i2 = wp.clamp(int(wp.clamp(z, -1.0, 1.0e6)), 0, n2 - 1)
                 brick = brick_at(bricks.near_index, n1, n2, i0, i1, i2)
                 skip = skip_at(bricks, brick, i0, i1, i2)
-                size = wp.where(brick < 0, _BLOCKS, 1)
+                size = wp.where(brick < 0, BLOCKS, 1)
                 w0 = exit_distance(x, s0[j], i0 & -size, size, skip)
                 w1 = exit_distance(y, s1[j], i1 & -size, size, skip)
                 w2 = exit_distance(z, s2[j], i2 & -size, size, skip)
@@ -282,7 +417,7 @@ def march_kernel(lanes: int) -> Any:
                 thick[j] = stride
                 advance = wp.min(wp.min(wp.min(w0, w1), w2), leave[j] - tj) + 0.02 * bricks.near_cell
                 ahead[j] = wp.where(near > 0, wp.where(skip > 0, advance, stride), 0.0)
-            if alive_count == 0 or queue_length == queue_capacity:
+            if alive_count == 0 or queue_length == 32:
                 for n in range(queue_length):
                     bits = queued[n]
                     while bits != 0:
@@ -295,7 +430,7 @@ def march_kernel(lanes: int) -> Any:
                 if alive_count == 0:
                     break
             if outside_count > 0:
-                for j in range(count):
+                for j in range(lanes):
                     tj = t[j]
                     alive = wp.where(tj < limit[j], 1, 0) * wp.where(transmittance[j] > _OPAQUE, 1, 0)
                     far = alive * (1 - wp.where(tj >= enter[j], 1, 0) * wp.where(tj < leave[j], 1, 0))
@@ -308,7 +443,7 @@ def march_kernel(lanes: int) -> Any:
                     i2 = int(g[2])
                     brick = brick_at(bricks.far_index, f1, f2, i0, i1, i2)
                     skip = skip_at(bricks, brick, i0, i1, i2)
-                    size = wp.where(brick < 0, _BLOCKS, 1)
+                    size = wp.where(brick < 0, BLOCKS, 1)
                     occupied = far * wp.where(skip > 0, 0, 1)
                     c4 = contracted_velocity(u, v, m)
                     q0 = 1.0 / nonzero(c4[0] * 0.25 * far_blocks[0])
@@ -344,12 +479,12 @@ def march_kernel(lanes: int) -> Any:
                     dense[j] = wp.where(occupied > 0, 1, dense[j])
                     sampling_count = sampling_count + occupied
             if _WAIT_RATIO * sampling_count < alive_count:  # the few sampling lanes wait for others
-                for j in range(count):
+                for j in range(lanes):
                     ahead[j] = wp.where(dense[j] > 0, 0.0, ahead[j])
             else:
                 bits = int(0)
                 # Density and features of a step are those at its middle.
-                for j in range(count):
+                for j in range(lanes):
                     filled = wp.where(slot[j] >= 0, 1.0, 0.0)
                     density = density_at(bricks, wp.max(slot[j], 0), p0[j], p1[j], p2[j])
                     # The part of the step beyond the limit blocks nothing.
@@ -373,9 +508,9 @@ def march_kernel(lanes: int) -> Any:
                     queued_2[queue_length, j] = p2[j]
                 queued[queue_length] = bits
                 queue_length = queue_length + wp.where(bits != 0, 1, 0)
-            for j in range(count):
+            for j in range(lanes):
                 t[j] = t[j] + ahead[j]
-        for j in range(count):
+        for j in range(lanes):
             if column + (j & 7) < image.width and row + (j >> 3) < image.height:
                 pixel = (row + (j >> 3)) * image.width + column + (j & 7)
                 opacity = wp.where(transmittance[j] > _OPAQUE, 1.0 - transmittance[j], 1.0)

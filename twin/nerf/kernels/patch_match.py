@@ -10,15 +10,15 @@ count, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
-_SIDE = wp.constant(5)
+_SIDE = 5
 _PIXELS = 25
 
 Window = wp.types.vector(length=_PIXELS, dtype=wp.float32)
 
-_WORST_COST = wp.constant(2.0)  # cost in a source that does not contain the window
-_GRAY_SIGMA = wp.constant(0.08)  # gray difference at which a window pixel has weight 1/e
-_MAX_RETURN_ERROR = wp.constant(2.0)  # [px] of a point mapped to a source and back
-_MIN_VARIANCE = wp.constant(1e-5)  # of gray, below which a window has no texture to match
+_WORST_COST = 2.0  # cost in a source that does not contain the window
+_GRAY_SIGMA = 0.08  # gray difference at which a window pixel has weight 1/e
+_MAX_RETURN_ERROR = 2.0  # [px] of a point mapped to a source and back
+_MIN_VARIANCE = 1e-5  # of gray, below which a window has no texture to match
 
 
 @wp.struct
@@ -63,27 +63,64 @@ def gray_at(frames: GrayImages, frame: int, x: float, y: float) -> float:
     return top * (1.0 - t) + bottom * t
 
 
+@wp.struct
+class ReferenceWindow:
+    """Window of a reference frame with weights that sum to 1."""
+
+    center: wp.vec2
+    spacing: float
+    values: Window
+    weights: Window
+    mean: float
+    variance: float
+
+
 @wp.func
-def ncc_cost(
-    frames: GrayImages,
-    views: SourceViews,
-    k: int,
-    center: wp.vec2,
-    plane: wp.vec3,
-    spacing: float,
-    values: Window,
-    weights: Window,
-    mean: float,
-    variance: float,
-) -> float:
-    """1 − NCC of a reference window (weights sum to 1) and its image in source k under the plane."""
+def reference_window(frames: GrayImages, frame: int, center: wp.vec2, spacing: float) -> ReferenceWindow:
+    """The window around a pixel, the border repeated."""
+    window = ReferenceWindow()
+    window.center = center
+    window.spacing = spacing
+    width = frames.width[frame]
+    height = frames.height[frame]
+    at = int(frames.start[frame])
+    values = Window()
+    for i in range(_SIDE):
+        for j in range(_SIDE):
+            x = wp.clamp(int(center[0] + float(j - 2) * spacing), 0, width - 1)
+            y = wp.clamp(int(center[1] + float(i - 2) * spacing), 0, height - 1)
+            values[i * _SIDE + j] = frames.gray[at + y * width + x]
+    weights = Window()
+    gray = values[_PIXELS // 2]
+    total = float(0.0)
+    for i in range(_PIXELS):
+        w = wp.exp(-wp.abs(values[i] - gray) / _GRAY_SIGMA)
+        weights[i] = w
+        total += w
+    mean = float(0.0)
+    squares = float(0.0)
+    for i in range(_PIXELS):
+        w = weights[i] / total
+        weights[i] = w
+        mean += w * values[i]
+        squares += w * values[i] * values[i]
+    window.values = values
+    window.weights = weights
+    window.mean = mean
+    window.variance = squares - mean * mean
+    return window
+
+
+@wp.func
+def ncc_cost(frames: GrayImages, views: SourceViews, k: int, window: ReferenceWindow, plane: wp.vec3) -> float:
+    """1 − NCC of a reference window and its image in source k under the plane."""
     source = views.source[k]
     homography = views.homography[k]
     epipole = views.epipole[k]
     # The homography of the plane: affine in the window's offsets before the division.
-    middle = homography * wp.vec3(center[0], center[1], 1.0) + epipole * plane[0]
-    along_u = (wp.vec3(homography[0, 0], homography[1, 0], homography[2, 0]) + epipole * plane[1]) * spacing
-    along_v = (wp.vec3(homography[0, 1], homography[1, 1], homography[2, 1]) + epipole * plane[2]) * spacing
+    middle = homography * wp.vec3(window.center[0], window.center[1], 1.0) + epipole * plane[0]
+    along_u = (wp.vec3(homography[0, 0], homography[1, 0], homography[2, 0]) + epipole * plane[1]) * window.spacing
+    along_v = (wp.vec3(homography[0, 1], homography[1, 1], homography[2, 1]) + epipole * plane[2]) * window.spacing
     total = float(0.0)
     squares = float(0.0)
     products = float(0.0)
@@ -95,34 +132,24 @@ def ncc_cost(
             value = gray_at(frames, source, h[0] / h[2] - 0.5, h[1] / h[2] - 0.5)
             if value < 0.0:
                 return _WORST_COST
-            w = weights[i * _SIDE + j]
+            w = window.weights[i * _SIDE + j]
             total += w * value
             squares += w * value * value
-            products += w * value * values[i * _SIDE + j]
+            products += w * value * window.values[i * _SIDE + j]
     spread = squares - total * total
     if spread < _MIN_VARIANCE:
         return _WORST_COST
-    return 1.0 - (products - total * mean) / wp.sqrt(spread * variance)
+    return 1.0 - (products - total * window.mean) / wp.sqrt(spread * window.variance)
 
 
 @wp.func
-def matching_cost(
-    frames: GrayImages,
-    views: SourceViews,
-    center: wp.vec2,
-    plane: wp.vec3,
-    spacing: float,
-    values: Window,
-    weights: Window,
-    mean: float,
-    variance: float,
-) -> float:
+def matching_cost(frames: GrayImages, views: SourceViews, window: ReferenceWindow, plane: wp.vec3) -> float:
     """Mean of the two lowest `ncc_cost` over all sources."""
     best = float(_WORST_COST)
     second = float(_WORST_COST)
     count = views.source.shape[0]
     for k in range(count):
-        d = ncc_cost(frames, views, k, center, plane, spacing, values, weights, mean, variance)
+        d = ncc_cost(frames, views, k, window, plane)
         if d < best:
             second = best
             best = d
@@ -131,20 +158,6 @@ def matching_cost(
     if count == 1:
         return best
     return 0.5 * (best + second)
-
-
-@wp.func
-def reference_window(frames: GrayImages, frame: int, center: wp.vec2, spacing: float, values: Window) -> Window:
-    """Gray of the reference window around a pixel, the border repeated."""
-    width = frames.width[frame]
-    height = frames.height[frame]
-    at = int(frames.start[frame])
-    for i in range(_SIDE):
-        for j in range(_SIDE):
-            x = wp.clamp(int(center[0] + float(j - 2) * spacing), 0, width - 1)
-            y = wp.clamp(int(center[1] + float(i - 2) * spacing), 0, height - 1)
-            values[i * _SIDE + j] = frames.gray[at + y * width + x]
-    return values
 
 
 @wp.kernel(enable_backward=False)
@@ -175,24 +188,8 @@ def sweep(
     column = 2 * half + (row + parity) % 2
     if column >= columns:
         return
-    center = cell_center(row, column, step)
-    values = reference_window(frames, frame, center, spacing, Window())
-    weights = Window()
-    gray = values[12]
-    sum_w = float(0.0)
-    for i in range(25):
-        w = wp.exp(-wp.abs(values[i] - gray) / _GRAY_SIGMA)
-        weights[i] = w
-        sum_w += w
-    mean = float(0.0)
-    squares = float(0.0)
-    for i in range(25):
-        w = weights[i] / sum_w
-        weights[i] = w
-        mean += w * values[i]
-        squares += w * values[i] * values[i]
-    variance = squares - mean * mean
-    if variance < _MIN_VARIANCE:
+    window = reference_window(frames, frame, cell_center(row, column, step), spacing)
+    if window.variance < _MIN_VARIANCE:
         costs[row, column] = _WORST_COST
         if round_number == 0:
             planes[row, column] = first[row, column]
@@ -200,58 +197,45 @@ def sweep(
     state = wp.rand_init(seed + 7919 * round_number, row * columns + column)
     best = planes[row, column]
     lowest = costs[row, column]
+    trials = 6
     if round_number == 0:
-        guess = low * wp.pow(high / low, wp.randf(state))
-        best = wp.vec3(guess, 0.0, 0.0)
-        lowest = matching_cost(frames, views, center, best, spacing, values, weights, mean, variance)
-        for n in range(2):
+        best = wp.vec3(low * wp.pow(high / low, wp.randf(state)), 0.0, 0.0)
+        lowest = matching_cost(frames, views, window, best)
+        trials = 2
+    scale = wp.pow(0.4, float(round_number))
+    for n in range(trials):
+        trial = wp.vec3()
+        if round_number == 0:
             trial = first[row, column]
             if n == 1:
                 trial = second[row, column]
-            if trial[0] >= low and trial[0] <= high:
-                cost = matching_cost(frames, views, center, trial, spacing, values, weights, mean, variance)
-                if cost < lowest:
-                    lowest = cost
-                    best = trial
-    else:
-        for n in range(4):
-            r = row
-            c = column
-            if n == 0:
-                c = column - 1
-            elif n == 1:
-                c = column + 1
-            elif n == 2:
-                r = row - 1
-            else:
-                r = row + 1
-            if r >= 0 and r < rows and c >= 0 and c < columns:
-                there = planes[r, c]
-                trial = wp.vec3(
-                    there[0] + float(step) * (there[1] * float(column - c) + there[2] * float(row - r)),
-                    there[1],
-                    there[2],
-                )
-                if trial[0] >= low and trial[0] <= high and trial[0] != best[0]:
-                    cost = matching_cost(frames, views, center, trial, spacing, values, weights, mean, variance)
-                    if cost < lowest:
-                        lowest = cost
-                        best = trial
-        scale = wp.pow(0.4, float(round_number))
-        for n in range(2):
+        elif n < 4:
+            c = column + wp.where(n < 2, 2 * n - 1, 0)
+            r = row + wp.where(n < 2, 0, 2 * n - 5)
+            if r < 0 or r >= rows or c < 0 or c >= columns:
+                continue
+            there = planes[r, c]
+            trial = wp.vec3(
+                there[0] + float(step) * (there[1] * float(column - c) + there[2] * float(row - r)),
+                there[1],
+                there[2],
+            )
+            if trial[0] == best[0]:
+                continue
+        else:
             slope = scale * best[0] * 0.02
             trial = wp.vec3(
                 best[0],
                 best[1] + slope * (2.0 * wp.randf(state) - 1.0),
                 best[2] + slope * (2.0 * wp.randf(state) - 1.0),
             )
-            if n == 0:
+            if n == 4:
                 trial[0] = best[0] * (1.0 + 0.5 * scale * (2.0 * wp.randf(state) - 1.0))
-            if trial[0] >= low and trial[0] <= high:
-                cost = matching_cost(frames, views, center, trial, spacing, values, weights, mean, variance)
-                if cost < lowest:
-                    lowest = cost
-                    best = trial
+        if trial[0] >= low and trial[0] <= high:
+            cost = matching_cost(frames, views, window, trial)
+            if cost < lowest:
+                lowest = cost
+                best = trial
     planes[row, column] = best
     costs[row, column] = lowest
 

@@ -12,27 +12,24 @@ quantiles of the bins' weights; it is sampled once, and the sample stands for it
 from twin.nerf.kernels.space import expansion, grid_position, max_norm
 from twin.warp_runtime import wp
 
-BINS = wp.constant(256)
-_FAR = wp.constant(100.0)  # unit positions beyond this count as the horizon
-_MAX_OPACITY = wp.constant(0.99)  # of a cell
-_STEP = wp.constant(0.75)  # bin length [cells]
-_BINS_BEHIND = wp.constant(2)  # bins behind an opaque one
-_OPAQUE = wp.constant(0.02)  # transmittance from which a ray counts as blocked
+BINS = 256
+_FAR = 100.0  # unit positions beyond this count as the horizon
+_MAX_OPACITY = 0.99  # of a cell
+_STEP = 0.75  # bin length [cells]
+_BINS_BEHIND = 2  # bins behind an opaque one
+_OPAQUE = 0.02  # transmittance from which a ray counts as blocked
 # A grazing ray runs for meters through cells that contain ground before it reaches the ground. So _DOUBT_SHARE of the
 # weight is distributed as if cells had only _DOUBT of their opacity.
-_DOUBT_SHARE = wp.constant(0.35)
-_DOUBT = wp.constant(0.25)
-_WIDENING = wp.constant(0.02)  # least bin length as a share of the distance
+_DOUBT_SHARE = 0.35
+_DOUBT = 0.25
+_WIDENING = 0.02  # least bin length as a share of the distance
 
 
 @wp.func
-def grid_cell(g: wp.vec3f, nx: wp.int32, ny: wp.int32, nz: wp.int32) -> wp.vec3i:
+def grid_cell(g: wp.vec3f, grid: wp.array3d(dtype=wp.float32)) -> wp.vec3i:
+    n = wp.vec3i(grid.shape[0], grid.shape[1], grid.shape[2])
     # Rounding may carry a position just below 1 to the end of the grid.
-    return wp.vec3i(
-        wp.min(wp.int32(g[0] * wp.float32(nx)), nx - 1),
-        wp.min(wp.int32(g[1] * wp.float32(ny)), ny - 1),
-        wp.min(wp.int32(g[2] * wp.float32(nz)), nz - 1),
-    )
+    return wp.min(wp.vec3i(wp.cw_mul(g, wp.vec3f(n))), n - wp.vec3i(1, 1, 1))
 
 
 @wp.func
@@ -106,10 +103,10 @@ def sample_rays(
         opacity = float(0.0)
         b = near_box_position(g)
         if inside_near_box(b):
-            c = grid_cell(b, near_grid.shape[0], near_grid.shape[1], near_grid.shape[2])
+            c = grid_cell(b, near_grid)
             opacity = near_grid[c[0], c[1], c[2]]
         else:
-            c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
+            c = grid_cell(g, far_grid)
             opacity = far_grid[c[0], c[1], c[2]]
         opacity *= wp.min(1.0, step / length)
         doubt = _DOUBT * opacity
@@ -168,6 +165,23 @@ def sample_rays(
         lengths[i, k] = (edge - edges[i, k]) / expansion(u)
 
 
+@wp.func
+def update_cell(
+    grid: wp.array3d(dtype=wp.float32),
+    g: wp.vec3f,
+    optical_depth: wp.float32,
+    rise: wp.float32,
+    fall: wp.float32,
+    part: wp.int32,
+    parts: wp.int32,
+):
+    c = grid_cell(g, grid)
+    if (c[0] + c[1]) % parts == part:
+        opacity = wp.min(1.0 - wp.exp(-optical_depth), _MAX_OPACITY)
+        old = grid[c[0], c[1], c[2]]
+        grid[c[0], c[1], c[2]] = old + wp.where(opacity > old, rise, fall) * (opacity - old)
+
+
 @wp.kernel(enable_backward=False)
 def update_grids(
     positions: wp.array(dtype=wp.vec3f),
@@ -189,14 +203,6 @@ def update_grids(
     g = positions[i]
     b = near_box_position(g)
     if inside_near_box(b):
-        c = grid_cell(b, near_grid.shape[0], near_grid.shape[1], near_grid.shape[2])
-        if (c[0] + c[1]) % parts == part:
-            opacity = wp.min(1.0 - wp.exp(-densities[i] * near_cell), _MAX_OPACITY)
-            old = near_grid[c[0], c[1], c[2]]
-            near_grid[c[0], c[1], c[2]] = old + wp.where(opacity > old, rise, fall) * (opacity - old)
+        update_cell(near_grid, b, densities[i] * near_cell, rise, fall, part, parts)
     else:
-        c = grid_cell(g, far_grid.shape[0], far_grid.shape[1], far_grid.shape[2])
-        if (c[0] + c[1]) % parts == part:
-            opacity = wp.min(1.0 - wp.exp(-densities[i] * far_cell), _MAX_OPACITY)
-            old = far_grid[c[0], c[1], c[2]]
-            far_grid[c[0], c[1], c[2]] = old + wp.where(opacity > old, rise, fall) * (opacity - old)
+        update_cell(far_grid, g, densities[i] * far_cell, rise, fall, part, parts)

@@ -11,7 +11,7 @@ length of a meter outside. Density is per contracted meter, so the far field sta
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
-_TOP = wp.constant(1.0 - 1.0e-6)
+_TOP = 1.0 - 1.0e-6  # greatest coordinate of a grid position
 
 
 @wp.func
@@ -35,6 +35,27 @@ def grid_position(u: wp.vec3f) -> wp.vec3f:
         c = u * ((2.0 - 1.0 / m) / m)
     g = c * 0.25 + wp.vec3f(0.5, 0.5, 0.5)
     return wp.vec3f(wp.clamp(g[0], 0.0, _TOP), wp.clamp(g[1], 0.0, _TOP), wp.clamp(g[2], 0.0, _TOP))
+
+
+@wp.func
+def grid_position_backward(u: wp.vec3f, g: wp.vec3f) -> wp.vec3f:
+    """Gradient with respect to the unit position u, given the gradient g with respect to `grid_position(u)`."""
+    ax = wp.abs(u[0])
+    ay = wp.abs(u[1])
+    az = wp.abs(u[2])
+    m = wp.max(wp.max(ax, ay), az)
+    if m <= 1.0:
+        return g * 0.25
+    along = (2.0 - 1.0 / m) / m
+    slope = wp.dot(u, g) * (2.0 / (m * m * m) - 2.0 / (m * m))
+    out = g * along
+    if ax == m:
+        out[0] += wp.sign(u[0]) * slope
+    elif ay == m:
+        out[1] += wp.sign(u[1]) * slope
+    else:
+        out[2] += wp.sign(u[2]) * slope
+    return out * 0.25
 
 
 @wp.kernel(enable_backward=False)
@@ -75,3 +96,31 @@ def pixel_rays(
     origins[i] = position[c]
     directions[i] = rotation[c] * (local / length)
     cosines[i] = 1.0 / length
+
+
+@wp.kernel(enable_backward=False)
+def rays_backward(
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    distances: wp.array2d(dtype=wp.float32),
+    center: wp.vec3f,
+    inverse_half: wp.vec3f,
+    start: wp.int32,
+    positions_grad: wp.array2d(dtype=wp.vec3f),
+    origins_grad: wp.array(dtype=wp.vec3f),
+    directions_grad: wp.array(dtype=wp.vec3f),
+):
+    """Gradients with respect to origins and directions of rays [start, start + dim), at fixed sample distances [m]."""
+    i = start + wp.tid()
+    o = origins[i]
+    d = directions[i]
+    by_origin = wp.vec3f()
+    by_direction = wp.vec3f()
+    for k in range(distances.shape[1]):
+        t = distances[i, k]
+        u = wp.cw_mul(o + d * t - center, inverse_half)
+        g = wp.cw_mul(grid_position_backward(u, positions_grad[i, k]), inverse_half)
+        by_origin += g
+        by_direction += g * t
+    origins_grad[i] = by_origin
+    directions_grad[i] = by_direction
