@@ -23,7 +23,6 @@ from twin.geometry.cameras import Cameras, Viewpoints, opencv_to_mujoco, pixel_g
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import CAMERA_SIZE, GROUND_GROUP, PART_GROUP, World, arc_lengths, point_at
 from twin.nerf.rendering import FAR, RenderableField
-from twin.report.html import Caution, Fact, Section, Verdict, number, pick
 from twin.report.review_studio import caption_line, scale_bar, titled_panel
 from twin.report.video_layout import BACKGROUND, PANEL_BACKGROUND, depth_colors, fit
 from twin.runtime import track
@@ -254,100 +253,10 @@ def _medians(edges: Array, station: Array, values: Array, among: NDArray[np.bool
     return [round(float(np.median(v)), 4) if len(v) else None for v in found]
 
 
-# ---- report section
+# ---- picture
 
-_LARGE_MEDIAN_GAP = 0.05  # [m] threshold of a caution
 _MAX_GAP = 0.3  # [m] at the ends of the color scale
 _PANEL_WIDTH = 320  # [px] of a panel
-
-
-def geometry_section(report: dict[str, Any]) -> Section:
-    """Section of the report on visual against collision geometry; part of the review stage."""
-    found = pick(report, "seen_touched")
-    name, title = "seen_touched", "Visual and collision geometry"
-    if not isinstance(found, dict):
-        return Section(name, title, "", not_applicable="nothing was driven here, so there are no views to compare")
-    rows = (
-        (
-            "median_m",
-            "visual to collision geometry, along the ray",
-            "{:.3f} m",
-            f"median within {MAX_DEPTH:g} m, ground and parts",
-        ),
-        ("p90_m", "the same, 90th percentile", "{:.3f} m", "large where the ground is seen at a low angle"),
-        ("ground_median_m", "visual to collision ground", "{:.3f} m", "median height difference in the corridor"),
-        ("ground_p95_m", "the same, 95th percentile", "{:.3f} m", "height difference in the corridor"),
-        (
-            "corridor_leak_m",
-            "largest visual-only in the corridor",
-            "{:.3f} m",
-            "visible above the ground, without collision geometry",
-        ),
-        (
-            "corridor_ghost_m",
-            "largest collision-only in the corridor",
-            "{:.3f} m",
-            "collision geometry that is not visible",
-        ),
-        (
-            "unfilmed_ghost_m",
-            "the same, filmed from one direction",
-            "{:.3f} m",
-            "where no film shows the corridor from two directions; not part of the previous number",
-        ),
-        (
-            "standing_median_m",
-            "visible obstacles to collision geometry",
-            "{:.3f} m",
-            "median distance to the nearest surface",
-        ),
-        ("leak_share", "visual-only", "{:.1%}", f"of visible obstacles, by more than {LARGE_ERROR:g} m"),
-        ("ghost_share", "collision-only", "{:.1%}", f"of the parts in view, by more than {LARGE_ERROR:g} m"),
-        ("views", "views", "{}", "of the robot’s camera, along its drive"),
-    )
-    facts = [Fact(label, number(found.get(key), form), meaning) for key, label, form, meaning in rows]
-    cautions = []
-    for key, limit, what, cure in (
-        (
-            "median_m",
-            _LARGE_MEDIAN_GAP,
-            "Visual and collision geometry differ",
-            "raise nerf.steps, or lower mesh.voxel.",
-        ),
-        (
-            "corridor_leak_m",
-            LARGE_ERROR,
-            "Something in the corridor is visible but has no collision geometry",
-            "mask what moved while filming.",
-        ),
-        ("corridor_ghost_m", LARGE_ERROR, "Collision geometry in the corridor is not visible", "raise nerf.steps."),
-        (
-            "unfilmed_ghost_m",
-            LARGE_ERROR,
-            "Collision geometry in the corridor is not visible where no film shows it from two directions; the field’s "
-            "depth there is not determined and may differ from build to build",
-            "start the drive a little further along, or start to film a little earlier.",
-        ),
-    ):
-        value = found.get(key)
-        if isinstance(value, int | float) and value > limit:
-            cautions.append(Caution(f"{what}: {number(value, '{:.3f} m')}, more than {limit:g} m.", cure))
-    return Section(
-        name,
-        title,
-        "A policy sees the radiance field but collides with MuJoCo’s ground and convex parts. Both were rendered from "
-        "the robot’s camera along the drive and compared pixel by pixel.",
-        facts,
-        cautions,
-        verdict=_geometry_verdict(found),
-    )
-
-
-def _geometry_verdict(found: dict[str, Any]) -> Verdict | None:
-    apart = found.get("median_m")
-    if not isinstance(apart, int | float):
-        return None
-    return Verdict(f"Visual and collision geometry differ by {100 * apart:.1f} cm in the median.", "good")
 
 
 def gap_row(views: GeometryViews, k: int) -> Image:
