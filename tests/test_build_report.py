@@ -24,8 +24,7 @@ from twin.errors import join_names
 from twin.files import write_json
 from twin.geometry.images import write_image
 from twin.report import build_report as report_page
-from twin.report import build_sections, visual_vs_collision
-from twin.report import build_sections as section_words
+from twin.report import build_sections
 from twin.report.build_report import page, write_page
 from twin.report.build_sections import SECTIONS, cautions, headline_sections, sections, truth_section
 from twin.report.html import (
@@ -324,33 +323,38 @@ def test_what_is_wrong_is_said_with_a_cure_below_and_above(
 
 def test_every_kind_of_caution_is_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """A caution that the code can give and the list above lacks would not be tested."""
-    modules = (build_sections, build_sections, build_sections, section_words, visual_vs_collision)
-    given: set[tuple[str, int]] = set()
+    given: set[int] = set()
+    limits: set[str] = set()
+    exceeded: set[str] = set()
+    above = build_sections._above
 
     def recording(*args: str) -> Caution:
-        caller = sys._getframe(1)
-        given.add((caller.f_globals["__name__"], caller.f_lineno))
+        given.add(sys._getframe(1).f_lineno)
         return Caution(*args)
 
-    for module in modules:
-        monkeypatch.setattr(module, "Caution", recording)
+    def recording_limits(report: dict[str, Any], *rows: build_sections.Limit) -> list[Caution]:
+        limits.update(path for path, *_ in rows)
+        exceeded.update(row[0] for row in rows if above(report, row))
+        return above(report, *rows)
+
+    monkeypatch.setattr(build_sections, "Caution", recording)
+    monkeypatch.setattr(build_sections, "_above", recording_limits)
     for _, path, value, _ in CAUTIONS:
         sections(changed(path, value))
     written = {
-        (module.__name__, node.lineno)
-        for module in modules
-        for node in ast.walk(ast.parse(inspect.getsource(module)))
+        node.lineno
+        for node in ast.walk(ast.parse(inspect.getsource(build_sections)))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Caution"
     }
-    assert len(written) > 20 and given == written
+    assert len(written) > 15 and given == written
+    assert len(limits) > 12 and exceeded == limits
     elsewhere = {
         path.stem
-        for path in Path(section_words.__file__).parent.glob("*.py")
+        for path in Path(build_sections.__file__).parent.glob("*.py")
         if "Caution(" in path.read_text(encoding="utf-8").replace("class Caution", "")
     }
     # The pages of a validation and of a forecast have their own.
-    apart = {path for path in elsewhere if path.startswith(("validation", "forecast"))}
-    assert elsewhere - apart == {module.__name__.rsplit(".", 1)[1] for module in modules}
+    assert elsewhere == {"build_sections", "validation_report", "forecast_report"}
 
 
 @pytest.mark.usefixtures("no_charts")

@@ -66,15 +66,17 @@ def every_figure() -> dict[str, figures.Figure]:
     colours = rng.integers(0, 255, (300, 3)).astype(np.uint8)
     half = np.arange(10) % 2 == 0
     return {
-        "place": figures.place_map(positions, ["a"] * 5 + ["b"] * 5, half, points, colours, route, 1.0, parts),
+        "place": figures.place_map(positions, ["a"] * 5 + ["b"] * 5, half, points, colours, route, 1.0),
         "bare place": figures.place_map(positions, ["a"] * 10, half, points[:0], colours[:0]),
         "ground": figures.ground_map(ground, route, route, 1.0, parts),
         "bare ground": figures.ground_map(ground, route, None, 0.0, []),
-        "training": figures.training_curve([0, 10, 20], [10.0, 15.0, 17.0], "PSNR [dB]"),
+        "training": figures.curve_chart({"": ([0, 10, 20], [10.0, 15.0, 17.0])}, "step", "PSNR [dB]"),
         "bars": figures.bar_chart({"day": 23.44, "night": 17.0}, {"day": 7}, "dB", "PSNR [dB]"),
-        "histogram": figures.histogram(rng.gamma(2.0, 0.3, 500), "error [px]", 4.0),
-        "along": figures.curves_along_path([0, 1, 2], {"x": [0.0, 0.1, 0.2], "y": [0.1, 0.1, 0.1]}, "off [m]", 1.0),
-        "groups": figures.errors_by_group({"day": [0.1, 0.2], "night": [0.3]}, "off [m]"),
+        "histogram": figures.histogram(rng.gamma(2.0, 0.3, 500), "error [px]", "points", 4.0),
+        "along": figures.curve_chart(
+            {"x": ([0, 1, 2], [0.0, 0.1, 0.2]), "y": ([0, 1], [0.1, 0.1])}, "way [m]", "off [m]", 1.0, 0.0
+        ),
+        "rates": figures.rate_chart(["a", "b"], {"day": [("a", 0.5, 0.3, 0.7)], "night": [("b", 1.0, 0.8, 1.0)]}, "%"),
     }
 
 
@@ -118,8 +120,8 @@ def test_names_from_files_are_text() -> None:
 
 
 def test_the_histogram_shows_the_median() -> None:
-    svg = figures.svg(figures.histogram(np.array([1.0, 2.0, 2.5, 9.0, 100.0]), "px", 4.0))
-    assert "median 2.5" in parsed(svg).text
+    svg = figures.svg(figures.histogram(np.array([1.0, 2.0, 2.5, 9.0, 100.0]), "px", "points", 4.0))
+    assert "median 2.5 (n = 5)" in parsed(svg).text
 
 
 def test_the_corridor_is_as_wide_as_it_says() -> None:

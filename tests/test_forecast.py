@@ -18,12 +18,13 @@ from twin.evaluation.statistics import MIN_POLICIES, mmrv, pearson, spearman, wi
 from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
 from twin.report import forecast_report
-from twin.report.forecast_report import forecast_page, lighting_labels
-from twin.report.forecast_summary import (
+from twin.report.figures import lighting_labels
+from twin.report.forecast_report import (
     CSV_COLUMNS,
     NOMINAL_INTERVALS,
     STATISTICS,
     candidates_csv,
+    forecast_page,
     format_estimate,
     limitations,
     next_trials,
@@ -317,11 +318,12 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
         assert tile_texts(figure(candidates, pairs)) == {key: f"{100 * rate:.0f}" for key, rate in wanted.items()}
     figure = forecast_report.difference_heatmap(candidates, pairs)
     told = tile_texts(figure)
-    assert {key: int(text.replace("−", "-")) for key, text in told.items()} == {
+    assert {key: int(text.strip("()").replace("−", "-")) for key, text in told.items()} == {
         key: round(100 * bias) for key, bias in off.items()
     }
     alpha = dict(zip(told, figure.axes[0].collections[0].get_facecolor()[:, 3].tolist(), strict=True))
     assert {(p.policy, p.lighting) for p in pairs if p.within_chance} == {k for k, v in alpha.items() if v < 0.1}
+    assert {k for k, text in told.items() if text.startswith("(")} == {k for k, v in alpha.items() if v < 0.1}
     assert lighting_labels(["sun+randomised", "any+randomised"]) == (["sun", "any"], "lights, all of them +randomised")
     assert lighting_labels(["sun", "sun+randomised"]) == (["sun", "sun+randomised"], "")
 
@@ -354,9 +356,9 @@ def test_the_papers_table_has_training_twin_and_road_of_every_policy() -> None:
         for row, c in zip(told, made.candidates_of(task), strict=True):
             policy, *cells_ = (Text(cell).text.strip() for cell in (part.split("</td>")[0] for part in row))
             assert policy == c.policy and cells_ == [
-                format_estimate(e, percent=True) for e in (c.trained, c.twin, c.real)
+                format_estimate(e, percent=True) + (f" n = {e.n}" if e.n else "") for e in (c.trained, c.twin, c.real)
             ]
-            assert (cells_[0] == "97% (93% to 99%)") == ((policy, task) == ("p0", "straight"))
+            assert (cells_[0] == "97% (93% to 99%) n = 100") == ((policy, task) == ("p0", "straight"))
             assert (cells_[2] == "–") == (policy == "p6")
     assert candidates_csv(made).count("0.97,0.93,0.99") == 1
 

@@ -23,7 +23,7 @@ from twin.learn import policy_evaluation
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_evaluation import EpisodeChunk, campaign, run_chunk, with_sampled_lighting
 from twin.loading import Twin
-from twin.report.validation_summary import compare_pairs, success_rate, summarize, summary_lines
+from twin.report.validation_report import compare_pairs, success_rate, summarize, summary_lines
 from twin.robot import HuskyParams
 from twin.runtime import exclusive_lock
 from twin.validate import lighting_seeds

@@ -22,23 +22,21 @@ from twin.evaluation.trials import EPISODE_COLUMNS, RECENT_EPISODES, Trial, csv_
 from twin.files import digest_file, write_json
 from twin.report.figures import SERIES
 from twin.report.validation_report import (
+    FAILURES,
     MAX_PLOTTED_LIGHTINGS,
     TrainingCurve,
-    pair_heatmap,
-    rate_figure,
-    rate_heatmap,
-    validation_page,
-)
-from twin.report.validation_summary import (
-    FAILURES,
     failure_text,
     limitations,
     p_value_text,
+    pair_heatmap,
     pair_text,
+    rate_figure,
+    rate_heatmap,
     rate_text,
     success_rate,
     summarize,
     typical_episode,
+    validation_page,
     verdicts,
     worst_episode,
 )
@@ -155,14 +153,14 @@ def test_the_headline_compares_what_all_have_driven():
     trials += [trial("b", k, "goal" if k < 7 else "stuck") for k in range(10)]
     (verdict,) = verdicts(told(trials))
     assert (
-        "b reaches the goal most often: in 7 of 10 episodes in the light that was used for all policies (day)"
+        "“b” reaches the goal most often: in 7 of 10 episodes in the light that was used for all policies (day)"
         in verdict.text
         and verdict.mood == "mixed"
     )
     apart = [trial("a", 0, light="day"), trial("b", 0, light="night")]
     assert "there is no best one" in verdicts(told(apart))[0].text
     alike = [trial("a", 0), trial("b", 0)]
-    assert "most often" not in verdicts(told(alike))[0].text and "so does b" in verdicts(told(alike))[0].text
+    assert "most often" not in verdicts(told(alike))[0].text and "“b” as often" in verdicts(told(alike))[0].text
 
 
 def test_a_weak_light_and_untrusted_pictures_are_headlines():
@@ -174,8 +172,8 @@ def test_a_weak_light_and_untrusted_pictures_are_headlines():
 
 def test_differences_are_named_by_chance():
     pair = {"a": "x", "b": "y", "only_a": 9, "only_b": 1, "p": 0.02}
-    assert pair_text(pair) == "first is better"
-    assert pair_text(pair | {"only_a": 1, "only_b": 9}) == "second is better"
+    assert pair_text(pair) == "“x” is better"
+    assert pair_text(pair | {"only_a": 1, "only_b": 9}) == "“y” is better"
     assert pair_text(pair | {"p": 0.3}) == "within chance" and pair_text(pair | {"only_b": 9}) == "no difference"
     assert [p_value_text(p) for p in (1e-5, 0.0213, 0.62, 1.0)] == ["<0.1%", "2.1%", "62%", "100%"]
 
@@ -201,7 +199,7 @@ def test_the_page_says_the_tables_numbers(tmp_path):
     for cell in [*said["cells"], *worst]:
         assert rate_text(cell) in text and failure_text(cell) in text
     assert rate_text(trained["a"]) in text and "after 300 steps" in text and "in varying light" in text
-    assert "19" in text and "only first arrived" in text and "first is better" in text  # 31 - 12 episodes
+    assert "19" in text and "only A arrived" in text and "“a” is better" in text  # 31 - 12 episodes
     assert rate_text(said["cells"][0]["low_trust"]) in text
     assert "drawn_3" in text and "5 rolled over" in text
     assert all(v.text in text for v in verdicts(said)) and all(c.what in text for c in limitations(said))
@@ -390,7 +388,7 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
     drawn = tiles(pair_heatmap(summarize(trials)["pairs"]))
     assert {key: text for key, (text, _) in drawn.items()} == {
         ("good  1", "2"): "+18", ("good  1", "3"): "+20", ("fair  2", "1"): "−18",
-        ("fair  2", "3"): "+2", ("poor  3", "1"): "−20", ("poor  3", "2"): "−2",
+        ("fair  2", "3"): "(+2)", ("poor  3", "1"): "−20", ("poor  3", "2"): "(−2)",
     }  # fmt: skip
     colour = {key: face for key, (_, face) in drawn.items()}
     assert to_hex(colour["good  1", "2"]) == SERIES[0] and to_hex(colour["fair  2", "1"]) == SERIES[1]

@@ -26,8 +26,15 @@ from twin.files import digest_file, digest_json, read_json, wrap_read_errors, wr
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign
 from twin.loading import Twin, load_scene
-from twin.report.validation_report import TrainingCurve, write_validation_page
-from twin.report.validation_summary import failure_map, summarize, summary_lines, typical_episode, worst_episode
+from twin.report.validation_report import (
+    TrainingCurve,
+    failure_map,
+    summarize,
+    summary_lines,
+    typical_episode,
+    worst_episode,
+    write_validation_page,
+)
 from twin.runtime import exclusive_lock
 from twin.scene import SceneDir
 

@@ -26,7 +26,7 @@ from twin.learn.policy import load_policy
 from twin.reality.lighting import WEATHER
 from twin.reality.real_test import RealTest
 from twin.report.figures import CARD, INK, LINE, MUTED, SERIES
-from twin.report.forecast_report import twin_against_road
+from twin.report.forecast_report import rates_against_road
 from twin.types import Image
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] total width, gap between images, height of a caption
@@ -53,7 +53,7 @@ def main() -> None:
     run = given.scene / "runs" / given.run
     test = RealTest(load_policy(run), "straight")
     road = [test.reset(name, _TRIAL).capture(test.road.physics.camera_to_world, 0.0) for name in _SHOWN]
-    agreement = twin_against_road(Forecast.load(given.scene / "forecast"))
+    agreement = rates_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(write_success_curve(run)))[..., ::-1]
     parts = [
         _caption("The twin in training: randomised lighting, sun, shadows and haze"),

@@ -4,8 +4,6 @@ The page is self-contained except for the review video beside it. Pictures and f
 from `twin.report.build_sections`.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,6 @@ from twin.report.build_sections import SECTIONS, costs_section, headline_section
 from twin.report.html import Chart, Picture, command, data_url, duration, flatten, number, numbers, pick, render
 from twin.report.video_layout import load_footprints
 from twin.scene import SceneDir, stage_result
-from twin.types import Array
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram
 _MAX_TRACK_LENGTH = 30.0  # frames, right end of the histogram
@@ -33,42 +30,40 @@ def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
         *_map_charts(scene, report),
         *_reconstruction_charts(scene),
         *_field_charts(report),
-        *_drive_charts(report),
-        *_geometry_charts(report),
-        *_truth_charts(scene),
+        *_drive_charts(scene, report),
     ]
 
 
 def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     """Maps of the reconstruction and of the drivable ground."""
-    folder = scene.stage("metric")
+    folder, mesh = scene.stage("metric"), scene.stage("mesh")
     if not (folder / "cameras.npz").exists():
         return []
     cameras = Cameras.load(folder)
     points = SparsePoints.load(folder) if (folder / "points.npz").exists() else SparsePoints.empty()
-    mesh = scene.stage("mesh")
-    ground = Ground.load(mesh) if (mesh / "ground.npz").exists() else None
-    parts = load_footprints(mesh / "parts.npz", ground)
-    route = _load_route(mesh / "route.npz")
-    half_width = pick(report, "mjcf.half_width_m")
-    wide = float(half_width) if isinstance(half_width, int | float) else 0.0
+    route = None
+    if (mesh / "route.npz").exists():
+        with np.load(mesh / "route.npz", allow_pickle=False) as data:
+            route = data["xy"].astype(np.float64)
+    wide = _half_width(report) or 0.0
     passes = find_passes(cameras) if route is not None else []
     drawn = figures.place_map(
-        cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide, passes=passes
+        cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide, passes
     )
-    out = [Chart("Map of points, cameras and route", figures.svg(drawn), "metric")]
-    if ground is not None:
+    title = f"Map of points (n = {len(points):,}), cameras (n = {len(cameras)}) and route"
+    out = [Chart(title, figures.svg(drawn), "metric")]
+    if (mesh / "ground.npz").exists():
+        ground = Ground.load(mesh)
         path = cameras.positions[:, :2] if route is None else route
-        drawn = figures.ground_map(ground, path, route, wide, parts)
+        drawn = figures.ground_map(ground, path, route, wide, load_footprints(mesh / "parts.npz", ground))
         out.append(Chart("Ground and solid parts", figures.svg(drawn), "mesh"))
     return out
 
 
-def _load_route(path: Path) -> Array | None:
-    if not path.exists():
-        return None
-    with np.load(path, allow_pickle=False) as data:
-        return data["xy"].astype(np.float64)
+def _half_width(report: dict[str, Any]) -> float | None:
+    """Half width of the corridor [m], if it is known."""
+    half_width = pick(report, "mjcf.half_width_m")
+    return float(half_width) if isinstance(half_width, int | float) else None
 
 
 def _reconstruction_charts(scene: SceneDir) -> list[Chart]:
@@ -78,8 +73,8 @@ def _reconstruction_charts(scene: SceneDir) -> list[Chart]:
     points = SparsePoints.load(folder)
     if not len(points):
         return []
-    error = figures.histogram(points.error, "reprojection error of a point [px]", _MAX_REPROJECTION)
-    tracks = figures.histogram(points.track_length, "frames that observe a point", _MAX_TRACK_LENGTH, integer=True)
+    error = figures.histogram(points.error, "mean reprojection error [px]", "points", _MAX_REPROJECTION)
+    tracks = figures.histogram(points.track_length, "frames that observe it", "points", _MAX_TRACK_LENGTH, integer=True)
     return [
         Chart("Reprojection error of points", figures.svg(error), "cameras"),
         Chart("Track length of points", figures.svg(tracks), "cameras"),
@@ -96,49 +91,43 @@ def _field_charts(report: dict[str, Any]) -> list[Chart]:
     curve = pick(report, "field.curve")
     if isinstance(curve, list) and len(curve) > 1 and all(isinstance(row, list) and len(row) == 2 for row in curve):
         steps, values = zip(*curve, strict=True)
-        drawn = figures.training_curve(steps, values, "PSNR on training pixels [dB]")
+        drawn = figures.curve_chart({"": (steps, values)}, "training step", "PSNR on training pixels [dB]")
         out.append(Chart("How training went", figures.svg(drawn), "field"))
     return out
 
 
-def _drive_charts(report: dict[str, Any]) -> list[Chart]:
+def _drive_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
+    """Curves along the drive, and along the films where the truth is known."""
+    out = []
+    along_route = "distance along the route [m]"
     trace = pick(report, "review.trace")
-    if not isinstance(trace, dict) or len(trace.get("progress_m") or []) < 2:
-        return []
-    half_width = pick(report, "mjcf.half_width_m")
-    limit = float(half_width) if isinstance(half_width, int | float) else None
-    off = figures.curves_along_path(
-        trace["progress_m"], {"cross-track": trace["cross_track_m"]}, "off the route [m], left is positive", limit
-    )
-    speed = figures.curves_along_path(trace["progress_m"], {"speed": trace["speed_m_s"]}, "speed [m/s]", lowest=0.0)
-    title = "How far off the route it drove" + ("" if limit is None else "; dashed: the corridor")
-    return [Chart(title, figures.svg(off), "review"), Chart("How fast it drove", figures.svg(speed), "review")]
-
-
-def _geometry_charts(report: dict[str, Any]) -> list[Chart]:
-    """Visual against collision geometry along the route."""
+    if isinstance(trace, dict) and len(trace.get("progress_m") or []) > 1:
+        limit, at = _half_width(report), trace["progress_m"]
+        off, speed = {"": (at, trace["cross_track_m"])}, {"": (at, trace["speed_m_s"])}
+        drawn = figures.curve_chart(off, along_route, "off the route [m], left is positive", limit)
+        title = "How far off the route it drove" + ("" if limit is None else "; dashed: the corridor")
+        out.append(Chart(title, figures.svg(drawn), "review"))
+        drawn = figures.curve_chart(speed, along_route, "speed [m/s]", lowest=0.0)
+        out.append(Chart("How fast it drove", figures.svg(drawn), "review"))
     along = pick(report, "seen_touched.along")
-    if not isinstance(along, dict) or len(along.get("station_m") or []) < 2:
-        return []
-    known: dict[str, Sequence[float]] = {
-        name: [float("nan") if value is None else float(value) for value in along[key]]
-        for name, key in (
-            ("largest visual-only", "leak_m"),
-            ("largest collision-only", "ghost_m"),
-            ("ground, median", "ground_m"),
+    if isinstance(along, dict) and len(along.get("station_m") or []) > 1:
+        keys = {"largest visual-only": "leak_m", "largest collision-only": "ghost_m", "ground, median": "ground_m"}
+        curves = {name: (along["station_m"], np.array(along[key], float)) for name, key in keys.items()}
+        drawn = figures.curve_chart(curves, along_route, "difference in the corridor [m]", lowest=0.0)
+        title = "Difference of visual and collision geometry along the route"
+        out.append(Chart(title, figures.svg(drawn), "seen_touched"))
+    if compared := load_truth_comparison(scene):
+        errors = compared["camera_errors_m"]
+        shares = {name: np.linspace(0.0, 100.0 * (len(values) > 1), len(values)) for name, values in errors.items()}
+        drawn = figures.curve_chart(
+            {name: (shares[name], values) for name, values in errors.items()},
+            "position in the film [%]",
+            "camera position error [m]",
+            lowest=0.0,
         )
-    }
-    drawn = figures.curves_along_path(along["station_m"], known, "in the corridor [m]", lowest=0.0)
-    return [Chart("Difference of visual and collision geometry along the route", figures.svg(drawn), "seen_touched")]
-
-
-def _truth_charts(scene: SceneDir) -> list[Chart]:
-    compared = load_truth_comparison(scene)
-    if not compared:
-        return []
-    errors = compared["camera_errors_m"]
-    drawn = figures.errors_by_group(errors, "camera position error [m]")
-    return [Chart("Camera position error along the films", figures.svg(drawn), "truth")]
+        title = f"Camera position error along the films (n = {sum(map(len, errors.values()))} frames)"
+        out.append(Chart(title, figures.svg(drawn), "truth"))
+    return out
 
 
 def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:

@@ -8,7 +8,6 @@ import hashlib
 import io
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any
 
 import matplotlib
@@ -18,32 +17,33 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from twin.assets.ground import Ground
+from twin.config import RANDOMIZED, Condition
 from twin.geometry.passes import FilmedPass
 from twin.types import Array
 
 # Placeholder colors, used by nothing else; `svg` replaces them by the page's CSS variables.
 INK, MUTED, LINE, CARD = "#0a0b01", "#0a0b02", "#0a0b03", "#0a0b04"
 SERIES = ("#0a0b11", "#0a0b12", "#0a0b13", "#0a0b14", "#0a0b15", "#0a0b16")
+MARKERS = ("o", "s", "D", "^", "v", "P")
+"""Marker of each series: colors alone do not reach every reader."""
+_DASHES = ("-", "-.", ":")
 _VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line", CARD: "--card"}
 _VARIABLES |= {color: f"--c{i + 1}" for i, color in enumerate(SERIES)}
 
 _WIDTH = 4.8  # [in]; 8.5 pt text stays legible where the figure is as wide as a phone's screen
 _RASTER_DPI = 200
 _MAX_POINTS = 20_000  # per map
+_LEGEND_LETTERS = 55  # per row of a legend; a marker counts as four
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
     "font.family": "sans-serif",
-    "axes.titlesize": 9.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": LINE,
     "axes.labelcolor": MUTED,
-    "axes.titlecolor": INK,
     "axes.facecolor": "none",
     "axes.grid": True,
     "axes.axisbelow": True,
@@ -57,32 +57,27 @@ _STYLE: dict[str, Any] = {
     "figure.facecolor": "none",
     "legend.frameon": False,
     "legend.fontsize": 8,
+    "legend.handlelength": 1.4,
+    "legend.columnspacing": 1.2,
     "lines.linewidth": 1.6,
     "svg.fonttype": "none",
     "svg.hashsalt": "twin",  # deterministic ids: the same numbers give the same SVG
     # Names come from the user's files; a dollar sign is no math mode.
     "text.parse_math": False,
 }
+styled = matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
+"""Decorator of functions that draw: text, lines and ticks get the common style when they are created."""
 
 
-def style() -> AbstractContextManager[None]:
-    """Context of the common matplotlib style; text, lines and ticks must be created inside it."""
-    return matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
-
-
+@styled
 def svg(figure: Figure) -> str:
     """Returns a figure as an inline SVG element with CSS color variables and ids that no other figure shares."""
     buffer = io.BytesIO()
-    with style():
-        FigureCanvasSVG(figure)
-        figure.savefig(
-            buffer,
-            format="svg",
-            dpi=_RASTER_DPI,
-            metadata={"Date": None, "Creator": None},
-            bbox_inches="tight",
-            pad_inches=0.04,
-        )
+    FigureCanvasSVG(figure)
+    no_metadata = {"Date": None, "Creator": None}
+    figure.savefig(
+        buffer, format="svg", dpi=_RASTER_DPI, metadata=no_metadata, bbox_inches="tight", pad_inches=0.04
+    )  # fmt: skip
     text = buffer.getvalue().decode()
     text = text[text.index("<svg") :]
     # The style element would apply to the whole page, which has the same rule.
@@ -97,15 +92,26 @@ def svg(figure: Figure) -> str:
     text = re.sub(r' id="([^"]+)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in referred else "", text)
     text = re.sub(r"#([\w.-]+)([\")])", lambda m: f"#{prefix}{m[1]}{m[2]}" if m[1] in referred else m[0], text)
     # The page sets width and height.
-    return re.sub(
-        r'<svg([^>]*?) width="[^"]*"', r"<svg\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    )
+    opening, end, rest = text.partition(">")
+    return re.sub(r' (width|height)="[^"]*"', "", opening) + end + rest
 
 
+@styled
 def new_figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
-    with style():
-        figure = Figure(figsize=(width, height), layout="constrained")
-        return figure, figure.add_subplot()
+    """A figure of a size [in], with axes."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+@styled
+def add_legend(figure: Figure) -> None:
+    """Adds a legend of the first axes below the figure, in as many columns as fit."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    fitting = max(1, _LEGEND_LETTERS // (max(map(len, labels)) + 4))
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(fitting, len(labels)))
+
+
+# ---- maps
 
 
 def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
@@ -115,17 +121,6 @@ def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
     axes.set_aspect("equal")
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     return figure, axes
-
-
-def _legend(axes: Axes, columns: int) -> None:
-    with style():
-        axes.legend(
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.22 if axes.get_aspect() == "auto" else -0.12),
-            ncols=columns,
-            handlelength=1.4,
-            columnspacing=1.2,
-        )
 
 
 def map_bounds(path: Array, margin: float = 8.0) -> tuple[Array, Array]:
@@ -141,6 +136,7 @@ def corridor_outline(route: Array, half_width: float) -> Array:
     return np.concatenate([route + side, (route - side)[::-1]])
 
 
+@styled
 def place_map(
     positions: Array,
     sources: Sequence[str],
@@ -149,39 +145,37 @@ def place_map(
     point_rgb: NDArray[np.uint8],
     route: Array | None = None,
     half_width: float = 0.0,
-    parts: Sequence[Array] = (),
     passes: Sequence[FilmedPass] = (),
 ) -> Figure:
-    """Map of sparse points, cameras by source (held-out ones hollow), route with corridor, and solid parts [m].
+    """Map of sparse points, cameras by source (held-out ones hollow), and route with corridor [m].
 
-    Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (uint8) (m, 3), `route` and each part (k, 2).
+    Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` (k, 2).
     Several passes of one source are drawn as lines with their names.
     """
     low, high = map_bounds(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
     figure, axes = _map_axes(low, high)
-    with style():
-        shown = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(1))
-        if len(shown) > _MAX_POINTS:
-            shown = shown[np.linspace(0, len(shown) - 1, _MAX_POINTS).astype(int)]
-        # Middle tones are visible on dark and on bright pages.
-        colors = 0.25 + 0.5 * point_rgb[shown] / 255.0
-        axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colors, linewidths=0, rasterized=True)
-        _draw_route(axes, route, half_width)
-        _draw_parts(axes, parts)
-        _draw_passes(axes, passes)
-        for i, source in enumerate(dict.fromkeys(sources)):
-            mine = np.array([name == source for name in sources])
-            color = SERIES[i % len(SERIES)]
-            trained, unseen = positions[mine & ~held_out], positions[mine & held_out]
-            # Films of one path overlap; later sources get smaller markers so that all remain visible.
-            size = 16.0 / (1.0 + 0.8 * i)
-            axes.scatter(trained[:, 0], trained[:, 1], s=size, c=color, linewidths=0, label=source, zorder=4)
-            axes.scatter(unseen[:, 0], unseen[:, 1], s=size, facecolors="none", edgecolors=color, lw=0.8, zorder=4)
-        axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
-    _legend(axes, 3)
+    shown = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(1))
+    if len(shown) > _MAX_POINTS:
+        shown = shown[np.linspace(0, len(shown) - 1, _MAX_POINTS).astype(int)]
+    # Middle tones are visible on dark and on bright pages.
+    colors = 0.25 + 0.5 * point_rgb[shown] / 255.0
+    axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colors, linewidths=0, rasterized=True)
+    _draw_route(axes, route, half_width)
+    _draw_passes(axes, passes)
+    for i, source in enumerate(dict.fromkeys(sources)):
+        mine = np.array([name == source for name in sources])
+        color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
+        trained, unseen = positions[mine & ~held_out], positions[mine & held_out]
+        # Films of one path overlap; later sources get smaller markers so that all remain visible.
+        size = 16.0 / (1.0 + 0.8 * i)
+        axes.scatter(*trained[:, :2].T, s=size, c=color, marker=marker, linewidths=0, label=source, zorder=4)
+        axes.scatter(*unseen[:, :2].T, s=size, facecolors="none", edgecolors=color, marker=marker, lw=0.8, zorder=4)
+    axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
+    add_legend(figure)
     return figure
 
 
+@styled
 def ground_map(ground: Ground, path: Array, route: Array | None, half_width: float, parts: Sequence[Array]) -> Figure:
     """Map of the measured ground height [m], the route with its corridor, and the footprints of parts."""
     low, high = map_bounds(path if route is None else route)
@@ -190,27 +184,27 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
     y = ground.origin[1] + ground.cell * np.arange(rows)
     shown = ground.measured & ((x > low[0]) & (x < high[0])) & ((y > low[1]) & (y < high[1]))[:, None]
     figure, axes = _map_axes(low, high)
-    heights = ground.height[shown] if shown.any() else ground.height
-    lowest, highest = np.percentile(heights, [1, 99])
-    with style():
-        image = axes.imshow(
-            np.ma.masked_array(ground.height, ~ground.measured),
-            origin="lower",
-            extent=(x[0], x[-1], y[0], y[-1]),
-            vmin=lowest,
-            vmax=max(highest, lowest + 1e-3),
-            cmap="viridis",
-            rasterized=True,
-        )
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        _draw_route(axes, route, half_width)
-        _draw_parts(axes, parts)
-        color_axes = axes.inset_axes((1.03, 0.0, 0.035, 1.0))  # as tall as the map
-        bar = figure.colorbar(image, cax=color_axes, label="height of the ground [m]")
-        bar.outline.set_visible(False)
-        bar.solids.set_rasterized(True)  # type: ignore[union-attr]
+    lowest, highest = np.percentile(ground.height[shown] if shown.any() else ground.height, [1, 99])
+    image = axes.imshow(
+        np.ma.masked_array(ground.height, ~ground.measured),
+        origin="lower",
+        extent=(x[0], x[-1], y[0], y[-1]),
+        vmin=lowest,
+        vmax=max(highest, lowest + 1e-3),
+        cmap="viridis",
+        rasterized=True,
+    )
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    _draw_route(axes, route, half_width)
+    if len(parts):
+        look: dict[str, Any] = {"facecolors": SERIES[1], "edgecolors": SERIES[1], "alpha": 0.55, "lw": 0.5}
+        axes.add_collection(PolyCollection(list(parts), label="solid part", **look))
+    color_axes = axes.inset_axes((1.03, 0.0, 0.035, 1.0))  # as tall as the map
+    bar = figure.colorbar(image, cax=color_axes, label="height of the ground [m]")
+    bar.outline.set_visible(False)
+    bar.solids.set_rasterized(True)  # type: ignore[union-attr]
     if route is not None or len(parts):
-        _legend(axes, 3)
+        add_legend(figure)
     return figure
 
 
@@ -234,9 +228,8 @@ def _draw_route(axes: Axes, route: Array | None, half_width: float) -> None:
     if route is None or len(route) < 2:
         return
     if half_width > 0.0:
-        axes.add_collection(
-            PolyCollection([corridor_outline(route, half_width)], facecolors=SERIES[2], alpha=0.25, label="corridor")
-        )
+        outline = corridor_outline(route, half_width)
+        axes.add_collection(PolyCollection([outline], facecolors=SERIES[2], alpha=0.25, label="corridor"))
     axes.plot(*route.T, color=INK, lw=1.0, label="route", zorder=3)
     axes.plot(*route[0], "o", color=INK, ms=4, zorder=3)
     for word, at in (("start", route[0]), ("goal", route[-1])):
@@ -244,93 +237,62 @@ def _draw_route(axes: Axes, route: Array | None, half_width: float) -> None:
         axes.annotate(word, at, xytext=(5, 5), textcoords="offset points", fontsize=8, bbox=box, zorder=5)
 
 
-def _draw_parts(axes: Axes, parts: Sequence[Array]) -> None:
-    if len(parts):
-        axes.add_collection(
-            PolyCollection(
-                list(parts), facecolors=SERIES[1], edgecolors=SERIES[1], alpha=0.55, lw=0.5, label="solid part"
-            )
-        )
+# ---- curves and bars
 
 
-def training_curve(steps: Sequence[float], values: Sequence[float], label: str) -> Figure:
-    figure, axes = new_figure(2.2)
-    with style():
-        axes.plot(steps, values, color=SERIES[0])
-        axes.set(xlabel="training step", ylabel=label)
-    return figure
-
-
-def bar_chart(values: dict[str, float], counts: dict[str, int], unit: str, label: str) -> Figure:
-    """Horizontal bars with value and, where known, number of samples."""
-    figure, axes = new_figure(0.55 + 0.36 * max(1, len(values)))
-    names = list(values)
-    with style():
-        axes.grid(False, axis="y")
-        axes.barh(range(len(names)), [values[name] for name in names], color=SERIES[0], height=0.62)
-        for i, name in enumerate(names):
-            n = f" (n = {counts[name]})" if name in counts else ""
-            text = f"{values[name]:.1f} {unit}{n}"
-            axes.annotate(text, (values[name], i), (4, 0), textcoords="offset points", va="center", fontsize=8)
-        axes.set_yticks(range(len(names)), [name if len(name) < 20 else name[:18] + "…" for name in names])
-        axes.set(xlabel=label, xlim=(0, max([*values.values(), 1e-9]) * 1.35), ylim=(len(names) - 0.5, -0.5))
-    return figure
-
-
-def histogram(values: NDArray, label: str, highest: float | None = None, integer: bool = False) -> Figure:
-    """Histogram of nonnegative values (n,) with their median; values above `highest` are counted in the last bin.
-
-    `highest` defaults to the 99.5th percentile; `integer` uses one bin per integer.
-    """
-    figure, axes = new_figure(1.9)
-    values = np.asarray(values, np.float64)
-    top = float(highest if highest is not None else np.percentile(values, 99.5))
-    with style():
-        edges = np.arange(np.floor(top) + 2) - 0.5 if integer else np.linspace(0.0, max(top, 1e-9), 41)
-        axes.hist(np.minimum(values, top), bins=edges, color=SERIES[0], rwidth=0.9)  # type: ignore[arg-type]
-        median = float(np.median(values))
-        axes.axvline(median, color=SERIES[1], lw=1.2)
-        at = (median, axes.get_ylim()[1])
-        text = f"median {median:.3g}"
-        axes.annotate(text, at, (4, 0), textcoords="offset points", color=SERIES[1], va="top", fontsize=8)
-        axes.grid(False, axis="x")
-        axes.set(xlabel=label, ylabel="count")
-    return figure
-
-
-def curves_along_path(
-    distance: Sequence[float],
-    curves: dict[str, Sequence[float]],
-    label: str,
+@styled
+def curve_chart(
+    curves: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    x_label: str,
+    y_label: str,
     limit: float | None = None,
     lowest: float | None = None,
 ) -> Figure:
-    """Curves over distance [m], with dashed lines at ± `limit`; the y axis starts at `lowest`."""
+    """Curves by name, each from x (n,) and y (n,), with dashed lines at ± `limit`; the y axis starts at `lowest`."""
     figure, axes = new_figure(2.2)
-    with style():
-        for i, (name, values) in enumerate(curves.items()):
-            axes.plot(distance[: len(values)], values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)
-        if limit is not None:
-            axes.axhline(limit, color=SERIES[1], ls="--", lw=1.0)
-            axes.axhline(-limit, color=SERIES[1], ls="--", lw=1.0)
-        axes.set(xlabel="distance along the path [m]", ylabel=label)
-        if lowest is not None:
-            axes.set_ylim(bottom=lowest)
+    for i, (name, (x, y)) in enumerate(curves.items()):
+        axes.plot(x, y, _DASHES[i % len(_DASHES)], color=SERIES[i % len(SERIES)], label=name, lw=1.3)
+    for at in () if limit is None else (limit, -limit):
+        axes.axhline(at, color=SERIES[1], ls="--", lw=1.0)
+    axes.set(xlabel=x_label, ylabel=y_label)
+    if lowest is not None:
+        axes.set_ylim(bottom=lowest)
     if len(curves) > 1:
-        _legend(axes, 4)
+        add_legend(figure)
     return figure
 
 
-def errors_by_group(errors: dict[str, Sequence[float]], label: str) -> Figure:
-    """Per-frame errors over the relative position in the group, one curve per group (source)."""
-    figure, axes = new_figure(2.2)
-    with style():
-        for i, (name, values) in enumerate(errors.items()):
-            position = np.linspace(0.0, 100.0, len(values)) if len(values) > 1 else np.zeros(len(values))
-            axes.plot(position, values, color=SERIES[i % len(SERIES)], label=name, lw=1.3)
-        axes.set(xlabel="position in the film [%]", ylabel=label)
-        axes.set_ylim(bottom=0.0)
-    _legend(axes, 4)
+@styled
+def bar_chart(values: dict[str, float], counts: dict[str, int], unit: str, label: str) -> Figure:
+    """Horizontal bars with value and, where known, number of samples."""
+    figure, axes = new_figure(0.55 + 0.36 * max(1, len(values)))
+    axes.grid(False, axis="y")
+    axes.barh(range(len(values)), list(values.values()), color=SERIES[0], height=0.62)
+    for i, (name, value) in enumerate(values.items()):
+        text = f"{value:.1f} {unit}" + (f" (n = {counts[name]})" if name in counts else "")
+        axes.annotate(text, (value, i), (4, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set_yticks(range(len(values)), [name if len(name) < 20 else name[:18] + "…" for name in values])
+    axes.set(xlabel=label, xlim=(0, max([*values.values(), 1e-9]) * 1.35), ylim=(len(values) - 0.5, -0.5))
+    return figure
+
+
+@styled
+def histogram(values: NDArray, label: str, counted: str, highest: float, integer: bool = False) -> Figure:
+    """Histogram of nonnegative values (n,) with their median; values above `highest` are counted in the last bin.
+
+    `counted` names what has a value; `integer` uses one bin per integer.
+    """
+    figure, axes = new_figure(1.9)
+    edges = np.arange(np.floor(highest) + 2) - 0.5 if integer else np.linspace(0.0, highest, 41)
+    axes.hist(np.minimum(values, highest), bins=edges, color=SERIES[0], rwidth=0.9)  # type: ignore[arg-type]
+    median = float(np.median(values))
+    axes.axvline(median, color=SERIES[1], lw=1.2)
+    at = (median, axes.get_ylim()[1])
+    text = f"median {median:.3g} (n = {len(values):,})"
+    box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 0.5}
+    axes.annotate(text, at, (4, 0), textcoords="offset points", color=SERIES[1], va="top", fontsize=8, bbox=box)
+    axes.grid(False, axis="x")
+    axes.set(xlabel=label, ylabel=counted)
     return figure
 
 
@@ -348,6 +310,7 @@ _MIN_FONT, _MAX_FONT = 4.5, 7.0  # [pt]; smaller texts are left out
 _DIGIT_WIDTH = 0.8  # including its gap, in units of the font size
 
 
+@styled
 def heatmap(
     strength: Array,
     rows: Sequence[str],
@@ -373,24 +336,21 @@ def heatmap(
     faces = np.column_stack([colors, _MIN_ALPHA + (_MAX_ALPHA - _MIN_ALPHA) * np.abs(value)])
     longest = max(map(len, columns))
     upright = longest > _MAX_HORIZONTAL_LETTERS
-    figure, axes = new_figure(
-        _ROW_HEIGHT * len(rows) + _LABEL_HEIGHT + (_LETTER_WIDTH * longest if upright else _LABEL_HEIGHT), width
-    )
+    heading = _LETTER_WIDTH * longest if upright else _LABEL_HEIGHT
+    figure, axes = new_figure(_ROW_HEIGHT * len(rows) + _LABEL_HEIGHT + heading, width)
     room = 72.0 * (width - _LETTER_WIDTH * max(map(len, rows))) / len(columns)  # [pt]
     size = min(_MAX_FONT, room / (_DIGIT_WIDTH * max([1, *map(len, texts[tuple(finite.T)].tolist())])))
-    with style():
-        axes.grid(False)
-        axes.add_collection(PolyCollection(corners, facecolors=faces, linewidths=0.0))
-        if size >= _MIN_FONT:
-            for row, column in finite:
-                text = str(texts[row, column])
-                axes.annotate(text, (column, row), ha="center", va="center", fontsize=size, color=INK)
-        axes.set_yticks(range(len(rows)), list(rows))
-        axes.set_xticks(range(len(columns)), list(columns), rotation=90 if upright else 0)
-        axes.xaxis.tick_top()  # a long figure is read from the top
-        axes.xaxis.set_label_position("top")
-        axes.spines["bottom"].set_visible(False)
-        axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), xlabel=label)
+    axes.grid(False)
+    axes.add_collection(PolyCollection(corners, facecolors=faces, linewidths=0.0))
+    for row, column in finite if size >= _MIN_FONT else ():
+        text = str(texts[row, column])
+        axes.annotate(text, (column, row), ha="center", va="center", fontsize=size, color=INK)
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_xticks(range(len(columns)), list(columns), rotation=90 if upright else 0)
+    axes.xaxis.tick_top()  # a long figure is read from the top
+    axes.xaxis.set_label_position("top")
+    axes.spines["bottom"].set_visible(False)
+    axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), xlabel=label)
     return figure
 
 
@@ -401,3 +361,53 @@ def matrix(values: Mapping[tuple[str, str], float | None], rows: Sequence[str], 
 
 def percent_texts(rate: Array) -> NDArray[np.str_]:
     return np.array([[f"{100 * each:.0f}" for each in row] for row in rate])
+
+
+def difference_texts(difference: Array, certain: Array) -> NDArray[np.str_]:
+    """Signed whole numbers; in parentheses where the difference is not `certain`, same shape, 0 or ±1."""
+    texts = np.array([[f"{each:+.0f}".replace("-", "−") if each else "0" for each in row] for row in difference])
+    return np.where(certain == 0.0, np.char.add(np.char.add("(", texts), ")"), texts)
+
+
+# ---- rates
+
+RATE_AXIS: dict[str, Any] = {"xlim": (-0.04, 1.04), "xticks": (0.0, 0.25, 0.5, 0.75, 1.0)}
+"""Limits and ticks of a horizontal axis of rates."""
+
+_RATE_SPACING = 0.18  # between the rates of a policy, in units of the distance of two policies
+_RATE_HEIGHT = 0.17  # [in] per rate of a policy
+_MAX_NAME_LENGTH = 26  # characters of a name
+
+Rate = tuple[str, float, float, float]
+"""Policy, its rate, and the ends of the interval."""
+
+
+@styled
+def rate_chart(policies: Sequence[str], rates: Mapping[str, Sequence[Rate]], label: str) -> Figure:
+    """Rates with intervals: one row per policy, one color and marker per series of `rates`; shape as a table."""
+    figure, axes = new_figure(0.9 + max(0.34, _RATE_HEIGHT * len(rates)) * len(policies))
+    for k, (name, mine) in enumerate(rates.items()):
+        y = [policies.index(policy) + (k - (len(rates) - 1) / 2) * _RATE_SPACING for policy, *_ in mine]
+        x, low, high = (np.array(column, float) for column in list(zip(*mine, strict=True))[1:])
+        ends = np.maximum([x - low, high - x], 0.0)
+        axes.errorbar(x, y, xerr=ends, fmt=MARKERS[k], color=SERIES[k], ms=3.5, lw=1.1, label=name)
+    axes.set_yticks(range(len(policies)), [shorten_name(policy) for policy in policies])
+    axes.grid(False, axis="y")
+    axes.set(ylim=(len(policies) - 0.5, -0.5), xlabel=label, **RATE_AXIS)
+    if len(rates) > 1:
+        add_legend(figure)
+    return figure
+
+
+def shorten_name(name: str) -> str:
+    """Cuts a long name in its middle."""
+    half = _MAX_NAME_LENGTH // 2
+    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:half]}…{name[1 - half :]}"
+
+
+def lighting_labels(lightings: Sequence[str]) -> tuple[list[str], str]:
+    """Column names of lightings without a suffix common to all, and an axis label that names that suffix."""
+    conditions = [Condition.parse(name) for name in lightings]
+    common = all(one.randomised for one in conditions)
+    names = [shorten_name(one.lighting if common else str(one)) for one in conditions]
+    return names, f"lights, all of them {RANDOMIZED}" if common else ""

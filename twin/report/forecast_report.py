@@ -1,5 +1,10 @@
-"""Writes `forecast.html`: how well the twin predicts the road, which policy is best, and how certain that is."""
+"""The forecast in words and figures: `forecast.html`, the printed summary, and `forecast.csv`.
 
+They answer how well the twin predicts the road, which policy is best, and how certain that is; the numbers come from
+`twin.evaluation.forecasting`.
+"""
+
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,86 +13,364 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.config import RANDOMIZED, Condition
-from twin.evaluation.forecasting import Candidate, CellPair, Estimate, Forecast
+from twin.errors import join_names
+from twin.evaluation.forecasting import ALL_TASKS, Agreement, Candidate, CellPair, Estimate, Forecast, TrialAllocation
+from twin.evaluation.ranking import MAX_TRIALS
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
+from twin.evaluation.trials import csv_text
 from twin.files import write_text
-from twin.report.figures import CARD, FULL_WIDTH, MUTED, SERIES, heatmap, matrix, new_figure, percent_texts, style, svg
-from twin.report.forecast_summary import (
-    NOMINAL_INTERVALS,
-    PERCENT_STATISTICS,
-    STATISTICS,
-    allocation_text,
-    format_estimate,
-    format_probability,
-    limitations,
-    next_trials,
-    percentage_points,
-    verdicts,
+from twin.report.figures import (
+    CARD,
+    FULL_WIDTH,
+    MARKERS,
+    MUTED,
+    RATE_AXIS,
+    SERIES,
+    add_legend,
+    difference_texts,
+    heatmap,
+    lighting_labels,
+    matrix,
+    new_figure,
+    percent_texts,
+    rate_chart,
+    shorten_name,
+    styled,
+    svg,
 )
-from twin.report.html import MAX_TABLE_ROWS, Chart, command, render
+from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Verdict, command, render
+
+GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
+"""Rank correlations above which twin and road rank policies alike, or roughly alike."""
+SMALL_REGRET = 0.05
+
+STATISTICS = (
+    ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
+    ("pearson", "Pearson", "linear correlation of the rates: 1 on a straight line"),
+    ("mmrv", "MMRV", "mean maximum rank violation, in real success: 0 is best"),
+    ("winner_agreement", "winner agrees", "1 if the twin’s best policy is also the best on the road, else 0"),
+    ("winner_regret", "regret", "real success lost by choosing the twin’s best policy"),
+    ("bias", "road minus twin", "mean over the cells; below 0 the twin is too optimistic"),
+    (
+        "coverage",
+        "cells agree",
+        "share of the cells where twin and road differ by no more than chance; high for any guess if most cells are "
+        "all successes or all failures",
+    ),
+    ("corrected_coverage", "predictions hold", "share of policies within the interval predicted from the others"),
+    ("mean_real", "mean on the road", "of policies such as these, driven or not (prediction-powered estimate)"),
+)
+"""Field of `Agreement`, its short name, and its meaning."""
+PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage", "mean_real")
+"""Statistics shown in percent."""
+
+NOMINAL_INTERVALS = (
+    "These 90% intervals are nominal: in simulated experiments of 36 policies, 20 days and 5 trials per day, most days "
+    "all successes or all failures, they contained the true value in only about 60% (Spearman), 70% (Pearson) and 50% "
+    "(MMRV) of the cases. They assume that policies of one training, and trials of one day, are independent. More days "
+    "and more trainings reduce the uncertainty; more checkpoints and more trials on the same days reduce it less."
+)
+"""Note wherever intervals of the agreement of twin and road are shown; measured by `benchmarks/intervals.py`."""
+
+CSV_COLUMNS = (
+    *("task", "policy", "twin", "twin_low", "twin_high", "twin_trials", "rank", "rank_low", "rank_high"),
+    *("best_in_twin", "real", "real_low", "real_high", "real_trials", "best_on_road"),
+    *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
+)
+
+_POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
+_TRIALS_NEEDED = (
+    f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
+    "include good and bad ones, chosen before their real results are known."
+)
+
+# ---- numbers
+
+
+def format_estimate(estimate: Estimate, percent: bool = False, missing: str = "–") -> str:
+    """Formats an estimate as "0.93 (0.81 to 0.97)", or returns `missing`."""
+    if estimate.value is None:
+        return missing
+    value, *ends = (_format_value(x, percent) for x in (estimate.value, estimate.low, estimate.high) if x is not None)
+    return f"{value} ({' to '.join(ends)})" if len(ends) == 2 else value
+
+
+def _format_value(value: float, percent: bool) -> str:
+    text = f"{100 * value:.0f}%" if percent else f"{value:.2f}"
+    return text.replace("-", "−" if text.strip("-0.%") else "")
+
+
+def percentage_points(share: float) -> str:
+    return f"{abs(100 * share):.1f} percentage points"
+
+
+def format_probability(probability: float) -> str:
+    """Formats an estimated probability in percent; never as 0% or 100%."""
+    if probability > 0.995:
+        return ">99%"
+    return "<1%" if probability < 0.005 else f"{probability:.0%}"
+
+
+# ---- verdicts
+
+
+def verdicts(forecast: Forecast) -> list[Verdict]:
+    """The headlines."""
+    leaders = [_leader(forecast, task) for task in forecast.tasks]
+    if not forecast.groups:
+        return [Verdict("Nothing is known yet about the road: no real trials were given.", "mixed"), *leaders]
+    group = forecast.groups[-1]  # of all tasks, or of the only one
+    if group.missing:
+        first = f"Too few real trials to measure how well the twin predicts the road: {group.missing[0]}."
+        return [Verdict(first, "bad"), *leaders]
+    return [_agreement(group), *_regret(group), _bias(group), *_predictions(group)]
+
+
+def _agreement(group: Agreement) -> Verdict:
+    rank = group.spearman
+    if rank.value is None:
+        return Verdict(f"The rankings cannot be compared: {rank.missing}.", "bad")
+    how, mood = "does not rank", "bad"
+    if rank.value >= FAIR_CORRELATION:
+        how, mood = ("ranks", "good") if rank.value >= GOOD_CORRELATION else ("roughly ranks", "mixed")
+    what, where = "policies", f"on {group.task}"
+    if group.task == ALL_TASKS:
+        what, where = "pairs of policy and task", "on all tasks together"
+    text = f"The twin {how} these {group.policies} {what} as the road does: Spearman {format_estimate(rank)} {where}."
+    # A wide interval lowers the mood, whatever its center.
+    return Verdict(text, "mixed" if mood == "good" and (rank.low or 0.0) < FAIR_CORRELATION else mood)
+
+
+def _regret(group: Agreement) -> list[Verdict]:
+    regret = group.winner_regret
+    if regret.value is None or regret.high is None:
+        return []
+    lost = "nothing" if regret.value < 5e-4 else percentage_points(regret.value)
+    text = (
+        f"Choosing the twin’s best policy would have cost {lost} of real success; its nominal 90% interval ends at "
+        f"{percentage_points(regret.high)}."
+    )
+    return [Verdict(text, "good" if regret.value <= SMALL_REGRET else "bad")]
+
+
+def _bias(group: Agreement) -> Verdict:
+    bias, covered = group.bias, group.coverage
+    if bias.value is None or bias.low is None or bias.high is None:
+        return Verdict("The bias of the twin’s rates is not known.", "bad")
+    text, mood = f"On average its rates deviate by no more than chance ({format_estimate(bias, True)})", "good"
+    if not bias.low <= 0.0 <= bias.high:
+        much = "high" if bias.value < 0 else "low"
+        text, mood = f"On average its rates are {percentage_points(bias.value)} too {much}", "mixed"
+    return Verdict(f"{text}; {covered.value or 0.0:.0%} of the cells agree with the road within chance.", mood)
+
+
+def _predictions(group: Agreement) -> list[Verdict]:
+    hold = group.corrected_coverage
+    if hold.value is None:
+        return []
+    text = f"Predictions corrected by the other policies held for {hold.value:.0%} of {hold.n}; 90% are expected."
+    return [Verdict(text, "good" if (hold.low or 0.0) <= 0.9 <= (hold.high or 1.0) else "mixed")]
+
+
+def _leader(forecast: Forecast, task: str) -> Verdict:
+    first = forecast.candidates_of(task)[0]
+    chance = f"best there with {format_probability(first.twin_ranks[0])} probability"
+    sure = chance if len(first.twin_ranks) > 1 else "the only policy"
+    return Verdict(f"In the twin, on {task}, “{first.policy}” leads: {format_estimate(first.twin, True)}, {sure}.")
+
+
+# ---- limitations and next trials
+
+
+def limitations(forecast: Forecast) -> list[Caution]:
+    """Limits of the forecast, with cures."""
+    out = [
+        Caution(f"{group.task}: no correlation is given because there are {what}.", _TRIALS_NEEDED)
+        for group in forecast.groups
+        for what in group.missing
+    ]
+    if not forecast.real_trials:
+        what = "Whether the road ranks these policies as the twin does, and how far its rates are off, is not known."
+        out.append(Caution(what, _TRIALS_NEEDED))
+    on_road = {p.policy for p in forecast.pairs}
+    runs = {name.partition("/")[0] for name in on_road}
+    if len(runs) < len(on_road):
+        what = (
+            f"The {len(on_road)} policies that were driven on the road come from {len(runs)} trainings; the intervals "
+            "treat them as independent and are therefore too narrow."
+        )
+        cure = "train again with another --seed: the variation between trainings is known from these few only."
+        out.append(Caution(what, cure))
+    lightings = join_names(sorted({name for c in forecast.candidates for name in c.lightings}))
+    cure = (
+        "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
+        "with twin.relight."
+    )
+    out.append(Caution(f"Success was not measured in light unlike {lightings}.", cure))
+    for task in forecast.tasks:
+        mine = forecast.candidates_of(task)
+        sets = [frozenset(c.lightings) for c in mine]
+        usual = max(sets, key=sets.count)
+        if uneven := [c.policy for c, under in zip(mine, sets, strict=True) if under != usual]:
+            what = f"On {task} not all policies were validated under the same lightings ({join_names(uneven)} differ)."
+            cure = "validate all of them under the same ones; otherwise the ranking mixes policy and light."
+            out.append(Caution(what, cure))
+        driven = {
+            c.policy: {p.lighting for p in forecast.pairs if (p.policy, p.task) == (c.policy, task)} for c in mine
+        }
+        if len({frozenset(under) for under in driven.values() if under}) > 1:
+            what = f"On {task} not all policies were driven on the road under the same lightings."
+            cure = "drive all of them under the same ones; otherwise the rates mix policy and light."
+            out.append(Caution(what, cure))
+    what = (
+        "The twin lacks other traffic, wet ground, weather except for haze, sun and shadows, and all other changes "
+        "since the films."
+    )
+    return [*out, Caution(what, "only real trials measure it; spread them over several days.")]
+
+
+def next_trials(forecast: Forecast) -> list[str]:
+    """The most useful next trials on the road, per task."""
+    out = []
+    for task in forecast.tasks:
+        mine = forecast.candidates_of(task)
+        driven = [c for c in mine if c.driven]
+        enough = min(MIN_POLICIES, len(mine))
+        if len(driven) < enough:
+            some = [mine[round(k)] for k in np.linspace(0, len(mine) - 1, enough)]
+            names = join_names([c.policy for c in some if not c.driven], MIN_POLICIES)
+            out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each light: good and bad ones.")
+            continue
+        best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
+        if len(best) > 1:
+            odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], 6)
+            out.append(f"{task}: drive again those that may be the best of the driven, with this probability: {odds}.")
+        elif best:
+            out.append(f"{task}: drive {best[0].policy} on further days, in light that it has not met; it leads.")
+        if unseen := [c.policy for c in mine if not c.driven]:
+            out.append(f"{task}: drive what has not been driven, best in the twin first: {join_names(unseen, 6)}.")
+    return out
+
+
+def allocation_text(allocation: TrialAllocation) -> str:
+    """How many more real trials settle the best policy and the order."""
+    if allocation.policies < 2:
+        return f"{allocation.task}: one policy; there is nothing to rank."
+
+    def needed(trials: int | None, purpose: str, now: float | None) -> str:
+        many = f"more than {MAX_TRIALS}" if trials is None else f"{trials} more" if trials else "no more"
+        each = "" if trials == 0 else " each"
+        known = allocation.basis != "twin" and now is not None
+        sure = f", now {format_probability(now)} sure" if known and now is not None else ""
+        return f"{many} real trials{each} to {purpose}{sure}"
+
+    so_far = "" if allocation.basis == "road" else "no real trials yet; if the road were like the twin: "
+    winner = needed(allocation.more_for_winner, "find the best one", allocation.winner_now)
+    order = needed(allocation.more_for_order, "order all of them", allocation.order_now)
+    return f"{allocation.task}, {allocation.policies} policies: {so_far}{winner}; {order}."
+
+
+# ---- printed summary and table
+
+
+def summary_text(forecast: Forecast) -> str:
+    lines = []
+    for task in forecast.tasks:
+        mine = forecast.candidates_of(task)
+        width = max(len("policy"), *(len(c.policy) for c in mine))
+        row = f"  {{:<{width}}}  {{:<20}}  {{:<10}}  {{:<20}}  {{}}".format
+        lines += [f"{task}: success, with 90% intervals; ranks in the twin, 1 is best"]
+        lines += [row("policy", "twin", "rank", "road", "predicted for the road")]
+        for c in mine:
+            ranks = f"{c.twin_rank.low:.0f} to {c.twin_rank.high:.0f}"
+            road, predicted = format_estimate(c.real, True, "not driven"), format_estimate(c.corrected, True)
+            lines.append(row(c.policy, format_estimate(c.twin, True), ranks, road, predicted).rstrip())
+        lines.append("")
+    groups = [group for group in forecast.groups if not group.missing]
+    if groups:
+        lines.append(f"  {'':<18}" + "".join(f"{g.task + f' (n = {g.policies})':<26}" for g in groups).rstrip())
+        for name, title, _ in STATISTICS:
+            values = [format_estimate(getattr(group, name), name in PERCENT_STATISTICS) for group in groups]
+            lines.append(f"  {title:<18}{''.join(f'{value:<26}' for value in values)}".rstrip())
+        lines += ["", *textwrap.wrap(NOMINAL_INTERVALS, 110), ""]
+    lines += [f"{group.task}: no correlation: {'; '.join(group.missing)}" for group in forecast.groups if group.missing]
+    lines += [allocation_text(allocation) for allocation in forecast.plans]
+    lines += [verdict.text for verdict in verdicts(forecast)]
+    if not forecast.groups:
+        lines.append(limitations(forecast)[0].what)
+    return "\n".join(lines)
+
+
+def candidates_csv(forecast: Forecast) -> str:
+    """`forecast.csv`: one row per candidate; empty cells where there is no number."""
+    rows = []
+    for c in forecast.candidates:
+        numbers = [
+            *(c.twin.value, c.twin.low, c.twin.high, c.twin.n, c.twin_rank.value, c.twin_rank.low, c.twin_rank.high),
+            *(c.twin_ranks[0], c.real.value, c.real.low, c.real.high, c.real.n, *(c.real_ranks[:1] or [None])),
+            *(c.corrected.value, c.corrected.low, c.corrected.high, c.trained.value, c.trained.low, c.trained.high),
+        ]
+        rows.append((c.task, c.policy, *("" if x is None else f"{x:.4f}".rstrip("0").rstrip(".") for x in numbers)))
+    return csv_text(CSV_COLUMNS, rows)
+
 
 # ---- figures
 
-RATE_LIMITS = (-0.04, 1.04)
-RATE_TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)
-
 _MAX_LABELS = 3  # named points per figure
 _LABEL_SIZE = (0.5, 0.06)  # width and height of a name, in axis units
-_MAX_NAME_LENGTH = 26  # characters of a name
-_ROW_HEIGHT = 0.34  # [in] for three points with their intervals
 _SQUARE_SIZE = 4.6  # [in]
 
 
-def twin_against_road(forecast: Forecast) -> Figure:
-    """Real over twin rate of every driven candidate, colored by task; on the diagonal they are equal."""
-    driven = [c for c in forecast.candidates if c.driven]
-    figure, axes = _square("success in the twin", "success on the road")
-    with style():
-        for i, task in enumerate(forecast.tasks):
-            mine = [c for c in driven if c.task == task]
-            if mine:
-                _plot_crosses(axes, [c.twin for c in mine], [c.real for c in mine], SERIES[i % len(SERIES)], task)
-        _label_outliers(axes, [(c.policy, c.twin.value or 0.0, c.real.value or 0.0) for c in driven])
-    legend_below(axes, 3, _SQUARE_SIZE)
+@styled
+def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "success in the twin") -> Figure:
+    """Real rate over another one of every driven candidate, colored by task; on the diagonal they are equal.
+
+    `field` of the candidate is "twin" or "corrected" (predicted from the other candidates); `label` names it.
+    """
+    figure, axes = new_figure(_SQUARE_SIZE)
+    axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
+    limits, ticks = RATE_AXIS.values()
+    axes.set(xlabel=label, ylabel="success on the road", ylim=limits, yticks=ticks, **RATE_AXIS)
+    driven = [c for c in forecast.candidates if c.driven and getattr(c, field).value is not None]
+    for i, task in enumerate(forecast.tasks):
+        mine = [c for c in driven if c.task == task]
+        if mine:
+            (x, x_ends), (y, y_ends) = (
+                _error_bars([getattr(c, field) for c in mine]),
+                _error_bars([c.real for c in mine]),
+            )
+            color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
+            axes.errorbar(x, y, xerr=x_ends, yerr=y_ends, fmt="none", ecolor=color, elinewidth=0.8, alpha=0.5)
+            axes.plot(x, y, marker, color=color, ms=4.5, label=task, zorder=4)
+    _label_outliers(axes, [(c.policy, getattr(c, field).value, c.real.value or 0.0) for c in driven])
+    if driven:
+        add_legend(figure)
     return figure
 
 
-def predicted_against_road(forecast: Forecast) -> Figure:
-    """Real rate of every driven candidate over the rate predicted from the others."""
-    known = [c for c in forecast.candidates if c.driven and c.corrected.value is not None]
-    figure, axes = _square("predicted from the other policies", "success on the road")
-    with style():
-        for i, task in enumerate(forecast.tasks):
-            mine = [c for c in known if c.task == task]
-            if mine:
-                _plot_crosses(axes, [c.corrected for c in mine], [c.real for c in mine], SERIES[i % len(SERIES)], task)
-        _label_outliers(axes, [(c.policy, c.corrected.value or 0.0, c.real.value or 0.0) for c in known])
-    legend_below(axes, 3, _SQUARE_SIZE)
-    return figure
+def _error_bars(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n,), and lengths of the intervals below and above, shape (2, n)."""
+    value, low, high = np.array([_interval(e) for e in estimates]).T
+    return value, np.maximum([value - low, high - value], 0.0)
 
 
-def rate_figure(candidates: Sequence[Candidate]) -> Figure:
-    """Rates of the candidates of a task in the twin, on the road, and as predicted; best in the twin first."""
-    n = len(candidates)
-    figure, axes = new_figure(0.8 + _ROW_HEIGHT * n)
-    columns = (
-        ("in the twin", SERIES[0], "o", [c.twin for c in candidates]),
-        ("on the road", SERIES[1], "s", [c.real for c in candidates]),
-        ("road, predicted", SERIES[2], "D", [c.corrected for c in candidates]),
-    )
-    shown = [column for column in columns if any(e.value is not None for e in column[3])]
-    with style():
-        for k, (name, color, marker, estimates) in enumerate(shown):
-            rows = [i for i, e in enumerate(estimates) if e.value is not None]
-            y = np.array(rows) + (k - (len(shown) - 1) / 2) * 0.24
-            x, ends = _error_bars([estimates[i] for i in rows])
-            axes.errorbar(x, y, xerr=ends, fmt=marker, color=color, ms=3.5, lw=1.1, label=name)
-        _set_policy_ticks(axes, candidates)
-        axes.grid(False, axis="y")
-        axes.set(xlim=RATE_LIMITS, ylim=(n - 0.5, -0.5), xlabel="success rate", xticks=RATE_TICKS)
-    legend_below(axes, len(shown), 0.8 + _ROW_HEIGHT * n)
-    return figure
+def _interval(e: Estimate) -> tuple[float, float, float]:
+    value = e.value or 0.0
+    return value, value if e.low is None else e.low, value if e.high is None else e.high
+
+
+def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
+    """Names the points farthest from the diagonal, where names do not overlap."""
+    named: list[tuple[float, float]] = []
+    width, height = _LABEL_SIZE
+    for name, x, y in sorted(points, key=lambda p: -abs(p[2] - p[1])):
+        if len(named) == _MAX_LABELS or any(abs(x - a) < width and abs(y - b) < height for a, b in named):
+            continue
+        named.append((x, y))
+        offset, side = ((-7, -10), "right") if x > 0.5 else ((7, -10), "left")
+        box = {"facecolor": CARD, "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
+        look: dict[str, Any] = {"ha": side, "bbox": box, "zorder": 3, "fontsize": 7.5, "color": MUTED}
+        axes.annotate(shorten_name(name), (x, y), offset, textcoords="offset points", **look)
 
 
 def rank_heatmap(candidates: Sequence[Candidate]) -> Figure:
@@ -96,9 +379,8 @@ def rank_heatmap(candidates: Sequence[Candidate]) -> Figure:
     chance = np.array([c.twin_ranks for c in candidates])
     ranks = [str(k + 1) if k % -(-n // 12) == 0 else "" for k in range(n)]
     shown = np.where(chance > 0.005, chance, np.nan)
-    return heatmap(
-        shown, [shorten_name(c.policy) for c in candidates], ranks, percent_texts(chance), "rank in the twin [%]"
-    )
+    policies = [shorten_name(c.policy) for c in candidates]
+    return heatmap(shown, policies, ranks, percent_texts(chance), "rank in the twin; probabilities in %")
 
 
 def twin_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair]) -> Figure:
@@ -113,83 +395,19 @@ def _rate_heatmap(candidates: Sequence[Candidate], rates: dict[tuple[str, str], 
     policies, lightings = [c.policy for c in candidates if c.driven], list(dict.fromkeys(light for _, light in rates))
     rate = matrix(rates, policies, lightings)
     names, label = lighting_labels(lightings)
-    return heatmap(rate, [shorten_name(name) for name in policies], names, percent_texts(rate), label)
+    return heatmap(rate, list(map(shorten_name, policies)), names, percent_texts(rate), label)
 
 
 def difference_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair]) -> Figure:
-    """Road minus twin in percentage points; colored where it exceeds chance."""
+    """Road minus twin in percentage points; in parentheses and pale where it is within chance."""
     policies = [c.policy for c in candidates if c.driven]
     lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
     bias = matrix({(pair.policy, pair.lighting): pair.bias.value for pair in pairs}, policies, lightings)
     beyond = {(pair.policy, pair.lighting): float(not pair.within_chance) for pair in pairs}
-    texts = np.array([[f"{100 * each:+.0f}".replace("-", "−") if each else "0" for each in row] for row in bias])
-    shown = bias * matrix(beyond, policies, lightings)
+    certain = matrix(beyond, policies, lightings)
+    texts = difference_texts(100 * bias, certain)
     names, label = lighting_labels(lightings)
-    return heatmap(shown, [shorten_name(name) for name in policies], names, texts, label, FULL_WIDTH)
-
-
-def _square(x: str, y: str) -> tuple[Figure, Axes]:
-    figure, axes = new_figure(_SQUARE_SIZE)
-    with style():
-        axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
-        axes.set(xlim=RATE_LIMITS, ylim=RATE_LIMITS, xlabel=x, ylabel=y, xticks=RATE_TICKS, yticks=RATE_TICKS)
-    return figure, axes
-
-
-def _plot_crosses(axes: Axes, x: list[Estimate], y: list[Estimate], color: str, name: str) -> None:
-    (at_x, ends_x), (at_y, ends_y) = _error_bars(x), _error_bars(y)
-    axes.errorbar(at_x, at_y, xerr=ends_x, yerr=ends_y, fmt="none", ecolor=color, elinewidth=0.8, alpha=0.5)
-    axes.plot(at_x, at_y, "o", color=color, ms=4.5, label=name, zorder=4)
-
-
-def _error_bars(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray]:
-    """Values (n,), and lengths of the intervals below and above, shape (2, n)."""
-    rows = [(e.value or 0.0, e.low if e.low is not None else e.value, e.high if e.high is not None else e.value)
-            for e in estimates]  # fmt: skip
-    value, low, high = np.array(rows, float).reshape(-1, 3).T
-    return value, np.stack([np.maximum(value - low, 0.0), np.maximum(high - value, 0.0)])
-
-
-def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
-    named: list[tuple[float, float]] = []
-    for name, x, y in sorted(points, key=lambda p: -abs(p[2] - p[1])):
-        if len(named) == _MAX_LABELS or any(
-            abs(x - a) < _LABEL_SIZE[0] and abs(y - b) < _LABEL_SIZE[1] for a, b in named
-        ):
-            continue
-        named.append((x, y))
-        offset, side = ((-7, -10), "right") if x > 0.5 else ((7, -10), "left")
-        box = {"facecolor": CARD, "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
-        text = axes.annotate(
-            shorten_name(name), (x, y), offset, textcoords="offset points", ha=side, bbox=box, zorder=3
-        )
-        text.set(fontsize=7.5, color=MUTED)
-
-
-def _set_policy_ticks(axes: Axes, candidates: Sequence[Candidate]) -> None:
-    axes.set_yticks(range(len(candidates)), [shorten_name(c.policy) for c in candidates])
-
-
-def legend_below(axes: Axes, columns: int, height: float) -> None:
-    """Adds a legend below the axes of a figure of the given height [in]."""
-    with style():
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.45 / height), ncols=columns, handlelength=1.4)
-
-
-def lighting_labels(lightings: Sequence[str]) -> tuple[list[str], str]:
-    """Column names of lightings without a suffix common to all, and an axis label that names that suffix."""
-    conditions = [Condition.parse(name) for name in lightings]
-    if all(one.randomised for one in conditions):
-        return [shorten_name(one.lighting) for one in conditions], f"lights, all of them {RANDOMIZED}"
-    return [shorten_name(name) for name in lightings], ""
-
-
-def shorten_name(name: str) -> str:
-    return (
-        name
-        if len(name) <= _MAX_NAME_LENGTH
-        else f"{name[: _MAX_NAME_LENGTH // 2]}…{name[-(_MAX_NAME_LENGTH // 2 - 1) :]}"
-    )
+    return heatmap(bias * certain, list(map(shorten_name, policies)), names, texts, label, FULL_WIDTH)
 
 
 # ---- page
@@ -206,18 +424,20 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
     tasks = f"{len(forecast.tasks)} tasks" if len(forecast.tasks) > 1 else "one task"
     measured = [group for group in forecast.groups if not group.missing]
     known = [c for c in forecast.candidates if c.corrected.value is not None]
-    agreement, predictions, unpredicted = None, [], ""
+    driven = sum(c.driven for c in forecast.candidates)
+    agreement = []
     if forecast.groups:
-        title = "Success on the road over success in the twin; on the dashed line they are equal"
-        agreement = Chart(title, svg(twin_against_road(forecast)))
-    if any(c.driven for c in known):
-        title = "Observed rate over the rate predicted from the other policies"
-        predictions = [Chart(title, svg(predicted_against_road(forecast)))]
+        title = f"Success on the road over success in the twin (n = {driven}); on the dashed line they are equal"
+        agreement = [Chart(title, svg(rates_against_road(forecast)))]
+    predictions = []
+    if tested := [c for c in known if c.driven]:
+        title = f"Success on the road over the rate predicted from the other policies (n = {len(tested)})"
+        drawn = rates_against_road(forecast, "corrected", "predicted from the other policies")
+        predictions = [Chart(title, svg(drawn))]
+    unpredicted = ""
     if not known:
-        reasons = dict.fromkeys(c.corrected.missing for c in forecast.candidates)
-        unpredicted = "No real trials were given to estimate it from."
-        unpredicted = f"Not given: {'; '.join(reasons)}." if forecast.groups else unpredicted
-    again = "Add the results to real.csv, and forecast again:"
+        reasons = "; ".join(dict.fromkeys(c.corrected.missing for c in forecast.candidates))
+        unpredicted = f"Not given: {reasons}." if forecast.groups else "No real trials were given to estimate it from."
     return render(
         "forecast.html",
         title=f"{forecast.scene}: forecast",
@@ -240,14 +460,14 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
         statistic_heads=["", *(f"{g.task} (n = {g.policies}, {g.cells} cells)" for g in measured), "meaning"],
         agreement=agreement,
         predicted=[c for c in known if not c.driven],
-        tested=[c for c in known if c.driven],
+        tested=tested,
         prediction_charts=predictions,
         unpredicted=unpredicted,
         beyond_chance=sum(not pair.within_chance for pair in forecast.pairs),
         limitations=limitations(forecast),
         next_steps=[
             *((text, []) for text in next_trials(forecast)),
-            (again, [command("forecast", root, "--real", "real.csv")]),
+            ("Add the results to real.csv, and forecast again:", [command("forecast", root, "--real", "real.csv")]),
         ],
         MIN_POLICIES=MIN_POLICIES,
         MIN_TRIALS=MIN_TRIALS,
@@ -264,15 +484,22 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
 def _task(forecast: Forecast, task: str) -> dict[str, Any]:
     """Candidates and charts of a task."""
     mine, pairs = forecast.candidates_of(task), [pair for pair in forecast.pairs if pair.task == task]
-    charts = [Chart("Success rates with 90% intervals", svg(rate_figure(mine)))]
+    columns = {"in the twin": "twin", "on the road": "real", "road, predicted": "corrected"}
+    rates = {
+        title: [(c.policy, *_interval(e)) for c in mine if (e := getattr(c, field)).value is not None]
+        for title, field in columns.items()
+    }
+    drawn = rate_chart([c.policy for c in mine], {title: rows for title, rows in rates.items() if rows}, "success rate")
+    charts = [Chart("Success rates with 90% intervals; the number of trials is in the table", svg(drawn))]
     if len(mine) > 1:
-        charts.append(Chart("Probability of each rank in the twin", svg(rank_heatmap(mine))))
-    rates, differences = [], []
+        charts.append(Chart("Probability of each rank in the twin [%]", svg(rank_heatmap(mine))))
+    cell_rates, differences = [], []
     if pairs and len(forecast.pairs) > MAX_TABLE_ROWS:
-        rates = [
-            Chart("In the twin [%]", svg(twin_heatmap(mine, pairs))),
-            Chart("On the road [%]", svg(road_heatmap(mine, pairs))),
-        ]
-        title = "Road minus twin [points]: red where the twin was too optimistic, blue the opposite, pale within chance"
+        for title, figure in (("In the twin [%]", twin_heatmap), ("On the road [%]", road_heatmap)):
+            cell_rates.append(Chart(title, svg(figure(mine, pairs))))
+        title = (
+            "Road minus twin [percentage points]: red and below 0 where the twin was too optimistic, blue the "
+            "opposite, pale and in parentheses within chance"
+        )
         differences = [Chart(title, svg(difference_heatmap(mine, pairs)))]
-    return {"name": task, "candidates": mine, "charts": charts, "cell_rates": rates, "differences": differences}
+    return {"name": task, "candidates": mine, "charts": charts, "cell_rates": cell_rates, "differences": differences}

@@ -1,11 +1,14 @@
-"""Writes `validation.html`: how often policies reach the goal in each lighting, and why they fail.
+"""The summary of a validation, and `validation.html`: how often policies reach the goal, and why they fail.
 
-`results` is the content of `summary.json` (see `validation_summary.summarize` and `twin.validate`). Videos are stored
-beside the page, their posters inside it.
+`results` is the content of `summary.json`: `summarize` and what `twin.validate` adds. Paired episodes share lighting
+and seed; the exact McNemar test compares the numbers of episodes in which only one of two policies succeeded. Videos
+are stored beside the page, their posters inside it.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,90 +16,305 @@ from urllib.parse import quote
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
+from twin.config import ANY, HELD_OUT, TRAINING, Condition
 from twin.errors import join_names
-from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
+from twin.evaluation.forecasting import Estimate
+from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS, rate_summary
 from twin.evaluation.training_curves import plot_success_curve
-from twin.evaluation.trials import RECENT_EPISODES, csv_text
+from twin.evaluation.trials import RECENT_EPISODES, Trial, csv_text, tally
 from twin.files import write_text
-from twin.report.figures import FULL_WIDTH, INK, SERIES, heatmap, matrix, new_figure, percent_texts, style, svg
-from twin.report.forecast_report import RATE_LIMITS, RATE_TICKS, legend_below, lighting_labels, shorten_name
-from twin.report.html import MAX_TABLE_ROWS, Chart, Picture, command, data_url, render
-from twin.report.validation_summary import (
-    FAILURES,
-    MAX_P_VALUE,
-    failure_text,
-    lighting_text,
-    limitations,
-    p_value_text,
-    pair_text,
-    rate_text,
-    tasks,
-    training_text,
-    verdicts,
+from twin.mjcf.world import World, point_at
+from twin.report.figures import (
+    FULL_WIDTH,
+    INK,
+    RATE_AXIS,
+    SERIES,
+    corridor_outline,
+    difference_texts,
+    heatmap,
+    lighting_labels,
+    matrix,
+    new_figure,
+    percent_texts,
+    rate_chart,
+    shorten_name,
+    styled,
+    svg,
 )
+from twin.report.forecast_report import format_estimate
+from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Picture, Verdict, command, data_url, render
 from twin.scene import SceneDir
+
+MAX_P_VALUE = 0.1
+"""Paired differences with a larger p-value are reported as within chance."""
+FEW_EPISODES = 30
+"""Number of episodes in a cell below which a caution about wide intervals is given."""
+TRUSTED = 0.8
+"""Episodes with a lower mean trust of their pictures are counted separately."""
+FAILURES = {
+    "collision": ("hit something", "touched anything solid except the ground"),
+    "out_of_bounds": ("left the corridor", "its center was more than half the corridor’s width off the route"),
+    "timeout": ("ran out of time", "did not reach the goal within the time limit"),
+    "rollover": ("rolled over", "tipped onto its side"),
+    "stuck": ("got stuck", "stood still too long"),
+}
+"""Cause of failure → its name and meaning."""
+LIGHTING_SETS = {
+    HELD_OUT: "another light for every episode, sampled from those reserved for evaluation",
+    TRAINING: "another light for every episode, sampled from those used in training",
+    ANY: "another light for every episode, sampled from all that could have been filmed",
+}
+"""Lightings that are sets → their meaning."""
+
+_GOOD_RATE, _MIXED_RATE = 0.9, 0.5
+
+# ---- summary
+
+
+def success_rate(trials: Sequence[Trial]) -> dict[str, Any]:
+    return rate_summary(sum(t.success for t in trials), len(trials))
+
+
+def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
+    """Success and causes of failure per policy, task and lighting, and paired comparisons."""
+    cells = []
+    for cell in tally(trials):
+        own = [t for t in trials if (t.policy, t.task, t.lighting) == cell.key]
+        trusted = [t for t in own if t.trust is not None and t.trust >= TRUSTED]
+        cells.append(
+            {"policy": cell.policy, "task": cell.task, "lighting": cell.lighting}
+            | success_rate(own)
+            | {"causes": {c: n for c, n in Counter(t.cause for t in own).items() if c != "goal"}}
+            | {"trusted": success_rate(trusted), "low_trust": success_rate([t for t in own if t not in trusted])}
+        )
+    return {"confidence": 0.9, "trusted_from": TRUSTED, "cells": cells, "pairs": compare_pairs(trials)}
+
+
+def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """Compares every two policies on the episodes that both drove, if there are any."""
+    by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
+    for t in trials:
+        by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
+    out = []
+    for (task, a), (other, b) in combinations(by_policy, 2):
+        first, second = by_policy[task, a], by_policy[other, b]
+        both = [(first[key], second[key]) for key in first if key in second]
+        if task != other or not both:
+            continue
+        only_a, only_b = sum(x and not y for x, y in both), sum(y and not x for x, y in both)
+        chance = float(binomtest(only_a, only_a + only_b).pvalue) if only_a + only_b else 1.0
+        out.append(
+            {"task": task, "a": a, "b": b, "episodes": len(both), "only_a": only_a, "only_b": only_b, "p": chance}
+        )
+    return out
+
+
+def typical_episode(trials: Sequence[Trial]) -> Trial:
+    """The episode with the median progress; the upper one of an even number."""
+    return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
+
+
+def worst_episode(trials: Sequence[Trial]) -> Trial:
+    """The failed episode with the least progress; if none failed, the one with the lowest trust."""
+    failed = [t for t in trials if not t.success]
+    if failed:
+        return min(failed, key=lambda t: t.progress)
+    return min(trials, key=lambda t: 1.0 if t.trust is None else t.trust)
+
+
+# ---- words
+
+
+def rate_text(rate: dict[str, Any]) -> str:
+    """Formats a rate as "93% (87% to 96%)", or as a dash if there are no trials."""
+    return format_estimate(Estimate(rate["rate"], rate["low"], rate["high"], rate["trials"]), percent=True)
+
+
+def failure_text(cell: dict[str, Any]) -> str:
+    """Formats the causes of failure, most frequent first, for instance "9 left the corridor, 2 hit something"."""
+    causes = sorted(cell["causes"].items(), key=lambda item: -item[1])
+    return ", ".join(f"{n} {FAILURES[cause][0]}" for cause, n in causes)
+
+
+def lighting_text(lighting: str) -> str:
+    condition = Condition.parse(lighting)
+    if condition.randomised:
+        return (
+            f"{lighting_text(condition.lighting)}; and for every episode another sun, other shadows, "
+            "haze unless a photo determines it, objects beside the corridor, and other robot parameters except for the "
+            "identified ones"
+        )
+    if lighting.startswith("drawn_"):
+        return f"light number {lighting[6:]} of those sampled in the search"
+    if lighting.count(":") == 2:
+        a, b, part = lighting.split(":")
+        return f"{float(part):.0%} of the way from {a} to {b}"
+    return LIGHTING_SETS.get(lighting, "the same light in every episode")
+
+
+def training_text(trained: dict[str, Any]) -> str:
+    """Describes a training, for instance "on straight, in varying light"."""
+    if trained["observe"] == "simulator":
+        return f"on {trained['task']}, from MuJoCo’s picture of the mesh"
+    light = "in varying light" if trained["lighting"] in (TRAINING, ANY) else f"in the light {trained['lighting']}"
+    return f"on {trained['task']}, {light}"
+
+
+def pair_text(pair: dict[str, Any]) -> str:
+    if pair["only_a"] == pair["only_b"]:
+        return "no difference"
+    if pair["p"] > MAX_P_VALUE:
+        return "within chance"
+    return f"“{pair['a'] if pair['only_a'] > pair['only_b'] else pair['b']}” is better"
+
+
+def p_value_text(p: float) -> str:
+    return "<0.1%" if p < 0.001 else f"{100 * p:.1f}%" if p < MAX_P_VALUE else f"{p:.0%}"
+
+
+def verdicts(results: dict[str, Any]) -> list[Verdict]:
+    """The headlines: the best policy of every task and its worst lighting."""
+    out = [_task_verdict(task, [c for c in results["cells"] if c["task"] == task]) for task in tasks(results)]
+    low, of = (sum(c[k]["trials"] for c in results["cells"]) for k in ("low_trust", "trusted"))
+    if low:
+        text = f"In {low} of {low + of} episodes the pictures are not trusted; these are counted separately below."
+        out.append(Verdict(text, "mixed"))
+    return out
+
+
+def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
+    lightings: dict[str, set[str]] = {}
+    for c in cells:
+        lightings.setdefault(c["policy"], set()).add(c["lighting"])
+    # Only lightings in which all policies drove compare them fairly.
+    common = set.intersection(*lightings.values())
+    if not common:
+        return Verdict(f"On {task} no lighting was used for all policies: there is no best one.", "mixed")
+    shared = {policy: [c for c in cells if c["policy"] == policy and c["lighting"] in common] for policy in lightings}
+    means = {policy: sum(c["rate"] for c in mine) / len(common) for policy, mine in shared.items()}
+    best = max(means, key=lambda policy: means[policy])
+    won, of = (sum(c[key] for c in shared[best]) for key in ("successes", "trials"))
+    tied = [policy for policy in means if means[policy] == means[best] and policy != best]
+    lead = " most often" if len(means) > 1 and not tied else ""
+    text = f"On {task}, “{best}” reaches the goal{lead}: in {won} of {of} episodes"
+    every = dict.fromkeys(c["lighting"] for c in cells)
+    if len(common) < len(every):
+        names = join_names(name for name in every if name in common)
+        text += f" in the light that was used for all policies ({names})"
+    text += f", and {join_names(f'“{name}”' for name in tied)} as often" if tied else ""
+    weakest = min(shared[best], key=lambda c: c["rate"])
+    if weakest["rate"] < max(c["rate"] for c in shared[best]):
+        text += f"; least often in the light {weakest['lighting']}, {weakest['successes']} of {weakest['trials']}"
+    mood = "good" if means[best] >= _GOOD_RATE else "mixed" if means[best] >= _MIXED_RATE else "bad"
+    return Verdict(f"{text}.", mood)
+
+
+def limitations(results: dict[str, Any]) -> list[Caution]:
+    """Limits of the validation, with cures."""
+    cells = results["cells"]
+    what = "These rates are success in the twin. Success on the road was not measured here."
+    out = [Caution(what, "drive some of the policies on the road and run python -m twin.forecast.")]
+    if few := [c["trials"] for c in cells if c["trials"] < FEW_EPISODES]:
+        what = (
+            f"{len(few)} of {len(cells)} rates come from fewer than {FEW_EPISODES} episodes (minimum: {min(few)}), so "
+            "their intervals are wide."
+        )
+        out.append(Caution(what, "run the same command with more --episodes; earlier episodes are kept."))
+    drawn = dict.fromkeys(c["lighting"] for c in cells if Condition.parse(c["lighting"]).randomised)
+    if drawn and not results.get("robot_known"):
+        what = (
+            f"The result may differ for your robot: under {join_names(drawn)} another one drives every episode, "
+            "because none of its parameters are identified."
+        )
+        cure = "log five minutes of driving, run python -m twin.align, build again and validate again."
+        out.append(Caution(what, cure))
+    searched = {(w["policy"], w["task"]) for w in results.get("worst", [])}
+    if left := dict.fromkeys(c["policy"] for c in cells if (c["policy"], c["task"]) not in searched):
+        what = f"The worst light that {join_names(left)} might meet was not searched for."
+        out.append(Caution(what, "run the same command with --worst."))
+    return out
+
+
+def tasks(results: dict[str, Any]) -> list[str]:
+    return list(dict.fromkeys(c["task"] for c in results["cells"]))
+
+
+def summary_lines(results: dict[str, Any]) -> list[str]:
+    """The printed summary."""
+    out = []
+    wide, light = (max((len(c[key]) for c in results["cells"]), default=0) for key in ("policy", "lighting"))
+    for c in results["cells"]:
+        causes = failure_text(c)
+        out.append(
+            f"{c['policy']:{wide}}  {c['task']}  {c['lighting']:{light}}  {c['successes']:3d}/{c['trials']:<3d} = "
+            f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})" + (f"  {causes}" if causes else "")
+        )
+        trusted, low = c["trusted"], c["low_trust"]
+        if low["trials"]:
+            counts = [f"{rate['successes']}/{rate['trials']}" for rate in (trusted, low)]
+            out.append(f"{'':{wide}}  trusted pictures {counts[0]}, others {counts[1]}")
+    for p in results["pairs"]:
+        out.append(
+            f"{p['a']} against {p['b']}, {p['task']}, the same {p['episodes']} episodes: only the first succeeded in "
+            f"{p['only_a']}, only the second in {p['only_b']} (p = {p['p']:.2g})"
+        )
+    for w in results.get("worst", []):
+        out.append(
+            f"{w['policy']}, {w['task']}: of {w['of']} sampled lights the worst is {w['lighting']}, in new "
+            f"episodes {w['successes']}/{w['trials']} ({w['low']:.2f} to {w['high']:.2f})"
+        )
+    return out
+
 
 # ---- figures
 
 MAX_PLOTTED_LIGHTINGS = 4
 """Up to this many lightings rates are plotted with intervals, else as a heatmap."""
 
-_ROW_HEIGHT = 0.17  # [in] per rate
-_LEGEND_LETTERS = 55  # per row of the legend; a marker counts as four
-_LIGHTING_SPACING = 0.18  # in units of the distance of two policies
+_BIN = 2.0  # [m] bin of the route in the failure histogram
+_FAILURE_LOOKS = {  # cause → color and hatching
+    "collision": ("#d62728", ""),
+    "out_of_bounds": ("#ff7f0e", "//"),
+    "timeout": ("#7f7f7f", ".."),
+    "rollover": ("#9467bd", "xx"),
+    "stuck": ("#8c564b", "--"),
+}
 
 
 def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
     """Success in the cells of a task with intervals: one row per policy, one color per lighting."""
-    policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
-    height = 0.9 + max(0.34, _ROW_HEIGHT * len(lightings)) * len(policies)
-    figure, axes = new_figure(height)
-    with style():
-        for k, lighting in enumerate(lightings):
-            mine = [c for c in cells if c["lighting"] == lighting]
-            y = (
-                np.array([policies.index(c["policy"]) for c in mine])
-                + (k - (len(lightings) - 1) / 2) * _LIGHTING_SPACING
-            )
-            x, low, high = (np.array([c[key] for c in mine], float) for key in ("rate", "low", "high"))
-            ends = np.maximum([x - low, high - x], 0.0)
-            axes.errorbar(x, y, xerr=ends, fmt="o", color=SERIES[k], ms=3.5, lw=1.1, label=lighting)
-        axes.set_yticks(range(len(policies)), [shorten_name(name) for name in policies])
-        axes.grid(False, axis="y")
-        label = "success rate" if len(lightings) > 1 else f"success rate in the light {lightings[0]}"
-        axes.set(xlim=RATE_LIMITS, ylim=(len(policies) - 0.5, -0.5), xlabel=label, xticks=RATE_TICKS)
-    if len(lightings) > 1:
-        fitting = max(
-            1, _LEGEND_LETTERS // (max(map(len, lightings)) + 4)
-        )  # a legend wider than the figure leaves no room for the axes
-        legend_below(axes, min(fitting, len(lightings)), height)
-    return figure
+    rates: dict[str, list[tuple[str, float, float, float]]] = {}
+    for c in cells:
+        rates.setdefault(c["lighting"], []).append((c["policy"], c["rate"], c["low"], c["high"]))
+    label = "success rate" if len(rates) > 1 else f"success rate in the light {next(iter(rates))}"
+    return rate_chart(list(dict.fromkeys(c["policy"] for c in cells)), rates, label)
 
 
 def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | None]) -> Figure:
     """Success in the cells of a task in percent: one row per policy, one column per lighting.
 
-    The first columns are the rate in training, and the mean over the lightings in which all policies drove.
+    The first columns are the rate in training, if any is known, and the mean over the lightings in which all policies
+    drove.
     """
     policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
     rate = matrix({(c["policy"], c["lighting"]): c["rate"] for c in cells}, policies, lightings)
     common = rate[:, np.isfinite(rate).all(0)]
     means = common.mean(1) if common.size else np.full(len(policies), np.nan)
     training = np.array([trained.get(policy) for policy in policies], float)
-    shown = np.column_stack([training, means, rate])
     names, label = lighting_labels(lightings)
-    columns = ["in training", "mean", *names]
-    return heatmap(
-        shown, [shorten_name(policy) for policy in policies], columns, percent_texts(shown), label, FULL_WIDTH
-    )
+    shown, columns = np.column_stack([means, rate]), ["mean", *names]
+    if np.isfinite(training).any():
+        shown, columns = np.column_stack([training, shown]), ["in training", *columns]
+    return heatmap(shown, list(map(shorten_name, policies)), columns, percent_texts(shown), label, FULL_WIDTH)
 
 
 def pair_heatmap(pairs: Sequence[dict[str, Any]]) -> Figure:
     """Paired comparisons of a task's policies: the row's policy is better (blue), worse (red), or within chance (pale).
 
-    A cell's number is how many more of the shared episodes the row's policy succeeded in. Rows are sorted by
-    significant wins minus losses; columns have the same order.
+    A cell's number is how many more of the shared episodes the row's policy succeeded in, in parentheses if that is
+    within chance. Rows are sorted by significant wins minus losses; columns have the same order.
     """
     policies = list(dict.fromkeys(p[key] for p in pairs for key in ("a", "b")))
     ahead, surely = (np.full((len(policies), len(policies)), np.nan) for _ in range(2))
@@ -109,20 +327,56 @@ def pair_heatmap(pairs: Sequence[dict[str, Any]]) -> Figure:
     ahead, surely = ahead[order][:, order], surely[order][:, order]
     numbers = [str(k + 1) for k in range(len(policies))]
     rows = [f"{shorten_name(policies[i])}  {number}" for i, number in zip(order, numbers, strict=True)]
-    texts = np.array([[f"{each:+.0f}".replace("-", "−") if each else "0" for each in row] for row in ahead])
+    texts = difference_texts(ahead, surely)
     return heatmap(surely, rows, numbers, texts, "compared with the policy of this number", FULL_WIDTH)
 
 
+@styled
 def training_figure(steps: NDArray[np.int64], success: NDArray[np.int64], saved: Sequence[int]) -> Figure:
     """Success (0 or 1, shape (n,)) over ascending training steps with its interval; `saved` steps are dashed lines."""
     figure, axes = new_figure(2.2)
-    with style():
-        plot_success_curve(axes, steps, success, SERIES[0])
-        for one in saved:
-            axes.axvline(one, color=INK, lw=0.9, ls="--")
-        axes.set(xlabel="training step", ylabel="success in training", ylim=RATE_LIMITS, yticks=RATE_TICKS)
-        axes.set_xlim(left=0)
+    plot_success_curve(axes, steps, success, SERIES[0])
+    for one in saved:
+        axes.axvline(one, color=INK, lw=0.9, ls="--")
+    limits, ticks = RATE_AXIS.values()
+    axes.set(xlabel="training step", ylabel="success rate in training", ylim=limits, yticks=ticks)
+    axes.set_xlim(left=0)
     return figure
+
+
+def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tuple[float, float]) -> None:
+    """Plots where on the route the failed episodes of a task ended; `segment` is the task on the route [m]."""
+    start, end = segment
+    line = point_at(world.route[:, :2], np.append(np.arange(start, end, 0.5), end))
+    edges = np.arange(0.0, end - start + _BIN, _BIN)
+    across, up = np.ptp(line, axis=0) + 2.0 * world.half_width
+    tall = float(np.clip(6.4 * up / across, 0.5, 6.0))
+    figure = Figure(figsize=(7.2, tall + 4.0), layout="constrained")
+    above, along = figure.subplots(2, 1, height_ratios=[tall + 0.6, 2.6])
+    above.fill(*corridor_outline(line, world.half_width).T, color="#dfe6ee")
+    above.plot(*line.T, color="#7a8794", linewidth=1)
+    look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 9, "annotation_clip": False}
+    for name, at in (("start", line[0]), ("goal", line[-1])):
+        above.annotate(name, at, xytext=(0, 10), **look)
+    total = np.zeros(len(edges) - 1)
+    for cause, (color, hatch) in _FAILURE_LOOKS.items():
+        distances = [t.progress for t in trials if t.cause == cause]
+        if distances:
+            count = np.histogram(np.clip(distances, 0.0, edges[-1]), edges)[0]
+            name = f"{FAILURES[cause][0]} ({len(distances)})"
+            along.bar(
+                edges[:-1], count, _BIN, total, align="edge", edgecolor="white", color=color, hatch=hatch, label=name
+            )
+            total += count
+    at = point_at(line, edges[:-1] + _BIN / 2)[total > 0]
+    above.scatter(*at.T, s=30.0 * total[total > 0], color="#c0392b", alpha=0.6, linewidths=0)
+    title = f"{total.sum():.0f} of {len(trials)} episodes failed; a dot’s area is the number of failures there"
+    above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
+    along.set(xlabel="distance along the task [m]", ylabel="failed episodes", xlim=(0.0, edges[-1]))
+    along.yaxis.get_major_locator().set_params(integer=True)
+    if total.any():
+        figure.legend(frameon=False, loc="outside lower center", ncols=3)
+    figure.savefig(path, dpi=110)
 
 
 # ---- page
@@ -160,11 +414,11 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         "unknown": "Limitations",
         "next": "What to do next",
     }
+    counts = f"{_count(len(policies), 'policy', 'policies')}, {_count(len(lights), 'lighting', 'lightings')}"
     return render(
         "validation.html",
         title=f"{scene}: validation",
-        kicker=f"{_count(len(policies), 'policy', 'policies')}, {_count(len(lights), 'lighting')}: "
-        f"{sum(c['trials'] for c in cells)} episodes in the twin.",
+        kicker=f"{counts}: {sum(c['trials'] for c in cells)} episodes in the twin.",
         verdicts=verdicts(results),
         headings={name: heading for name, heading in headings.items() if heading},
         files=["summary.json", "cells.csv", "episodes.csv"],
@@ -174,7 +428,12 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         | {FAILURES[cause][0]: FAILURES[cause][1] for c in cells for cause in c["causes"]},
         untrusted=[c for c in cells if c["low_trust"]["trials"]],
         maps=[Picture(folder / f"failures_{task}.png", f"{task}, all policies and lights") for task in tasks(results)],
-        films=[_video(film, folder) for film in results["films"]],
+        films=[
+            film
+            | {"url": quote(film["file"]), "poster": data_url(folder / film["poster"])}
+            | {"ended": FAILURES.get(film["cause"], ("reached the goal",))[0]}
+            for film in results["films"]
+        ],
         films_of=join_names(dict.fromkeys(str(film["of"]) for film in results["films"])),
         training=[_training_chart(results, curve) for curve in curves],
         limitations=limitations(results),
@@ -193,43 +452,40 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
 def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
     """Cells, pairs and charts of a task."""
     mine, pairs = ([it for it in results[key] if it["task"] == task] for key in ("cells", "pairs"))
+    least, most = min(c["trials"] for c in mine), max(c["trials"] for c in mine)
+    each = f"n = {least} per light" if least == most else f"n = {least} to {most} per light"
     if len({c["lighting"] for c in mine}) <= MAX_PLOTTED_LIGHTINGS:
-        rates = Chart("Share of episodes that reached the goal", svg(rate_figure(mine)))
+        title, figure = f"Share of episodes that reached the goal, with 90% intervals ({each})", rate_figure(mine)
     else:
-        least, most = min(c["trials"] for c in mine), max(c["trials"] for c in mine)
-        each = f"{least}" if least == most else f"{least} to {most}"
-        title = f"Episodes that reached the goal [%], of {each} in each light; the mean is over the common lights"
         trained = {policy: rate["rate"] for policy, rate in results["training"].items()}
-        rates = Chart(title, svg(rate_heatmap(mine, trained)))
-    title = (
-        "Number of episodes in which only the row’s policy reached the goal, minus those of the column’s: blue is "
-        "better, red is worse, pale is within chance"
+        title = f"Episodes that reached the goal [%] ({each}); the mean is over the common lights"
+        figure = rate_heatmap(mine, trained)
+    pair_title = (
+        "Number of episodes in which only the row’s policy reached the goal, minus those of the column’s: blue and + "
+        "is better, red and − is worse, pale and in parentheses is within chance"
     )
     return {
         "name": task,
         "cells": mine,
         "by_policy": {c["policy"]: [it for it in mine if it["policy"] == c["policy"]] for c in mine},
-        "rates": rates,
+        "rates": Chart(title, svg(figure)),
         "pairs": pairs,
-        "pair_charts": [Chart(title, svg(pair_heatmap(pairs)))] if len(pairs) > MAX_TABLE_ROWS else [],
+        "pair_charts": [Chart(pair_title, svg(pair_heatmap(pairs)))] if len(pairs) > MAX_TABLE_ROWS else [],
     }
 
 
-def _video(film: dict[str, Any], folder: Path) -> dict[str, Any]:
-    ended = "reached the goal" if film["cause"] == "goal" else FAILURES[film["cause"]][0]
-    return film | {"url": quote(film["file"]), "poster": data_url(folder / film["poster"]), "ended": ended}
-
-
 def _training_chart(results: dict[str, Any], curve: TrainingCurve) -> Chart:
-    saved = [t["step"] for t in results["training"].values() if t["run"] == curve.run]
-    return Chart(curve.run, svg(training_figure(curve.steps, curve.success, sorted(saved))))
+    saved = sorted(t["step"] for t in results["training"].values() if t["run"] == curve.run)
+    return Chart(
+        f"{curve.run} (n = {len(curve.steps)} episodes)", svg(training_figure(curve.steps, curve.success, saved))
+    )
 
 
 def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str]]]:
     """What to do after a validation: texts with their commands."""
     policies = list(dict.fromkeys((c["policy"], c["task"]) for c in results["cells"]))
     rows = [(policy, task, "LIGHT", "TRIALS", "SUCCESSES") for policy, task in policies[:2]]
-    head = ("policy", "task", "lighting", "trials", "successes")
+    table = csv_text(("policy", "task", "lighting", "trials", "successes"), rows).splitlines()
     return [
         (
             f"Drive some of these policies on the road, good and bad ones, on several days: at least {MIN_POLICIES} "
@@ -240,11 +496,11 @@ def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str
             "Write real.csv, with a line for each policy and light: the light’s name, how often you drove, and how "
             "often the goal was reached. If the twin has no light of that name, name the one to compare with in a "
             "further column twin_lighting, such as held-out.",
-            [*csv_text(head, rows).splitlines(), *(["…"] if len(policies) > 2 else [])],
+            [*table, *(["…"] if len(policies) > 2 else [])],
         ),
         ("Forecast how all of them do on the road:", [command("forecast", root, "--real", "real.csv")]),
     ]
 
 
-def _count(n: int, one: str, many: str = "") -> str:
-    return f"{n} {one if n == 1 else many or one + 's'}"
+def _count(n: int, one: str, many: str) -> str:
+    return f"{n} {one if n == 1 else many}"

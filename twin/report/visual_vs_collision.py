@@ -8,11 +8,13 @@ shows a place from two directions. Elsewhere (mainly just ahead of a drive's fir
 build; collision-only there is reported separately as `unfilmed_ghost_m`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
+import trimesh
 from matplotlib import colormaps
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -23,7 +25,6 @@ from twin.geometry.cameras import Cameras, Viewpoints, opencv_to_mujoco, pixel_g
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import CAMERA_SIZE, GROUND_GROUP, PART_GROUP, World, arc_lengths, point_at
 from twin.nerf.rendering import FAR, RenderableField
-from twin.report.html import Caution, Fact, Section, Verdict, number, pick
 from twin.report.review_studio import caption_line, scale_bar, titled_panel
 from twin.report.video_layout import BACKGROUND, PANEL_BACKGROUND, depth_colors, fit
 from twin.runtime import track
@@ -57,52 +58,41 @@ class GeometryViews:
     def points(self, depth: Array, intrinsics: Array) -> Array:
         """Points on the pixels' rays at z-depths, shape (n, height, width, 3)."""
         rays = unproject(pixel_grid(*CAMERA_SIZE), intrinsics)
-        local = rays * depth[..., None]
-        return (
-            np.einsum("nhwi,nji->nhwj", local, self.camera_to_world[:, :3, :3])
-            + (self.camera_to_world[:, None, None, :3, 3])
-        )
+        turned = np.einsum("nhwi,nji->nhwj", rays * depth[..., None], self.camera_to_world[:, :3, :3])
+        return turned + self.camera_to_world[:, None, None, :3, 3]
 
 
 def render_views(field: RenderableField, world: World, camera_to_world: Array, lighting: str) -> GeometryViews:
     """Renders the field and casts rays at the collision geometry from camera poses (n, 4, 4)."""
-    import mujoco_warp as mjw  # slow to import
+    from twin.env.mujoco_renderer import RayCaster  # slow to import
 
     model = world.model()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    camera = model.camera(world.names["camera"]).id
-    on_device, state = mjw.put_model(model), mjw.put_data(model, data)
-    context = mjw.create_render_context(
+    camera, ground = model.camera(world.names["camera"]).id, model.geom(world.names["ground"]).id
+    caster = RayCaster(
         model,
+        data,
         cam_res=CAMERA_SIZE,
         cam_active=[world.names["camera"]],
-        render_rgb=False,
-        render_depth=True,
         render_seg=True,
         use_textures=False,
         enabled_geom_groups=[GROUND_GROUP, PART_GROUP],
     )
-    ground = model.geom(world.names["ground"]).id
     shape = CAMERA_SIZE[::-1]
     visual_depth, collision_depth, is_ground, rgb = [], [], [], []
-    positions, turns = data.cam_xpos.copy(), data.cam_xmat.reshape(-1, 3, 3).copy()
-    mjw.refit_bvh(on_device, state, context)
     for pose in track(list(camera_to_world), "visual vs collision", unit="view"):
         flipped = opencv_to_mujoco(pose)
-        positions[camera], turns[camera] = flipped[:3, 3], flipped[:3, :3]
-        state.cam_xpos.assign(positions[None].astype(np.float32))
-        state.cam_xmat.assign(turns[None].astype(np.float32))
-        mjw.render(on_device, state, context)
-        depth = context.depth_data.numpy()[0].reshape(shape).astype(np.float64)
+        data.cam_xpos[camera], data.cam_xmat[camera] = flipped[:3, 3], flipped[:3, :3].ravel()
+        caster.set_poses(cam_xpos=data.cam_xpos, cam_xmat=data.cam_xmat)
+        depth = caster.cast()[1].reshape(shape).astype(np.float64)
         collision_depth.append(np.where(depth > 0.0, depth, FAR))
-        is_ground.append(context.seg_data.numpy()[0, :, 0].reshape(shape) == ground)
+        is_ground.append(caster.hit_geoms().reshape(shape) == ground)
         out = field.render(Viewpoints.of(pose, world.intrinsics, CAMERA_SIZE), lighting, CAMERA_SIZE)
         visual_depth.append(np.where(out.opacity[0] >= _MIN_OPACITY, out.depth[0], FAR).astype(np.float64))
         rgb.append(out.rgb[0])
-    return GeometryViews(
-        camera_to_world, np.stack(visual_depth), np.stack(collision_depth), np.stack(is_ground), np.stack(rgb)
-    )
+    depths = np.stack(visual_depth), np.stack(collision_depth)
+    return GeometryViews(camera_to_world, *depths, np.stack(is_ground), np.stack(rgb))
 
 
 def view_poses(camera_to_world: Array) -> Array:
@@ -127,10 +117,8 @@ def compare_geometry(
         shows the corridor from two directions), and `along`, the maxima per meter of the route. Every collision-only
         point of the corridor is in one of the two.
     """
-    visual, collision = (
-        views.points(views.visual_depth, world.intrinsics),
-        views.points(views.collision_depth, world.intrinsics),
-    )
+    visual = views.points(views.visual_depth, world.intrinsics)
+    collision = views.points(views.collision_depth, world.intrinsics)
     height = np.where(views.visual_depth < FAR, visual[..., 2] - ground.at(visual[..., :2]), np.inf)
     top = max([float((v[:, 2] - ground.at(v[:, :2])).max()) for v in parts.vertices], default=0.0)
     near = (views.visual_depth < MAX_DEPTH) & (height < max(top, _MIN_OBSTACLE_HEIGHT))
@@ -140,10 +128,8 @@ def compare_geometry(
 
     station, inside = _in_corridor(world, visual, near & (height < HEADROOM))
     low = inside & (height < _MIN_OBSTACLE_HEIGHT)
-    out |= {
-        "ground_median_m": _quantile(np.abs(height[low]), 0.5),
-        "ground_p95_m": _quantile(np.abs(height[low]), 0.95),
-    }
+    off = np.abs(height[low])
+    out |= {"ground_median_m": _quantile(off, 0.5), "ground_p95_m": _quantile(off, 0.95)}
 
     hit_station, hit = _in_corridor(world, collision, views.collision_depth < MAX_DEPTH)
     hit &= collision[..., 2] - np.where(hit, ground.at(collision[..., :2]), 0.0) < HEADROOM
@@ -156,10 +142,8 @@ def compare_geometry(
     out["unfilmed_ghost_m"] = float(np.where(hit & ~filmed, behind, 0.0).max())
 
     surface = _collision_surface(ground, parts)
-    obstacle_points, part_points = (
-        _thin(visual[near & (height > _MIN_OBSTACLE_HEIGHT)]),
-        _thin(collision[(views.collision_depth < MAX_DEPTH) & ~views.is_ground]),
-    )
+    obstacle_points = _thin(visual[near & (height > _MIN_OBSTACLE_HEIGHT)])
+    part_points = _thin(collision[(views.collision_depth < MAX_DEPTH) & ~views.is_ground])
     distance = surface.distance(obstacle_points) if len(obstacle_points) else np.zeros(0)
     out["standing_median_m"] = _quantile(distance, 0.5)
     out["leak_share"] = float((distance > LARGE_ERROR).mean()) if len(distance) else None
@@ -170,9 +154,9 @@ def compare_geometry(
     edges = np.arange(0.0, arc_lengths(world.route)[-1] + _BIN, _BIN)
     out["along"] = {
         "station_m": [float(s) for s in edges[:-1] + _BIN / 2],
-        "leak_m": _largest(edges, station, visual_only, inside),
-        "ghost_m": _largest(edges, hit_station, collision_only, hit & filmed),
-        "ground_m": _medians(edges, station, np.abs(height), low),
+        "leak_m": _by_bin(edges, station[inside], visual_only[inside].clip(0.0), np.max, 0.0),
+        "ghost_m": _by_bin(edges, hit_station[hit & filmed], collision_only[hit & filmed].clip(0.0), np.max, 0.0),
+        "ground_m": _by_bin(edges, station[low], np.abs(height[low]), np.median, None),
     }
     return out
 
@@ -215,22 +199,11 @@ def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_])
 
 
 def _collision_surface(ground: Ground, parts: Parts) -> Any:
+    from twin.assets.tsdf import height_mesh  # slow to import
     from twin.geometry.mesh_rays import Surface
 
-    rows, columns = ground.height.shape
-    x, y = np.meshgrid(
-        ground.origin[0] + ground.cell * np.arange(columns), ground.origin[1] + ground.cell * np.arange(rows)
-    )
-    vertices = [np.stack([x, y, ground.height], -1).reshape(-1, 3)]
-    i = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
-    faces = [np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])]
-    start = len(vertices[0])
-    for v, f in zip(parts.vertices, parts.faces, strict=True):
-        vertices.append(v)
-        faces.append(f + start)
-        start += len(v)
-    return Surface(np.concatenate(vertices), np.concatenate(faces))
+    vertices, faces = height_mesh(ground, ground.cell, 2 * ground.height.size)
+    return Surface(*trimesh.util.append_faces([vertices, *parts.vertices], [faces, *parts.faces]))
 
 
 def _thin(points: Array) -> Array:
@@ -242,112 +215,17 @@ def _quantile(values: Array, share: float) -> float | None:
     return float(np.quantile(values, share)) if len(values) else None
 
 
-def _largest(edges: Array, station: Array, values: Array, among: NDArray[np.bool_]) -> list[float]:
-    out = np.zeros(len(edges) - 1)
-    np.maximum.at(out, np.clip(np.digitize(station[among], edges) - 1, 0, len(out) - 1), values[among])
-    return [round(float(v), 4) for v in out]
+def _by_bin(edges: Array, station: Array, values: Array, reduce: Callable[[Array], Any], empty: float | None) -> list:
+    """Reduces the values at stations [m] to one per bin of the route."""
+    which = np.clip(np.digitize(station, edges) - 1, 0, len(edges) - 2)
+    found = [values[which == k] for k in range(len(edges) - 1)]
+    return [round(float(reduce(v)), 4) if len(v) else empty for v in found]
 
 
-def _medians(edges: Array, station: Array, values: Array, among: NDArray[np.bool_]) -> list[float | None]:
-    which, selected = np.clip(np.digitize(station[among], edges) - 1, 0, len(edges) - 2), values[among]
-    found = [selected[which == k] for k in range(len(edges) - 1)]
-    return [round(float(np.median(v)), 4) if len(v) else None for v in found]
+# ---- picture
 
-
-# ---- report section
-
-_LARGE_MEDIAN_GAP = 0.05  # [m] threshold of a caution
 _MAX_GAP = 0.3  # [m] at the ends of the color scale
 _PANEL_WIDTH = 320  # [px] of a panel
-
-
-def geometry_section(report: dict[str, Any]) -> Section:
-    """Section of the report on visual against collision geometry; part of the review stage."""
-    found = pick(report, "seen_touched")
-    name, title = "seen_touched", "Visual and collision geometry"
-    if not isinstance(found, dict):
-        return Section(name, title, "", not_applicable="nothing was driven here, so there are no views to compare")
-    rows = (
-        (
-            "median_m",
-            "visual to collision geometry, along the ray",
-            "{:.3f} m",
-            f"median within {MAX_DEPTH:g} m, ground and parts",
-        ),
-        ("p90_m", "the same, 90th percentile", "{:.3f} m", "large where the ground is seen at a low angle"),
-        ("ground_median_m", "visual to collision ground", "{:.3f} m", "median height difference in the corridor"),
-        ("ground_p95_m", "the same, 95th percentile", "{:.3f} m", "height difference in the corridor"),
-        (
-            "corridor_leak_m",
-            "largest visual-only in the corridor",
-            "{:.3f} m",
-            "visible above the ground, without collision geometry",
-        ),
-        (
-            "corridor_ghost_m",
-            "largest collision-only in the corridor",
-            "{:.3f} m",
-            "collision geometry that is not visible",
-        ),
-        (
-            "unfilmed_ghost_m",
-            "the same, filmed from one direction",
-            "{:.3f} m",
-            "where no film shows the corridor from two directions; not part of the previous number",
-        ),
-        (
-            "standing_median_m",
-            "visible obstacles to collision geometry",
-            "{:.3f} m",
-            "median distance to the nearest surface",
-        ),
-        ("leak_share", "visual-only", "{:.1%}", f"of visible obstacles, by more than {LARGE_ERROR:g} m"),
-        ("ghost_share", "collision-only", "{:.1%}", f"of the parts in view, by more than {LARGE_ERROR:g} m"),
-        ("views", "views", "{}", "of the robot’s camera, along its drive"),
-    )
-    facts = [Fact(label, number(found.get(key), form), meaning) for key, label, form, meaning in rows]
-    cautions = []
-    for key, limit, what, cure in (
-        (
-            "median_m",
-            _LARGE_MEDIAN_GAP,
-            "Visual and collision geometry differ",
-            "raise nerf.steps, or lower mesh.voxel.",
-        ),
-        (
-            "corridor_leak_m",
-            LARGE_ERROR,
-            "Something in the corridor is visible but has no collision geometry",
-            "mask what moved while filming.",
-        ),
-        ("corridor_ghost_m", LARGE_ERROR, "Collision geometry in the corridor is not visible", "raise nerf.steps."),
-        (
-            "unfilmed_ghost_m",
-            LARGE_ERROR,
-            "Collision geometry in the corridor is not visible where no film shows it from two directions; the field’s "
-            "depth there is not determined and may differ from build to build",
-            "start the drive a little further along, or start to film a little earlier.",
-        ),
-    ):
-        value = found.get(key)
-        if isinstance(value, int | float) and value > limit:
-            cautions.append(Caution(f"{what}: {number(value, '{:.3f} m')}, more than {limit:g} m.", cure))
-    return Section(
-        name,
-        title,
-        "A policy sees the radiance field but collides with MuJoCo’s ground and convex parts. Both were rendered from "
-        "the robot’s camera along the drive and compared pixel by pixel.",
-        facts,
-        cautions,
-        verdict=_geometry_verdict(found),
-    )
-
-
-def _geometry_verdict(found: dict[str, Any]) -> Verdict | None:
-    apart = found.get("median_m")
-    if not isinstance(apart, int | float):
-        return None
-    return Verdict(f"Visual and collision geometry differ by {100 * apart:.1f} cm in the median.", "good")
 
 
 def gap_row(views: GeometryViews, k: int) -> Image:
