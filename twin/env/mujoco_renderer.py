@@ -254,7 +254,7 @@ class SceneCamera:
         return rgb.reshape(height, width, 3).astype(np.uint8), depth.reshape(height, width)
 
 
-def blend_parts(rgb: Image, depth: Array, part_rgb: Image, part_depth: Array, identity: NDArray) -> Image:
+def blend_parts(rgb: Image, depth: NDArray, part_rgb: Image, part_depth: NDArray, identity: NDArray) -> Image:
     """Blends visible collision parts, with outlines, over a picture (h, w, 3); z-depths [m] have shape (h, w).
 
     `depth` is 0 where nothing is hit; `identity` is the id of the visible part, −1 for none.

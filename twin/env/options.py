@@ -102,11 +102,11 @@ Check = tuple[Callable[[Any], bool], str]
 
 def _is_number(value: Any) -> bool:
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return real and -_MAX_NUMBER <= value <= _MAX_NUMBER
+    return real and bool(-_MAX_NUMBER <= value <= _MAX_NUMBER)
 
 
 def _is_integer(value: Any, low: int, high: int) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and low <= value <= high
+    return bool(isinstance(value, int | np.integer) and not isinstance(value, bool) and low <= value <= high)
 
 
 def _is_sequence(value: Any) -> bool:
