@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from twin import runtime
-from twin.cli import signals_held, signals_kept
 from twin.env.domain_randomization import Ranges, lighting_options
 from twin.env.suite import EnvFactory
 from twin.env.vector_env import make_vector_env
@@ -37,7 +36,7 @@ from twin.learn.checkpoint import saved_steps
 from twin.learn.policy import Policy, copy_policy, load_policy
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin, load_scene
-from twin.runtime import die_with_parent, ignore_terminal_signals
+from twin.runtime import die_with_parent, ignore_terminal_signals, signals_held, signals_kept
 
 CHUNK = 16
 """Most episodes of a chunk, which one process drives."""

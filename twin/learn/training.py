@@ -28,7 +28,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from twin.cli import StopNotice, Stopped, stop_noted
 from twin.config import RANDOMIZED
 from twin.env.suite import fingerprint
 from twin.errors import InputError
@@ -43,7 +42,7 @@ from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
-from twin.runtime import resident_memory
+from twin.runtime import StopNotice, Stopped, resident_memory, stop_noted
 
 TRAINING_EPISODE_COLUMNS = (
     *("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m"),
