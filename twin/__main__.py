@@ -1,4 +1,4 @@
-"""The command `twin`, also `python -m twin`: a map of the verbs, and the way to each of them."""
+"""The command `twin`, also `python -m twin`: lists the verbs, and runs one."""
 
 import sys
 
@@ -7,25 +7,22 @@ from twin.errors import print_error, short_repr
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs a verb; returns its exit status, see `twin.cli`."""
+    """Runs a verb; returns its exit status, see `twin.commands`."""
     given = sys.argv[1:] if arguments is None else arguments
     if not given or given[0] in ("-h", "--help", "help"):
-        print(_map())
-        return 0
-    if given[0] == "--version":
+        print("usage: twin VERB ...\n\nA filmed place as a MuJoCo digital twin. The verbs, in the order of use:\n")
+        for name, verb in commands.VERBS.items():
+            print(f"  {name:<10} {verb.summary}")
+        print("\ntwin VERB --help shows a verb's options. Begin with: twin new SCENE VIDEO...")
+    elif given[0] == "--version":
         from importlib import metadata
 
         print(f"twin {metadata.version('twin')}")
-        return 0
-    if given[0] not in commands.VERBS:
+    elif given[0] not in commands.VERBS:
         return print_error(f"no verb {short_repr(given[0])}; expected one of {', '.join(commands.VERBS)}")
-    return commands.main(given[0], given[1:])
-
-
-def _map() -> str:
-    rows = [f"  {name:<10} {verb.summary}" for name, verb in commands.VERBS.items()]
-    head = ["usage: twin VERB ...", "", "A filmed place as a MuJoCo digital twin. The verbs, in the order of use:", ""]
-    return "\n".join([*head, *rows, "", "twin VERB --help shows a verb's options. Begin with: twin new SCENE VIDEO..."])
+    else:
+        return commands.main(given[0], given[1:])
+    return 0
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -180,13 +181,8 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
     return rows
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("align", arguments)
-
-
 def command(options: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     if options.log.suffix.lower() in FILM_SUFFIXES:
         if options.out or options.level:
             raise InputError(f"{options.log} is a film; --out and --level are for logs")
@@ -204,6 +200,8 @@ def command(options: argparse.Namespace) -> None:
             )
         print(f"wrote {folder / ROBOT_TOML}; look at {folder / RESULT_FOLDER}")
 
+
+main = partial(commands.main, "align")
 
 if __name__ == "__main__":
     sys.exit(main())

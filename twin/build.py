@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -340,19 +341,16 @@ def summary(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("build", arguments)
-
-
 def command(options: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     report = build(options.scene, options.until, tuple(options.force), tuple(options.set), options.device)
     if not options.quiet:
         print(summary(report))
         if options.until is None:
             print(f"look at {SceneDir(options.scene).report_html} and {SceneDir(options.scene).review_mp4}")
 
+
+main = partial(commands.main, "build")
 
 if __name__ == "__main__":
     sys.exit(main())

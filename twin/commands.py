@@ -1,18 +1,48 @@
 """The command line of every verb: `twin VERB`, also `python -m twin.VERB`.
 
 Only options are defined here, so that help appears at once; a verb's module is imported when its work begins.
+
+| exit status | meaning |
+|---|---|
+| 0 | done |
+| 1 | a bug: a traceback |
+| 2 | bad input, or the machine refuses (disk full, no permission): one line with the cause and the cure |
+| 128 + n | stopped by signal n (SIGINT, SIGTERM, SIGHUP): one line; running the same command again continues |
 """
 
 import argparse
+import contextlib
+import errno
 import importlib
+import io
+import os
+import signal
+import sys
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NoReturn
 
-from twin import cli
+from twin import runtime
 from twin.config import HELD_OUT, Condition
+from twin.errors import InputError, print_error, shortened
 from twin.scene import STAGES
+
+_FULL = "free some space and run it again"
+_DENIED = "make it readable and writable, or choose another place"
+_CURES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),  # EFBIG: a limit on the size of files
+    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), _DENIED),
+    **dict.fromkeys((errno.EEXIST, errno.ENOTEMPTY), "move it away"),
+    errno.ENOENT: "put it there, or correct the path",
+    errno.EISDIR: "expected a file; move the folder away",
+    errno.ENOTDIR: "expected a folder; move the file away",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "the link points to itself; remove it",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENOMEM: "close other programs, or ask for less at once",
+}
 
 
 @dataclass(frozen=True)
@@ -24,6 +54,19 @@ class Verb:
     """Adds the verb's description and options to a parser."""
     module: str
     """Its function `command` does the work, given the parsed options."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        if action.option_strings and action.nargs is None and arg_strings == ["--"]:
+            # argparse would take the value of --option=-- for the end of the options, and return an empty list.
+            raise argparse.ArgumentError(action, "expected one argument")
+        return super()._get_values(action, arg_strings)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"error: {shortened(message)}; see {self.prog} --help\n")
 
 
 class _Help(argparse.HelpFormatter):
@@ -43,24 +86,62 @@ class _Help(argparse.HelpFormatter):
 
 
 def main(verb: str, arguments: list[str] | None = None) -> int:
-    """Runs a verb; returns the exit status, see `twin.cli`.
-
-    Args:
-        verb: A key of `VERBS`.
-        arguments: Those after the verb; of the process where None.
-    """
+    """Runs a verb (a key of `VERBS`) with the given arguments, or those of the process; returns the exit status."""
 
     def work(options: argparse.Namespace) -> None:
         importlib.import_module(VERBS[verb].module).command(options)
 
-    return cli.run(parser_of(verb), work, arguments)
+    return run(parser_of(verb), work, arguments)
 
 
 def parser_of(verb: str) -> argparse.ArgumentParser:
     """The argument parser of a verb, a key of `VERBS`."""
-    parser = cli.Parser(prog=f"twin {verb}", formatter_class=_Help)
+    parser = Parser(prog=f"twin {verb}", formatter_class=_Help)
     VERBS[verb].define(parser)
     return parser
+
+
+def run(
+    parser: argparse.ArgumentParser, work: Callable[[argparse.Namespace], None], arguments: list[str] | None = None
+) -> int:
+    """Parses arguments and calls `work` with the options; returns the exit status. `--quiet` turns progress off."""
+    try:
+        options = parser.parse_args(arguments)
+        runtime.set_quiet(getattr(options, "quiet", runtime.is_quiet()))
+        with runtime.stoppable():
+            if isinstance(sys.stdout, io.TextIOWrapper):
+                sys.stdout.reconfigure(errors="backslashreplace")  # so that names that are not UTF-8 can be printed
+            work(options)
+            sys.stdout.flush()
+    except InputError as error:
+        return print_error(error)
+    except BrokenPipeError:  # the reader of our output has gone
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the exit would report an error
+        return 128 + int(signal.SIGPIPE)
+    except MemoryError as error:
+        return print_error(f"out of memory ({error}); close other programs, or ask for less at once")
+    except OSError as error:
+        return print_error(_describe(error))
+    except KeyboardInterrupt as error:
+        with contextlib.suppress(OSError):
+            print("stopped; run it again to go on", file=sys.stderr)
+        return 128 + (error.number if isinstance(error, runtime.Stopped) else int(signal.SIGINT))
+    return 0
+
+
+def _describe(error: OSError) -> str:
+    """The operation that the machine refused, and the cure if one is known."""
+    number = error.errno
+    if number is None and "requested and" in str(error):  # NumPy's error for a write that was cut short
+        number = errno.ENOSPC
+    what = os.strerror(number) if number else str(error)
+    where = f"{error.filename2 or error.filename}: " if error.filename else ""
+    cure = f"; {_CURES[number]}" if number in _CURES else ""
+    return f"{where}{what}{cure}"
+
+
+# ---- options
 
 
 def _new(parser: argparse.ArgumentParser) -> None:
@@ -238,7 +319,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "A generated place whose truth is known: film it, drive policies in it, compare a build with it."
     )
-    commands = parser.add_subparsers(dest="command", required=True, parser_class=cli.Parser)
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
 
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, description=text, formatter_class=_Help)

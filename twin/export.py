@@ -8,6 +8,7 @@ rendered from the filmed poses (see `assets/splats.py`), and are not fitted to p
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -87,19 +88,16 @@ def export(scene: Path, lighting: str | None, glb: Path | None, ply: Path | None
     return lines
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("export", arguments)
-
-
 def command(options: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     if options.glb is None and options.ply is None:
         raise InputError("nothing to write; give --glb FILE, --ply FILE or both")
     lines = export(options.scene, options.lighting, options.glb, options.ply)
     if not options.quiet:
         print("\n".join(lines))
 
+
+main = partial(commands.main, "export")
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -10,6 +10,7 @@ lighting and seed determine the episode: those of a row of `validation/episodes.
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,13 +101,8 @@ def film_name(task: str, lighting: str, seed: int) -> str:
     return "".join(c if c.isalnum() or c in "-." else "_" for c in f"{task}_{lighting}_{seed}") + ".mp4"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("film", arguments)
-
-
 def command(given: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     options = {
         "lighting_drift": given.drift,
         "randomise": given.randomise,
@@ -129,6 +125,8 @@ def _obstacles(text: str) -> str | int:
         raise InputError(f"--obstacles {text!r}: expected a number, or 'scene' for those of scene.toml")
     return int(text)
 
+
+main = partial(commands.main, "film")
 
 if __name__ == "__main__":
     sys.exit(main())

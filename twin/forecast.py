@@ -8,6 +8,7 @@ reads `validation/episodes.csv` of `twin.validate` and the user's real trials, a
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
 from twin import commands
@@ -50,13 +51,8 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     return result
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("forecast", arguments)
-
-
 def command(options: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     result = forecast(options.scene, options.real, options.seed)
@@ -66,6 +62,8 @@ def command(options: argparse.Namespace) -> None:
         print(summary_text(result))
         print(f"look at {SceneDir(options.scene).forecast / 'forecast.html'}")
 
+
+main = partial(commands.main, "forecast")
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -13,6 +13,7 @@ import argparse
 import os
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
 
 from twin import commands
@@ -194,19 +195,16 @@ def _lighting(path: Path, kind: str) -> str:
     return f"{name}_light" if name in RESERVED_LIGHTINGS else name
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("new", arguments)
-
-
 def command(options: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     config = new_scene(options.scene, options.films, options.camera_height)
     print(f"wrote {config}")
     if options.camera_height is None:
         print("fill in [metric] there: without a scale nothing is metric")
     print(f"next: python -m twin.build {options.scene}")
 
+
+main = partial(commands.main, "new")
 
 if __name__ == "__main__":
     sys.exit(main())

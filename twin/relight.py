@@ -11,6 +11,7 @@ has it as `lighting="afternoon"` or `"sun:afternoon:0.5"`; environments apply it
 import argparse
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -201,18 +202,15 @@ def summary(lighting: AddedLighting) -> str:
     )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("relight", arguments)
-
-
 def command(options: argparse.Namespace) -> None:
-    """The work of the verb, given the options of `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     lighting = relight(options.scene, options.photo, options.name)
     if not options.quiet:
         print(summary(lighting))
         print(f"look at {SceneDir(options.scene).lightings / f'{options.name}.png'}")
 
+
+main = partial(commands.main, "relight")
 
 if __name__ == "__main__":
     sys.exit(main())

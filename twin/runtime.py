@@ -1,4 +1,4 @@
-"""Runtime services of the verbs: progress bars, child processes, CPU cores, memory and file locks."""
+"""Runtime services of the verbs: progress bars, signals, child processes, CPU cores, memory and file locks."""
 
 import contextlib
 import ctypes
@@ -8,11 +8,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import psutil
@@ -29,13 +28,12 @@ _quiet = False
 
 
 def set_quiet(quiet: bool) -> None:
-    """Turns all progress output of this process off or on."""
+    """Turns all progress output of this process off (True) or on."""
     global _quiet
     _quiet = quiet
 
 
 def is_quiet() -> bool:
-    """True if progress output of this process is off."""
     return _quiet
 
 
@@ -46,21 +44,17 @@ class BuildStage:
     number: int
     count: int
     expected: float
-    """Expected duration of the stage [s], from the pace so far."""
+    """Expected duration of the stage [s]."""
     later: float
     """Expected duration of the stages after it [s]."""
     started: float = field(default_factory=time.monotonic)
-
-    def left(self, bar: float) -> float:
-        """Time left of the whole build [s], given that of the current bar [s]."""
-        return max(self.expected - (time.monotonic() - self.started), bar) + self.later
 
 
 _stage: BuildStage | None = None
 
 
 def set_stage(stage: BuildStage | None) -> None:
-    """Sets the build stage that bars of this process show with the time left of the build; None: no build."""
+    """Sets the build stage that progress bars show with the time left of the build; None outside a build."""
     global _stage
     _stage = stage
 
@@ -74,21 +68,16 @@ class _Bar(tqdm):
         if _stage:
             rate = facts["rate"] or (facts["n"] - facts["initial"]) / max(facts["elapsed"], 1e-6)
             bar = max((facts["total"] or 0) - facts["n"], 0) / rate if rate else 0.0
-            left = self.format_interval(_stage.left(bar))
-            facts["bar_format"] = f"{{l_bar}}{{bar}}{{r_bar}}, stage {_stage.number}/{_stage.count}, {left} to the end"
+            left = max(_stage.expected - (time.monotonic() - _stage.started), bar) + _stage.later
+            facts["bar_format"] = "{l_bar}{bar}{r_bar}, "
+            facts["bar_format"] += f"stage {_stage.number}/{_stage.count}, {self.format_interval(left)} to the end"
         return facts
 
 
 def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
-    """A progress bar, advanced by `update(n)`; also a context manager.
+    """A progress bar, also a context manager: drawn in a terminal, a line every 10 s in a log file, none if quiet.
 
-    A terminal shows a bar with the time left, a log file a line every 10 s, quiet mode nothing.
-
-    Args:
-        what: Description.
-        total: Number of units.
-        unit: Name of a unit.
-        after: Delay before the bar appears [s], for work that is slow only the first time.
+    It appears after a delay `after` [s], for work that is slow only the first time.
     """
     every = 0.1 if sys.stderr.isatty() else 10.0
     return _Bar(
@@ -97,7 +86,7 @@ def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
 
 
 def track(items: Iterable[T], what: str, total: int | None = None, unit: str = "it") -> Iterator[T]:
-    """Yields the items and advances a progress bar."""
+    """Yields the items and advances a progress bar; `total` is needed if the items have no length."""
     if total is None:
         total = len(items)  # type: ignore[arg-type]
     with bar(what, total, unit) as progress:
@@ -112,48 +101,133 @@ def log_line(line: str) -> None:
         tqdm.write(line, file=sys.stderr)
 
 
+# ---- signals
+
+_STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asked the process to stop."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[None]:
+    """SIGINT, SIGTERM and SIGHUP raise `Stopped` within the block, the first time only, so that cleanup can finish.
+
+    A signal that the process was started to ignore, as by nohup, stays ignored. A second SIGINT ends the process at
+    once.
+    """
+    stopping = False
+
+    def stop(number: int, _: Any) -> None:
+        nonlocal stopping
+        if not stopping:
+            stopping = True
+            raise Stopped(number)
+        if number == signal.SIGINT:
+            os._exit(128 + number)
+
+    with _handled(stop):
+        yield
+
+
+class StopNotice:
+    """Number of the first signal that asked to stop; 0: none."""
+
+    number = 0
+
+
+@contextlib.contextmanager
+def stop_noted() -> Iterator[StopNotice]:
+    """Only notes SIGINT, SIGTERM and SIGHUP within the block, which saves its work and then raises `Stopped`."""
+    stop = StopNotice()
+
+    def note(number: int, _: Any) -> None:
+        stop.number = stop.number or number
+
+    with _handled(note):
+        yield stop
+
+
+@contextlib.contextmanager
+def _handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Handles SIGINT, SIGTERM and SIGHUP within the block, if in the main thread; ignored signals stay ignored."""
+    with signals_kept():
+        if threading.current_thread() is threading.main_thread():
+            for number in _STOPPING:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    signal.signal(number, handler)
+        yield
+
+
+@contextlib.contextmanager
+def signals_kept() -> Iterator[None]:
+    """Restores the signal handlers at the end of the block, since some libraries replace them when imported."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (*_STOPPING, signal.SIGABRT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:  # not from Python
+                signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def signals_held() -> Iterator[None]:
+    """Delays SIGINT, SIGTERM and SIGHUP to the end of the block; in processes started in it, until they unblock."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 # ---- child processes
 
-PARENT_VARIABLE = "TWIN_PARENT"
-"""Environment variable with the process number of the parent."""
-
+_PARENT = "TWIN_PARENT"  # environment variable with the process number of the parent
 _PR_SET_PDEATHSIG = 1
 _PARENT_POLL = 0.5  # [s] between checks for the parent
 
 
 def child_environment(**more: str) -> dict[str, str]:
     """Environment variables for a child process that calls `die_with_parent`."""
-    return {**os.environ, PARENT_VARIABLE: str(os.getpid()), **more}
+    return {**os.environ, _PARENT: str(os.getpid()), **more}
 
 
 def die_with_parent(parent: int | None = None) -> None:
     """Makes this process die when its parent dies, so that no second writer survives; call first in a child.
 
-    Args:
-        parent: Process number; by default that of `child_environment`, or the present parent.
+    `parent` is a process number; by default that of `child_environment`, or the present parent.
     """
-    parent = parent or int(os.environ.get(PARENT_VARIABLE, os.getppid()))
+    parent = parent or int(os.environ.get(_PARENT, os.getppid()))
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+    def exit_when_orphaned() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PARENT_POLL)
+        os._exit(1)
+
     if os.getppid() != parent:  # it died before the call
         os._exit(1)
     # For systems without prctl.
-    threading.Thread(target=_exit_when_orphaned, args=(parent,), daemon=True).start()
+    threading.Thread(target=exit_when_orphaned, daemon=True).start()
 
 
 def ignore_terminal_signals() -> None:
-    """Makes a child ignore the terminal's signals, which the parent handles; SIGTERM still ends it."""
+    """Makes a child ignore the terminal's signals, which its parent handles; SIGTERM still ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
-
-
-def _exit_when_orphaned(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_PARENT_POLL)
-    os._exit(1)
 
 
 # ---- CPU cores
@@ -163,20 +237,20 @@ _core_limit: int | None = None
 
 
 def limit_cores(limit: int) -> None:
-    """Limits `available_cores`, for one of several processes that share the cores."""
+    """Limits `available_cores` in a process that shares the cores with others."""
     global _core_limit
     _core_limit = limit
 
 
 def available_cores() -> int:
-    """Number of CPU cores this process may use: its affinity, else all cores, within `limit_cores` and cgroup quota."""
+    """Number of CPU cores this process may use: its affinity, the container's quota, and `limit_cores`."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(count, _core_limit or count, _quota() or count)
 
 
 @cache
 def _quota() -> int | None:
-    """CPU quota of the container (Linux cgroup v2) in whole cores; None: unlimited."""
+    """CPU quota of the container (cgroup v2) in whole cores; None: unlimited."""
     try:
         quota, period = _QUOTA.read_text(encoding="ascii").split()
     except (OSError, ValueError):
@@ -212,7 +286,7 @@ class PeakMemory:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
+    def __exit__(self, *error: object) -> None:
         self._stop.set()
         self._thread.join()
 
@@ -228,11 +302,10 @@ class PeakMemory:
 
 @contextlib.contextmanager
 def exclusive_lock(path: Path, what: str) -> Iterator[None]:
-    """Holds a lock on a file; it is released when the process ends, even if killed.
+    """Holds a lock on a file, released when the process ends, even if killed.
 
     Args:
-        path: Lock file, which contains the holder's process number. It is removed at the end; a file left by a killed
-            process is taken over.
+        path: Lock file with the holder's process number, removed at the end; one left by a killed process is reused.
         what: Describes the locked work in the error message.
 
     Raises:
@@ -260,7 +333,6 @@ def exclusive_lock(path: Path, what: str) -> Iterator[None]:
 
 
 def _is_same_file(descriptor: int, path: Path) -> bool:
-    """True if an open file is the one at `path`."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +26,8 @@ if TYPE_CHECKING:
     from twin.learn.train_config import TrainConfig
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("train", arguments)
-
-
 def command(given: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     from twin.evaluation.training_curves import write_success_curve
     from twin.learn.train_config import PRESETS, TrainConfig
 
@@ -73,6 +69,8 @@ def _train(twin: Twin, folder: Path, config: "TrainConfig", processes: int | Non
         training.train(twin, folder, config, watch, processes)
     return training.select_checkpoint(twin, folder, config, processes)["chosen"]
 
+
+main = partial(commands.main, "train")
 
 if __name__ == "__main__":
     sys.exit(main())

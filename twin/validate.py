@@ -11,6 +11,7 @@ episodes. Episodes in `validation/episodes.csv` are not driven again, so a stopp
 import argparse
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -360,13 +361,8 @@ def _has_rows(path: Path) -> bool:
     return path.read_bytes().count(b"\n") > 1
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
-    return commands.main("validate", arguments)
-
-
 def command(given: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb with the options parsed by `twin.commands`."""
     for name, most in (("episodes", _PER_LIGHTING), ("processes", _MAX_PROCESSES)):
         if not 1 <= getattr(given, name) <= most:
             raise InputError(f"--{name} {getattr(given, name)}; expected 1 to {most}")
@@ -376,6 +372,8 @@ def command(given: argparse.Namespace) -> None:
         print("\n".join(summary_lines(results)))
         print(f"look at {SceneDir(given.scene).validation / 'validation.html'}")
 
+
+main = partial(commands.main, "validate")
 
 if __name__ == "__main__":
     sys.exit(main())

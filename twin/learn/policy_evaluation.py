@@ -19,7 +19,6 @@ from multiprocessing import active_children, get_context
 
 import numpy as np
 
-from twin.cli import signals_held, signals_kept
 from twin.config import Condition
 from twin.env.domain_randomization import Ranges, condition_options
 from twin.env.suite import EnvFactory
@@ -28,7 +27,7 @@ from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
 from twin.learn.policy import Policy, load_policy
 from twin.loading import load_scene
-from twin.runtime import die_with_parent, ignore_terminal_signals
+from twin.runtime import die_with_parent, ignore_terminal_signals, signals_held, signals_kept
 
 CHUNK = 16
 """Most episodes of a chunk, which one process drives."""

@@ -28,7 +28,6 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin import runtime
-from twin.cli import StopNotice, Stopped, stop_noted
 from twin.config import Condition
 from twin.env.suite import fingerprint
 from twin.env.vector_env import make_vector_env
@@ -53,6 +52,7 @@ from twin.learn.sac import (
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
+from twin.runtime import StopNotice, Stopped, stop_noted
 
 TRAINING_EPISODE_COLUMNS = (
     *("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m"),

@@ -81,7 +81,7 @@ def scene_toml(plan: FilmingPlan, name: str) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.cli`."""
+    """Runs the verb; returns the exit status, see `twin.commands`."""
     return commands.main("reality", arguments)
 
 
