@@ -55,6 +55,7 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
         folder: For the scene.
     """
     import psutil
+    import tqdm
     from tiny_twin import tiny_twin
 
     from twin.config import TRAINING
@@ -71,7 +72,7 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
     worlds.begin(range(_WORLDS))
     rng, process = np.random.default_rng(0), psutil.Process()
     rounds, sizes, episodes, bad, start = steps // _WORLDS, [], 0, 0, time.perf_counter()
-    for k in range(rounds):
+    for k in tqdm.trange(rounds, desc="endurance", mininterval=60.0):
         actions = np.stack([rng.uniform(0, 1, _WORLDS), rng.uniform(-0.4, 0.4, _WORLDS)], 1)  # mostly forward
         out = worlds.step(actions)
         states = [p.data.qpos for p in worlds.physics] + [p.data.qvel for p in worlds.physics]
@@ -82,6 +83,7 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
         if (k + 1) % max(1, rounds // 50) == 0:
             gc.collect()
             sizes.append(process.memory_info().rss)
+            tqdm.tqdm.write(f"{(k + 1) * _WORLDS} steps, {sizes[-1] / 2**20:.1f} MiB, {bad} rounds not finite")
     settled = sizes[len(sizes) // 5]  # by then every kind of thing has been in view once
     return {
         "steps": rounds * _WORLDS,
