@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.reality import true_world
-from twin.reality.centerline import RoadLine, ground_height
-from twin.reality.lighting import LIGHTINGS, Lighting, apply_haze
-from twin.reality.place_objects import SEED, KnownPlace
+from twin.reality.lighting import Lighting, apply_haze
+from twin.reality.place_objects import SEED, KnownPlace, Road
 from twin.runtime import track
 from twin.types import Array
 from twin.warp_runtime import wp
@@ -60,7 +59,7 @@ def smooth_noise(rng: np.random.Generator, times: Array, period: float) -> Array
     return np.sin(times[:, None] * rates + rng.uniform(0, 2 * np.pi, 3)).sum(1) / np.sqrt(1.5)
 
 
-def trajectory(plan: FilmingPlan, route: RoadLine, lighting: str) -> tuple[Array, Array]:
+def trajectory(plan: FilmingPlan, route: Road, lighting: str) -> tuple[Array, Array]:
     """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of one film."""
     rng = np.random.default_rng([SEED, 11, sum(map(ord, lighting))])
     speed = plan.speed * rng.uniform(0.93, 1.07)
@@ -71,7 +70,7 @@ def trajectory(plan: FilmingPlan, route: RoadLine, lighting: str) -> tuple[Array
     lateral = np.clip(rng.uniform(-0.12, 0.12) + 0.12 * smooth_noise(rng, times, 9.0), -0.3, 0.3)
     xy = route.at(station, lateral)
     lift = 0.004 * smooth_noise(rng, times, 1.1)
-    position = np.concatenate([xy, (ground_height(route, xy) + CAMERA_HEIGHT + lift)[:, None]], 1)
+    position = np.concatenate([xy, (route.ground_height(xy) + CAMERA_HEIGHT + lift)[:, None]], 1)
     # Heading of the cart: direction of the center line plus the slope of the lateral wander.
     drift = np.gradient(lateral, station)
     yaw = route.heading(station + 0.6) + np.arctan(drift) + np.deg2rad(0.9) * smooth_noise(rng, times, 2.3)
@@ -112,7 +111,7 @@ class Renderer:
                 render_rgb=True,
                 render_depth=True,
                 render_seg=False,
-                use_shadows=any(shadow for _, _, shadow in LIGHTINGS[lighting].suns),
+                use_shadows=any(shadow for _, _, shadow in place.lightings[lighting].suns),
                 enabled_geom_groups=[0, 1],
                 render_skybox=True,
                 enable_backface_culling=False,
@@ -151,20 +150,20 @@ def sensor_image(
     return (np.clip(signal, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def exposures(lighting: str, times: Array) -> Array:
+def exposures(lighting: Lighting, times: Array) -> Array:
     """Relative exposure of each frame, with a slow drift like that of automatic exposure."""
-    rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting))])
-    return np.exp(LIGHTINGS[lighting].drift * smooth_noise(rng, times, 11.0))
+    rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting.name))])
+    return np.exp(lighting.drift * smooth_noise(rng, times, 11.0))
 
 
 def film_lighting(lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path) -> tuple[Array, Array]:
     """Writes the film of one lighting; returns its times (n,) [s] and poses (n, 4, 4)."""
     times, poses = trajectory(plan, place.route, lighting)
-    gains = exposures(lighting, times)
+    light = place.lightings[lighting]
+    gains = exposures(light, times)
     rng = np.random.default_rng([SEED, 13, sum(map(ord, lighting))])
     render = Renderer(lighting, place, plan)
     steps = track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame")
-    light = LIGHTINGS[lighting]
     write_video(
         (sensor_image(rng, apply_haze(*render(pose), light), light, float(gain)) for pose, gain in steps), plan, path
     )

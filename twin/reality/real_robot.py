@@ -27,7 +27,7 @@ from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World, heading_at, point_at
 from twin.reality import place as places
 from twin.reality import true_world
-from twin.reality.centerline import RoadLine, ground_height
+from twin.reality.centerline import RoadLine
 from twin.reality.filming import FilmingPlan, sensor_image, smooth_noise, trajectory
 from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.place_objects import SEED, KnownPlace, PlaceObject
@@ -97,7 +97,7 @@ def true_route(plan: FilmingPlan | None = None, line: RoadLine | None = None) ->
     paths = [smooth_route(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
     lengths = np.array([route_length(path) for path in paths])
     xy = paths[int(np.argmax(lengths >= _LENGTH_TOLERANCE * lengths.max()))]
-    return np.column_stack([xy, ground_height(line, xy)])
+    return np.column_stack([xy, line.ground_height(xy)])
 
 
 @cache
@@ -122,7 +122,7 @@ class TrueRoad:
         line = true_route()
         half_width = MjcfConfig().half_width
         yaw = float(heading_at(line, 0.0))
-        start, quaternion = rest_pose(lambda xy: ground_height(place_on_test_day().route, xy), line[0, :2], yaw)
+        start, quaternion = rest_pose(lambda xy: place_on_test_day().route.ground_height(xy), line[0, :2], yaw)
         self.world = World(line, half_width, (*start.tolist(), yaw), Path(), robot=robot.params)
         self.segment: RouteSegment = find_task(task, self.world)
         spec = true_world.collision_spec(self._near(half_width + _COLLISION_REACH))
@@ -148,7 +148,8 @@ class TrueRoad:
                 along.query(one.center[:2])[0] - np.hypot(one.half[0], one.half[1]) <= reach for one in obj.solids
             )
 
-        return KnownPlace(place_on_test_day().route, [obj for obj in place_on_test_day().objects if near(obj)], [])
+        day = place_on_test_day()
+        return replace(day, objects=[obj for obj in day.objects if near(obj)], lamp_heads=[])
 
 
 def _rotate_camera(model: mujoco.MjModel, turn: tuple[float, float, float]) -> None:

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
 from twin.files import read_json, write_json
-from twin.reality import centerline as roads
 from twin.reality import place as places
 from twin.reality.centerline import RoadLine
 from twin.reality.place_objects import SEED, KnownPlace
@@ -90,7 +89,7 @@ class Truth:
 
     def ground_height(self, xy: Array) -> Array:
         """Height of the ground [m], shape (..., 2) → (...)."""
-        return roads.ground_height(self.route, xy)
+        return self.route.ground_height(xy)
 
     def path(self, step: float = 0.25) -> Array:
         """The filmed segment of the center line on the ground [m], shape (m, 3)."""
