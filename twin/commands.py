@@ -243,9 +243,21 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, description=text, formatter_class=_Help)
 
+    def place(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            "--place",
+            type=int,
+            default=0,
+            metavar="NUMBER",
+            help="0: the demo's street; from 1: drawn places (1 to 49 are for development)",
+        )
+
     command = add("film", "film the place into a scene folder")
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
-    command.add_argument("--lightings", nargs="+", metavar="NAME", help="default: sun overcast night")
+    place(command)
+    command.add_argument(
+        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; those of a drawn place"
+    )
     command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
     command = add("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
     command.add_argument("scene", type=Path, help="folder of a built scene")

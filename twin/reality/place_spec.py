@@ -9,6 +9,7 @@ The *driven line* is the line that the first film follows and that the robot's t
 relative to it; the road need not be symmetrical about it.
 """
 
+import colorsys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -442,11 +443,7 @@ def _shade(rng: np.random.Generator, base: Rgb, spread: float) -> Rgb:
 
 def _hsv(hue: float, saturation: float, value: float) -> Rgb:
     """RGB of a hue in turns, saturation and value in [0, 1]."""
-    red, green, blue = (
-        value * (1.0 - saturation * float(np.clip(1.0 - abs((6.0 * hue - k) % 6.0 - 3.0) + 1.0, 0.0, 1.0)))
-        for k in (3.0, 5.0, 1.0)
-    )
-    return red, green, blue
+    return colorsys.hsv_to_rgb(hue, saturation, value)
 
 
 def _section(rng: np.random.Generator, setting: str) -> SectionSpec:
