@@ -263,7 +263,8 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("scene", type=Path, help="folder of a built scene")
     command = add("drive", "the real test: drive policy files in weather that was not filmed")
     command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
-    command.add_argument("--task", choices=("straight", "right_turn"), required=True)
+    command.add_argument("--task", required=True, help="{straight,right_turn}; a drawn place names its own")
+    place(command)
     command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
     command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
     command.add_argument(
@@ -274,11 +275,14 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command = add("log", "a drive log of the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
     command.add_argument("--duration", type=float, default=300.0, help="[s]")
+    place(command)
     command = add("onboard", "a film by that Husky's own camera, for twin align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
+    place(command)
     command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
     command.add_argument("--lighting", required=True, metavar="NAME", help="a weather of the test")
     command.add_argument("--out", type=Path, required=True, help="photo.png")
+    place(command)
 
 
 VERBS = {

@@ -135,12 +135,12 @@ def command(options: argparse.Namespace) -> None:
         publish(scene, load_scene(options.scene).report())
         print("\n".join(f"{name:<32} {value:.4g}" for name, value in figures.items() if value is not None))
     elif options.command == "log":
-        recordings.write_log(options.out, recordings.record_log(options.duration))
+        recordings.write_log(options.out, recordings.record_log(options.duration, options.place))
     elif options.command == "onboard":
-        recordings.write_film(options.out)
+        recordings.write_film(options.out, options.place)
     elif options.command == "photo":
         _check_lightings([options.lighting], WEATHER)
-        recordings.write_photo(options.lighting, options.out)
+        recordings.write_photo(options.lighting, options.out, options.place)
     else:
         options.lightings = options.lightings or list(WEATHER)
         _check_lightings(options.lightings, WEATHER)
@@ -152,6 +152,7 @@ def command(options: argparse.Namespace) -> None:
             options.out,
             options.twin_lighting,
             options.films,
+            options.place,
         )
         print(cells_csv(tally(trials)), end="")
 

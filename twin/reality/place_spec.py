@@ -854,8 +854,7 @@ def _film(rng: np.random.Generator, line: LineSpec, section: SectionSpec, lighti
     speed = float(rng.uniform(*{"phone": (0.9, 1.8), "cart": (1.0, 3.6)}.get(carrier, (0.6, 2.4))))
     spacing = float(np.exp(rng.uniform(np.log(0.3), np.log(min(2.0, speed)))))
     spacing = max(spacing, line.length * len(passes) * lightings / MAX_FRAMES)
-    fps = max(1, round(speed / spacing))
-    fps += speed / fps > 2.0
+    fps = int(np.clip(round(speed / spacing), np.ceil(speed / 2.0), np.floor(speed / 0.3)))
     size = _pick(rng, _SIZES)
     fov = float(np.deg2rad(rng.uniform(55.0, 95.0)))
     pitch = float(np.deg2rad(rng.uniform(2.0, 14.0)))
