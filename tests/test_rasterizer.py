@@ -14,7 +14,6 @@ from twin.geometry.images import psnr
 from twin.geometry.mesh_rays import Surface
 from twin.reality import filming, true_world
 from twin.reality import place as places
-from twin.reality.centerline import ground_height
 from twin.reality.rasterizer import SAMPLES, Rasterizer, ShadowMap, flatten, render_shadow_map, sun_visibility
 
 PLAN = replace(filming.FilmingPlan(), width=160, height=90)
@@ -62,7 +61,7 @@ def test_shadows_are_where_rays_to_the_sun_are_blocked(campus, sunny):
     flat = flatten(sunny)
     station, lateral = np.meshgrid(np.linspace(0, 60, 400), np.linspace(-7.0, 7.0, 80))
     xy = campus.route.at(station, lateral).reshape(-1, 2)
-    ground = np.column_stack([xy, ground_height(campus.route, xy)])
+    ground = np.column_stack([xy, campus.route.ground_height(xy)])
     shadows = render_shadow_map(wp.array(flat.corners, dtype=wp.vec3, device="cpu"), flat)
     out = wp.zeros(len(ground), dtype=float, device="cpu")
     points = wp.array((ground + np.array([0.0, 0.0, 0.01])).astype(np.float32), dtype=wp.vec3, device="cpu")

@@ -63,7 +63,7 @@ def test_route_runs_straight_then_right_at_unit_speed():
 def test_ground_is_gentle_but_not_flat():
     road = RoadLine()
     station = np.linspace(0.0, 60.0, 601)
-    middle = centerline.ground_height(road, road.at(station))
+    middle = road.ground_height(road.at(station))
     assert 0.06 < np.ptp(middle) < 0.3
     assert np.abs(np.gradient(middle, station)).max() < 0.05
     across = centerline.cross_profile(np.linspace(-2.9, 2.9, 59))
@@ -78,7 +78,7 @@ def test_nothing_solid_in_the_corridor(campus):
         mesh = trimesh.Trimesh(obj.part.vertices, obj.part.faces, process=False)
         points = np.concatenate([mesh.vertices, mesh.triangles_center])
         station, lateral = campus.route.project(points[:, :2])
-        low = points[:, 2] - centerline.ground_height(campus.route, points[:, :2]) < 2.2
+        low = points[:, 2] - campus.route.ground_height(points[:, :2]) < 2.2
         inside = low & (np.abs(lateral) < 1.6) & (station > -2.0) & (station < 65.0)
         assert not inside.any(), obj.name
 
@@ -102,7 +102,7 @@ def test_trajectories_are_what_a_cart_does():
         assert np.array_equal(poses, again[1])
         paths[name] = poses[:, :3, 3]
         xy = poses[:, :2, 3]
-        height = poses[:, 2, 3] - centerline.ground_height(road, xy)
+        height = poses[:, 2, 3] - road.ground_height(xy)
         assert abs(height.mean() - filming.CAMERA_HEIGHT) < 0.005
         assert np.abs(height - filming.CAMERA_HEIGHT).max() < 0.02
         assert np.abs(road.project(xy)[1]).max() <= 0.3 + 1e-9
@@ -126,9 +126,7 @@ def test_one_drives_on_the_true_ground(campus):
     spec = true_world.collision_spec(campus)
     xy = campus.route.at(np.array([12.3, 36.4, 55.1]), np.array([0.2, -0.9, 1.1]))
     for k, point in enumerate(xy):
-        body = spec.worldbody.add_body(
-            name=f"ball_{k}", pos=[*point, centerline.ground_height(campus.route, point) + 0.12]
-        )
+        body = spec.worldbody.add_body(name=f"ball_{k}", pos=[*point, campus.route.ground_height(point) + 0.12])
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], damping=4.0)
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], mass=1.0)
     model = spec.compile()
@@ -136,7 +134,7 @@ def test_one_drives_on_the_true_ground(campus):
     mujoco.mj_step(model, data, 600)
     for k, point in enumerate(xy):
         rest = data.body(f"ball_{k}").xpos[2] - 0.1
-        assert rest == pytest.approx(centerline.ground_height(campus.route, point), abs=0.006)
+        assert rest == pytest.approx(campus.route.ground_height(point), abs=0.006)
 
 
 def test_truth_survives_saving(truth, tmp_path):
@@ -293,7 +291,7 @@ def test_frames_are_true_and_rich(campus, lighting):
     points = (rays * depth[..., None]) @ poses[frame][:3, :3].T + poses[frame][:3, 3]
     road = np.abs(campus.route.project(points[..., :2])[1]) < 1.5
     road &= (depth > 0) & (depth < 15)
-    error = points[road][:, 2] - centerline.ground_height(campus.route, points[road][:, :2])
+    error = points[road][:, 2] - campus.route.ground_height(points[road][:, :2])
     assert road.sum() > 20_000
     assert np.quantile(np.abs(error), 0.99) < 0.004
     image = filming.sensor_image(np.random.default_rng(0), light, LIGHTINGS[lighting], 1.0)
@@ -317,7 +315,7 @@ def test_the_demo_is_this_world(campus):
         assert np.allclose(poses, truth.films[name].camera_to_world, atol=1e-9)
         light, _ = filming.Renderer(name, campus, plan)(poses[0])
         frame = filming.sensor_image(
-            np.random.default_rng(0), light, LIGHTINGS[name], filming.exposures(name, times)[0]
+            np.random.default_rng(0), light, LIGHTINGS[name], filming.exposures(LIGHTINGS[name], times)[0]
         )
         error = cv2.GaussianBlur(frame.astype(float) - shipped, (0, 0), 2.0)
         assert np.sqrt((error**2).mean()) < 4.0

@@ -324,15 +324,28 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     def add(name: str, text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=text, description=text, formatter_class=_Help)
 
+    def place(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            "--place",
+            type=int,
+            default=0,
+            metavar="NUMBER",
+            help="0: the demo's street; from 1: drawn places (1 to 49 are for development)",
+        )
+
     command = add("film", "film the place into a scene folder")
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
-    command.add_argument("--lightings", nargs="+", metavar="NAME", help="default: sun overcast night")
+    place(command)
+    command.add_argument(
+        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; those of a drawn place"
+    )
     command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
     command = add("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
     command.add_argument("scene", type=Path, help="folder of a built scene")
     command = add("drive", "the real test: drive policy files in weather that was not filmed")
     command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
-    command.add_argument("--task", choices=("straight", "right_turn"), required=True)
+    command.add_argument("--task", required=True, help="{straight,right_turn}; a drawn place names its own")
+    place(command)
     command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
     command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
     command.add_argument(
@@ -345,11 +358,14 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command = add("log", "a drive log of the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
     command.add_argument("--duration", type=float, default=300.0, help="[s]")
+    place(command)
     command = add("onboard", "a film by that Husky's own camera, for twin align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
+    place(command)
     command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
     command.add_argument("--lighting", required=True, metavar="NAME", help="a weather of the test")
     command.add_argument("--out", type=Path, required=True, help="photo.png")
+    place(command)
 
 
 VERBS = {

@@ -4,7 +4,7 @@ pycolmap is imported here, before any module of this package, to restore our sig
 COLMAP's log library would answer SIGTERM with a C++ stack trace.
 """
 
-from twin.cli import signals_kept
+from twin.runtime import signals_kept
 
 with signals_kept():
     import pycolmap  # noqa: F401

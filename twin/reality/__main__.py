@@ -1,6 +1,6 @@
 """Verbs of the known-truth world.
 
-    python -m twin.reality film --out DIR
+    python -m twin.reality film [--place NUMBER] --out DIR
     python -m twin.reality compare DIR
     python -m twin.reality drive --policy FILE... --task straight|right_turn --out results.csv
     python -m twin.reality log --out drive.csv
@@ -27,9 +27,13 @@ from twin.files import toml_string, write_text
 from twin.loading import load_scene
 from twin.reality import place as places
 from twin.reality import real_test, recordings
+from twin.reality.centerline import RoadLine
 from twin.reality.comparison import compare
-from twin.reality.filming import CAMERA_HEIGHT, FilmingPlan, depth_maps, film_lighting
+from twin.reality.drawn_place import build_number
+from twin.reality.drawn_road import DrawnRoad
+from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
 from twin.reality.lighting import LIGHTINGS, WEATHER
+from twin.reality.place_spec import PlaceSpec, draw, tasks
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
 from twin.scene import SceneDir
 
@@ -39,8 +43,13 @@ TINY = FilmingPlan(
 """12 m around the start of the turn, for tests."""
 
 
-def film(plan: FilmingPlan, out: Path) -> Truth:
-    """Films every lighting of a plan into a scene folder and saves the truth beside it.
+def _tiny(plan: FilmingPlan) -> FilmingPlan:
+    """The first 12 m of a plan in 320 × 180 px, under at most two lightings."""
+    return replace(plan, lightings=plan.lightings[:2], length=12.0, width=320, height=180)
+
+
+def film(plan: FilmingPlan, out: Path, number: int = 0) -> Truth:
+    """Films every pass and lighting of a plan into a scene folder and saves the truth beside it.
 
     Raises:
         InputError: `out` is not empty and was not written by this function.
@@ -50,33 +59,52 @@ def film(plan: FilmingPlan, out: Path) -> Truth:
             f"{out} is not empty and has no truth/, so it is not a scene of this world; give another --out"
         )
     (out / "input").mkdir(parents=True, exist_ok=True)
-    place = places.build()
-    films = {}
+    place = build_number(number) if number else places.build()
+    films, lightings = {}, {}
     for lighting in plan.lightings:
-        times, poses = film_lighting(lighting, place, plan, out / "input" / f"{lighting}.mp4")
-        films[lighting] = TrueFilm(times, poses, *depth_maps(lighting, place, plan, poses))
-    truth = Truth(place.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (plan.width, plan.height), films)
+        for one in plan.passes:
+            name = film_name(lighting, one)
+            times, poses = film_pass(lighting, place, plan, out / "input" / f"{name}.mp4", one)
+            films[name] = TrueFilm(times, poses, *depth_maps(lighting, place, plan, poses))
+            lightings[name] = lighting
+    size = plan.width, plan.height
+    assert isinstance(place.route, RoadLine | DrawnRoad)
+    truth = Truth(
+        place.route,
+        plan.start,
+        plan.length,
+        HALF_WIDTH,
+        plan.intrinsics,
+        size,
+        films,
+        number,
+        lightings,
+        plan.camera_height,
+    )
     truth.save(out / "truth")
-    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name))
+    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, draw(number) if number else None))
     return truth
 
 
-def scene_toml(plan: FilmingPlan, name: str) -> str:
-    """The contents of `scene.toml`, as a user would write them."""
+def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None) -> str:
+    """The contents of `scene.toml`, as a user would write them; `spec` describes a drawn place."""
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
-    lines = ["# A drive through the known-truth world, filmed by python -m twin.reality film --out THIS_FOLDER"]
-    lines += [
-        f"name = {toml_string(name)}",
-        "seed = 0",
-        "",
-        "[metric]",
-        f"camera_height = {CAMERA_HEIGHT}  # metres",
-        "",
-    ]
+    place = f" --place {spec.number}" if spec else ""
+    height = f"camera_height = {plan.camera_height}  # metres"
+    if spec:
+        height = f"camera_height = {spec.film.stated_height}  # metres, ± {spec.film.height_tolerance:.3f}"
+    lines = [f"# A drive through the known-truth world, filmed by python -m twin.reality film{place} --out THIS_FOLDER"]
+    lines += [f"name = {toml_string(name)}", "seed = 0", "", "[metric]", height, ""]
     for lighting in plan.lightings:
-        lines += ["[[source]]", f'path = "input/{lighting}.mp4"', f'lighting = "{lighting}"']
-        lines += ["[source.camera]", 'model = "PINHOLE"', f"params = [{fx}, {fy}, {cx}, {cy}]"]
-        lines += [f"width = {plan.width}", f"height = {plan.height}", ""]
+        for one in plan.passes:
+            lines += ["[[source]]", f'path = "input/{film_name(lighting, one)}.mp4"', f'lighting = "{lighting}"']
+            if spec is None or spec.film.calibrated:
+                lines += ["[source.camera]", 'model = "PINHOLE"', f"params = [{fx}, {fy}, {cx}, {cy}]"]
+                lines += [f"width = {plan.width}", f"height = {plan.height}"]
+            lines += [""]
+    for task, (start, length) in (tasks(spec.line) if spec else {}).items():
+        if start + length <= plan.length:
+            lines += ["[[task]]", f'name = "{task}"', f"start = {start}", f"length = {length}", ""]
     return "\n".join(lines)
 
 
@@ -94,21 +122,25 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
 def command(options: argparse.Namespace) -> None:
     """Runs this verb with the options parsed by `twin.commands`."""
     if options.command == "film":
-        _check_lightings(options.lightings or [], LIGHTINGS)
         plan = TINY if options.tiny else FilmingPlan()
-        film(replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan, options.out)
+        if options.place:
+            plan = FilmingPlan.of(draw(options.place))
+            plan = _tiny(plan) if options.tiny else plan
+        _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
+        plan = replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan
+        film(plan, options.out, options.place)
     elif options.command == "compare":
         scene = SceneDir(options.scene)
         figures = compare(scene)["figures"]
         publish(scene, load_scene(options.scene).report())
         print("\n".join(f"{name:<32} {value:.4g}" for name, value in figures.items() if value is not None))
     elif options.command == "log":
-        recordings.write_log(options.out, recordings.record_log(options.duration))
+        recordings.write_log(options.out, recordings.record_log(options.duration, options.place))
     elif options.command == "onboard":
-        recordings.write_film(options.out)
+        recordings.write_film(options.out, options.place)
     elif options.command == "photo":
         _check_lightings([options.lighting], WEATHER)
-        recordings.write_photo(options.lighting, options.out)
+        recordings.write_photo(options.lighting, options.out, options.place)
     else:
         options.lightings = options.lightings or list(WEATHER)
         _check_lightings(options.lightings, WEATHER)
@@ -120,6 +152,7 @@ def command(options: argparse.Namespace) -> None:
             options.out,
             options.twin_lighting,
             options.films,
+            options.place,
         )
         print(cells_csv(tally(trials)), end="")
 

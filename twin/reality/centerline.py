@@ -1,4 +1,4 @@
-"""The center line of the road and the height of the ground.
+"""The center line of the campus road (place 0) and the height of the ground.
 
 *Station* s [m] is the arc length along the center line, *lateral* [m] the signed offset from it, positive to the left
 of the driving direction. The road runs straight along +x, turns right on a circular arc, and runs straight on. Heights
@@ -77,6 +77,10 @@ class RoadLine:
         best = np.argmin(np.where(valid, np.abs(laterals), np.inf), 0)[None]
         return np.take_along_axis(stations, best, 0)[0], np.take_along_axis(laterals, best, 0)[0]
 
+    def ground_height(self, xy: ArrayLike) -> Array:
+        """True height of the ground [m], shape (..., 2) → (...)."""
+        return undulation(xy) + cross_profile(self.project(xy)[1])
+
 
 def undulation(xy: ArrayLike) -> Array:
     """Height of the undulating land without the road [m], shape (..., 2) → (...)."""
@@ -91,8 +95,3 @@ def cross_profile(lateral: ArrayLike) -> Array:
     edge = -_CROWN * (np.hypot(ROAD_HALF_WIDTH, _CROWN_ROUNDING) - _CROWN_ROUNDING)
     verge = edge + KERB_HEIGHT + VERGE_SLOPE * np.clip(away - ROAD_HALF_WIDTH, 0.0, 8.0)
     return np.where(away <= ROAD_HALF_WIDTH, crown, verge)
-
-
-def ground_height(route: RoadLine, xy: ArrayLike) -> Array:
-    """True height of the ground [m], shape (..., 2) → (...)."""
-    return undulation(xy) + cross_profile(route.project(xy)[1])

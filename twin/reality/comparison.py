@@ -283,12 +283,13 @@ def depth_errors(
     """Median depth errors of a field against the true depth up to `reach` [m], in three frames of each film."""
     errors, relative = [], []
     for name, film in truth.films.items():
-        if name not in field.lightings:
+        lighting = truth.lighting(name)
+        if lighting not in field.lightings:
             continue
         pick = np.unique(np.linspace(0, len(film.depth) - 1, 5).round().astype(int))[1:4]
         poses = to_truth.inverse().poses(film.camera_to_world[film.depth_frames[pick]])
         height, width = film.depth.shape[1:]
-        depth = field.render(Viewpoints.of(poses, truth.intrinsics, truth.size), name, (width, height)).depth
+        depth = field.render(Viewpoints.of(poses, truth.intrinsics, truth.size), lighting, (width, height)).depth
         true_depth = film.depth[pick].astype(np.float64)
         valid = (true_depth > 0.0) & (true_depth < reach)
         errors.append(np.abs(depth - true_depth)[valid])

@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.reality import true_world
-from twin.reality.centerline import RoadLine, ground_height
-from twin.reality.lighting import LIGHTINGS, Lighting, apply_haze
-from twin.reality.place_objects import SEED, KnownPlace
+from twin.reality.lighting import Lighting, apply_haze
+from twin.reality.place_objects import SEED, KnownPlace, Road
+from twin.reality.place_spec import PassSpec, PlaceSpec
 from twin.runtime import track
 from twin.types import Array
 from twin.warp_runtime import wp
 
 CAMERA_HEIGHT = 1.2  # [m] mean height of the lens above the ground; it varies by less than 1 cm
-_PITCH = np.deg2rad(8.0)  # downwards
-_HFOV = np.deg2rad(85.0)
+OUT = PassSpec("out", 0.0, False)
 
 
 @dataclass(frozen=True)
@@ -46,11 +45,40 @@ class FilmingPlan:
     """Rays per pixel and axis."""
     crf: int = 29
     """Quality of the H.264 film; lower is better."""
+    camera_height: float = CAMERA_HEIGHT
+    """Mean height of the lens above the ground [m]."""
+    pitch: float = float(np.deg2rad(8.0))
+    """Mean pitch of the camera, downwards [rad]."""
+    fov: float = float(np.deg2rad(85.0))
+    """Horizontal field of view [rad]."""
+    shake: float = 1.0
+    """Amplitude of the camera's rotations and lifts relative to a cart's."""
+    passes: tuple[PassSpec, ...] = (OUT,)
+    """Passes along the road; each is filmed under every lighting."""
+
+    @staticmethod
+    def of(spec: PlaceSpec) -> "FilmingPlan":
+        """The plan of a drawn place."""
+        film = spec.film
+        return FilmingPlan(
+            lightings=tuple(light.name for light in spec.lights),
+            length=spec.line.length,
+            speed=film.speed,
+            fps=film.fps,
+            width=film.size[0],
+            height=film.size[1],
+            crf=24,
+            camera_height=film.camera_height,
+            pitch=film.pitch,
+            fov=film.fov,
+            shake=film.shake,
+            passes=film.passes,
+        )
 
     @property
     def intrinsics(self) -> Array:
         """fx, fy, cx, cy [px], shape (4,)."""
-        focal = self.width / 2 / np.tan(_HFOV / 2)
+        focal = self.width / 2 / np.tan(self.fov / 2)
         return np.array([focal, focal, self.width / 2, self.height / 2])
 
 
@@ -60,23 +88,33 @@ def smooth_noise(rng: np.random.Generator, times: Array, period: float) -> Array
     return np.sin(times[:, None] * rates + rng.uniform(0, 2 * np.pi, 3)).sum(1) / np.sqrt(1.5)
 
 
-def trajectory(plan: FilmingPlan, route: RoadLine, lighting: str) -> tuple[Array, Array]:
-    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of one film."""
-    rng = np.random.default_rng([SEED, 11, sum(map(ord, lighting))])
+def film_name(lighting: str, one: PassSpec) -> str:
+    """The name of the film of a pass under a lighting."""
+    return lighting if one.name == OUT.name else f"{lighting}_{one.name}"
+
+
+def trajectory(plan: FilmingPlan, route: Road, film: str, one: PassSpec = OUT) -> tuple[Array, Array]:
+    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of one film, by its name."""
+    rng = np.random.default_rng([SEED, 11, sum(map(ord, film))])
     speed = plan.speed * rng.uniform(0.93, 1.07)
     frames = round(plan.length / speed * plan.fps) + 1
     times = np.arange(frames) / plan.fps
     progress = times / times[-1]
     station = plan.start + plan.length * progress + 0.18 * smooth_noise(rng, times, 6.0) * np.sin(np.pi * progress)
     lateral = np.clip(rng.uniform(-0.12, 0.12) + 0.12 * smooth_noise(rng, times, 9.0), -0.3, 0.3)
+    if one.backwards:
+        station = 2 * plan.start + plan.length - station
+    lateral = lateral + one.lateral
     xy = route.at(station, lateral)
-    lift = 0.004 * smooth_noise(rng, times, 1.1)
-    position = np.concatenate([xy, (ground_height(route, xy) + CAMERA_HEIGHT + lift)[:, None]], 1)
+    lift = 0.004 * plan.shake * smooth_noise(rng, times, 1.1)
+    position = np.concatenate([xy, (route.ground_height(xy) + plan.camera_height + lift)[:, None]], 1)
     # Heading of the cart: direction of the center line plus the slope of the lateral wander.
     drift = np.gradient(lateral, station)
-    yaw = route.heading(station + 0.6) + np.arctan(drift) + np.deg2rad(0.9) * smooth_noise(rng, times, 2.3)
-    pitch = _PITCH + np.deg2rad(0.5) * smooth_noise(rng, times, 1.3)
-    roll = np.deg2rad(0.6) * smooth_noise(rng, times, 1.7)
+    ahead, turned = (-0.6, np.pi) if one.backwards else (0.6, 0.0)
+    yaw = route.heading(station + ahead) + turned + np.arctan(drift)
+    yaw = yaw + np.deg2rad(0.9) * plan.shake * smooth_noise(rng, times, 2.3)
+    pitch = plan.pitch + np.deg2rad(0.5) * plan.shake * smooth_noise(rng, times, 1.3)
+    roll = np.deg2rad(0.6) * plan.shake * smooth_noise(rng, times, 1.7)
     return times, np.stack([_pose(p, a, b, c) for p, a, b, c in zip(position, yaw, pitch, roll, strict=True)])
 
 
@@ -112,7 +150,7 @@ class Renderer:
                 render_rgb=True,
                 render_depth=True,
                 render_seg=False,
-                use_shadows=any(shadow for _, _, shadow in LIGHTINGS[lighting].suns),
+                use_shadows=any(shadow for _, _, shadow in place.lightings[lighting].suns),
                 enabled_geom_groups=[0, 1],
                 render_skybox=True,
                 enable_backface_culling=False,
@@ -151,20 +189,23 @@ def sensor_image(
     return (np.clip(signal, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def exposures(lighting: str, times: Array) -> Array:
+def exposures(lighting: Lighting, times: Array) -> Array:
     """Relative exposure of each frame, with a slow drift like that of automatic exposure."""
-    rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting))])
-    return np.exp(LIGHTINGS[lighting].drift * smooth_noise(rng, times, 11.0))
+    rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting.name))])
+    return np.exp(lighting.drift * smooth_noise(rng, times, 11.0))
 
 
-def film_lighting(lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path) -> tuple[Array, Array]:
-    """Writes the film of one lighting; returns its times (n,) [s] and poses (n, 4, 4)."""
-    times, poses = trajectory(plan, place.route, lighting)
-    gains = exposures(lighting, times)
-    rng = np.random.default_rng([SEED, 13, sum(map(ord, lighting))])
+def film_pass(
+    lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path, one: PassSpec = OUT
+) -> tuple[Array, Array]:
+    """Writes the film of one pass under one lighting; returns its times (n,) [s] and poses (n, 4, 4)."""
+    name = film_name(lighting, one)
+    times, poses = trajectory(plan, place.route, name, one)
+    light = place.lightings[lighting]
+    gains = exposures(light, times)
+    rng = np.random.default_rng([SEED, 13, sum(map(ord, name))])
     render = Renderer(lighting, place, plan)
-    steps = track(list(zip(poses, gains, strict=True)), f"film {lighting}", unit="frame")
-    light = LIGHTINGS[lighting]
+    steps = track(list(zip(poses, gains, strict=True)), f"film {name}", unit="frame")
     write_video(
         (sensor_image(rng, apply_haze(*render(pose), light), light, float(gain)) for pose, gain in steps), plan, path
     )
@@ -186,8 +227,12 @@ def write_video(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Pa
 def depth_maps(
     lighting: str, place: KnownPlace, plan: FilmingPlan, poses: Array
 ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
-    """Indices (k,) of about ten frames and their depth maps [m] at a quarter of the film's size, (k, h / 4, w / 4)."""
-    small = replace(plan, width=plan.width // 4, height=plan.height // 4, samples=1)
+    """Indices (k,) of about ten frames and their depth maps [m], shape (k, h, w).
+
+    They have a quarter of the film's size, or a third where its height is no multiple of four.
+    """
+    part = 4 if plan.height % 4 == 0 else 3
+    small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1)
     frames = np.unique(np.linspace(0, len(poses) - 1, 10).round().astype(np.int64))
     render = Renderer(lighting, place, small)
     return frames, np.stack([render(poses[k])[1] for k in frames]).astype(np.float16)

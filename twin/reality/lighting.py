@@ -123,10 +123,20 @@ LIGHTINGS: dict[str, Lighting] = {
 }
 
 
-def sky_cube_map(lighting: Lighting, seed: int, width: int = 512) -> NDArray[np.uint8]:
+def _tree_line(seed: int) -> tuple[NDArray, NDArray]:
+    """The skyline of the campus road: a row of trees; see `drawn_lighting.skyline`."""
+    still = np.random.default_rng([seed, 7])
+    ring = fbm(still, (1, 4096), 300, 3.0, 0.75)[0]
+    ring[-200:] += (ring[0] - ring[-1]) * np.linspace(0, 1, 200)  # closes the circle
+    return 0.075 + 0.028 * ring, 1.0 + 0.22 * fbm(still, (512, 4096), 40, 2.0, 0.8)
+
+
+def sky_cube_map(
+    lighting: Lighting, seed: int, width: int = 512, skyline: tuple[NDArray, NDArray] | None = None
+) -> NDArray[np.uint8]:
     """A cube map for MuJoCo's skybox: six stacked faces, shape (6 · width, width, 3) uint8.
 
-    The clouds differ per lighting; the skyline is the same in all.
+    The clouds differ per lighting; the skyline (see `drawn_lighting.skyline`) is the same in all.
     """
     t, s = np.meshgrid(np.arange(width), np.arange(width), indexing="ij")
     a, b = (2 * (s + 0.5) / width - 1), (2 * (t + 0.5) / width - 1)
@@ -154,14 +164,11 @@ def sky_cube_map(lighting: Lighting, seed: int, width: int = 512) -> NDArray[np.
         toward = -np.asarray(lighting.suns[0][0]) / np.linalg.norm(lighting.suns[0][0])
         close = np.clip((world * toward).sum(-1), 0.0, 1.0)[..., None]
         out += np.asarray(lighting.glow_sun) * (close**24 + 2.0 * close**600)
-    still = np.random.default_rng([seed, 7])
-    ring = fbm(still, (1, 4096), 300, 3.0, 0.75)[0]
-    ring[-200:] += (ring[0] - ring[-1]) * np.linspace(0, 1, 200)  # closes the circle
+    heights, shade = skyline or _tree_line(seed)
     column = ((azimuth / (2 * np.pi) + 0.5) * 4095).astype(int)
-    edge = 0.075 + 0.028 * ring[column]
-    texture = fbm(still, (512, 4096), 40, 2.0, 0.8)
+    edge = heights[column]
     row = np.clip((elevation / 0.2 * 511), 0, 511).astype(int)
-    trees = np.asarray(lighting.skyline) * (1.0 + 0.22 * texture[row, column])[..., None]
+    trees = np.asarray(lighting.skyline) * shade[row, column][..., None]
     out = np.where((elevation < edge)[..., None], trees, out)
     return (np.clip(out, 0.0, 1.0) * 255 + 0.5).astype(np.uint8).reshape(6 * width, width, 3)
 
@@ -228,6 +235,43 @@ def _day(number: int) -> Lighting:
     visibility, wetness = float(np.exp(rng.uniform(np.log(60.0), np.log(400.0)))), float(rng.uniform(0.15, 0.4))
     tint, brightness = rng.uniform(-0.03, 0.03), float(np.exp(rng.uniform(-0.15, 0.15)))
 
+    return daylight(
+        f"day_{number}",
+        elevation,
+        azimuth,
+        clouds,
+        veil,
+        visibility if hazy else float("inf"),
+        wetness if wet else 0.0,
+        tint,
+        brightness,
+    )
+
+
+def daylight(
+    name: str,
+    elevation: float,
+    azimuth: float,
+    clouds: float,
+    veil: float,
+    visibility: float,
+    wet: float,
+    tint: float,
+    brightness: float,
+) -> Lighting:
+    """The lighting of a day; its colors follow from sun, clouds and haze.
+
+    Args:
+        name: Of the lighting.
+        elevation: Of the sun [°].
+        azimuth: Of the sun [rad].
+        clouds: Cloud cover, 0 to 1; above 0.8 the sun casts no shadow.
+        veil: Thickness of high cloud in front of the sun, 0 to 1.
+        visibility: Distance at which haze transmits 1/e of the light [m].
+        wet: Darkening of the wet ground, 0 to 1.
+        tint: White balance, positive is warmer.
+        brightness: Relative exposure.
+    """
     up, low = np.sin(np.deg2rad(elevation)), float(np.exp(-elevation / _REDDENING_ANGLE))
     overcast = clouds > 0.8
     through = 0.0 if overcast else (1.0 - clouds) ** 0.3 * (1.0 - 0.4 * veil)  # fraction of direct sunlight
@@ -243,7 +287,7 @@ def _day(number: int) -> Lighting:
     cloud = bright * (low * np.array([0.95, 0.72, 0.66]) + (1.0 - low) * np.array([0.93, 0.94, 0.95]))
     cloud *= 0.78 if overcast else 1.0
     return Lighting(
-        f"day_{number}",
+        name,
         ambient=_color(ambient),
         suns=(
             ((0.1, 0.2, -1.0), _color(np.full(3, 0.3 * gray)), False) if overcast else (ray, _color(sun), True),
@@ -259,8 +303,8 @@ def _day(number: int) -> Lighting:
         noise=0.003 + 0.004 * low,
         gain=(1.0 + tint, 1.0, 1.0 - tint),
         glow_sun=_color(0.45 * through * np.array([1.0, 0.8, 0.55])),
-        wet=wetness if wet else 0.0,
-        visibility=visibility if hazy else float("inf"),
+        wet=wet,
+        visibility=visibility,
     )
 
 

@@ -1,19 +1,24 @@
-"""Data of the place: its objects with their collision shapes, and the texture atlas.
+"""Data of a place: its objects with their collision shapes, its textures and its lightings.
 
 The kind of an object is `ground` (driven or walked on), `obstacle` (solid), `foliage` (not solid) or `detail` (too
 small to matter). Stations and laterals are those of `centerline.py`.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from twin.reality.centerline import RoadLine, ground_height
+from twin.reality import primitives
 from twin.reality.primitives import MeshPart
 from twin.types import Array
 
+if TYPE_CHECKING:
+    from twin.reality.lighting import Lighting
+
 SEED = 20  # of the place, its textures, sky and films
-ATLAS_SIDE = 8  # cells per side of the atlas
 ATLAS_CELL = 256  # [px] per side of a cell
 CELLS = (
     *("bark0", "bark1", "bark2", "leaf0", "leaf1", "leaf2", "leaf3", "hedge"),
@@ -23,7 +28,64 @@ CELLS = (
     *(f"window{k}" for k in range(16)),
     *(f"lit{k}" for k in range(8)),
 )
-"""Names of the atlas cells, row by row."""
+"""Names of the cells that every atlas begins with, row by row."""
+
+
+class Road(Protocol):
+    """A driven line and the ground around it."""
+
+    @property
+    def length(self) -> float:
+        """Length of the drive [m]."""
+
+    def heading(self, station: ArrayLike) -> Array:
+        """Direction of travel, counterclockwise from +x [rad]; shape as `station`."""
+
+    def at(self, station: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
+        """Points (x, y) [m], shape (..., 2)."""
+
+    def project(self, xy: ArrayLike) -> tuple[Array, Array]:
+        """Station and lateral [m] of points, shapes (..., 2) → (...), (...)."""
+
+    def ground_height(self, xy: ArrayLike) -> Array:
+        """True height of the ground [m], shape (..., 2) → (...)."""
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """A texture of square cells with names, in 8 columns and at least as many rows."""
+
+    names: tuple[str, ...] = CELLS
+    """Row by row."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        return max(8, -(-len(self.names) // 8)), 8
+
+    def cell(self, name: str, part: MeshPart) -> MeshPart:
+        """Maps the texture coordinates of a part into a cell."""
+        rows, columns = self.shape
+        row, column = divmod(self.names.index(name), columns)
+        count = np.array([columns, rows])
+        low, inset = np.array([column, row]) / count, 1.5 / (count * ATLAS_CELL)
+        return part.in_window(low + inset, low + 1.0 / count - inset)
+
+
+@dataclass(frozen=True)
+class GroundLayout:
+    """Where the ground textures and the collision geometry of a place lie."""
+
+    stations: tuple[float, float]
+    """First and last station of the road mesh [m]."""
+    bands: Mapping[str, tuple[float, float]]
+    """Texture → laterals of its first and last row [m]; its columns run along the road."""
+    land: tuple[float, float, float, float]
+    """x and y range of the texture `land` [m]."""
+    field: tuple[tuple[float, float], tuple[float, float]]
+    """Lowest and highest x, y [m] of the height field that robots drive on."""
+    wet: tuple[str, ...]
+    """Textures that rain darkens."""
 
 
 @dataclass(frozen=True)
@@ -52,20 +114,40 @@ class PlaceObject:
 
 @dataclass
 class KnownPlace:
-    """The whole place: its road, its objects and the positions of its lamp heads [m]."""
+    """A whole place: its road, its objects, and all that a picture of it needs."""
 
-    route: RoadLine
+    route: Road
+    layout: GroundLayout
+    textures: Callable[[], dict[str, NDArray[np.uint8]]]
+    """Returns all textures by name, uint8 RGB."""
+    lightings: "Mapping[str, Lighting]"
+    """Lightings of its films by name."""
+    sky: "Callable[[Lighting], NDArray[np.uint8]]"
+    """Returns the cube map of the sky under a lighting; see `lighting.sky_cube_map`."""
+    number: int = 0
+    seed: tuple[int, ...] = (SEED,)
+    """Of the details of its objects."""
+    atlas: Atlas = field(default_factory=Atlas)
     objects: list[PlaceObject] = field(default_factory=list)
     lamp_heads: list[Array] = field(default_factory=list)
+    """Positions of the shining lamps [m], each of shape (3,)."""
 
     def spot(self, station: float, lateral: float) -> Array:
         """The ground point at a station and lateral [m], shape (3,)."""
         xy = self.route.at(station, lateral)
-        return np.append(xy, ground_height(self.route, xy))
+        return np.append(xy, self.route.ground_height(xy))
 
     def heading(self, station: float) -> float:
         """Direction of travel at a station [rad]."""
         return float(self.route.heading(station))
+
+    def cell(self, name: str, part: MeshPart) -> MeshPart:
+        """Maps the texture coordinates of a part into a cell of the atlas."""
+        return self.atlas.cell(name, part)
+
+    def rng(self, *key: int) -> np.random.Generator:
+        """The random generator of one object."""
+        return np.random.default_rng([*self.seed, *key])
 
 
 def up(height: float) -> Array:
@@ -73,8 +155,6 @@ def up(height: float) -> Array:
     return np.array([0.0, 0.0, height])
 
 
-def cell(name: str, part: MeshPart) -> MeshPart:
-    """Maps the texture coordinates of a part into a cell of the atlas."""
-    row, column = divmod(CELLS.index(name), ATLAS_SIDE)
-    low, inset = np.array([column, row]) / ATLAS_SIDE, 1.5 / (ATLAS_SIDE * ATLAS_CELL)
-    return part.in_window(low + inset, low + 1.0 / ATLAS_SIDE - inset)
+def vertical_quad(left: Array, right: Array, low: float, high: float) -> MeshPart:
+    """A vertical rectangle between two points (x, y) [m] and two heights [m]."""
+    return primitives.quad(np.array([[*left, high], [*left, low], [*right, low], [*right, high]]))

@@ -88,6 +88,25 @@ def walls(width: float, depth: float, low: float, high: float) -> MeshPart:
     return join(parts)
 
 
+def prism(outline: Array, width: float) -> MeshPart:
+    """A convex outline in the x–z plane, shape (n, 2), extruded along y by `width` [m], centered on y = 0.
+
+    Each side face shows the whole texture; the caps show its bounding box.
+    """
+    n = len(outline)
+    low, size = outline.min(0), np.ptp(outline, axis=0)
+    parts = []
+    for y, order in ((-width / 2, 1), (width / 2, -1)):
+        cap = np.stack([outline[:, 0], np.full(n, y), outline[:, 1]], 1)
+        fan = np.array([[0, k, k + 1][::order] for k in range(1, n - 1)], np.int32)
+        uv = (outline - low) / size
+        parts.append(MeshPart(cap, fan, np.stack([uv[:, 0], 1.0 - uv[:, 1]], 1)))
+    for (ax, az), (bx, bz) in zip(outline, np.roll(outline, -1, 0), strict=True):
+        y = width / 2
+        parts.append(quad(np.array([[ax, y, az], [ax, -y, az], [bx, -y, bz], [bx, y, bz]])))
+    return join(parts)
+
+
 def tube(
     bottom: Array, top: Array, radius_bottom: float, radius_top: float, sides: int = 10, capped: bool = True
 ) -> MeshPart:

@@ -140,7 +140,11 @@ def _mip_levels(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], NDArray[np.in
 
 # ---- shadow map
 
-_SHADOW_RANGE = ((-14.0, -66.0, -1.0), (66.0, 24.0, 6.0))  # [m] box that the map covers; points outside are lit
+ShadowRange = tuple[tuple[float, float, float], tuple[float, float, float]]
+SHADOW_RANGE: ShadowRange = (
+    (-14.0, -66.0, -1.0),
+    (66.0, 24.0, 6.0),
+)  # [m] box that the map covers on the campus road; points outside are lit
 _SHADOW_TEXEL = 0.03  # [m]
 _FAR = 1.0e6  # [m]
 _MAX_BIAS = 12.0  # [texels] bound of the bias against self-shadowing
@@ -219,7 +223,7 @@ def sun_visibility(shadows: ShadowMap, point: wp.vec3, normal: wp.vec3):
     return low * (1.0 - fy) + high * fy
 
 
-def render_shadow_map(corners: wp.array, flat: FlatScene) -> ShadowMap:
+def render_shadow_map(corners: wp.array, flat: FlatScene, reach: ShadowRange = SHADOW_RANGE) -> ShadowMap:
     """The map of the first directional light that casts shadows; without one, an empty map with `sun` = −1."""
     out = ShadowMap()
     casting = np.flatnonzero(flat.sun_shadows)
@@ -229,7 +233,7 @@ def render_shadow_map(corners: wp.array, flat: FlatScene) -> ShadowMap:
     right = np.cross(ray, helper)
     right /= np.linalg.norm(right)
     up = np.cross(right, ray)
-    box = np.array([[x, y, z] for x, y, z in np.array(np.meshgrid(*np.array(_SHADOW_RANGE).T)).reshape(3, -1).T])
+    box = np.array([[x, y, z] for x, y, z in np.array(np.meshgrid(*np.array(reach).T)).reshape(3, -1).T])
     low, high = (box @ np.stack([right, up], 1)).min(0), (box @ np.stack([right, up], 1)).max(0)
     columns, rows = np.ceil((high - low) / _SHADOW_TEXEL).astype(int).tolist() if len(casting) else (1, 1)
     out.right, out.up, out.ray, out.left_bottom = wp.vec3(*right), wp.vec3(*up), wp.vec3(*ray), wp.vec2(*low)
@@ -476,12 +480,19 @@ def _shade(
 class Rasterizer:
     """Renders one place under one lighting from any pose."""
 
-    def __init__(self, model: mujoco.MjModel, intrinsics: Array, size: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        intrinsics: Array,
+        size: tuple[int, int],
+        shadow_range: ShadowRange = SHADOW_RANGE,
+    ) -> None:
         """
         Args:
             model: Compiled `true_world.world_spec`.
             intrinsics: fx, fy, cx, cy [px], shape (4,).
             size: Width, height of the image [px].
+            shadow_range: Box in which the sun casts shadows [m].
         """
         flat: FlatScene = flatten(model)
         if len(flat.corners) >= 1 << _INDEX_BITS:
@@ -507,7 +518,7 @@ class Rasterizer:
                 wp.array(flat.sun_colors, dtype=wp.vec3),
                 wp.array(flat.lamps, dtype=wp.vec3),
                 wp.vec3(*flat.lamp_falloff.tolist()),
-                render_shadow_map(self._corners, flat),
+                render_shadow_map(self._corners, flat, shadow_range),
             ]
 
     def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from twin.config import MjcfConfig
+from twin.config import MjcfConfig, TaskConfig
 from twin.env.camera_noise import CameraNoise, CameraOptions
 from twin.env.obstacles import EpisodeObstacles
 from twin.env.options import Options
@@ -26,11 +26,13 @@ from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World, heading_at, point_at
 from twin.reality import place as places
 from twin.reality import true_world
-from twin.reality.centerline import RoadLine, ground_height
+from twin.reality.centerline import RoadLine
+from twin.reality.drawn_place import build_number
 from twin.reality.filming import FilmingPlan, sensor_image, smooth_noise, trajectory
 from twin.reality.lighting import Lighting, apply_haze
-from twin.reality.place_objects import SEED, KnownPlace, PlaceObject
-from twin.reality.rasterizer import Rasterizer
+from twin.reality.place_objects import SEED, KnownPlace, PlaceObject, Road
+from twin.reality.place_spec import draw, tasks
+from twin.reality.rasterizer import SHADOW_RANGE, Rasterizer
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.types import Array
 
@@ -87,7 +89,7 @@ _COLLISION_REACH = 1.5  # [m] beyond the corridor; as in the twin, the robot tou
 _LENGTH_TOLERANCE = 0.98  # fraction of the longest path; the first film above it gives the route
 
 
-def true_route(plan: FilmingPlan | None = None, line: RoadLine | None = None) -> Array:
+def true_route(plan: FilmingPlan | None = None, line: Road | None = None) -> Array:
     """The route: the filmed path on the true ground [m], shape (m, 3).
 
     As in a build, the first film within 2 % of the longest gives the path.
@@ -96,38 +98,53 @@ def true_route(plan: FilmingPlan | None = None, line: RoadLine | None = None) ->
     paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
     lengths = np.array([path_length(path) for path in paths])
     xy = paths[int(np.argmax(lengths >= _LENGTH_TOLERANCE * lengths.max()))]
-    return np.column_stack([xy, ground_height(line, xy)])
+    return np.column_stack([xy, line.ground_height(xy)])
 
 
 @cache
-def place_on_test_day() -> KnownPlace:
-    """The place on the day of the trials, after small objects have moved."""
-    return places.build(displaced=True)
+def place_on_test_day(number: int = 0) -> KnownPlace:
+    """The place of a number on the day of the trials, after small objects have moved."""
+    return build_number(number, displaced=True) if number else places.build(displaced=True)
+
+
+def shadow_range(place: KnownPlace) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """The box [m] in which the rasterizer casts shadows."""
+    if place.number == 0:
+        return SHADOW_RANGE
+    (x0, y0), (x1, y1) = place.layout.field
+    height = place.route.ground_height(place.route.at(np.linspace(0.0, place.route.length, 100)))
+    return (x0, y0, float(height.min()) - 1.5), (x1, y1, float(height.max()) + 6.0)
 
 
 class TrueRoad:
     """One task of the real test on the true ground, with the twin's task names and episode rules."""
 
-    def __init__(self, task: str, robot: HiddenRobot, options: Options) -> None:
+    def __init__(self, task: str, robot: HiddenRobot, options: Options, number: int = 0) -> None:
         """
         Args:
-            task: straight, right_turn or route.
+            task: straight, right_turn or route; on a drawn place one of `place_spec.tasks`.
             robot: The robot that drives.
             options: Environment options of the policy, without images.
+            number: Number of the place.
 
         Raises:
             InputError: unknown task.
         """
-        line = true_route()
+        self.place = place_on_test_day(number)
+        spec = draw(number) if number else None
+        line = true_route(FilmingPlan.of(spec) if spec else None, self.place.route)
+        offered = tasks(spec.line) if spec else {}
         half_width = MjcfConfig().half_width
         yaw = float(heading_at(line, 0.0))
-        start, quaternion = rest_pose(lambda xy: ground_height(place_on_test_day().route, xy), line[0, :2], yaw)
+        start, quaternion = rest_pose(self.place.route.ground_height, line[0, :2], yaw)
         self.world = World(line, half_width, (*start.tolist(), yaw), Path(), robot=robot.params)
-        self.segment: RouteSegment = find_task(task, self.world)
-        spec = true_world.collision_spec(self._near(half_width + _COLLISION_REACH))
-        husky.set_options(spec, robot.params)
-        husky.add_husky(spec, start, quaternion, robot.params)
-        self.model = spec.compile()
+        self.segment: RouteSegment = find_task(
+            task, self.world, tuple(TaskConfig(name, start, length) for name, (start, length) in offered.items())
+        )
+        model = true_world.collision_spec(self._near(half_width + _COLLISION_REACH))
+        husky.set_options(model, robot.params)
+        husky.add_husky(model, start, quaternion, robot.params)
+        self.model = model.compile()
         _rotate_camera(self.model, robot.camera_misalignment)
         self.physics = DrivePhysics.of(self.model, robot.params)
         none = EpisodeObstacles((), self.world, self.segment)
@@ -147,7 +164,7 @@ class TrueRoad:
                 along.query(one.center[:2])[0] - np.hypot(one.half[0], one.half[1]) <= reach for one in obj.solids
             )
 
-        return KnownPlace(place_on_test_day().route, [obj for obj in place_on_test_day().objects if near(obj)], [])
+        return replace(self.place, objects=[obj for obj in self.place.objects if near(obj)], lamp_heads=[])
 
 
 def _rotate_camera(model: mujoco.MjModel, turn: tuple[float, float, float]) -> None:

@@ -35,7 +35,7 @@ from twin.reality import true_world
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import WEATHER
 from twin.reality.rasterizer import Rasterizer
-from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day
+from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day, shadow_range
 from twin.runtime import bar, exclusive_lock
 from twin.types import Image
 
@@ -59,10 +59,10 @@ def load_policy_file(path: Path) -> Policy:
 
 
 @cache
-def _rasterizer(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int]) -> Rasterizer:
-    return Rasterizer(
-        true_world.world_spec(WEATHER[lighting], place_on_test_day()).compile(), np.array(intrinsics), size
-    )
+def _rasterizer(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int) -> Rasterizer:
+    place = place_on_test_day(number)
+    model = true_world.world_spec(WEATHER[lighting], place).compile()
+    return Rasterizer(model, np.array(intrinsics), size, shadow_range(place))
 
 
 class RealTest:
@@ -70,11 +70,11 @@ class RealTest:
 
     __test__ = False  # not a pytest class
 
-    def __init__(self, policy: Policy, task: str) -> None:
+    def __init__(self, policy: Policy, task: str, number: int = 0) -> None:
         """Raises InputError for an unknown task or a policy with options that the robot does not support."""
         self.policy, self._robot = policy, hidden_robot()
         options = {key: value for key, value in policy.options().items() if key not in ("size", "stack")}
-        self.road = TrueRoad(task, self._robot, parse_options({**options, "pixels": False}))
+        self.road = TrueRoad(task, self._robot, parse_options({**options, "pixels": False}), number)
         self._environment = control.Environment(
             self.road.physics, self.road.drive, control_timestep=policy.control.control_timestep
         )
@@ -85,7 +85,7 @@ class RealTest:
         self._environment.reset()
         size = self.policy.size
         intrinsics = self.road.intrinsics(size)
-        raster = _rasterizer(lighting, tuple(intrinsics.tolist()), size)
+        raster = _rasterizer(lighting, tuple(intrinsics.tolist()), size, self.road.place.number)
         return RealCamera(raster, WEATHER[lighting], self._robot, intrinsics, size, self.road.drive.rng(CAMERA))
 
     def run_trial(self, lighting: str, seed: int, on_image: Callable[[Image], None] | None = None) -> Trial:
@@ -120,18 +120,20 @@ def run(
     out: Path,
     twin_lighting: str = str(Condition(HELD_OUT, True)),
     films: Path | None = None,
+    number: int = 0,
 ) -> list[Trial]:
     """Drives the trials that are not in the table yet, and writes the table and its summary.
 
     Args:
         policies: Policy files.
-        task: One of `TASKS`.
+        task: One of `TASKS`, on a drawn place one of `place_spec.tasks`.
         lightings: Names from `WEATHER`.
         trials: Trials per policy and lighting.
         out: Results file as read by `twin.forecast`. `<name>_trials.csv` beside it has a row per trial,
             `<name>_policies.json` the digests of the policy files.
         twin_lighting: Value of the column of this name in new rows.
         films: Folder for a film of every trial, by the robot's camera.
+        number: Number of the place; a table is of one place.
 
     Returns:
         All trials of the table, including those of earlier calls.
@@ -152,7 +154,7 @@ def run(
         done = read_trials(table) if table.exists() else []
         known = {(*_key(one), one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
-            test = RealTest(policy, task)
+            test = RealTest(policy, task, number)
             for lighting in dict.fromkeys(lightings):
                 # Each weather has its own seeds; shared ones would repeat the same ten starts in every weather.
                 first = _FIRST_SEED + _SEEDS_PER_LIGHTING * list(WEATHER).index(lighting)

@@ -16,12 +16,12 @@ from twin.env.options import Options
 from twin.errors import InputError
 from twin.geometry.images import write_image
 from twin.reality import true_world
-from twin.reality.centerline import RoadLine
+from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, write_video
-from twin.reality.lighting import LIGHTINGS, WEATHER, Lighting
-from twin.reality.place_objects import SEED
+from twin.reality.lighting import WEATHER, Lighting
+from twin.reality.place_objects import SEED, Road
 from twin.reality.rasterizer import Rasterizer
-from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day
+from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day, shadow_range
 from twin.runtime import track
 from twin.types import Array
 
@@ -35,7 +35,7 @@ _FPS = 4
 _CONTROL_STEP = 0.05  # [s]
 
 
-def write_film(path: Path) -> None:
+def write_film(path: Path, number: int = 0) -> None:
     """Drives the robot down the road and writes a film by its camera, 4 frames per second as the robot is slow.
 
     Raises:
@@ -48,10 +48,10 @@ def write_film(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     frames = round((_STATIONS[1] - _STATIONS[0]) / _SPEED * _FPS)
     plan = replace(FilmingPlan(), width=width, height=height, fps=_FPS, crf=16)
-    write_video(track(_frames(frames), "film from the robot", unit="frame", total=frames), plan, path)
+    write_video(track(_frames(frames, number), "film from the robot", unit="frame", total=frames), plan, path)
 
 
-def write_photo(weather: str, path: Path) -> None:
+def write_photo(weather: str, path: Path, number: int = 0) -> None:
     """Writes a photo for `twin.relight` from the robot's start pose.
 
     Raises:
@@ -61,29 +61,39 @@ def write_photo(weather: str, path: Path) -> None:
         raise InputError(f"lighting {weather!r}: reality's are {', '.join(WEATHER)}")
     if path.suffix not in (".png", ".jpg") or path.is_dir():
         raise InputError(f"{path}: expected a .png or .jpg file to write, such as dawn.png")
-    road, camera = _road_and_camera(WEATHER[weather])
-    _set_start_pose(road, RoadLine())
+    road, camera = _road_and_camera(WEATHER[weather], number)
+    _set_start_pose(road, road.place.route)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, camera.capture(road.physics.camera_to_world, 0.0))
 
 
-def _road_and_camera(light: Lighting) -> tuple[TrueRoad, RealCamera]:
+def _road_and_camera(light: Lighting, number: int) -> tuple[TrueRoad, RealCamera]:
     """The road, and the robot's camera at its full image size."""
     husky = hidden_robot()
-    road, size = TrueRoad("straight", husky, Options(pixels=False)), husky.params.camera_size
+    road, size = _true_road(number), husky.params.camera_size
     intrinsics = road.intrinsics(size)
-    raster = Rasterizer(true_world.world_spec(light, place_on_test_day()).compile(), intrinsics, size)
+    model = true_world.world_spec(light, road.place).compile()
+    raster = (
+        Rasterizer(model, intrinsics, size, shadow_range(road.place)) if number else Rasterizer(model, intrinsics, size)
+    )
     return road, RealCamera(raster, light, husky, intrinsics, size, np.random.default_rng([SEED, 43]))
 
 
-def _set_start_pose(road: TrueRoad, line: RoadLine) -> None:
+def _set_start_pose(road: TrueRoad, line: Road) -> None:
     """Puts the robot at the first station of `_STATIONS`."""
     start = line.at(_STATIONS[0])
     road.physics.robot.set_pose(float(start[0]), float(start[1]), float(line.heading(_STATIONS[0])))
 
 
-def _frames(count: int) -> Iterator[NDArray[np.uint8]]:
-    line, (road, camera) = RoadLine(), _road_and_camera(LIGHTINGS[LIGHTING])
+def _true_road(number: int) -> TrueRoad:
+    return TrueRoad("whole" if number else "straight", hidden_robot(), Options(pixels=False), number)
+
+
+def _frames(count: int, number: int) -> Iterator[NDArray[np.uint8]]:
+    filmed = place_on_test_day(number).lightings
+    light = filmed.get(LIGHTING) or next(iter(filmed.values()))
+    road, camera = _road_and_camera(light, number)
+    line = road.place.route
     _set_start_pose(road, line)
     physics = road.physics.robot
     for i in range(count):
@@ -93,7 +103,7 @@ def _frames(count: int) -> Iterator[NDArray[np.uint8]]:
             physics.step(_CONTROL_STEP)
 
 
-def _steering(line: RoadLine, pose: NDArray[np.float64]) -> float:
+def _steering(line: Road, pose: NDArray[np.float64]) -> float:
     """Yaw rate [rad/s] that steers a base at pose x, y, yaw to the weaving line."""
     station, lateral = (float(value[0]) for value in line.project(pose[None, :2]))
     phase = 2.0 * np.pi * station / _WEAVE_PERIOD
@@ -121,7 +131,7 @@ _WHEEL_NOISE, _ACCELERATION_NOISE = 0.03, 0.08  # [rad/s], [m/s²]
 _MAX_TRIES = 40
 
 
-def record_log(duration: float) -> dict[str, Array]:
+def record_log(duration: float, number: int = 0) -> dict[str, Array]:
     """A drive log of `duration` [s] on the straight segment: columns by name, each of shape (rows,).
 
     Random joystick commands drive forwards, backwards and turning, never off the asphalt. The log has commands, wheel
@@ -130,8 +140,8 @@ def record_log(duration: float) -> dict[str, Array]:
     if not duration >= 10.0:
         raise InputError(f"duration = {duration:g} s; expected at least 10")
     rng = np.random.default_rng([SEED, 42])
-    road = TrueRoad("straight", hidden_robot(), Options(pixels=False))
-    physics, line = road.physics.robot, RoadLine()
+    road = _true_road(number)
+    physics, line = road.physics.robot, road.place.route
     start = line.at(12.0)
     physics.set_pose(float(start[0]), float(start[1]), float(line.heading(12.0)))
     first = physics.planar_pose
@@ -165,7 +175,7 @@ def write_log(path: Path, columns: dict[str, Array]) -> None:
         writer.writerows([f"{value:.6f}" for value in row] for row in np.stack(list(columns.values()), 1))
 
 
-def _sample_command(rng: np.random.Generator, line: RoadLine, pose: Array, hold: float) -> Array:
+def _sample_command(rng: np.random.Generator, line: Road, pose: Array, hold: float) -> Array:
     """A random command that keeps the robot on the asphalt, or a turn on the spot if none is found."""
     for _ in range(_MAX_TRIES):
         command = rng.uniform([-_LOG_SPEED, -_YAW_RATE], [_LOG_SPEED, _YAW_RATE])
@@ -174,14 +184,17 @@ def _sample_command(rng: np.random.Generator, line: RoadLine, pose: Array, hold:
     return np.array([0.0, rng.choice([-1.0, 1.0]) * _YAW_RATE])
 
 
-def _stays_inside(line: RoadLine, pose: Array, command: Array, ahead: float) -> bool:
+def _stays_inside(line: Road, pose: Array, command: Array, ahead: float) -> bool:
     """True if a command held for `ahead` [s] keeps the robot inside the bounds."""
     times = np.linspace(0.0, ahead, 8)
     heading = pose[2] + command[1] * times
     step = np.diff(times) * command[0]
     xy = pose[:2] + np.cumsum(np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], 1) * step[:, None], 0)
     station, lateral = line.project(xy)
-    inside = (np.abs(lateral) <= _MAX_LATERAL) & (station >= _LOG_STATIONS[0]) & (station <= _LOG_STATIONS[1])
+    bound = _MAX_LATERAL
+    if isinstance(line, DrawnRoad):
+        bound = min(bound, max(0.9, min(line.section.left, line.section.right) - 0.2))
+    inside = (np.abs(lateral) <= bound) & (station >= _LOG_STATIONS[0]) & (station <= _LOG_STATIONS[1])
     return bool(inside.all())
 
 

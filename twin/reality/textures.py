@@ -31,14 +31,15 @@ def blend(image: NDArray, color: tuple[float, float, float], weight: NDArray) ->
     image += w * (np.asarray(color, np.float32) - image)
 
 
-def _tinted(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
+def tinted(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
+    """A color modulated by noise with zero mean; `tint` shifts it between warm and cold."""
     image = np.asarray(base, np.float32) * (1.0 + contrast * noise[..., None].astype(np.float32))
     if tint is not None:
         image = image * (1.0 + tint[..., None] * np.array([0.10, 0.02, -0.10], np.float32))
     return image.astype(np.float32)
 
 
-def _speckle(rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[float, float], colors: NDArray) -> None:
+def speckle(rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[float, float], colors: NDArray) -> None:
     """Draws small random ellipses (chips, fallen leaves, stones) into an image, in place."""
     rows, columns = image.shape[:2]
     centers = np.stack([rng.uniform(0, columns, count), rng.uniform(0, rows, count)], -1)
@@ -63,16 +64,14 @@ def _speckle(rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[
         )
 
 
-def _grains(rng: np.random.Generator, image: Array32, share: float, colors: NDArray) -> None:
+def grains(rng: np.random.Generator, image: Array32, share: float, colors: NDArray) -> None:
     """Colors a fraction `share` of single texels in place, as the stones of asphalt."""
     hit = rng.random(image.shape[:2]) < share
     shade = rng.uniform(0.75, 1.15, (int(hit.sum()), 1))
     image[hit] = 0.35 * image[hit] + 0.65 * colors[rng.integers(0, len(colors), int(hit.sum()))] * shade
 
 
-def _crack(
-    rng: np.random.Generator, mask: NDArray, start: NDArray, heading: float, length: float, width: float
-) -> None:
+def crack(rng: np.random.Generator, mask: NDArray, start: NDArray, heading: float, length: float, width: float) -> None:
     """Draws a wandering, branching crack into `mask`."""
     point = start.astype(float)
     step = 6.0
@@ -82,7 +81,7 @@ def _crack(
         cv2.line(mask, point.astype(int).tolist(), ahead.astype(int).tolist(), 1.0, max(1, round(width)))
         point = ahead
         if length > 60 and rng.random() < 0.05:
-            _crack(rng, mask, point, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.2), length * 0.35, width * 0.7)
+            crack(rng, mask, point, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.2), length * 0.35, width * 0.7)
 
 
 def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Array32:
@@ -93,12 +92,12 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
     rows, columns = round(2 * half_width / pixel), round(length / pixel)
     shape = (rows, columns)
     lateral = (half_width - (np.arange(rows) + 0.5) * pixel)[:, None]
-    image = _tinted(
+    image = tinted(
         (0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, 0.5 * fbm(rng, shape, 6.0 / pixel, 40.0)
     )
     chips = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
-    _grains(rng, image, 0.16, chips)
-    _speckle(rng, image, int(length * 45), (0.5, 1.6), chips)
+    grains(rng, image, 0.16, chips)
+    speckle(rng, image, int(length * 45), (0.5, 1.6), chips)
     for track in (-1.95, -0.75, 0.75, 1.95):  # polished by wheels
         wander = track + 0.08 * fbm(rng, (1, columns), 8.0 / pixel, 200.0)
         blend(image, (0.27, 0.27, 0.275), 0.33 * np.exp(-0.5 * ((lateral - wander) / 0.22) ** 2))
@@ -112,8 +111,8 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         if c1 - c0 < 8 or r1 - r0 < 8:
             continue
         level = rng.uniform(0.19, 0.48)
-        part = _tinted((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
-        _grains(rng, part, rng.uniform(0.05, 0.2), chips)
+        part = tinted((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
+        grains(rng, part, rng.uniform(0.05, 0.2), chips)
         image[r0:r1, c0:c1] = 0.25 * image[r0:r1, c0:c1] + 0.75 * part
         seam = np.zeros((r1 - r0, c1 - c0), np.float32)
         cv2.rectangle(seam, (1, 1), (c1 - c0 - 2, r1 - r0 - 2), 1.0, int(rng.integers(2, 4)))
@@ -124,7 +123,7 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
         across = rng.random() < 0.45
         heading = (np.pi / 2 if across else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
-        _crack(rng, cracks, start, heading, rng.uniform(40, 330), rng.uniform(1.0, 3.0))
+        crack(rng, cracks, start, heading, rng.uniform(40, 330), rng.uniform(1.0, 3.0))
     blend(image, (0.08, 0.08, 0.085), 0.85 * cv2.GaussianBlur(cracks, (3, 3), 0.6))
     for _ in range(int(length / 1.8)):  # drips of oil, spilt water, chewing gum
         center = [int(rng.uniform(0, columns)), int(rng.uniform(0, rows))]
@@ -139,10 +138,10 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
     _markings(rng, image, lateral, pixel)
     for station in np.arange(4.0, length, 11.0):  # manholes and gullies
         station += rng.uniform(-3, 3)
-        _manhole(image, (int(station / pixel), int(rng.uniform(0.3, 0.7) * rows)), int(0.32 / pixel))
-        _gully(image, int((station + 4.0) / pixel), rng.random() < 0.5, pixel)
+        manhole(image, (int(station / pixel), int(rng.uniform(0.3, 0.7) * rows)), int(0.32 / pixel))
+        gully(image, int((station + 4.0) / pixel), rng.random() < 0.5, pixel)
     leaves = np.array([[0.55, 0.42, 0.16], [0.42, 0.28, 0.12], [0.38, 0.42, 0.18], [0.6, 0.5, 0.25]], np.float32)
-    _speckle(rng, image, int(length * 5), (1.5, 4.5), leaves)
+    speckle(rng, image, int(length * 5), (1.5, 4.5), leaves)
     return np.clip(image, 0.02, 1.0)
 
 
@@ -164,7 +163,8 @@ def _markings(rng: np.random.Generator, image: Array32, lateral: NDArray, pixel:
         blend(image, (0.80, 0.80, 0.76), worn * mask)
 
 
-def _manhole(image: Array32, center: tuple[int, int], radius: int) -> None:
+def manhole(image: Array32, center: tuple[int, int], radius: int) -> None:
+    """Draws a manhole cover; center (column, row) and radius [px]."""
     cv2.circle(image, center, radius + 3, (0.14, 0.14, 0.14), -1)
     cv2.circle(image, center, radius, (0.36, 0.33, 0.30), -1)
     for k in range(-radius + 4, radius - 2, 6):
@@ -173,7 +173,8 @@ def _manhole(image: Array32, center: tuple[int, int], radius: int) -> None:
     cv2.circle(image, center, radius - 2, (0.22, 0.2, 0.19), 2)
 
 
-def _gully(image: Array32, column: int, left: bool, pixel: float) -> None:
+def gully(image: Array32, column: int, left: bool, pixel: float) -> None:
+    """Draws the grating of a gully at the left or right edge of the road."""
     rows = image.shape[0]
     across, along = int(0.34 / pixel), int(0.55 / pixel)
     r0 = 2 if left else rows - 2 - across
@@ -184,7 +185,7 @@ def _gully(image: Array32, column: int, left: bool, pixel: float) -> None:
 
 def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
     """Turf from above: patches, bare earth, blades, stones, fallen leaves; `pixel` [m]."""
-    image = _tinted((0.29, 0.38, 0.15), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8), 0.17, fbm(rng, shape, 4.0 / pixel, 10))
+    image = tinted((0.29, 0.38, 0.15), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8), 0.17, fbm(rng, shape, 4.0 / pixel, 10))
     blend(image, (0.44, 0.36, 0.22), np.clip(fbm(rng, shape, 1.8 / pixel, 3.0) - 1.1, 0, 0.8))
     count = int(shape[0] * shape[1] * 0.02)
     starts = np.stack([rng.uniform(0, shape[1], count), rng.uniform(0, shape[0], count)], -1)
@@ -193,7 +194,7 @@ def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Arr
     for a, b, tone in zip(starts.astype(int).tolist(), ends.astype(int).tolist(), tones, strict=True):
         cv2.line(image, a, b, (0.29 * tone, 0.37 * tone, 0.14 * tone), 1)
     colors = np.array([[0.6, 0.45, 0.18], [0.45, 0.27, 0.1], [0.8, 0.8, 0.7], [0.5, 0.5, 0.47], [0.72, 0.66, 0.2]])
-    _speckle(rng, image, int(shape[0] * shape[1] * 0.0015), (1.0, 3.2), colors.astype(np.float32))
+    speckle(rng, image, int(shape[0] * shape[1] * 0.0015), (1.0, 3.2), colors.astype(np.float32))
     return np.clip(image, 0.02, 1.0)
 
 
@@ -204,11 +205,11 @@ def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: 
     tone = rng.uniform(0.8, 1.15, (int(r[-1]) + 1, int(c[-1]) + 2))
     offset = 0.5 * (r.astype(int) % 2)[:, None]
     cells = (c[None] + offset).astype(int)
-    image = _tinted((0.53, 0.51, 0.47), fbm(rng, shape, 60, 1.5), 0.10) * tone[r.astype(int)[:, None], cells, None]
+    image = tinted((0.53, 0.51, 0.47), fbm(rng, shape, 60, 1.5), 0.10) * tone[r.astype(int)[:, None], cells, None]
     joint = ((r % 1.0) < 1.5 * pixel / slab[0])[:, None] | (((c[None] + offset) % 1.0) < 1.5 * pixel / slab[1])
     blend(image, (0.19, 0.2, 0.14), 0.85 * joint)
     spots = np.array([[0.2, 0.2, 0.2], [0.7, 0.68, 0.64], [0.4, 0.33, 0.22]], np.float32)
-    _speckle(rng, image, int(rows * columns * 0.004), (0.7, 2.6), spots)
+    speckle(rng, image, int(rows * columns * 0.004), (0.7, 2.6), spots)
     return np.clip(image, 0.02, 1.0).astype(np.float32)
 
 
@@ -231,13 +232,13 @@ def plaster(
     rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]
 ) -> Array32:
     """Plastered wall: blotches, drip streaks, cracks, a darker plinth."""
-    image = _tinted(base, fbm(rng, shape, 3.0 / pixel, 1.5), 0.06, 0.5 * fbm(rng, shape, 2.0 / pixel, 8))
+    image = tinted(base, fbm(rng, shape, 3.0 / pixel, 1.5), 0.06, 0.5 * fbm(rng, shape, 2.0 / pixel, 8))
     streaks = np.clip(fbm(rng, (1, shape[1]), 24, 2.0), 0, 3) * np.linspace(1.0, 0.1, shape[0])[:, None]
     image *= 1.0 - 0.07 * streaks[..., None]
     cracks = np.zeros(shape, np.float32)
     for _ in range(shape[1] // 60):
         start = np.array([rng.uniform(0, shape[1]), rng.uniform(0, shape[0])])
-        _crack(rng, cracks, start, rng.uniform(0, 2 * np.pi), rng.uniform(30, 120), 1.0)
+        crack(rng, cracks, start, rng.uniform(0, 2 * np.pi), rng.uniform(30, 120), 1.0)
     blend(image, (0.25, 0.23, 0.2), 0.55 * cracks)
     plinth = round(0.7 / pixel)
     image[-plinth:] *= 0.62
@@ -251,8 +252,22 @@ def weathered(image: Array32, pixel: float) -> Array32:
     return (image * (1.0 - 0.35 * np.exp(-up / 0.6) - 0.30 * np.exp(-down / 0.5))).astype(np.float32)
 
 
-def window(rng: np.random.Generator, lit: bool) -> Array32:
-    """A window of 96 × 72 px: frame, glazing bars, and sky, curtains or a lit room behind the glass."""
+WINDOW_BARS: dict[str, tuple[tuple[slice, ...], ...]] = {
+    "cross": (np.s_[:, 34:38], np.s_[30:33, :]),
+    "casement": (np.s_[:, 34:38],),
+    "sash": (np.s_[46:51, :], np.s_[:, 35:37]),
+    "ribbon": (),
+    "shutters": (np.s_[:, 34:38], np.s_[30:33, :], np.s_[62:65, :]),
+}
+"""Glazing bars by style of window, within 96 rows and 72 columns."""
+_FRAMES = np.array([[0.86, 0.86, 0.84], [0.32, 0.22, 0.15], [0.25, 0.3, 0.27]])
+
+
+def window(rng: np.random.Generator, lit: bool, style: str = "cross", frames: NDArray[np.float64] = _FRAMES) -> Array32:
+    """A window of 96 × 72 px: frame, glazing bars, and sky, curtains or a lit room behind the glass.
+
+    `frames` are the colors of frames to choose from, shape (n, 3).
+    """
     image = np.zeros((96, 72, 3), np.float32)
     down = np.linspace(0, 1, 96)[:, None]
     if lit:
@@ -273,40 +288,44 @@ def window(rng: np.random.Generator, lit: bool) -> Array32:
     if rng.random() < 0.35:  # a blind half down
         drop = int(rng.uniform(12, 60))
         image[4:drop] = (0.62 + 0.13 * (np.arange(4, drop) % 5 < 2))[:, None, None] * np.array([1.0, 0.97, 0.9])
-    frame = rng.choice(np.array([[0.86, 0.86, 0.84], [0.32, 0.22, 0.15], [0.25, 0.3, 0.27]]))
-    for bar in (np.s_[:5], np.s_[-5:], np.s_[:, :5], np.s_[:, -5:], np.s_[:, 34:38], np.s_[30:33]):
+    frame = rng.choice(frames)
+    for bar in (np.s_[:5], np.s_[-5:], np.s_[:, :5], np.s_[:, -5:], *WINDOW_BARS[style]):
         image[bar] = frame
     return np.clip(image, 0.02, 1.0)
 
 
-def bark(rng: np.random.Generator, shape: tuple[int, int]) -> Array32:
+def bark(
+    rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float] = (0.34, 0.27, 0.20)
+) -> Array32:
     """Bark: long vertical furrows, lichen."""
     grain = fbm(rng, (shape[0] // 4, shape[1]), 24, 1.0, 0.85)
     grain = cv2.resize(grain, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
-    image = _tinted((0.34, 0.27, 0.20), grain, 0.30)
+    image = tinted(base, grain, 0.30)
     blend(image, (0.52, 0.54, 0.42), np.clip(fbm(rng, shape, 40, 2.0) - 1.0, 0, 0.7))
     return np.clip(image, 0.03, 1.0)
 
 
 def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
     """Leaf tones from dark (left) to light (right); `primitives.leaves` gives each leaf a window of it."""
-    image = _tinted(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
+    image = tinted(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
     image *= np.linspace(0.35, 1.35, shape[1], dtype=np.float32)[None, :, None]
     return np.clip(image, 0.03, 1.0)
 
 
-def wood(rng: np.random.Generator, shape: tuple[int, int]) -> Array32:
+def wood(
+    rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float] = (0.50, 0.37, 0.24)
+) -> Array32:
     """Weathered planks with the grain along the columns."""
     grain = cv2.resize(fbm(rng, (shape[0], shape[1] // 8), 12, 1.0), shape[::-1], interpolation=cv2.INTER_LINEAR)
-    image = _tinted((0.50, 0.37, 0.24), grain, 0.17)
+    image = tinted(base, grain, 0.17)
     image[:: max(2, shape[0] // 5)] *= 0.4
-    _speckle(rng, image, 30, (1.0, 3.0), np.array([[0.2, 0.13, 0.08]], np.float32))
+    speckle(rng, image, 30, (1.0, 3.0), np.array([[0.2, 0.13, 0.08]], np.float32))
     return np.clip(image, 0.03, 1.0)
 
 
 def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
     """Painted or galvanized metal: scratches, rust, stickers."""
-    image = _tinted(base, fbm(rng, shape, 40, 1.5), 0.11)
+    image = tinted(base, fbm(rng, shape, 40, 1.5), 0.11)
     blend(image, (0.36, 0.2, 0.1), np.clip(fbm(rng, shape, 30, 1.5) - 1.5, 0, 0.8))
     for _ in range(9):
         a, b = rng.uniform(0, shape[1], 2).astype(int), rng.uniform(0, shape[0], 2).astype(int)

@@ -3,7 +3,7 @@
 `python -m twin.reality film` writes it to `<scene>/truth`; only `twin/reality/comparison.py` and tests may read it.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -13,13 +13,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
 from twin.files import read_json, write_json
-from twin.reality import centerline as roads
 from twin.reality import place as places
 from twin.reality.centerline import RoadLine
+from twin.reality.drawn_place import build_number
+from twin.reality.drawn_road import DrawnRoad
+from twin.reality.filming import CAMERA_HEIGHT
 from twin.reality.place_objects import SEED, KnownPlace
+from twin.reality.place_spec import FREE_HALF_WIDTH, draw
 from twin.types import Array
 
-HALF_WIDTH = 1.5  # [m] of the free corridor around the route
+HALF_WIDTH = FREE_HALF_WIDTH  # [m] of the free corridor around the route
 
 
 @dataclass(frozen=True)
@@ -33,14 +36,14 @@ class TrueFilm:
     depth_frames: NDArray[np.int64]
     """Indices of the frames with a depth map, shape (k,)."""
     depth: NDArray[np.float16]
-    """z-depth [m], 0 = sky, at a quarter of the film's size, shape (k, height / 4, width / 4)."""
+    """z-depth [m], 0 = sky, at a quarter or a third of the film's size, shape (k, h, w)."""
 
 
 @dataclass(frozen=True)
 class Truth:
     """The truth of one filmed scene."""
 
-    route: RoadLine
+    route: RoadLine | DrawnRoad
     start: float
     """Station where the films start [m]."""
     length: float
@@ -53,13 +56,23 @@ class Truth:
     """Width, height of every film [px]."""
     films: dict[str, TrueFilm]
     """Films by source name."""
+    number: int = 0
+    """Number of the place."""
+    lightings: dict[str, str] = field(default_factory=dict)
+    """Lighting of every film that is not named after its lighting."""
+    camera_height: float = CAMERA_HEIGHT
+    """Mean height of the lens above the ground [m]."""
 
     def save(self, folder: Path) -> None:
         """Writes `truth.json` and `truth.npz`."""
         folder.mkdir(parents=True, exist_ok=True)
         arrays = {f"{key}_{name}": value for name, film in self.films.items() for key, value in vars(film).items()}
         np.savez_compressed(folder / "truth.npz", intrinsics=self.intrinsics, **arrays)
-        head = {"route": asdict(self.route), "start": self.start, "length": self.length, "half_width": self.half_width}
+        road = asdict(self.route) if isinstance(self.route, RoadLine) else self.number
+        head = {"route" if self.number == 0 else "place": road, "start": self.start, "length": self.length}
+        head |= {"half_width": self.half_width}
+        if self.number > 0:
+            head |= {"lightings": self.lightings, "camera_height": self.camera_height}
         head |= {"size": list(self.size), "films": list(self.films), "seed": SEED}
         write_json(folder / "truth.json", head | {"fingerprint": fingerprint(self.place)})
 
@@ -74,9 +87,21 @@ class Truth:
         with np.load(folder / "truth.npz", allow_pickle=False) as data:
             keys = ("times", "camera_to_world", "depth_frames", "depth")
             films = {name: TrueFilm(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]}
-            route = RoadLine(**head["route"])
+            number = int(head.get("place", 0))
+            route = DrawnRoad(draw(number)) if number else RoadLine(**head["route"])
             size = (int(head["size"][0]), int(head["size"][1]))
-            truth = Truth(route, head["start"], head["length"], head["half_width"], data["intrinsics"], size, films)
+            truth = Truth(
+                route,
+                head["start"],
+                head["length"],
+                head["half_width"],
+                data["intrinsics"],
+                size,
+                films,
+                number,
+                head.get("lightings", {}),
+                head.get("camera_height", CAMERA_HEIGHT),
+            )
         if not np.allclose(head["fingerprint"], fingerprint(truth.place), atol=1e-4):
             raise InputError(
                 f"{folder}: filmed in another version of the place; film again: python -m twin.reality film"
@@ -86,11 +111,15 @@ class Truth:
     @cached_property
     def place(self) -> KnownPlace:
         """The rebuilt place."""
-        return places.build(self.route)
+        return places.build(self.route) if isinstance(self.route, RoadLine) else build_number(self.number)
 
     def ground_height(self, xy: Array) -> Array:
         """Height of the ground [m], shape (..., 2) → (...)."""
-        return roads.ground_height(self.route, xy)
+        return self.route.ground_height(xy)
+
+    def lighting(self, film: str) -> str:
+        """The lighting of a film by its source name."""
+        return self.lightings.get(film, film)
 
     def path(self, step: float = 0.25) -> Array:
         """The filmed segment of the center line on the ground [m], shape (m, 3)."""

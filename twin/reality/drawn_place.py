@@ -1,0 +1,618 @@
+"""A place built from its description: ground, objects, textures, lightings.
+
+Objects are placed one after the other: what stands on firm ground first (houses, lamps, boundaries), then what finds
+room. A candidate is dropped where its footprint touches the road, the mouth of a side road, the free corridor or an
+earlier footprint.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.reality import primitives, surfaces
+from twin.reality import street_furniture as furniture
+from twin.reality.atlas_painting import AtlasColors, paint_atlas, to_uint8
+from twin.reality.boundaries import BAY, add_boundary, thickness
+from twin.reality.drawn_lighting import place_lightings, place_sky
+from twin.reality.drawn_road import DrawnRoad
+from twin.reality.houses import House, add_house
+from twin.reality.place_objects import CELLS, SEED, Atlas, GroundLayout, KnownPlace, PlaceObject
+from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, BoundarySpec, PlaceSpec, Rgb, draw, stream
+from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
+from twin.reality.textures import slabs
+from twin.types import Array
+
+_EXTRA_CELLS = (
+    *(f"paint{k}" for k in range(6)),
+    *("boundary_left", "boundary_right", "chimney", "shutter", "cabinet", "stone", "pole", "birch"),
+)
+_ROAD_PIXEL, _VERGE_PIXEL, _LAND_PIXEL, _WALL_PIXEL = 0.0135, 0.022, 0.09, 0.035  # [m]
+_STEP = 0.5  # [m] between vertices along the road
+_LAND_STEP = 1.5  # [m]
+_LAND_MARGIN = 48.0  # [m] of land around the driven line
+_FIELD_MARGIN = 14.0  # [m] of the height field around the driven line
+_MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
+_MIN_GAP = 0.35  # [m] between footprints
+
+
+def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
+    """The place of a description; the result is always the same.
+
+    Args:
+        spec: The description.
+        displaced: The place on another day than the film's: cones, bins, crates and cars stand elsewhere.
+    """
+    road = DrawnRoad(spec)
+    stations = np.arange(road.start, road.end + _STEP / 2, _STEP)
+    line = road.at(stations)
+    low, high = line.min(0), line.max(0)
+    driven = road.at(np.linspace(0.0, spec.line.length, 200))
+    corners = ((driven.min(0) - _FIELD_MARGIN).tolist(), (driven.max(0) + _FIELD_MARGIN).tolist())
+    section = spec.section
+    left, right = section.left + section.kerb_width, -section.right - section.kerb_width
+    layout = GroundLayout(
+        stations=(float(stations[0]), float(stations[-1])),
+        bands={
+            "road": (section.left, -section.right),
+            "verge_left": (left + section.sides[0].width, left),
+            "verge_right": (right, right - section.sides[1].width),
+        },
+        land=(
+            float(low[0] - _LAND_MARGIN),
+            float(high[0] + _LAND_MARGIN),
+            float(low[1] - _LAND_MARGIN),
+            float(high[1] + _LAND_MARGIN),
+        ),
+        field=((corners[0][0], corners[0][1]), (corners[1][0], corners[1][1])),
+        wet=("road", "kerb", "verge_left", "verge_right", "land", "side_road"),
+    )
+    names: dict[str, tuple[House, str, Rgb, Rgb]] = {}
+    place = KnownPlace(
+        road,
+        layout,
+        partial(_textures, spec, layout, names),
+        place_lightings(spec),
+        partial(place_sky, spec),
+        number=spec.number,
+        seed=(SEED, 100, spec.number, 1000),
+        atlas=Atlas(CELLS + _EXTRA_CELLS),
+    )
+    _add_ground(place, road, stations)
+    site = Site(road)
+    names.update(_add_houses(place, spec, site))
+    _add_lamps(place, spec, site)
+    _add_boundaries(place, spec, site)
+    _add_poles(place, spec, site)
+    _add_cars(place, spec, site, place.rng(20) if displaced else None)
+    _add_furniture(place, spec, site, place.rng(21) if displaced else None)
+    _add_trees(place, spec, site)
+    _add_tufts(place, spec, site)
+    return place
+
+
+@cache
+def build_number(number: int, displaced: bool = False) -> KnownPlace:
+    """The place of a number from 1 on."""
+    return build(draw(number), displaced)
+
+
+# ---- ground
+
+
+def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
+    section = road.section
+
+    def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
+        """A strip through laterals, left first, at heights above the section or on the ground; open at mouths."""
+        xy = road.at(stations[None], laterals[:, None])
+        z = road.ground_height(xy)
+        if lifts is not None:
+            z = road.profile(stations)[None] + lifts
+        v = (laterals[0] - laterals) / (laterals[0] - laterals[-1]) if np.ptp(laterals) > 0 else np.zeros(len(laterals))
+        u = (stations - stations[0]) / (stations[-1] - stations[0])
+        uv = np.stack(np.broadcast_arrays(u[None], v[:, None]), -1)
+        part = primitives.grid(np.concatenate([xy, z[..., None]], -1), uv)
+        if gaps:
+            middle = stations[(part.faces % len(stations))].mean(1)
+            keep = np.ones(len(part.faces), bool)
+            for mouth in road.mouths(gaps):
+                keep &= np.abs(middle - mouth.station) > 0.5 * mouth.width
+            part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
+        place.objects.append(PlaceObject(name, "ground", part, texture))
+
+    inner = 1e-6  # keeps vertices of the road's edges on the road
+    strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
+    for sign, name, edge, side in (
+        (1, "left", section.left, section.sides[0]),
+        (-1, "right", section.right, section.sides[1]),
+    ):
+        outer = edge + section.kerb_width
+        if section.kerb_height > 0.0:
+            low = road.cross_profile(stations, sign * edge)
+            high = road.cross_profile(stations, sign * (edge + 0.03))
+            profile = [
+                (edge, low - 0.02),
+                (edge + 0.015, high - 0.15 * (high - low)),
+                (edge + 0.03, high),
+                (outer, road.cross_profile(stations, sign * (outer + inner))),
+            ]
+            profile = profile[::-1] if sign > 0 else profile
+            laterals, lifts = np.array([sign * p[0] for p in profile]), np.stack([p[1] for p in profile])
+            strip(f"kerb_{name}", "kerb", laterals, lifts)
+        across = sign * np.linspace(outer + inner, outer + side.width, 9)
+        strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
+    for k, mouth in enumerate(road.line.mouths):
+        edge = section.left if mouth.side > 0 else section.right
+        reach = edge + section.kerb_width + np.arange(0.0, _MOUTH_REACH, 0.5)
+        first = stations[np.argmax(stations + _STEP / 2 > mouth.station - mouth.width / 2)]
+        inside = stations[(stations >= first - _STEP) & (stations <= mouth.station + mouth.width / 2 + _STEP)]
+        xy = road.at(inside[None], mouth.side * reach[:, None])
+        z = road.ground_height(xy) + 0.01
+        u = (reach - reach[0]) / np.ptp(reach)
+        v = (inside - inside[0]) / np.ptp(inside)
+        uv = np.stack(np.broadcast_arrays(0.03 + 0.3 * k + 0.25 * u[:, None], v[None]), -1)
+        order = slice(None, None, -1) if mouth.side > 0 else slice(None)
+        points = np.concatenate([xy, z[..., None]], -1)[order]
+        part = primitives.grid(points, uv[order])
+        place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
+    x0, x1, y0, y1 = place.layout.land
+    x, y = np.meshgrid(np.arange(x0, x1 + 0.1, _LAND_STEP), np.arange(y1, y0 - 0.1, -_LAND_STEP))
+    xy = np.stack([x, y], -1)
+    station, lateral = road.project(xy)
+    away = road.edges(lateral) - section.kerb_width
+    width = np.where(lateral > 0.0, section.sides[0].width, section.sides[1].width)
+    along = (station > road.start - 2.0) & (station < road.end + 2.0)
+    sunk = np.where(along & (away < width - 1.6), 0.5, np.where(along & (away < width + 1.6), 0.12, 0.0))
+    for mouth in road.line.mouths:
+        near = (np.abs(station - mouth.station) < mouth.width / 2 + 1.6) & (lateral * mouth.side > 0.0)
+        sunk = np.where(near & (away < _MOUTH_REACH), 0.3, sunk)
+    points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
+    uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
+    place.objects.append(PlaceObject("land", "ground", primitives.grid(points, uv), "land"))
+
+
+# ---- placement
+
+
+class Site:
+    """The ground that is taken: the road, its mouths, the free corridor, and footprints of what stands already.
+
+    A footprint is a rectangle: its center [m], half sizes [m] and the direction of its first axis [rad].
+    """
+
+    def __init__(self, road: DrawnRoad) -> None:
+        self._road = road
+        self._taken: list[tuple[Array, float, Array]] = []  # center, radius, corners
+
+    def take(
+        self, center: Array, half: tuple[float, float], yaw: float, clear: float = CLEARANCE, gap: float = _MIN_GAP
+    ) -> bool:
+        """Takes a footprint if it is free of road and footprints; returns False if it is not.
+
+        Args:
+            center: x, y [m].
+            half: Half sizes along and across `yaw` [m].
+            yaw: Direction of the first axis [rad].
+            clear: Least distance from the road's edge or kerb [m].
+            gap: Least distance from other footprints [m].
+        """
+        corners = _corners(center, half, yaw)
+        if not self._off_road(center, half, yaw, clear):
+            return False
+        grown, radius = _corners(center, (half[0] + gap, half[1] + gap), yaw), float(np.hypot(*half)) + gap
+        for other, reach, outline in self._taken:
+            if np.hypot(*(center - other)) < radius + reach and _overlap(grown, outline):
+                return False
+        self._taken.append((center, float(np.hypot(*half)), corners))
+        return True
+
+    def _off_road(self, center: Array, half: tuple[float, float], yaw: float, clear: float) -> bool:
+        road, section = self._road, self._road.section
+        counts = [max(2, round(2 * h / 0.4) + 1) for h in half]
+        a, b = np.meshgrid(*(np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)))
+        axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+        station, lateral = road.project(center + np.stack([a.ravel(), b.ravel()], -1) @ axes)
+        free = (road.edges(lateral) > section.kerb_width + clear) & (np.abs(lateral) > FREE_HALF_WIDTH + CLEARANCE)
+        for mouth in road.line.mouths:
+            free &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.4) | (lateral * mouth.side < 0.0)
+        return bool(free.all())
+
+
+def _corners(center: Array, half: tuple[float, float], yaw: float) -> Array:
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    return center + np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half @ axes
+
+
+def _overlap(a: Array, b: Array) -> bool:
+    """True if two rectangles (4, 2) overlap, by the separating axis theorem."""
+    for corners in (a, b):
+        for side in (corners[1] - corners[0], corners[2] - corners[1]):
+            normal = np.array([-side[1], side[0]])
+            p, q = a @ normal, b @ normal
+            if p.max() < q.min() or q.max() < p.min():
+                return False
+    return True
+
+
+def _spot(place: KnownPlace, station: float, lateral: float) -> Array:
+    return place.route.at(station, lateral)
+
+
+def _edge(spec: PlaceSpec, side: int) -> float:
+    """Distance of the kerb's outer edge from the driven line on a side (1 = left) [m]."""
+    return (spec.section.left if side > 0 else spec.section.right) + spec.section.kerb_width
+
+
+def _verge(spec: PlaceSpec, side: int) -> float:
+    """Width of pavement and verge on a side [m]."""
+    return spec.section.sides[0 if side > 0 else 1].width
+
+
+def _reach(spec: PlaceSpec) -> tuple[float, float]:
+    """Stations between which objects stand [m]."""
+    return -6.0, spec.line.length + 22.0
+
+
+# ---- objects
+
+
+def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tuple[House, str, Rgb, Rgb]]:
+    """Adds rows of houses; returns, by name, each house with the material and color of its walls and its roof's."""
+    rng, houses = stream(spec.number, "houses", 1), spec.houses
+    out: dict[str, tuple[House, str, Rgb, Rgb]] = {}
+    first, last = _reach(spec)
+    if houses.density <= 0.05:
+        return out
+    for side in (1, -1):
+        station = first + float(rng.uniform(0.0, 12.0))
+        while station < last + 10.0:
+            width, depth = float(rng.uniform(*houses.front)), float(rng.uniform(6.0, 11.0))
+            storeys = int(rng.integers(houses.storeys[0], houses.storeys[1] + 1))
+            setback = float(rng.uniform(*houses.setback))
+            away = _edge(spec, side) + max(0.6, _verge(spec, side) - 1.0) + setback + depth / 2
+            yaw = place.heading(station) + (0.0 if side > 0 else np.pi) + float(rng.normal(0.0, 0.03))
+            wall, roof = str(rng.choice(houses.walls)), str(rng.choice(houses.roofs))
+            color = houses.colors[int(rng.integers(len(houses.colors)))]
+            tiles = houses.roof_colors[int(rng.integers(len(houses.roof_colors)))]
+            house = House(
+                _spot(place, station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
+            )
+            if len(out) < 16 and site.take(house.center, (width / 2 + 0.3, depth / 2 + 0.3), yaw, 0.6, 0.6):
+                name = f"house_{len(out)}"
+                add_house(place, name, house, spec.lamps.lit_windows)
+                out[name] = (house, wall, color, tiles)
+            mean = 100.0 / houses.density
+            station += max(width + 0.8, float(rng.uniform(0.7, 1.3)) * mean)
+    return out
+
+
+def _add_lamps(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
+    rng, lamps = stream(spec.number, "lamps", 1), spec.lamps
+    if lamps.kind == "none":
+        return
+    first, last = _reach(spec)
+    for k, station in enumerate(np.arange(first + rng.uniform(0.0, lamps.spacing), last, lamps.spacing)):
+        side = lamps.side or (1 if k % 2 else -1)
+        shines = bool(rng.random() >= lamps.broken)
+        away = max(_edge(spec, side) + 0.45, FREE_HALF_WIDTH + 0.35)
+        for shift in (0.0, 3.0, -3.0):
+            at = float(station + shift), side * away
+            if site.take(_spot(place, *at), (0.12, 0.12), 0.0):
+                break
+        else:
+            continue
+        if lamps.kind in ("post_top", "lantern"):
+            furniture.add_lantern(place, k, *at, lamps.height, lamps.kind, shines)
+        else:
+            arm = 0.25 * lamps.height
+            arms = (arm, -arm) if lamps.kind == "double" else (arm,)
+            furniture.add_lamp_post(place, k, *at, lamps.height, arms, shines)
+
+
+def _add_boundaries(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
+    rng = stream(spec.number, "boundaries", 1)
+    first, last = _reach(spec)
+    for side, name, boundary in ((1, "left", spec.boundaries[0]), (-1, "right", spec.boundaries[1])):
+        if boundary.kind == "none":
+            continue
+        away = _edge(spec, side) + max(boundary.distance, 0.3)
+        if away < FREE_HALF_WIDTH + 0.6:
+            away = FREE_HALF_WIDTH + 0.6
+        lateral, thick = side * away, thickness(boundary.kind)
+        tight = min((1 / abs(p.curvature) for p in spec.line.pieces if side * p.curvature > 0.0), default=np.inf)
+        if away > tight - 0.8:
+            continue
+        runs: list[list[float]] = [[]]
+        wanted = rng.random(1000) < boundary.covered
+        for k, station in enumerate(np.arange(first, last, BAY).tolist()):
+            at, half = station + BAY / 2, (BAY / 2, thick / 2)
+            if boundary.kind == "bollards":
+                at, half = station, (0.12, 0.12)
+            # Neighboring pieces touch, hence the negative gap.
+            if wanted[k // 4] and site.take(_spot(place, at, lateral), half, place.heading(at), 0.1, -0.05):
+                runs[-1].append(station)
+            elif runs[-1]:
+                runs.append([])
+        for k, run in enumerate(runs):
+            skin = f"boundary_{name}"
+            add_boundary(place, f"{name}_{boundary.kind}_{k}", boundary, skin, np.array(run), lateral)
+
+
+def _add_poles(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
+    if not spec.furniture.poles:
+        return
+    rng = stream(spec.number, "furniture", 1)
+    side, height = int(rng.choice([-1, 1])), float(rng.uniform(6.5, 8.5))
+    away = _edge(spec, side) + min(1.2, 0.5 * _verge(spec, side)) + float(rng.uniform(0.4, 1.6))
+    first, last = _reach(spec)
+    feet = []
+    for k, station in enumerate(np.arange(first + rng.uniform(0, 10), last, rng.uniform(20.0, 30.0))):
+        at = float(station), side * away
+        if site.take(_spot(place, *at), (0.16, 0.16), 0.0):
+            furniture.add_post(place, f"pole_{k}", *at, height, 0.13, "pole")
+            feet.append(at)
+    if len(feet) > 1:
+        furniture.add_wires(place, "wires", feet, height)
+
+
+def _scatter(
+    rng: np.random.Generator, spec: PlaceSpec, amount: float, near: float, far: float
+) -> list[tuple[float, float]]:
+    """Random stations and laterals: `amount` per 100 m of road, `near` to `far` beyond the kerb [m]."""
+    first, last = _reach(spec)
+    out = []
+    for _ in range(int(rng.poisson(amount * (last - first) / 100.0))):
+        side = int(rng.choice([-1, 1]))
+        out.append((float(rng.uniform(first, last)), side * (_edge(spec, side) + float(rng.uniform(near, far)))))
+    return out
+
+
+def _moved(
+    other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
+) -> tuple[float, float]:
+    """Where a movable thing stands: as filmed, or up to 1.5 m away along the road where that is free."""
+    if other_day is None:
+        return at
+    moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]
+    free = site.take(_spot(place, *moved), (radius, radius), place.heading(moved[0]), gap=-0.9 * radius)
+    return moved if free else at
+
+
+def _add_cars(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.random.Generator | None) -> None:
+    rng = stream(spec.number, "cars", 1)
+    for k, (station, lateral) in enumerate(_scatter(rng, spec, spec.furniture.cars, 1.25, 3.2)):
+        kinds = furniture.VEHICLES
+        kind = "van" if rng.random() < spec.furniture.vans else str(rng.choice(kinds[:-1]))
+        turn = np.pi * int(rng.integers(0, 2)) + float(rng.normal(0.0, 0.03))
+        skin = f"paint{int(rng.integers(len(spec.furniture.car_colors)))}"
+        if rng.random() < 0.25:  # parked at right angles to the road
+            turn, lateral = turn + np.pi / 2, float(lateral + np.sign(lateral) * 1.6)
+        length, width = furniture.vehicle_size(kind)
+        yaw = place.heading(station) + turn
+        if site.take(_spot(place, station, lateral), (length / 2, width / 2), yaw):
+            if other_day is not None:
+                shifted = station + float(other_day.uniform(-1.5, 1.5))
+                if site.take(_spot(place, shifted, lateral), (length / 2, width / 2), yaw, gap=-1.7):
+                    station = shifted
+            furniture.add_vehicle(place, k, station, lateral, turn, kind, skin)
+
+
+def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.random.Generator | None) -> None:
+    f = spec.furniture
+
+    def each(index: int, amount: float, near: float, far: float, radius: float, add: Callable[..., None]) -> None:
+        rng = stream(spec.number, "furniture", 2, index)
+        for k, at in enumerate(_scatter(rng, spec, amount, near, far)):
+            if site.take(_spot(place, *at), (radius, radius), place.heading(at[0])):
+                add(k, at, rng)
+
+    def sign(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        wide, high = float(rng.uniform(0.5, 1.3)), float(rng.uniform(1.7, 2.7))
+        low = high - float(rng.uniform(0.45, 1.1))
+        turn = float(rng.normal(0.0, 0.25)) + np.pi * (rng.random() < 0.25)
+        furniture.add_sign(place, int(rng.integers(0, 6)) + 8 * k, *at, turn, (wide, low, high))
+
+    def small(kind: str) -> Callable[..., None]:
+        def add(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+            at = _moved(other_day, place, site, at, 0.4)
+            if kind == "bin":
+                furniture.add_bin(place, k, *at, str(rng.choice(["green", "dark", "blue", "red", "zinc"])))
+            elif kind == "cone":
+                furniture.add_cone(place, k, *at)
+            else:
+                furniture.add_crate(place, k, *at, float(rng.uniform(0.7, 1.2)))
+
+        return add
+
+    def bench(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        furniture.add_bench(place, k, *at)
+
+    def bollard(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        furniture.add_post(place, f"bollard_{k}", *at, float(rng.uniform(0.7, 1.1)), 0.07, "dark")
+
+    def cabinet(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        size = float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.8, 1.4))
+        furniture.add_cabinet(place, k, *at, size)
+
+    def stone(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        furniture.add_stone(place, k, *at, float(rng.uniform(0.25, 0.65)))
+
+    each(0, f.signs, 0.25, 1.2, 0.35, sign)
+    each(1, f.bins, 0.5, 2.5, 0.35, small("bin"))
+    each(2, f.benches, 0.7, 2.8, 0.9, bench)
+    each(3, f.bollards, 0.2, 0.6, 0.12, bollard)
+    each(4, f.cones, 0.3, 1.2, 0.3, small("cone"))
+    each(5, f.crates, 1.0, 4.0, 0.75, small("crate"))
+    each(6, f.cabinets, 0.6, 3.0, 0.6, cabinet)
+    each(7, f.stones, 0.5, 6.0, 0.6, stone)
+
+
+def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
+    rng, trees = stream(spec.number, "trees", 1), spec.trees
+    first, last = _reach(spec)
+    spots: list[tuple[float, float]] = []
+    for side in (1, -1):
+        count = int(trees.density * (last - first + 8.0) / 100.0)
+        row = max(1.0, 0.6 * _verge(spec, side))
+        for k in range(count):
+            station = first + (k + float(rng.uniform(0.2, 0.8))) / max(1, count) * (last - first + 8.0)
+            beyond = row + float(rng.normal(0.0, 0.15)) if trees.row else float(rng.gamma(2.0, 3.5)) + 0.8
+            spots.append((station, side * (_edge(spec, side) + beyond)))
+    for _ in range(14 if spec.setting not in ("town", "works") else 5):  # further off
+        side = int(rng.choice([-1, 1]))
+        spots.append((float(rng.uniform(first, last + 25.0)), side * float(rng.uniform(14.0, 38.0))))
+    for k, at in enumerate(spots):
+        kind, height = str(rng.choice(trees.kinds)), float(rng.uniform(*trees.height))
+        skin = f"leaf{int(rng.integers(0, 3))}"
+        crown, low = height * float(rng.uniform(0.22, 0.36)), float(rng.uniform(0.7, 1.8))
+        radius = {"shrub": 0.5 * low}.get(kind, 0.35)
+        clear = {"conifer": 0.9, "shrub": 0.5 * low}.get(kind, 0.4)
+        if not site.take(_spot(place, *at), (radius, radius), 0.0, clear, 0.3):
+            continue
+        if kind == "conifer":
+            add_conifer(place, k, at, 1.25 * height, skin)
+        elif kind == "bare":
+            add_bare_tree(place, k, at, height)
+        elif kind == "shrub":
+            add_shrub(place, k, at, low, skin)
+        elif kind == "birch":
+            add_crowned_tree(place, k, at, 1.1 * height, 0.6 * crown, 1.8, "leaf3")
+        elif kind == "slender":
+            add_crowned_tree(place, k, at, 1.3 * height, 0.55 * crown, 2.2, skin)
+        else:
+            add_crowned_tree(place, k, at, height, crown, 1.0, skin)
+
+
+def _add_tufts(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
+    rng = stream(spec.number, "trees", 2)
+    road = place.route
+    count = int(spec.trees.tufts * (spec.line.length + 20.0))
+    station = rng.uniform(-7.0, spec.line.length + 20.0, count)
+    side = rng.choice([-1, 1], count)
+    edges = np.where(side > 0, _edge(spec, 1), _edge(spec, -1))
+    paved = np.where(side > 0, spec.section.sides[0].pavement, spec.section.sides[1].pavement)
+    lateral = side * (edges + paved + 0.06 + rng.exponential(0.9, count).clip(0, 5.0))
+    keep = np.ones(count, bool)
+    for mouth in spec.line.mouths:
+        keep &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.2) | (side != mouth.side)
+    xy = road.at(station, lateral)
+    keep &= np.abs(road.project(xy)[1]) > 0.5 * edges  # not across the line on the inside of a bend
+    if keep.any():
+        add_tufts(place, rng, station[keep], lateral[keep])
+
+
+# ---- textures
+
+_WORDS = ("STOP", "SLOW", "BAKERY", "PARK", "30", "NO ENTRY", "BUS", "SCHOOL", "FARM", "HOTEL", "CAFE", "DEPOT", "EXIT")
+_SIGN_GROUNDS: tuple[Rgb, ...] = (
+    *((0.10, 0.22, 0.55), (0.85, 0.85, 0.82), (0.9, 0.75, 0.1), (0.12, 0.4, 0.2), (0.75, 0.1, 0.1)),
+    *((0.92, 0.9, 0.85), (0.35, 0.2, 0.12), (0.2, 0.2, 0.22)),
+)
+
+
+@cache
+def _atlas_image(spec: PlaceSpec) -> NDArray[np.uint8]:
+    rng = stream(spec.number, "furniture", 3)
+
+    def near(color: Rgb, spread: float = 0.25) -> Rgb:
+        red, green, blue = np.clip(np.array(color) * rng.uniform(1 - spread, 1 + spread, 3), 0.03, 0.9).tolist()
+        return red, green, blue
+
+    defaults = AtlasColors()
+    metals = {name: near(color) for name, color in defaults.metals.items()}
+    metals |= {f"paint{k}": c for k, c in enumerate((spec.furniture.car_colors * 6)[:6])}
+    left, right = spec.boundaries
+    metals |= {"cabinet": near((0.5, 0.53, 0.5), 0.3), "stone": near((0.45, 0.44, 0.42), 0.2)}
+    woods = {"planks": near((0.50, 0.37, 0.24)), "crate": near((0.52, 0.40, 0.27)), "pole": near((0.33, 0.26, 0.2))}
+    woods["shutter"] = near((0.3, 0.34, 0.3), 0.8)
+
+    def surface(boundary: BoundarySpec, name: str) -> None:
+        (woods if boundary.kind in ("picket", "boards", "rails") else metals)[name] = boundary.color
+
+    surface(left, "boundary_left")
+    surface(right, "boundary_right")
+    metals["chimney"] = near((0.45, 0.3, 0.25), 0.3)
+    metals["birch"] = (0.78, 0.77, 0.73)
+    plates = [((0.93, 0.92, 0.88), f"{chr(65 + int(rng.integers(26)))}X {int(rng.integers(100, 999))}") for _ in "12"]
+    signs = [
+        (_SIGN_GROUNDS[int(rng.integers(len(_SIGN_GROUNDS)))], _WORDS[int(rng.integers(len(_WORDS)))]) for _ in range(6)
+    ]
+    color = spec.lamps.color
+    trees = spec.trees
+    dark = trees.greens[0]
+    colors = AtlasColors(
+        metals=metals,
+        woods=woods,
+        doors=(near((0.6, 0.42, 0.3), 0.5), near((0.4, 0.5, 0.5), 0.6)),
+        greens=trees.greens,
+        hedge=(0.45 * dark[0], 0.45 * dark[1], 0.45 * dark[2]),
+        barks=(trees.bark, near(trees.bark), near(trees.bark)),
+        lamp=(0.4 + 0.6 * color[0], 0.4 + 0.6 * color[1], 0.4 + 0.6 * color[2]),
+        signs=(*signs, *plates),
+        window=spec.houses.window,
+        frames=np.array([spec.houses.trim]),
+    )
+    return to_uint8(paint_atlas(lambda k: stream(spec.number, "furniture", 4, k), CELLS + _EXTRA_CELLS, colors))
+
+
+def _textures(
+    spec: PlaceSpec, layout: GroundLayout, houses: dict[str, tuple[House, str, Rgb, Rgb]]
+) -> dict[str, NDArray[np.uint8]]:
+    """All textures of a place by name, uint8 RGB."""
+    if spec not in _painted:
+        if len(_painted) > 1:
+            _painted.pop(next(iter(_painted)))
+        _painted[spec] = _paint(spec, layout, houses)
+    return _painted[spec]
+
+
+_painted: dict[PlaceSpec, dict[str, NDArray[np.uint8]]] = {}  # the last two places, for films under several lightings
+
+
+def _paint(
+    spec: PlaceSpec, layout: GroundLayout, houses: dict[str, tuple[House, str, Rgb, Rgb]]
+) -> dict[str, NDArray[np.uint8]]:
+    surface, section = spec.surface, spec.section
+
+    def rng(*key: int) -> np.random.Generator:
+        return stream(spec.number, "surface", *key)
+
+    first, last = layout.stations
+    length = last - first
+    zebras: tuple[float, ...] = ()
+    if "zebra" in surface.markings:
+        zebras = (float(rng(1).uniform(0.2, 0.8)) * spec.line.length - first,)
+    out = {"road": to_uint8(surfaces.road(rng(2), surface, section, length, _ROAD_PIXEL, zebras))}
+    for k, (name, side) in enumerate(zip(("verge_left", "verge_right"), section.sides, strict=True)):
+        shape = (max(8, round(side.width / _VERGE_PIXEL)), round(length / _VERGE_PIXEL))
+        image = surfaces.turf(rng(3, k), surface, shape, _VERGE_PIXEL, side.verge)
+        if side.pavement > 0.0:
+            paved = min(shape[0], round(side.pavement / _VERGE_PIXEL))
+            inner = slice(shape[0] - paved, None) if k == 0 else slice(0, paved)
+            image[inner] = surfaces.paving(rng(4, k), surface, (paved, shape[1]), _VERGE_PIXEL, side.paving)
+        out[name] = to_uint8(image)
+    if section.kerb_height > 0.0:
+        tone = float(rng(5).uniform(0.7, 1.25))
+        stones = (16, round(length / 0.02))
+        out["kerb"] = to_uint8(slabs(rng(6), stones, 0.02, (10.0, float(rng(5).uniform(0.5, 1.2)))) * tone)
+    if spec.line.mouths:
+        plain = replace(surface, markings=(), strip=0.0)
+        half = 0.5 * max(mouth.width for mouth in spec.line.mouths)
+        across = replace(section, left=half, right=half, kerb_height=0.0)
+        out["side_road"] = to_uint8(surfaces.road(rng(7), plain, across, _MOUTH_REACH / 0.25, 0.02))
+    x0, x1, y0, y1 = layout.land
+    kind = {"town": "grass", "works": "gravel", "field": "meadow", "forest": "earth"}.get(spec.setting, "grass")
+    shape = (round((y1 - y0) / _LAND_PIXEL), round((x1 - x0) / _LAND_PIXEL))
+    out["land"] = to_uint8(surfaces.land(rng(8), surface, shape, _LAND_PIXEL, kind))
+    for k, (name, (house, wall, color, tiles)) in enumerate(houses.items()):
+        size = (round((house.eaves + 0.5) / _WALL_PIXEL), round(2 * (house.width + house.depth) / _WALL_PIXEL))
+        paint = stream(spec.number, "houses", 2, k)
+        out[name] = to_uint8(surfaces.wall(paint, wall, color, size, _WALL_PIXEL))
+        ridge, slope = house.roof_size
+        tiled = (max(16, round(slope / 0.045)), round(ridge / 0.045))
+        out[f"{name}_roof"] = to_uint8(surfaces.roof(paint, spec.houses, tiles, tiled, 0.045))
+    out["atlas"] = _atlas_image(spec)
+    return out
