@@ -148,8 +148,9 @@ def expanded_pairs(
             if source_index[i] == a and source_index[j] == b:
                 best[int(position[i])] = max(best.get(int(position[i]), (0, 0)), (count, int(position[j])))
         k, pace = np.arange(len(first)), (len(second) - 1) / max(len(first) - 1, 1)
+        offsets: tuple[int, ...] = _CROSS_OFFSETS
         if len(best) >= 2:
-            anchors, offsets = sorted(best), _CROSS_OFFSETS
+            anchors = sorted(best)
             counterpart = np.interp(k, anchors, [best[p][1] for p in anchors])
             # np.interp is constant beyond the outermost anchors; there the mean ratio of the sources is used.
             counterpart += pace * (np.minimum(k - anchors[0], 0) + np.maximum(k - anchors[-1], 0))

@@ -108,8 +108,8 @@ def _sparse_points(result: Any, frames: NDArray[np.int64], total: int) -> Sparse
     valid = np.isfinite(result["xyz"]).all(1) & (result["error"] < _MAX_POINT_ERROR)
     observed = (frame >= 0) & valid[result["point"]]
     number = np.cumsum(valid) - 1
-    kept = (result[name][valid] for name in ("xyz", "rgb", "error"))
-    return SparsePoints(*kept, number[result["point"][observed]], frame[observed])
+    xyz, rgb, error = (result[name][valid] for name in ("xyz", "rgb", "error"))
+    return SparsePoints(xyz, rgb, error, number[result["point"][observed]], frame[observed])
 
 
 def _check_registered(capture: Capture, frames: NDArray[np.int64], settings: CamerasConfig) -> None:

@@ -261,8 +261,8 @@ def read_film(
         if size != count.size:
             image = np.asarray(resize(image, *size), np.uint8)
         height = max(1, round(size[1] * FLOW_WIDTH / size[0]))
-        small = cv2.cvtColor(np.asarray(resize(image, FLOW_WIDTH, height), np.uint8), cv2.COLOR_RGB2GRAY)
-        small = np.asarray(small, np.uint8)
+        gray = cv2.cvtColor(np.asarray(resize(image, FLOW_WIDTH, height), np.uint8), cv2.COLOR_RGB2GRAY)
+        small: Image = np.asarray(gray, np.uint8)
         mask = mask_of(candidate.index, *size)
         small_mask = None
         if mask is not None:

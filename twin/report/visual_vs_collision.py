@@ -203,7 +203,8 @@ def _collision_surface(ground: Ground, parts: Parts) -> Any:
     from twin.geometry.mesh_rays import Surface
 
     vertices, faces = height_mesh(ground, ground.cell, 2 * ground.height.size)
-    return Surface(*trimesh.util.append_faces([vertices, *parts.vertices], [faces, *parts.faces]))
+    corners, triangles = trimesh.util.append_faces([vertices, *parts.vertices], [faces, *parts.faces])
+    return Surface(np.asarray(corners, np.float64), np.asarray(triangles))
 
 
 def _thin(points: Array) -> Array:

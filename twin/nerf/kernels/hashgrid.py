@@ -21,8 +21,8 @@ _PRIME_Z = wp.uint32(805459861)
 
 
 @wp.struct
-class Cell:
-    """Cell of a level: its lowest vertex, and the weights of the upper (b) and lower (a = 1 − b) vertices per axis."""
+class HashCell:
+    """HashCell of a level: its lowest vertex, and the weights of the upper (b) and lower (a = 1 − b) vertices per axis."""
 
     x: wp.int32
     y: wp.int32
@@ -32,10 +32,10 @@ class Cell:
 
 
 @wp.func
-def cell_at(position: wp.vec3f, cells: wp.vec3f) -> Cell:
+def cell_at(position: wp.vec3f, cells: wp.vec3f) -> HashCell:
     s = wp.cw_mul(position, cells)
     floor = wp.vec3f(wp.floor(s[0]), wp.floor(s[1]), wp.floor(s[2]))
-    cell = Cell()
+    cell = HashCell()
     cell.x = wp.int32(floor[0])
     cell.y = wp.int32(floor[1])
     cell.z = wp.int32(floor[2])
@@ -45,7 +45,7 @@ def cell_at(position: wp.vec3f, cells: wp.vec3f) -> Cell:
 
 
 @wp.func
-def vertex_index(cell: Cell, n: wp.int32, shape: wp.vec4i, mask: wp.uint32) -> wp.int32:
+def vertex_index(cell: HashCell, n: wp.int32, shape: wp.vec4i, mask: wp.uint32) -> wp.int32:
     """Row of a cell's vertex n = x + 2·y + 4·z in the level's table (Müller et al. 2022, eq. 4).
 
     `shape` is (nx, ny, nz, dense?).
@@ -59,7 +59,7 @@ def vertex_index(cell: Cell, n: wp.int32, shape: wp.vec4i, mask: wp.uint32) -> w
 
 
 @wp.func
-def vertex_weight(cell: Cell, n: wp.int32) -> wp.float32:
+def vertex_weight(cell: HashCell, n: wp.int32) -> wp.float32:
     """Trilinear weight of a cell's vertex n."""
     x = wp.where((n & 1) > 0, cell.b[0], cell.a[0])
     y = wp.where((n & 2) > 0, cell.b[1], cell.a[1])
