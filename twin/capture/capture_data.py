@@ -50,22 +50,16 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
 class SourceInfo:
     """One source after capture. Its frames share one camera, except posed input with one camera per image."""
 
-    name: str
-    """Unique folder name of the source."""
+    name: str  # unique folder name of the source
     lighting: str
-    kind: str
-    """video, images, colmap or transforms."""
-    width: int
-    """Size of the kept frames [px]."""
+    kind: str  # video, images, colmap or transforms
+    width: int  # size of the kept frames [px]
     height: int
-    camera_model: str
-    """COLMAP model name of the known or assumed camera."""
+    camera_model: str  # COLMAP model name of the known or assumed camera
     camera_params: tuple[float, ...]
     """Calibration or focal length prior [px], at the size of the kept frames; empty if unknown."""
-    calibrated: bool
-    """True if `camera_params` are a given calibration, which stays fixed."""
-    camera_height: float
-    """Lens above ground [m]; 0 = not given."""
+    calibrated: bool  # true if `camera_params` are a given calibration, which stays fixed
+    camera_height: float  # lens above ground [m]; 0 = not given
 
 
 @dataclass(frozen=True)
@@ -75,14 +69,10 @@ class Capture:
     sources: tuple[SourceInfo, ...]
     names: tuple[str, ...]
     """`<source>/<six digits>`; the image is `images/<name>.png` in the stage folder, its mask `masks/<name>.png`."""
-    source_index: NDArray[np.int64]
-    """Shape (n,)."""
-    times: Array
-    """Time within the source [s]; the index for photos without a clock. Shape (n,)."""
-    held_out: NDArray[np.bool_]
-    """True for test frames, which are never trained on. Shape (n,)."""
-    gps: Array
-    """Latitude [°], longitude [°], altitude [m]; NaN where unknown. Shape (n, 3)."""
+    source_index: NDArray[np.int64]  # shape (n,)
+    times: Array  # time within the source [s]; the index for photos without a clock. Shape (n,)
+    held_out: NDArray[np.bool_]  # true for test frames, which are never trained on. Shape (n,)
+    gps: Array  # latitude [°], longitude [°], altitude [m]; NaN where unknown. Shape (n, 3)
     camera_to_world: Array | None = None
     """Poses given with the input (OpenCV axes), shape (n, 4, 4); None unless all sources have them."""
     intrinsics: Array | None = None
@@ -140,8 +130,7 @@ class SourceTask:
     kind: str
     source: SourceConfig
     config: CaptureConfig
-    masks: Path | None
-    """One mask for all frames, or a folder with a mask per frame."""
+    masks: Path | None  # one mask for all frames, or a folder with a mask per frame
     writer: "FrameWriter"
 
     @property
@@ -201,10 +190,8 @@ class KeptFrames:
     times: list[float]
     gps: list[tuple[float, float, float]]
     metrics: dict[str, Any]
-    poses: list[Array]
-    """camera_to_world (4, 4) per frame; empty for a source without poses."""
-    intrinsics: list[Array]
-    """fx, fy, cx, cy [px] at the kept size per pose."""
+    poses: list[Array]  # camera_to_world (4, 4) per frame; empty for a source without poses
+    intrinsics: list[Array]  # fx, fy, cx, cy [px] at the kept size per pose
 
 
 class FrameWriter:

@@ -174,14 +174,10 @@ class ImageSet:
     """n image files in natural order of their names, posed or not."""
 
     paths: tuple[Path, ...]
-    lenses: tuple[Lens, ...] | None = None
-    """One per image, at the size given in the file; None without cameras."""
-    camera_to_world: Array | None = None
-    """OpenCV axes, shape (n, 4, 4); None without poses."""
-    masks: tuple[Path | None, ...] | None = None
-    """One per image, as listed by the set."""
-    missing: int = 0
-    """Number of listed images that do not exist."""
+    lenses: tuple[Lens, ...] | None = None  # one per image, at the size given in the file; None without cameras
+    camera_to_world: Array | None = None  # OpenCV axes, shape (n, 4, 4); None without poses
+    masks: tuple[Path | None, ...] | None = None  # one per image, as listed by the set
+    missing: int = 0  # number of listed images that do not exist
 
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:

@@ -40,14 +40,10 @@ lies below it."""
 class Road:
     """The layer of points below a path."""
 
-    points: NDArray[np.int64]
-    """Indices of its points, shape (k,)."""
-    drop: float
-    """Median height of the cameras above it."""
-    spread: float
-    """Robust standard deviation of the drops of its points."""
-    reach: float
-    """Largest offset of its points [drops]. At 1 they lie under the path, at larger values on verges."""
+    points: NDArray[np.int64]  # indices of its points, shape (k,)
+    drop: float  # median height of the cameras above it
+    spread: float  # robust standard deviation of the drops of its points
+    reach: float  # largest offset of its points [drops]. At 1 they lie under the path, at larger values on verges
 
     @property
     def reliable(self) -> bool:
@@ -58,12 +54,9 @@ class Road:
 class Gravity:
     """The up direction with its uncertainty."""
 
-    direction: Array
-    """Unit vector, shape (3,)."""
-    uncertainty: float
-    """Standard deviation of the angle [rad]."""
-    source: str
-    """The evidence used."""
+    direction: Array  # unit vector, shape (3,)
+    uncertainty: float  # standard deviation of the angle [rad]
+    source: str  # the evidence used
 
 
 def camera_up(camera_to_world: Array) -> Array:

@@ -57,16 +57,12 @@ _FOCAL_STEPS = np.array([0.98, 0.99, 1.0, 1.01, 1.02])  # relative focal lengths
 class Registration:
     """Pose and lens of a photo."""
 
-    camera_to_world: Array
-    """OpenCV axes [m], shape (4, 4)."""
-    lens: Lens
-    """At the photo's size."""
-    lens_from: str
-    """Source of the focal length."""
+    camera_to_world: Array  # OpenCV axes [m], shape (4, 4)
+    lens: Lens  # at the photo's size
+    lens_from: str  # source of the focal length
     matches: int
     inliers: int
-    error: float
-    """Mean reprojection error of the inliers [px of the photo]."""
+    error: float  # mean reprojection error of the inliers [px of the photo]
 
 
 def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir, seed: int = 0) -> Registration:
@@ -196,13 +192,10 @@ def solve_photo(job: dict[str, Any], work: Path) -> None:
 class _LocalizedFrame:
     """Inliers, pose and lens of a localized photo or film frame."""
 
-    image: Array
-    """Inliers in the image [px], shape (m, 2)."""
-    points: Array
-    """Inliers in the scene [m], shape (m, 3)."""
+    image: Array  # inliers in the image [px], shape (m, 2)
+    points: Array  # inliers in the scene [m], shape (m, 3)
     camera_from_world: pycolmap.Rigid3d
-    lens: Lens
-    """Estimated from this image alone, where it was free."""
+    lens: Lens  # estimated from this image alone, where it was free
 
     def residuals(self, lens: Lens) -> Array:
         """Reprojection errors of the inliers under a lens [px], shape (m, 2)."""
@@ -311,16 +304,11 @@ def _trusted_pairs(matches: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:
 class FilmRegistration:
     """Poses of a film's frames, all with one pinhole lens."""
 
-    frames: NDArray[np.int64]
-    """Indices of the localized frames, shape (n,)."""
-    camera_to_world: Array
-    """OpenCV axes [m], shape (n, 4, 4)."""
-    lens: Lens
-    """At the frames' size."""
-    focal_error: float
-    """Standard error of the focal length [px]; 0 for a given lens."""
-    error: float
-    """Median over the frames of the mean reprojection error of their inliers [px]."""
+    frames: NDArray[np.int64]  # indices of the localized frames, shape (n,)
+    camera_to_world: Array  # OpenCV axes [m], shape (n, 4, 4)
+    lens: Lens  # at the frames' size
+    focal_error: float  # standard error of the focal length [px]; 0 for a given lens
+    error: float  # median over the frames of the mean reprojection error of their inliers [px]
 
 
 def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, seed: int = 0) -> FilmRegistration:
@@ -330,8 +318,7 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
     frame; with its median all frames are localized again, and a joint fit to all inliers gives the final value. The
     principal point is assumed at the center. Frames are RGB (h, w, 3), in order, of one camera without distortion.
 
-    Raises:
-        InputError: no frame could be localized, or the focal length is not determined.
+    Raises InputError: no frame could be localized, or the focal length is not determined.
     """
     full = frames[0].shape[1], frames[0].shape[0]
     size = fitted_size(*full, _MAX_SIZE)
@@ -426,8 +413,7 @@ def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float,
     A parabola is fitted through the costs. Each frame counts as a single (x, y) measurement, because its inliers'
     errors are correlated.
 
-    Raises:
-        InputError: the frames do not determine the focal length.
+    Raises InputError: the frames do not determine the focal length.
     """
     robust_scale, center = _ROBUST_SCALE * max(lens.width, lens.height), lens.params[0]
     for _ in range(_MAX_ITERATIONS):

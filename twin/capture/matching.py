@@ -194,8 +194,7 @@ class Matcher:
     images: Path
     masks: Path | None
     capture: Capture
-    image_ids: NDArray[np.int64]
-    """Database id of each frame, shape (n,)."""
+    image_ids: NDArray[np.int64]  # database id of each frame, shape (n,)
     threads: int
     seed: int
     tried: set[Pair]

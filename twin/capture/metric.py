@@ -44,8 +44,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         gravity_uncertainty_deg, camera_height_median_m, camera_height_spread_m, path_length_m, floor_source, the
         similarity from the reconstruction, and the notes of the `Scale`.
 
-    Raises:
-        InputError: no scale given, or the data lack the evidence for it.
+    Raises InputError: no scale given, or the data lack the evidence for it.
     """
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))

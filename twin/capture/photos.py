@@ -41,14 +41,10 @@ _MAX_FOCAL_SPREAD = 0.05  # relative; photos of one source that differ more were
 class PhotoExif:
     """A photo's EXIF header."""
 
-    focal: float | None
-    """Focal length in units of the image's longer side; None if unknown."""
-    gps: tuple[float, float, float]
-    """Latitude [°], longitude [°], altitude [m]; NaN where unknown."""
-    time: float | None
-    """Time of exposure [s since the epoch, in the camera's time zone]; None if unknown."""
-    orientation: int
-    """EXIF orientation, 1 to 8; 1 is upright."""
+    focal: float | None  # focal length in units of the image's longer side; None if unknown
+    gps: tuple[float, float, float]  # latitude [°], longitude [°], altitude [m]; NaN where unknown
+    time: float | None  # time of exposure [s since the epoch, in the camera's time zone]; None if unknown
+    orientation: int  # EXIF orientation, 1 to 8; 1 is upright
 
 
 def read_exif(path: Path) -> PhotoExif:
@@ -278,8 +274,7 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoExif]:
     The lens of a posed image usually describes the stored image, so a posed image is rotated upright only if the stored
     image does not fit its lens.
 
-    Raises:
-        InputError: missing, empty, truncated or undecodable, or of another aspect than its lens.
+    Raises InputError: missing, empty, truncated or undecodable, or of another aspect than its lens.
     """
     stored = _stored_size(path)
     exif = read_exif(path)

@@ -32,10 +32,8 @@ class Scale:
     """Meters per unit of the reconstruction."""
 
     value: float
-    uncertainty: float
-    """Relative standard deviation; 0 for poses that are given as metric."""
-    notes: dict[str, Any] = field(default_factory=dict)
-    """Further entries of `metric.json`."""
+    uncertainty: float  # relative standard deviation; 0 for poses that are given as metric
+    notes: dict[str, Any] = field(default_factory=dict)  # further entries of `metric.json`
 
 
 def select_scale_sources(metric: MetricConfig, source_heights: dict[str, float]) -> list[str]:

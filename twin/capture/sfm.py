@@ -64,8 +64,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         registered, total, reprojection_error_px, mean_track_length, points, focal_px (per source), pairs,
         verified_pairs, outliers (names), mapper, registered_per_source.
 
-    Raises:
-        InputError: no texture, no overlap, or fewer frames registered than `cameras.min_registered`.
+    Raises InputError: no texture, no overlap, or fewer frames registered than `cameras.min_registered`.
     """
     stage, settings = scene.stage("capture"), config.cameras
     capture = Capture.load(stage)

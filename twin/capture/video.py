@@ -99,12 +99,9 @@ def _contrast_stretched(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 class FilmTiming:
     """Frame times of a film from its packets, read without decoding."""
 
-    times: Array
-    """Presentation times since the first frame [s], sorted, shape (n,)."""
-    start: float
-    """Time stamp of the first frame in its stream [s]."""
-    declared: int
-    """Number of frames declared by the container; n if it declares none."""
+    times: Array  # presentation times since the first frame [s], sorted, shape (n,)
+    start: float  # time stamp of the first frame in its stream [s]
+    declared: int  # number of frames declared by the container; n if it declares none
 
     @property
     def interval(self) -> float:
@@ -213,8 +210,7 @@ class FilmStatistics:
     blank: int = 0
     declared: int = 0
     duration: float = 0.0
-    size: tuple[int, int] = (0, 0)
-    """Upright width and height of the input [px]."""
+    size: tuple[int, int] = (0, 0)  # upright width and height of the input [px]
     sharpness: list[float] = field(default_factory=list)
 
 
@@ -224,10 +220,8 @@ class FilmFrame:
 
     index: int
     time: float
-    image: Image
-    """RGB, shape (h, w, 3)."""
-    mask: Image | None
-    """0 = ignore, shape (h, w); None without a mask."""
+    image: Image  # RGB, shape (h, w, 3)
+    mask: Image | None  # 0 = ignore, shape (h, w); None without a mask
 
 
 @dataclass(frozen=True)

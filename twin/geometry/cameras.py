@@ -38,26 +38,16 @@ def opencv_to_mujoco(camera_to_world: Array) -> Array:
 class Cameras:
     """n undistorted, posed pinhole frames with their metadata, ordered by source and then by time."""
 
-    names: tuple[str, ...]
-    """Frame names, `<source>/<six digits>`; unique."""
-    camera_to_world: Array
-    """Shape (n, 4, 4)."""
-    intrinsics: Array
-    """fx, fy, cx, cy [px], shape (n, 4)."""
-    sizes: NDArray[np.int64]
-    """Width, height [px], shape (n, 2)."""
-    lightings: tuple[str, ...]
-    """Lighting name per frame."""
-    sources: tuple[str, ...]
-    """Source name per frame."""
-    times: Array
-    """Time within its source [s], shape (n,)."""
-    held_out: NDArray[np.bool_]
-    """True for test frames, which are never trained on; shape (n,)."""
-    images: Path
-    """Folder with `<name>.png`, undistorted, 8-bit RGB (or gray, read as RGB)."""
-    masks: Path | None = None
-    """Folder with `<name>.png`, 0 = ignore; None if no frame has a mask."""
+    names: tuple[str, ...]  # frame names, `<source>/<six digits>`; unique
+    camera_to_world: Array  # shape (n, 4, 4)
+    intrinsics: Array  # fx, fy, cx, cy [px], shape (n, 4)
+    sizes: NDArray[np.int64]  # width, height [px], shape (n, 2)
+    lightings: tuple[str, ...]  # lighting name per frame
+    sources: tuple[str, ...]  # source name per frame
+    times: Array  # time within its source [s], shape (n,)
+    held_out: NDArray[np.bool_]  # true for test frames, which are never trained on; shape (n,)
+    images: Path  # folder with `<name>.png`, undistorted, 8-bit RGB (or gray, read as RGB)
+    masks: Path | None = None  # folder with `<name>.png`, 0 = ignore; None if no frame has a mask
 
     def __len__(self) -> int:
         return len(self.names)
@@ -141,12 +131,9 @@ class PosedCameras(Protocol):
 class Viewpoints:
     """n virtual pinhole views."""
 
-    camera_to_world: Array
-    """Shape (n, 4, 4)."""
-    intrinsics: Array
-    """fx, fy, cx, cy [px], shape (n, 4)."""
-    sizes: NDArray[np.int64]
-    """Width, height [px] that the intrinsics are for, shape (n, 2)."""
+    camera_to_world: Array  # shape (n, 4, 4)
+    intrinsics: Array  # fx, fy, cx, cy [px], shape (n, 4)
+    sizes: NDArray[np.int64]  # width, height [px] that the intrinsics are for, shape (n, 2)
 
     @staticmethod
     def of(camera_to_world: Array, intrinsics: Array, size: tuple[int, int]) -> "Viewpoints":
@@ -207,16 +194,11 @@ def scaled_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[
 class SparsePoints:
     """m points and their k observations (one per point and frame in which it was matched)."""
 
-    xyz: NDArray[np.float64]
-    """Shape (m, 3), in the same frame as the `Cameras` stored beside them."""
-    rgb: NDArray[np.uint8]
-    """Shape (m, 3)."""
-    error: NDArray[np.float64]
-    """Mean reprojection error [px], shape (m,)."""
-    point: NDArray[np.int64]
-    """Point index per observation, shape (k,)."""
-    frame: NDArray[np.int64]
-    """Index into the `Cameras` stored beside them per observation, shape (k,)."""
+    xyz: NDArray[np.float64]  # shape (m, 3), in the same frame as the `Cameras` stored beside them
+    rgb: NDArray[np.uint8]  # shape (m, 3)
+    error: NDArray[np.float64]  # mean reprojection error [px], shape (m,)
+    point: NDArray[np.int64]  # point index per observation, shape (k,)
+    frame: NDArray[np.int64]  # index into the `Cameras` stored beside them per observation, shape (k,)
 
     def __len__(self) -> int:
         return len(self.xyz)
