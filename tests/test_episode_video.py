@@ -11,11 +11,10 @@ from tqdm import tqdm
 from twin.env.drivers import RecordedDrive
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
-from twin.report.review_chapters import drive_metrics, drive_trace, frame_timing, smoothed_speed, write_drive_chapter
-from twin.report.review_studio import Studio
-from twin.report.shots import frame_indices
+from twin.report.review_chapters import Studio, frame_timing, smoothed_speed, write_drive_chapter
+from twin.report.review_video import drive_metrics, drive_trace
 from twin.report.video_layout import FrameLayout, MapView
-from twin.report.video_writer import VideoWriter, read_frames
+from twin.report.video_writer import VideoWriter, frame_indices, read_frames
 from twin.robot import PixelCamera
 
 

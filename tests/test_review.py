@@ -21,9 +21,7 @@ from twin.geometry.cameras import (
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
 from twin.nerf.rendering import FAR, Rendering
-from twin.report.review_chapters import lighting_at
-from twin.report.review_studio import (
-    Prefetcher,
+from twin.report.review_chapters import (
     Studio,
     appearance_of_frame,
     comparison_row,
@@ -31,11 +29,9 @@ from twin.report.review_studio import (
     evenly_spaced,
     frames_to_compare,
     gray_out,
-    scale_bar,
-    side_by_side,
+    lighting_at,
 )
-from twin.report.review_video import write_review_video
-from twin.report.shots import overview_pose
+from twin.report.review_video import Prefetcher, overview_pose, write_review_video
 from twin.report.video_layout import (
     FrameLayout,
     MapView,
@@ -44,7 +40,9 @@ from twin.report.video_layout import (
     fit,
     footprints,
     map_rotation,
+    scale_bar,
     shorten,
+    side_by_side,
     text_width,
     wrap,
 )

@@ -15,7 +15,7 @@ from twin.geometry.poses import inverse_pose
 from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
-from twin.report.shots import frame_indices
+from twin.report.video_writer import frame_indices
 from twin.robot import REAR_HEAVY, HuskyParams
 
 

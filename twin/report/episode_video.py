@@ -12,7 +12,6 @@ from twin.env.mujoco_renderer import SceneCamera, chase_poses
 from twin.env.obstacles import obstacle_pose
 from twin.errors import join_names
 from twin.mjcf.world import World, point_at
-from twin.report.shots import frame_indices
 from twin.report.video_layout import (
     ACCENT,
     AMBER,
@@ -30,7 +29,7 @@ from twin.report.video_layout import (
     draw_text,
     paste,
 )
-from twin.report.video_writer import VideoWriter
+from twin.report.video_writer import VideoWriter, frame_indices
 from twin.runtime import bar
 from twin.types import Array, Image
 

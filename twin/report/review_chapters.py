@@ -1,42 +1,202 @@
-"""Chapters of the review video: real against rendered frames, changing light, and the drive."""
+"""Chapters of the review video: real against rendered frames, changing light, and the drive.
+
+A `Studio` has what all chapters share: it renders the field, counts renders, and saves pictures for the page.
+"""
 
 import math
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from dataclasses import field as with_default
 from itertools import pairwise
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from twin.env.drivers import RecordedDrive
 from twin.errors import join_names
-from twin.geometry.cameras import nearest_frame
+from twin.files import write_bytes
+from twin.geometry.cameras import Cameras, Viewpoints, nearest_frame
+from twin.geometry.images import psnr, read_image, resize
 from twin.mjcf.world import World, arc_lengths
-from twin.report.review_studio import Studio, comparison_row, frames_to_compare, side_by_side, to_uint8
-from twin.report.shots import frame_indices
+from twin.nerf.rendering import RenderableField, Rendering
 from twin.report.video_layout import (
     ACCENT,
     AMBER,
+    FARTHEST_DEPTH,
     GREEN,
     INK,
     MUTED,
+    NEAREST_DEPTH,
     PANEL_BACKGROUND,
     RED,
     Box,
     Color,
+    FrameLayout,
     MapView,
+    caption_line,
+    colored,
     depth_colors,
+    depth_scale,
     draw_depth_legend,
     draw_facts,
     draw_label,
     draw_text,
+    fit,
+    panel_row,
     paste,
+    scale_bar,
     shorten,
+    side_by_side,
+    titled_panel,
+    to_uint8,
 )
+from twin.report.video_writer import VideoWriter, even, frame_indices
 from twin.robot import CAMERA_SIZE
 from twin.types import Array, Image
 
+# ---- studio
+
+_PICTURE_WIDTH = 1000  # [px] maximum, of pictures for the page
+_PICTURE_QUALITY = 82
+
+
+@dataclass(frozen=True)
+class PagePicture:
+    file: str
+    """Path within the stage folder."""
+    section: str
+    """Name of the report section."""
+    caption: str
+
+
+@dataclass
+class Studio:
+    """Renders views of the field, counts renders, and saves pictures for the page."""
+
+    name: str
+    """Name of the scene."""
+    field: RenderableField
+    cameras: Cameras
+    layout: FrameLayout
+    writer: VideoWriter
+    out: Path
+    render_width: int
+    path: Array
+    """Path on the map: the route, or the camera positions of the longest source [m], shape (n, 2)."""
+    pictures: list[PagePicture] = with_default(default_factory=list)
+    renders: int = 0
+    render_seconds: float = 0.0
+
+    @property
+    def fps(self) -> int:
+        return self.writer.fps
+
+    def render(
+        self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str, width: int | None = None
+    ) -> Rendering:
+        """Renders one view of the field, shapes (1, h, w, ...).
+
+        `intrinsics` are fx, fy, cx, cy [px] at `size`. The view has the same aspect and a longer side of `width` [px],
+        by default `render_width`.
+        """
+        shrink = (width or self.render_width) / max(size)
+        small = (even(round(size[0] * shrink)), even(round(size[1] * shrink)))
+        start = time.perf_counter()
+        rendering = self.field.render(Viewpoints.of(camera_to_world, intrinsics, size), lighting, small)
+        self.render_seconds += time.perf_counter() - start
+        self.renders += 1
+        return rendering
+
+    def render_frame(self, i: int, lighting: str | None = None, width: int | None = None) -> Rendering:
+        """Renders the field at the pose of frame i, by default in that frame's own appearance; see `render`."""
+        cameras = self.cameras
+        size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
+        light = lighting or appearance_of_frame(cameras, i)
+        return self.render(cameras.camera_to_world[i], cameras.intrinsics[i], size, light, width)
+
+    def real_frame(self, i: int) -> Image:
+        """The undistorted frame i, with its masked part grayed out."""
+        image = read_image(self.cameras.image_path(i))
+        mask = self.cameras.mask_path(i)
+        return image if mask is None else gray_out(image, read_image(mask)[..., 0] == 0)
+
+    def save_picture(self, name: str, section: str, caption: str, picture: Image, width: int = _PICTURE_WIDTH) -> None:
+        """Saves a picture for the page as `pictures/<name>.jpg`, at most `width` [px] wide."""
+        if picture.shape[1] > width:
+            height = round(picture.shape[0] * width / picture.shape[1])
+            picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _PICTURE_QUALITY])
+        if not ok:
+            raise OSError(f"could not encode picture {name}")
+        path = self.out / "pictures" / f"{name}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        write_bytes(path, data.tobytes())
+        self.pictures.append(PagePicture(f"pictures/{name}.jpg", section, caption))
+
+
+def gray_out(image: Image, ignored: NDArray[np.bool_]) -> Image:
+    """Shows the ignored part of an image, shape (h, w), in gray stripes."""
+    v, u = np.indices(ignored.shape)
+    width = max(4, len(ignored) // 40)
+    stripes = np.where((u + v) // width % 2 == 0, 0.55, 0.4)[..., None]
+    gray = image.mean(-1, keepdims=True) * stripes + 30.0
+    return np.where(ignored[..., None], gray, image).astype(np.uint8)
+
+
+def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
+    """At most `count` of the indices, evenly spaced, including the first and the last."""
+    if count >= len(indices):
+        return [int(i) for i in indices]
+    if count <= 1:
+        return [int(indices[len(indices) // 2])][:count]
+    return [int(indices[i]) for i in np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))]
+
+
+def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
+    """Frames of a lighting along its longest source, in order, half of them held out if there are enough."""
+    of_lighting = [i for i, name in enumerate(cameras.lightings) if name == lighting]
+    sources = [cameras.sources[i] for i in of_lighting]
+    if not sources:
+        return []
+    longest = max(dict.fromkeys(sources), key=sources.count)
+    mine = [i for i in of_lighting if cameras.sources[i] == longest]
+    held_out = [i for i in mine if cameras.held_out[i]]
+    trained = [i for i in mine if not cameras.held_out[i]]
+    unseen = evenly_spaced(held_out, max(1, count // 2))
+    return sorted([*unseen, *evenly_spaced(trained, count - len(unseen))])
+
+
+def appearance_of_frame(cameras: Cameras, i: int) -> str:
+    """Appearance of frame i, as a lighting for the field.
+
+    A trained frame has its own embedding. A held-out frame gets the interpolation of the trained frames before and
+    after it in its film, because light and exposure drift and are not part of the evaluation.
+    """
+    if not cameras.held_out[i]:
+        return cameras.names[i]
+    mine = [k for k, name in enumerate(cameras.sources) if name == cameras.sources[i] and not cameras.held_out[k]]
+    before = max(
+        (k for k in mine if cameras.times[k] <= cameras.times[i]), key=lambda k: cameras.times[k], default=None
+    )
+    after = min((k for k in mine if cameras.times[k] > cameras.times[i]), key=lambda k: cameras.times[k], default=None)
+    if before is None or after is None:
+        only = before if before is not None else after
+        return cameras.lightings[i] if only is None else cameras.names[only]
+    span = cameras.times[after] - cameras.times[before]
+    return f"{cameras.names[before]}:{cameras.names[after]}:{(cameras.times[i] - cameras.times[before]) / span:.6g}"
+
+
+# ---- first and second chapter
+
+PANEL_SIZE = 320  # [px] longer side of each panel and of the render
+MAX_ERROR = 0.3  # share of full brightness at the end of the color scale
+_DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] between the ends of the depth scale
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
 LIGHTING_STRIP = (0.62, 0.38)  # slider, map
 _CARD_SECONDS = 2.5
@@ -118,6 +278,48 @@ def _comparison_canvas(
         layout.text,
     )
     return canvas
+
+
+def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
+    """Real frame, render, depth and error of frame i with their scales, and its PSNR [dB].
+
+    The render uses the lighting's trained embedding; nothing is fitted to the frame. The error is the mean over the
+    channels of |render − film|, as a share of full brightness.
+    """
+    cameras = studio.cameras
+    render = studio.render_frame(i, cameras.lightings[i], PANEL_SIZE)
+    rgb, depth = render.rgb[0], depth_colors(render.depth[0], render.opacity[0])
+    height, width = depth.shape[:2]
+    film = resize(read_image(cameras.image_path(i)), width, height) / 255.0
+    path = cameras.mask_path(i)
+    # A pixel of the resized mask is valid only if all its source pixels are.
+    mask = None if path is None else resize((read_image(path)[..., 0] > 0).astype(np.float32), width, height) > 0.999
+    score = psnr(rgb, film, mask)
+    error = error_colors(np.abs(rgb - film).mean(-1), mask)
+    bar = max(40, width - 16)
+    ramp = NEAREST_DEPTH * (FARTHEST_DEPTH / NEAREST_DEPTH) ** np.linspace(0.0, 1.0, bar)
+    ticks = [(float(depth_scale(m)), f"{m:g}") for m in (NEAREST_DEPTH, *_DEPTH_TICKS)]
+    depths = scale_bar(width, depth_colors(ramp[None]), [*ticks, (1.0, f"{FARTHEST_DEPTH:g} m")])
+    ticks = [(share, f"{100 * share * MAX_ERROR:.0f}") for share in (0.0, 1 / 3, 2 / 3)]
+    errors = error_colors(np.linspace(0, MAX_ERROR, bar)[None])
+    errors = scale_bar(width, errors, [*ticks, (1.0, f"{100 * MAX_ERROR:.0f} %+")])
+    unseen = caption_line(width, *(("held out", AMBER) if cameras.held_out[i] else ("trained on", MUTED)))
+    own = caption_line(width, "trained appearance, not fitted")
+    panels = [
+        titled_panel(fit(studio.real_frame(i), (width, height)), "real", cameras.names[i], unseen),
+        titled_panel(to_uint8(rgb), "rendered", f"{score:.1f} dB PSNR", own),
+        titled_panel(depth, "depth", "gray: nothing solid", depths),
+        titled_panel(error, "error", "of full brightness", errors),
+    ]
+    return panel_row(panels), score
+
+
+def error_colors(error: NDArray, mask: NDArray[np.bool_] | None = None) -> Image:
+    """Colors of an error, shape (h, w), as a share of full brightness: dark is small; masked pixels are gray."""
+    colors = colored("viridis", np.clip(error / MAX_ERROR, 0.0, 1.0))
+    if mask is not None:
+        colors[~mask] = MUTED
+    return colors
 
 
 def map_with_pose(map_view: MapView, pose: NDArray[np.float64], dots: NDArray[np.float64] | None, text: int) -> Image:
@@ -210,23 +412,7 @@ T = TypeVar("T")
 DRIVE_STRIP = (0.62, 0.38)  # shares of the strip: map, facts
 _MAX_DRIVE_SECONDS = 14.0  # [s] in the video; longer drives are sped up
 _CROSSFADE_SHARE = 0.25  # share of a lighting's route segment that blends into the next
-_TRACE_SAMPLES = 200  # per drive, for the page
 _CONTROL_RATE = 10  # control steps per second of a FollowedDrive
-
-
-def drive_metrics(drive: RecordedDrive) -> dict[str, Any]:
-    base = drive.base_to_world
-    yaw = np.unwrap(np.arctan2(base[:, 1, 0], base[:, 0, 0]))
-    return {
-        "reached_goal": bool(drive.reached_goal),
-        "outcome": drive.outcome,
-        "touched": list(drive.touched),
-        "max_cross_track_m": drive.max_cross_track,
-        "mean_cross_track_m": drive.mean_cross_track,
-        "seconds": float(drive.times[-1]),
-        "distance_m": float(arc_lengths(base[:, :2, 3])[-1]),
-        "turn_deg": float(np.rad2deg(yaw[-1] - yaw[0])),
-    }
 
 
 def smoothed_speed(drive: RecordedDrive) -> Array:
@@ -236,13 +422,6 @@ def smoothed_speed(drive: RecordedDrive) -> Array:
     window = min(5, len(each))
     padded = np.pad(each, (window // 2, window - 1 - window // 2), mode="edge")
     return np.convolve(padded, np.full(window, 1.0 / window), "valid")
-
-
-def drive_trace(drive: RecordedDrive) -> dict[str, list[float]]:
-    """A downsampled drive: distance along the route [m], cross-track error [m], speed [m/s]."""
-    index = np.unique(np.linspace(0, len(drive.times) - 1, _TRACE_SAMPLES).round().astype(int))
-    columns = {"progress_m": drive.progress, "cross_track_m": drive.cross_track, "speed_m_s": smoothed_speed(drive)}
-    return {name: [round(float(v), 4) for v in values[index]] for name, values in columns.items()}
 
 
 def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:

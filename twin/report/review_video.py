@@ -4,21 +4,30 @@ The video has up to three chapters: real against rendered frames; changing light
 the Husky driven along the route by a scripted follower, if there is a route.
 """
 
+import queue
+import threading
+from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Generic, TypeVar
 
+import cv2
+import mujoco
 import numpy as np
 
 from twin.assets.ground import Ground
 from twin.config import SceneConfig
 from twin.env.drivers import RecordedDrive, follow_route
+from twin.env.mujoco_renderer import SceneCamera, chase_poses
 from twin.env.physics import HuskyPhysics
+from twin.env.trust import Trust
 from twin.files import write_json
-from twin.geometry.cameras import Cameras
+from twin.geometry.cameras import Cameras, Viewpoints
+from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import World, arc_lengths
+from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import RenderableField
 from twin.report.html import follower_verdict
@@ -26,26 +35,42 @@ from twin.report.review_chapters import (
     COMPARISON_STRIP,
     DRIVE_STRIP,
     LIGHTING_STRIP,
+    Studio,
     comparison_frames,
-    drive_metrics,
-    drive_trace,
+    evenly_spaced,
     frame_timing,
     lighting_steps,
     rendered_instants,
+    smoothed_speed,
     write_comparison_chapter,
     write_drive_chapter,
     write_lighting_chapter,
     write_title_card,
 )
-from twin.report.review_studio import Prefetcher, Studio, evenly_spaced, side_by_side
-from twin.report.shots import Shot, camera_shots, chase_shots, render_shots, route_shots
-from twin.report.trust_map import trust_grid, trust_metrics, trust_picture
-from twin.report.video_layout import AMBER, GREEN, RED, Box, FrameLayout, MapView, load_footprints
-from twin.report.video_writer import VideoWriter
+from twin.report.video_layout import (
+    AMBER,
+    BACKGROUND,
+    GREEN,
+    INK,
+    MUTED,
+    RED,
+    Box,
+    FrameLayout,
+    MapView,
+    colored,
+    draw_text,
+    load_footprints,
+    side_by_side,
+)
+from twin.report.video_writer import VideoWriter, frame_indices
 from twin.report.visual_vs_collision import compare_geometry, gap_row, render_views, view_poses
+from twin.robot import CAMERA_SIZE
 from twin.runtime import bar
 from twin.scene import SceneDir
-from twin.types import Array
+from twin.types import Array, Image
+
+Shot = tuple[Array | None, Array]
+"""A robot configuration (MuJoCo's qpos; None for the initial one) and a camera pose (OpenCV)."""
 
 _RENDER_SHARES = (0.25, 0.2, 0.55)  # of `review.renders` per chapter
 _PREFETCH_BYTES = 64 * 2**20  # [bytes] of prefetched MuJoCo pictures
@@ -192,3 +217,197 @@ def _save_capture_pictures(studio: Studio) -> None:
         studio.save_picture(
             f"capture_{number}", "capture", f"{lighting}: frames from start to end", side_by_side(row, 180)
         )
+
+
+# ---- numbers of the drive
+
+_TRACE_SAMPLES = 200  # per drive
+
+
+def drive_metrics(drive: RecordedDrive) -> dict[str, Any]:
+    base = drive.base_to_world
+    yaw = np.unwrap(np.arctan2(base[:, 1, 0], base[:, 0, 0]))
+    return {
+        "reached_goal": bool(drive.reached_goal),
+        "outcome": drive.outcome,
+        "touched": list(drive.touched),
+        "max_cross_track_m": drive.max_cross_track,
+        "mean_cross_track_m": drive.mean_cross_track,
+        "seconds": float(drive.times[-1]),
+        "distance_m": float(arc_lengths(base[:, :2, 3])[-1]),
+        "turn_deg": float(np.rad2deg(yaw[-1] - yaw[0])),
+    }
+
+
+def drive_trace(drive: RecordedDrive) -> dict[str, list[float]]:
+    """A downsampled drive: distance along the route [m], cross-track error [m], speed [m/s]."""
+    index = np.unique(np.linspace(0, len(drive.times) - 1, _TRACE_SAMPLES).round().astype(int))
+    columns = {"progress_m": drive.progress, "cross_track_m": drive.cross_track, "speed_m_s": smoothed_speed(drive)}
+    return {name: [round(float(v), 4) for v in values[index]] for name, values in columns.items()}
+
+
+# ---- shots of the MuJoCo scene
+
+
+_OVERVIEW_BEHIND, _OVERVIEW_ABOVE, _OVERVIEW_AHEAD = 9.0, 7.0, 10.0  # [m] camera position and look-at point
+_OVERVIEW_POSITIONS = (0.0, 0.45)  # of the overview, as shares of the route length
+
+
+def overview_pose(route: Array, s: float) -> Array:
+    """Camera pose behind and above the point at arc length s [m] of a route (m, 3), looking along it."""
+    ahead, here = point_at(route, s + _OVERVIEW_AHEAD), point_at(route, s)
+    if np.linalg.norm((ahead - here)[:2]) < 1e-6:  # at the end of the route: use its last heading
+        here = point_at(route, s - 1.0)
+    along = (ahead - here) * [1.0, 1.0, 0.0]
+    along /= np.linalg.norm(along)
+    return look_at(here - _OVERVIEW_BEHIND * along + [0.0, 0.0, _OVERVIEW_ABOVE], here + _OVERVIEW_AHEAD * along)
+
+
+def route_shots(route: Array) -> list[Shot]:
+    """Shots of the scene from above the route's start and from further along; the robot is at its initial pose."""
+    length = float(arc_lengths(route)[-1])
+    return [(None, overview_pose(route, share * length)) for share in _OVERVIEW_POSITIONS]
+
+
+def camera_shots(cameras: Cameras) -> list[Shot]:
+    """Shots from two of the filmed cameras, for a scene without a route."""
+    n = len(cameras)
+    return [(None, cameras.camera_to_world[i]) for i in dict.fromkeys((n // 4, 3 * n // 4))]
+
+
+def chase_shots(drive: RecordedDrive, every: int) -> list[Shot]:
+    """Shots of a drive from behind, every `every` control steps and at the last one."""
+    poses = chase_poses(drive.base_to_world)
+    return [(drive.qpos[i], poses[i]) for i in frame_indices(len(drive.times), every)]
+
+
+def render_shots(world: World, shots: list[Shot], size: tuple[int, int]) -> Iterator[Image]:
+    """Renders shots in order. All share one camera, because building it takes seconds."""
+    if not shots:
+        return
+    camera = SceneCamera(world, size)
+    data = mujoco.MjData(camera.model)
+    if camera.model.nkey:
+        mujoco.mj_resetDataKeyframe(camera.model, data, 0)
+    for qpos, pose in shots:
+        yield camera.render(data.qpos if qpos is None else qpos, pose)
+
+
+# ---- map of the trust estimate
+
+_TRUST_STEP = 1.5  # [m] along the route
+_OFFSETS = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # lateral, in half widths of the corridor, left positive
+_TRUST_SIZE = (80, 45)  # [px] of the rendered views
+_BATCH = 32
+_LOW_TRUST = 0.5  # views below this count as untrusted
+_CELL = (18, 16)  # [px] minimum width, height
+_MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] above and below; at the right, for the last label
+
+
+def trust_grid(field: RenderableField, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
+    """Estimates the trust of front camera views that look along the route.
+
+    Returns:
+        Arc lengths [m], shape (k,); lateral offsets, left positive [m], shape (m,); trust in [0, 1], shape (m, k).
+    """
+    s = np.arange(0.0, arc_lengths(world.route)[-1], _TRUST_STEP)
+    offsets = np.array(_OFFSETS) * world.half_width
+    heading = heading_at(world.route, s)
+    left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1)
+    down = np.tan(np.deg2rad(world.robot.camera_pitch))
+    ahead = np.stack([np.cos(heading), np.sin(heading), np.full_like(heading, -down)], -1)
+    poses = []
+    for offset in offsets:
+        eyes = point_at(world.route, s) + offset * left + [0.0, 0.0, world.robot.camera_height]
+        poses += [look_at(eye, eye + direction) for eye, direction in zip(eyes, ahead, strict=True)]
+    estimator, out = Trust(cameras), []
+    for start in range(0, len(poses), _BATCH):
+        batch = np.array(poses[start : start + _BATCH])
+        views = Viewpoints.of(batch, world.intrinsics, CAMERA_SIZE)
+        out.append(estimator.of(batch, field.render(views, field.lightings[0], _TRUST_SIZE)))
+    return s, offsets, np.concatenate(out).reshape(len(offsets), len(s))
+
+
+def trust_metrics(s: Array, offsets: Array, trust: Array) -> dict[str, Any]:
+    trust = trust[np.abs(offsets) <= np.abs(offsets[offsets != 0.0]).min() + 1e-9]
+    return {
+        "mean": float(trust.mean()),
+        "lowest": float(trust.min()),
+        "lowest_at_m": float(s[int(trust.min(0).argmin())]),
+        "low_share": float((trust < _LOW_TRUST).mean()),
+    }
+
+
+def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
+    """Draws the trust grid: arc length to the right, left of the route at the top, bright is trusted."""
+    wide, high = max(2, _CELL[0] * 40 // max(len(s), 1)), _CELL[1]
+    body = cv2.resize(
+        colored("viridis", trust[::-1]), (wide * len(s), high * len(offsets)), interpolation=cv2.INTER_NEAREST
+    )
+    out = np.empty((body.shape[0] + 2 * _MARGIN_ROWS, body.shape[1] + 64 + _MARGIN_RIGHT, 3), np.uint8)
+    out[:] = BACKGROUND
+    out[_MARGIN_ROWS : _MARGIN_ROWS + body.shape[0], 64:-_MARGIN_RIGHT] = body
+    for k, offset in enumerate(offsets[::-1]):
+        draw_text(out, f"{offset:+.1f} m", 58, _MARGIN_ROWS + k * high + 1, 11, MUTED, align="right")
+    for at in np.arange(0, s[-1] + 1, 10):
+        draw_text(out, f"{at:.0f} m", 64 + round(at / _TRUST_STEP * wide), out.shape[0] - _MARGIN_ROWS + 5, 12, MUTED)
+    draw_text(out, "trust from 0 (dark) to 1 (bright), along the route and beside it", 64, 5, 12, INK)
+    return out
+
+
+# ---- prefetching
+
+T = TypeVar("T")
+
+_POLL_INTERVAL = 0.2  # [s] between checks whether the reader has stopped
+
+
+class Prefetcher(Generic[T]):
+    """Iterates over `items`, which a thread computes up to `depth` items ahead from entering the block on.
+
+    Warp kernels release the GIL, so this uses a second core. An exception in the thread is raised at the next item.
+    Leaving the block stops the thread.
+    """
+
+    def __init__(self, items: Iterator[T], depth: int):
+        self._items = items
+        self._queue: queue.Queue[tuple[bool, T | BaseException | None]] = queue.Queue(max(1, depth))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+
+    def _work(self) -> None:
+        try:
+            for item in self._items:
+                self._put((True, item))
+                if self._stop.is_set():
+                    return
+            self._put((False, None))
+        except BaseException as error:  # raised again in the reader
+            self._put((False, error))
+
+    def _put(self, entry: tuple[bool, T | BaseException | None]) -> None:
+        while not self._stop.is_set():
+            try:
+                self._queue.put(entry, timeout=_POLL_INTERVAL)
+                return
+            except queue.Full:
+                continue
+
+    def __enter__(self) -> "Prefetcher[T]":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def __iter__(self) -> Iterator[T]:
+        while True:
+            there, item = self._queue.get()
+            if not there:
+                if isinstance(item, BaseException):
+                    raise item
+                return
+            yield item  # type: ignore[misc]

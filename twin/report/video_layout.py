@@ -5,6 +5,7 @@ take a canvas draw in place.
 """
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -107,10 +108,20 @@ def draw_label(
     draw_text(canvas, text, left + 7, top + 3, size, color, bold)
 
 
+def to_uint8(rgb: NDArray) -> Image:
+    """Colors in [0, 1] as bytes; NaN is 0."""
+    return (np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def colored(name: str, shares: NDArray) -> Image:
+    """Shares in [0, 1], shape (h, w), in the colors of a matplotlib colormap."""
+    return to_uint8(colormaps[name](shares)[..., :3])
+
+
 def fit(picture: NDArray, size: tuple[int, int]) -> Image:
     """Scales a picture into `size` (width, height), centered, keeping its aspect."""
     if picture.dtype != np.uint8:
-        picture = (np.clip(np.nan_to_num(picture), 0, 1) * 255 + 0.5).astype(np.uint8)
+        picture = to_uint8(picture)
     width, height = size
     scale = min(width / picture.shape[1], height / picture.shape[0])
     w, h = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
@@ -127,7 +138,7 @@ def depth_colors(depth: NDArray, opacity: NDArray | None = None) -> Image:
 
     Pixels with `opacity` below one half get the color of an empty panel.
     """
-    colors = (colormaps["inferno"](1.0 - 0.86 * depth_scale(depth))[..., :3] * 255 + 0.5).astype(np.uint8)
+    colors = colored("inferno", 1.0 - 0.86 * depth_scale(depth))
     if opacity is not None:
         colors[np.asarray(opacity) < 0.5] = PANEL_BACKGROUND
     return colors
@@ -251,6 +262,67 @@ def draw_depth_legend(canvas: Image, box: Box, size: int) -> None:
     canvas[top : top + bar_height, left : left + bar_width] = depth_colors(ramp[None])
     draw_text(canvas, f"{NEAREST_DEPTH:g} m", left, top - round(size * 1.4), size)
     draw_text(canvas, f"{FARTHEST_DEPTH:g} m", x + width - 8, top - round(size * 1.4), size, align="right")
+
+
+# ---- rows of panels
+
+_GAP = 6  # [px] between panels
+_TEXT = 15  # [px]
+_LINE_HEIGHT = 30  # [px] height of the lines above and below a panel
+
+
+def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image:
+    """A color bar with labels at shares of its length; labels without room are left out."""
+    out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
+    bar = ramp.shape[1]
+    left = (width - bar) // 2
+    out[8:18, left : left + bar] = ramp[:1]
+    free = left  # left end of the next label at least
+    last = width - text_width(labels[-1][1], _TEXT) - 2 * _GAP  # left end of the last label
+    for k, (share, text) in enumerate(labels):
+        at, half = left + round(share * (bar - 1)), text_width(text, _TEXT) // 2
+        align = "left" if k == 0 else "right" if k == len(labels) - 1 else "middle"
+        if align == "middle" and (at - half < free or at + half > last):
+            continue
+        out[18:22, at : at + 1] = INK
+        draw_text(out, text, at, 24, _TEXT, INK, align=align)
+        free = at + (2 if k == 0 else 1) * half + _GAP
+    return out
+
+
+def caption_line(width: int, text: str, color: Color = MUTED) -> Image:
+    out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
+    draw_text(out, shorten(text, width - 8, _TEXT), 4, 8, _TEXT, color)
+    return out
+
+
+def titled_panel(picture: Image, title: str, note: str, below: Image) -> Image:
+    width = picture.shape[1]
+    head = np.full((_LINE_HEIGHT, width, 3), BACKGROUND, np.uint8)
+    draw_text(head, title, 4, 5, _TEXT, INK, True)
+    free = width - text_width(title, _TEXT, True) - 20
+    if note and free > 20:
+        draw_text(head, shorten(note, free, _TEXT), width - 4, 5, _TEXT, MUTED, align="right")
+    body = picture.copy()
+    body[[0, -1]] = PANEL_BACKGROUND  # an edge for pictures as dark as the background
+    return np.concatenate([head, body, below])
+
+
+def panel_row(panels: Sequence[Image]) -> Image:
+    """Panels of one height beside each other, with gaps between and around them."""
+    gap = np.full((len(panels[0]), _GAP, 3), BACKGROUND, np.uint8)
+    return np.concatenate([part for panel in panels for part in (gap, panel)] + [gap], 1)
+
+
+def side_by_side(pictures: Sequence[Image], height: int) -> Image:
+    """Concatenates pictures in a row, scaled to one height, with thin gaps."""
+    gap = np.full((height, 6, 3), 255, np.uint8)
+    row: list[Image] = []
+    for picture in pictures:
+        width = max(1, round(picture.shape[1] * height / picture.shape[0]))
+        interpolation = cv2.INTER_AREA if picture.shape[0] > height else cv2.INTER_CUBIC
+        row += [gap, cv2.resize(picture, (width, height), interpolation=interpolation).astype(np.uint8)]
+    return np.concatenate(row[1:], 1)
 
 
 # ---- map

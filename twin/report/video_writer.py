@@ -97,6 +97,12 @@ class VideoWriter:
             self._partial.unlink(missing_ok=True)
 
 
+def frame_indices(count: int, every: int) -> list[int]:
+    """Every `every`-th of `count` indices, and the last one."""
+    indices = list(range(0, count, every))
+    return indices if indices[-1] == count - 1 else [*indices, count - 1]
+
+
 def read_frames(path: Path, every: int = 1) -> Iterator[NDArray[np.uint8]]:
     with av.open(str(path)) as container:
         for i, frame in enumerate(container.decode(video=0)):

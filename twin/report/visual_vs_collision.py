@@ -15,7 +15,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import trimesh
-from matplotlib import colormaps
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -25,8 +24,16 @@ from twin.geometry.cameras import Cameras, Viewpoints, opencv_to_mujoco, pixel_g
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import CAMERA_SIZE, GROUND_GROUP, PART_GROUP, World, arc_lengths, point_at
 from twin.nerf.rendering import FAR, RenderableField
-from twin.report.review_studio import caption_line, scale_bar, titled_panel
-from twin.report.video_layout import BACKGROUND, PANEL_BACKGROUND, depth_colors, fit
+from twin.report.video_layout import (
+    PANEL_BACKGROUND,
+    caption_line,
+    colored,
+    depth_colors,
+    fit,
+    panel_row,
+    scale_bar,
+    titled_panel,
+)
 from twin.runtime import track
 from twin.types import Array, Image
 
@@ -235,27 +242,19 @@ def gap_row(views: GeometryViews, k: int) -> Image:
     size = (_PANEL_WIDTH, round(_PANEL_WIDTH * height / width))
     near = (views.visual_depth < MAX_DEPTH) & (views.collision_depth < MAX_DEPTH)
     gap = np.where(near, views.collision_depth - views.visual_depth, 0.0)
-    share = np.clip(0.5 + 0.5 * gap / _MAX_GAP, 0.0, 1.0)
-    colors = (colormaps["coolwarm"](share)[..., :3] * 255 + 0.5).astype(np.uint8)
+    colors = colored("coolwarm", np.clip(0.5 + 0.5 * gap / _MAX_GAP, 0.0, 1.0))
     colors[~near] = PANEL_BACKGROUND
-    bar = _PANEL_WIDTH - 16
-    ramp = (colormaps["coolwarm"](np.linspace(0, 1, bar))[None, :, :3] * 255 + 0.5).astype(np.uint8)
     labels = [(0.0, f"−{_MAX_GAP * 100:g} cm"), (0.5, "0"), (1.0, f"+{_MAX_GAP * 100:g} cm")]
-    panels = [
-        titled_panel(fit(views.rgb[k], size), "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
-        titled_panel(
-            fit(depth_colors(views.visual_depth[k]), size),
-            "visual",
-            "depth",
-            caption_line(_PANEL_WIDTH, "bright is near"),
-        ),
-        titled_panel(
-            fit(depth_colors(views.collision_depth[k]), size),
+    scale = scale_bar(_PANEL_WIDTH, colored("coolwarm", np.linspace(0, 1, _PANEL_WIDTH - 16)[None]), labels)
+    panels = (
+        (views.rgb[k], "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
+        (depth_colors(views.visual_depth[k]), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
+        (
+            depth_colors(views.collision_depth[k]),
             "collision",
             "depth",
-            caption_line(_PANEL_WIDTH, "ground and convex parts"),
+            caption_line(_PANEL_WIDTH, "ground and parts"),
         ),
-        titled_panel(fit(colors[k], size), "gap", f"up to {MAX_DEPTH:g} m", scale_bar(_PANEL_WIDTH, ramp, labels)),
-    ]
-    space = np.full((len(panels[0]), 6, 3), BACKGROUND, np.uint8)
-    return np.concatenate([part for one in panels for part in (space, one)] + [space], 1)
+        (colors, "gap", f"up to {MAX_DEPTH:g} m", scale),
+    )
+    return panel_row([titled_panel(fit(picture, size), *texts) for picture, *texts in panels])
