@@ -35,8 +35,8 @@ class Twin:
         Args:
             device: cpu or cuda.
         """
-        from twin.nerf.lightings import added_lightings
         from twin.nerf.baked import BakedField
+        from twin.nerf.lightings import added_lightings
 
         field = BakedField.load(self._folder("field"), device)
         field.add_lightings(*added_lightings(self.scene, field.lightings_by_name.vectors.shape[1]))
@@ -48,8 +48,8 @@ class Twin:
         Args:
             device: cpu or cuda; None: cuda where it is usable.
         """
-        from twin.nerf.lightings import added_lightings
         from twin.nerf.field import RadianceField
+        from twin.nerf.lightings import added_lightings
 
         field = RadianceField.load(self._folder("field"), device)
         fresh, stale, _ = added_lightings(self.scene, field.appearance.vectors.shape[1])
