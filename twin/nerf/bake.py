@@ -4,6 +4,7 @@ Terms as in `kernels/bricks.py`. Fine-tuning changes the samples only; networks 
 """
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -66,9 +67,7 @@ def bake(
     if layout.near_side.max() / kernels.CELLS > _LARGE_CELL:
         layout, slots = _layout(field, near, far, round(_EXTRA_BRICKS * max_bricks))
     values = _sample_bricks(field, layout, slots)
-    tuner = _FineTuner(field, pixels, layout, slots, values, steps, seed)
-    error = tuner.run()
-    del tuner
+    psnr = _FineTuner(field, pixels, layout, slots, values, steps, seed).run()
     arrays = _quantized(values, slots, field, layout) | _probes(field, pixels, seed)
     baked = BakedField(layout, field.appearance.named(), arrays, field.device, field.about)
     return baked, {
@@ -76,7 +75,7 @@ def bake(
         "bricks_far": len(slots[1]),
         "cell_m": float(layout.near_side.max()) / kernels.CELLS,
         "bytes": baked.bytes,
-        "fine_tune_psnr": error,
+        "fine_tune_psnr": psnr,
         "seconds": time.perf_counter() - began,
     }
 
@@ -201,26 +200,20 @@ class _FineTuner:
         """Tunes the values in place; returns the PSNR [dB] over the last tenth of the batches."""
         rng = np.random.default_rng([self.seed, 5])
         errors = []
-        steps = self.steps
-        with bar("fine-tuning", steps, "step") as progress, single_threaded_torch():
-            for step in range(steps):
+        with bar("fine-tuning", self.steps, "step") as progress, single_threaded_torch():
+            for step in range(self.steps):
                 batch = self.pixels.batch(rng, _SHARDS, 0, self.rays // _SHARDS, 0)
                 self.ws.camera.copy_(torch.from_numpy(batch.frame))
                 self.ws.pixel.copy_(torch.from_numpy(batch.pixel))
                 self.ws.targets.zero_()
                 color = torch.from_numpy(batch.color).to(self.field.device)
-                decay = 0.05 ** (step / steps)
+                decay = 0.05 ** (step / self.steps)
 
-                def backward(shard: int, color: torch.Tensor = color, step: int = step) -> float:
-                    return self._backward(shard, color, step)
-
-                def update(part: int, decay: float = decay, step: int = step) -> None:
-                    self._update(part, _SHARDS, decay, step)
-
-                errors.append(sum(parallel(backward, range(_SHARDS), self.field.device)) / _SHARDS)
-                parallel(update, range(_SHARDS), self.field.device)
+                squared = parallel(partial(self._backward, color=color, step=step), range(_SHARDS), self.field.device)
+                errors.append(sum(squared) / _SHARDS)
+                parallel(partial(self._update, rate=decay, step=step), range(_SHARDS), self.field.device)
                 progress.update()
-        return float(-10 * np.log10(np.mean(errors[-max(1, steps // 10) :])))
+        return float(-10 * np.log10(np.mean(errors[-max(1, self.steps // 10) :])))
 
     def _backward(self, shard: int, color: torch.Tensor, step: int) -> float:
         f, ws = self.field, self.ws
@@ -247,24 +240,15 @@ class _FineTuner:
         with torch.no_grad():
             ws.composited_grad[rays] = gradient
             ws.inverse_grad[rays] = 0.0
-            wp.launch(
-                volume.composite_backward,
-                count,
-                [
-                    *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_weights, ws.w_targets),
-                    *(ws.w_composited_grad, ws.w_inverse_grad, f.layout.density_unit, 0.0, 0.0, 1.0, 1.0, start),
-                ],
-                [ws.w_ray_outputs_grad],
-                device=f.device,
-            )
+            f.composite_backward(ws, start, count)
         return float((error.detach() ** 2).mean())
 
-    def _update(self, part: int, parts: int, rate: float, step: int) -> None:
-        w_outputs_grad = warp_view(self.ws.outputs_grad, volume.Channels)
+    def _update(self, part: int, rate: float, step: int) -> None:
+        gradients = [self.ws.w_positions, *self.index, self.ws.w_outputs_grad, part, _SHARDS]
         wp.launch(
             kernels.interpolate_backward,
             self.rays * _SAMPLES,
-            [self.ws.w_positions, *self.index, w_outputs_grad, part, parts, self.w_gradient],
+            [*gradients, self.w_gradient],
             device=self.field.device,
         )
         t = step + 1
@@ -272,7 +256,7 @@ class _FineTuner:
             kernels.adam_step,
             self.rays * _SAMPLES,
             [
-                *(self.ws.w_positions, *self.index, w_outputs_grad, part, parts),
+                *gradients,
                 volume.Channels(_RATES[0] * rate, *[_RATES[1] * rate] * (volume.CHANNELS - 1)),
                 *(1.0 / (1.0 - 0.99**t), self.w_values, self.w_gradient, self.w_second),
             ],

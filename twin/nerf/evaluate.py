@@ -113,7 +113,6 @@ def evaluate(
 
 _MAX_POSES = 60  # in all, evenly spaced over each lighting's frames
 _WIDTH = 96  # [px] longer side of the images
-_DIGITS = 4  # decimals of the results
 
 
 def cross_lighting(
@@ -165,9 +164,9 @@ def cross_lighting(
     film = np.array([own[light == j].mean(0) for j in range(len(lightings))])
     out: dict[str, Any] = {
         "poses": len(poses),
-        "filmed_colour": {name: rounded(film[j]) for j, name in enumerate(lightings)},
+        "filmed_colour": {name: film[j].round(4).tolist() for j, name in enumerate(lightings)},
         "mean_colour": {
-            name: {other: rounded(shown[light == i, j].mean(0)) for j, other in enumerate(lightings)}
+            name: {other: shown[light == i, j].mean(0).round(4).tolist() for j, other in enumerate(lightings)}
             for i, name in enumerate(lightings)
         },
     }
@@ -175,15 +174,17 @@ def cross_lighting(
     pairs: dict[str, dict[str, float]] = {name: {} for name in lightings}
     for j, name in enumerate(lightings):
         rows = np.flatnonzero(light != j)
-        there = np.array([filmed(nearest(trained, poses[row], name)) for row in rows])
+        nearest = [nearest_frame(trained, poses[row], name) for row in rows]
+        there = np.array([filmed(i) for i in nearest if i is not None])  # none is None: every lighting has a frame
         # Differences below a thousandth of a byte are rounding, and count as a tie.
-        nearer = np.round(color_distance(shown[rows, j], own[rows]) - color_distance(shown[rows, j], there), 6)
-        columns["to_shown_rms"][name] = rms(color_distance(shown[rows, j], film[j]))
-        columns["to_filmed_rms"][name] = rms(color_distance(shown[rows, j], film[light[rows]]))
+        nearer = np.round(_distance(shown[rows, j], own[rows]) - _distance(shown[rows, j], there), 6)
+        for key, reference in (("to_shown_rms", film[j]), ("to_filmed_rms", film[light[rows]])):
+            rms = np.sqrt((_distance(shown[rows, j], reference) ** 2).mean())
+            columns[key][name] = round(float(rms), 4)
         follows = 0.5 + 0.5 * np.sign(nearer)
-        columns["colour_follows"][name] = round(float(follows.mean()), _DIGITS)
+        columns["colour_follows"][name] = round(float(follows.mean()), 4)
         for i in np.unique(light[rows]):
-            pairs[lightings[i]][name] = round(float(follows[light[rows] == i].mean()), _DIGITS)
+            pairs[lightings[i]][name] = round(float(follows[light[rows] == i].mean()), 4)
     return out | columns | {"follows_by_pair": pairs, "depth_moves_m": moves}
 
 
@@ -192,21 +193,6 @@ def mean_color(image: NDArray, mask: NDArray[np.bool_]) -> Array:
     return np.asarray(image[mask] if mask.any() else image.reshape(-1, 3), np.float64).mean(0)
 
 
-def nearest(cameras: Cameras, i: int, lighting: str) -> int:
-    """Index of the frame of a lighting (at least one exists) nearest to frame i."""
-    found = nearest_frame(cameras, i, lighting)
-    assert found is not None
-    return found
-
-
-def color_distance(a: Array, b: Array) -> Array:
+def _distance(a: Array, b: Array) -> Array:
     """Euclidean distances of colors, (n, 3) and (n, 3) or (3,) → (n,)."""
     return np.linalg.norm(a - b, axis=-1)
-
-
-def rms(values: Array) -> float:
-    return round(float(np.sqrt((values**2).mean())), _DIGITS)
-
-
-def rounded(color: Array) -> list[float]:
-    return [round(float(value), _DIGITS) for value in color]

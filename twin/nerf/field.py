@@ -155,6 +155,32 @@ class RadianceField:
             device=self.device,
         )
 
+    def composite_backward(
+        self,
+        ws: Workspace,
+        start: int,
+        count: int,
+        distortion: float = 0.0,
+        depth: float = 0.0,
+        depth_reach: float = 1.0,
+        log_offset: float = 1.0,
+    ) -> None:
+        """Gradients of opacity, features and Σwᵢ/tᵢ per ray → gradients of the network outputs.
+
+        The numbers weight two regularizers, see `composite.composite_backward`.
+        """
+        wp.launch(
+            volume.composite_backward,
+            count,
+            [
+                *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_weights, ws.w_targets),
+                *(ws.w_composited_grad, ws.w_inverse_grad, self.layout.density_unit),
+                *(distortion, depth, depth_reach, log_offset, start),
+            ],
+            [ws.w_ray_outputs_grad],
+            device=self.device,
+        )
+
     # ---- queries and rendering
 
     def density(self, points: NDArray) -> NDArray[np.float32]:

@@ -29,7 +29,8 @@ class PoseRefinement:
     def __init__(self, camera_to_world: Array, intrinsics: Array, near: float, ws: Workspace) -> None:
         """Starts at poses (n, 4, 4) with intrinsics (n, 4) [px of a training frame].
 
-        The distance `near` of near surfaces [m] converts pixels to translations; `ws` is the training's workspace.
+        `near` is the distance of near surfaces [m], which converts pixels to translations; `ws` is the training's
+        workspace.
         """
         n, device = len(camera_to_world), ws.device
         self.rotation = torch.zeros(n, 3, device=device, requires_grad=True)
@@ -46,10 +47,8 @@ class PoseRefinement:
         self._positions_grad = torch.zeros(ws.rays * ws.samples, 3, device=device)
         self._ray_grad = torch.zeros(2, ws.rays, 3, device=device)
         on_rays = self._positions_grad.view(ws.rays, ws.samples, 3)
-        self._w_positions_grad, self._w_ray_positions_grad = (
-            warp_view(self._positions_grad, wp.vec3f),
-            warp_view(on_rays, wp.vec3f),
-        )
+        self._w_positions_grad = warp_view(self._positions_grad, wp.vec3f)
+        self._w_ray_positions_grad = warp_view(on_rays, wp.vec3f)
         self._w_ray_grad: list[Any] = [warp_view(part, wp.vec3f) for part in self._ray_grad]
 
     def backward(self, field: RadianceField, start: int, count: int) -> None:

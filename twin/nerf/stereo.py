@@ -2,7 +2,7 @@
 
 A *source* of a frame is another frame of the same film with a similar view from a few degrees aside. PatchMatch stereo
 (Bleyer et al. 2011; for several views Galliani et al. 2015) fits a plane to every cell of a few pixels such that the
-sources look like the frame. A cell counts if enough sources find the same point; textureless surfaces get no depth.
+sources look like the frame. A cell counts if enough sources find the same point. Surfaces without texture get no depth.
 """
 
 from dataclasses import dataclass
@@ -34,23 +34,20 @@ _MIN_POINTS = 20  # sparse points from which a frame's depth range is estimated
 
 @dataclass(frozen=True)
 class StereoGeometry:
-    """A frame's s sources and the mapping of its pixels into them: homography · (u, v, 1) + epipole / depth."""
+    """Mapping of a frame's pixels into its s sources, homography · (u, v, 1) + epipole / depth, and back."""
 
-    source: NDArray[np.int32]
-    """Frame indices, shape (s,)."""
     homography: Array
     """K_source · R · K⁻¹, shape (s, 3, 3)."""
     epipole: Array
     """K_source · t, shape (s, 3)."""
     back_homography: Array
-    """The same from source to frame."""
     back_epipole: Array
 
 
 def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[DepthSupervision, dict[str, Any]]:
     """Depth supervision for every frame that has sources, and a summary; the same seed gives the same depths.
 
-    The sparse points of the frames give the depth range; without them there is no stereo.
+    The frames' sparse points give the depth range; without them nothing is found.
     """
     n = len(pixels.cameras)
     none = join_depths([])
@@ -72,7 +69,11 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
     costs: wp.array = wp.full((n, rows, columns), 2.0, dtype=wp.float32, device=device)
     cells: wp.array = wp.array(shapes, dtype=wp.vec2i, device=device)
     geometry = [_geometry(pixels, i, sources[i]) for i in range(n)]
-    views = [_source_views(g, device) for g in geometry]
+    views = [kernels.SourceViews() for _ in range(n)]
+    for view, source, g in zip(views, sources, geometry, strict=True):
+        view.source = wp.array(source, dtype=wp.int32, device=device)
+        view.homography = wp.array(g.homography.astype(np.float32), dtype=wp.mat33, device=device)
+        view.epipole = wp.array(g.epipole.astype(np.float32), dtype=wp.vec3, device=device)
     wp.load_module("twin.nerf.kernels.patch_match", device=device)
 
     with bar("stereo", n, "frame") as progress:
@@ -191,28 +192,14 @@ def _geometry(pixels: TrainingPixels, i: int, sources: NDArray[np.int32]) -> Ste
     def matrix(k: Array) -> Array:
         return np.array([[k[0], 0.0, k[2]], [0.0, k[1], k[3]], [0.0, 0.0, 1.0]])
 
-    own = matrix(pixels.intrinsics[i])
-    pose = pixels.cameras.camera_to_world[i]
-    homographies, epipoles, back_homographies, back_epipoles = [], [], [], []
-    for j in sources:
+    own, out = matrix(pixels.intrinsics[i]), np.zeros((len(sources), 2, 3, 4))
+    for k, j in enumerate(sources):
         other = matrix(pixels.intrinsics[j])
-        there = inverse_pose(pixels.cameras.camera_to_world[j]) @ pose
-        homographies.append(other @ there[:3, :3] @ np.linalg.inv(own))
-        epipoles.append(other @ there[:3, 3])
+        there = inverse_pose(pixels.cameras.camera_to_world[j]) @ pixels.cameras.camera_to_world[i]
         here = inverse_pose(there)
-        back_homographies.append(own @ here[:3, :3] @ np.linalg.inv(other))
-        back_epipoles.append(own @ here[:3, 3])
-    stack = [np.array(m).reshape(-1, *shape) for m, shape in ((homographies, (3, 3)), (epipoles, (3,)))]
-    back = [np.array(m).reshape(-1, *shape) for m, shape in ((back_homographies, (3, 3)), (back_epipoles, (3,)))]
-    return StereoGeometry(sources, *stack, *back)
-
-
-def _source_views(geometry: StereoGeometry, device: str) -> Any:
-    views = kernels.SourceViews()
-    views.source = wp.array(geometry.source, dtype=wp.int32, device=device)
-    views.homography = wp.array(geometry.homography.astype(np.float32), dtype=wp.mat33, device=device)
-    views.epipole = wp.array(geometry.epipole.astype(np.float32), dtype=wp.vec3, device=device)
-    return views
+        for way, a, b, pose in ((0, other, own, there), (1, own, other, here)):
+            out[k, way, :, :3], out[k, way, :, 3] = a @ pose[:3, :3] @ np.linalg.inv(b), a @ pose[:3, 3]
+    return StereoGeometry(out[:, 0, :, :3], out[:, 0, :, 3], out[:, 1, :, :3], out[:, 1, :, 3])
 
 
 def _frame_part(array: wp.array, i: int, shape: tuple[int, ...]) -> wp.array:

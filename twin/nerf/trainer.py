@@ -1,13 +1,13 @@
 """Stage `field`: trains a radiance field on metric cameras, bakes it for rendering, and evaluates both.
 
-A *step* takes one batch of rays forward and back. The number of steps is fixed (`nerf.steps`) and no clock decides
-anything, so on a CPU the same input gives the same field bit for bit. Every batch also holds *free points*: random
-points around the camera path, where nothing can be.
+The number of training steps is fixed (`nerf.steps`), and nothing depends on a clock, so on a CPU the same input gives
+the same field bit for bit. Every batch of rays comes with *free points*: random points around the camera path, where
+space is empty.
 """
 
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from twin.nerf.buffers import (
     parallel,
     resolve_device,
     single_threaded_torch,
+    warp_view,
 )
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.evaluate import cross_lighting, evaluate
@@ -50,27 +51,20 @@ from twin.warp_runtime import wp
 _EDGE_SHARPNESS = 10.0  # a color contrast of 1/10 divides the plane loss by e
 _MAX_BEND = 0.5  # relative bending beyond this is a depth edge, whatever the colors are
 _HORIZON_SINE = 0.03  # rays this close to level are neither above nor below the horizon
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Weights of the loss terms beside the color error."""
-
-    distortion: float = 0.005
-    depth: float = 1.0
-    depth_reach: float = 0.5
-    plane: float = 0.01
-    free: float = 1e-3
-    sky: float = 1e-2
-    ground: float = 1e-2
-    residual: float = 1e-3
+# Weights of the loss terms beside the color error.
+_DISTORTION = 0.005
+_DEPTH, _DEPTH_REACH = 1.0, 0.5
+_PLANE = 0.01
+_FREE = 1e-3
+_SKY, _GROUND = 1e-2, 1e-2
+_RESIDUAL = 1e-3
 
 
 def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor:
     """Edge-aware planarity loss of triples of rays, from inverse z-depths (3k,) [1/m] and colors (3k, 3).
 
-    The inverse z-depth of a plane is affine in the pixel, so its second difference, taken relative to it, is zero. The
-    road has little texture, and this loss spreads its few known depths.
+    The inverse z-depth of a plane is affine in the pixel, so its second difference is zero. The loss spreads the few
+    known depths over the road, which has little texture.
     """
     d = inverse_depth.view(-1, 3)
     c = color.view(-1, 3, 3)
@@ -79,11 +73,13 @@ def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor
     return (torch.exp(-_EDGE_SHARPNESS * contrast) * bend.clamp(max=_MAX_BEND)).mean()
 
 
-def horizon_loss(opacity: torch.Tensor, up: torch.Tensor, sky: float, ground: float) -> torch.Tensor:
-    """Mean cost of opaque rays above the horizon (`sky`; a plain sky fits at any distance) and transparent rays below
-    (`ground`), from opacity (n,) and the vertical component `up` (n,) of the ray directions."""
+def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
+    """Mean cost of opaque rays above the horizon, where a plain sky fits at any distance, and of transparent ones below.
+
+    Takes the opacity of rays (n,) and the vertical component `up` (n,) of their directions.
+    """
     above, below = (up > _HORIZON_SINE).float(), (up < -_HORIZON_SINE).float()
-    return (sky * above * opacity + ground * below * (1.0 - opacity)).mean()
+    return (_SKY * above * opacity + _GROUND * below * (1.0 - opacity)).mean()
 
 
 # ---- training
@@ -112,19 +108,17 @@ class Trainer:
         config: NerfConfig,
         seed: int,
         device: str,
-        weights: LossWeights | None = None,
         camera_height: float = 0.0,
     ):
         self.config, self.seed, self.device = config, seed, device
-        self.weights = weights or LossWeights()
         self.pixels = TrainingPixels(cameras, points, config.max_width, camera_height)
         self.stereo: dict[str, Any] | None = None
         """Summary of the stereo depths; None without `nerf.stereo`."""
         if config.stereo:
             self.pixels.stereo, self.stereo = stereo_depths(self.pixels, seed, device)
         train = self.pixels.cameras
-        self.lightings = tuple(dict.fromkeys(train.lightings))
-        frame_lighting = np.array([self.lightings.index(name) for name in train.lightings])
+        lightings = tuple(dict.fromkeys(train.lightings))
+        frame_lighting = np.array([lightings.index(name) for name in train.lightings])
         near_box = near_box_of_cameras(cameras.camera_to_world, config.near_half_extent)
         layout = Layout(
             near_box.center,
@@ -136,7 +130,7 @@ class Trainer:
             hidden=_HIDDEN,
             appearance_dim=config.appearance_dim,
         )
-        appearance = initial_appearance(self.lightings, train.names, frame_lighting, config.appearance_dim, seed)
+        appearance = initial_appearance(lightings, train.names, frame_lighting, config.appearance_dim, seed)
         self.field = untrained_field(layout, appearance, seed, device)
         self.rng = np.random.default_rng([seed, 2])
         self.rays = -(-config.rays // _SHARDS) * _SHARDS
@@ -158,14 +152,8 @@ class Trainer:
                 tensor.requires_grad_(True)
         learned = list(self.torch_parameters.values())
         self.optimizer = torch.optim.Adam(learned, lr=_NETWORK_RATE, betas=(0.9, 0.99), eps=1e-12)
-        self.table_grad = torch.zeros_like(f.table)
-        self.first, self.second = torch.zeros_like(f.table), torch.zeros_like(f.table)
-        feature = hashgrid.Feature
-        self.w_table_grad = wp.from_torch(self.table_grad, dtype=feature)
-        self.w_first, self.w_second = (
-            wp.from_torch(self.first, dtype=feature),
-            wp.from_torch(self.second, dtype=feature),
-        )
+        # The table's gradient, and its first and second moment.
+        self.moments = [warp_view(torch.zeros_like(f.table), hashgrid.Feature) for _ in range(3)]
         self.steps_done = 0
 
     def _growth(self, near_box: NearBox) -> float:
@@ -218,7 +206,7 @@ class Trainer:
 
     def _shard(self, shard: int, color: torch.Tensor, triples: int, free: bool) -> tuple[float, list[torch.Tensor]]:
         """Forward and backward pass of one shard: its error, and the gradients in the order of `torch_parameters`."""
-        f, ws, w = self.field, self.ws, self.weights
+        f, ws = self.field, self.ws
         count = self.rays // _SHARDS
         start = shard * count
         rays = slice(start, start + count)
@@ -240,28 +228,20 @@ class Trainer:
         error = rgb - color[rays]
         # The losses of the shards sum to a mean over the batch.
         loss = torch.nn.functional.smooth_l1_loss(rgb, color[rays], beta=0.1) / _SHARDS
-        loss = loss + w.residual * (residuals[frame] ** 2).mean() / _SHARDS
-        loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2], w.sky, w.ground) / _SHARDS
+        loss = loss + _RESIDUAL * (residuals[frame] ** 2).mean() / _SHARDS
+        loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2]) / _SHARDS
         inverse_depth = (ws.inverse_distance[rays] / ws.cosines[rays]).requires_grad_(True)
-        if triples and w.plane > 0.0:
-            loss = loss + w.plane / _SHARDS * plane_loss(inverse_depth[: 3 * triples], color[rays][: 3 * triples])
+        if triples:
+            loss = loss + _PLANE / _SHARDS * plane_loss(inverse_depth[: 3 * triples], color[rays][: 3 * triples])
         learned = [t for n, t in self.torch_parameters.items() if not n.startswith("trunk")]
         gradients = torch.autograd.grad(loss, [composited, inverse_depth, *learned], allow_unused=True)
         with torch.no_grad():
             ws.composited_grad[rays] = gradients[0]
             if gradients[1] is not None:
                 ws.inverse_grad[rays] = gradients[1] / ws.cosines[rays]
-            wp.launch(
-                volume.composite_backward,
-                count,
-                [
-                    *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_weights, ws.w_targets),
-                    *(ws.w_composited_grad, ws.w_inverse_grad, f.layout.density_unit),
-                    *(w.distortion / self.rays, w.depth / self.rays, w.depth_reach),
-                    *(_LOG_OFFSET * f.layout.near_box.scale, start),
-                ],
-                [ws.w_ray_outputs_grad],
-                device=self.device,
+            f.composite_backward(
+                *(ws, start, count, _DISTORTION / self.rays, _DEPTH / self.rays, _DEPTH_REACH),
+                _LOG_OFFSET * f.layout.near_box.scale,
             )
             first, second = self._trunk_backward(samples)
             if self._refines:
@@ -299,14 +279,14 @@ class Trainer:
         f, ws = self.field, self.ws
         f.query(ws, start, _FREE_POINTS)
         rows = slice(start, start + _FREE_POINTS)
-        depth = (
-            torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit * f.layout.near_box.scale
-        )
-        ws.outputs_grad[rows, 0] = self.weights.free / (_SHARDS * _FREE_POINTS) * depth / (1.0 + depth)
+        density = torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit
+        depth = density * f.layout.near_box.scale
+        ws.outputs_grad[rows, 0] = _FREE / (_SHARDS * _FREE_POINTS) * depth / (1.0 + depth)
         return self._trunk_backward(rows)
 
     def _update(self, task: int, rate: float) -> None:
-        """Task < levels: gradient scatter and Adam step of a hash level. The last two: halves of the opacity grids."""
+        """Scatters the gradient of hash level `task` and takes its Adam step. Each of the two tasks after the levels
+        updates half of the cells of the opacity grids."""
         f, ws = self.field, self.ws
         levels = self.config.levels
         if task >= levels:
@@ -324,7 +304,7 @@ class Trainer:
         wp.launch(
             hashgrid.encode_backward,
             (1, ws.features.shape[0]),
-            [ws.w_positions, f.w_cells, f.w_shapes, f.mask, task, ws.w_features_grad, self.w_table_grad],
+            [ws.w_positions, f.w_cells, f.w_shapes, f.mask, task, ws.w_features_grad, self.moments[0]],
             device=self.device,
         )
         wp.launch(
@@ -332,7 +312,7 @@ class Trainer:
             (1, f.table.shape[1]),
             [
                 *(task, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)),
-                *(f.w_table, self.w_table_grad, self.w_first, self.w_second),
+                *(f.w_table, *self.moments),
             ],
             device=self.device,
         )
@@ -343,9 +323,7 @@ class Trainer:
             return None
         pick = self.free[self.rng.integers(len(self.free), size=n)]
         offset = self.rng.normal(size=(n, 3))
-        offset *= (self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3)) / np.linalg.norm(offset, axis=1)[
-            :, None
-        ]
+        offset *= self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3) / np.linalg.norm(offset, axis=1)[:, None]
         x = pick[:, 0] + (pick[:, 1] - pick[:, 0]) * self.rng.random((n, 1)) + offset
         layout = self.field.layout
         u = (x - np.array(layout.centre)) / np.array(layout.half)  # camera positions lie in the near box
@@ -361,7 +339,7 @@ class Trainer:
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
     """Straight segments of the camera path, shape (k, 2, 3) [m]; space within the near plane around them is empty.
 
-    A step much longer than the median of its source is a jump between photos, not a path; its ends still count.
+    A segment much longer than the median of its source is a jump between photos, so only its ends count.
     """
     pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
     for source in dict.fromkeys(cameras.sources):
@@ -438,7 +416,7 @@ def constant_height(metric: dict[str, Any]) -> float:
 
 
 def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Metrics without timings, so that equal fields are equal files and lightings fitted to them stay valid."""
+    """Metrics without timings, so that equal fields have equal files and lightings fitted to them stay valid."""
     return {
         name: without_timings(value) if isinstance(value, dict) else value
         for name, value in metrics.items()
