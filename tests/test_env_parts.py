@@ -131,7 +131,7 @@ def test_anchors_are_sampled_equally_often(field):
     sets, rng = LightingSets(field), np.random.default_rng(3)
     for which, held_out in ((TRAINING, False), (HELD_OUT, True)):
         own = set(np.flatnonzero(sets.anchors.held_out == held_out))
-        near = [sets._set_and_anchor(sets.sample(which, rng))[1] for _ in range(40 * len(own))]
+        near = [sets.set_and_anchor(sets.sample(which, rng))[1] for _ in range(40 * len(own))]
         assert set(near) == own
         assert min(near.count(anchor) for anchor in own) > 20
 
