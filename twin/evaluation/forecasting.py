@@ -327,7 +327,8 @@ def _corrected(
         else:
             line = LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
             score = scores[i][0] if i in scores else _mean_rate(mine).value
-            out.append(Estimate(*(float(x) for x in line.predict(np.array(score))), line.n))
+            value, low, high = (float(x) for x in line.predict(np.array(score)))
+            out.append(Estimate(value, low, high, line.n))
     return out
 
 

@@ -169,5 +169,11 @@ class Prediction:
         """The score over some of the windows, a mask (n,)."""
         distance, angle = (error[which] for error in self.errors)
         off = np.abs(self.wheels - self.windows.wheels)[which]
-        numbers = np.median(distance), np.median(angle), np.quantile(distance, 0.9), np.quantile(angle, 0.9)
-        return Score(int(which.sum()), *map(float, numbers), float(np.median(off)))
+        return Score(
+            int(which.sum()),
+            float(np.median(distance)),
+            float(np.median(angle)),
+            float(np.quantile(distance, 0.9)),
+            float(np.quantile(angle, 0.9)),
+            float(np.median(off)),
+        )
