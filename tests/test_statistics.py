@@ -18,9 +18,8 @@ from twin.evaluation.statistics import (
     spearman,
     spearman_batched,
     wilson,
-    winner_agreement,
+    winner,
     winner_batched,
-    winner_regret,
 )
 
 
@@ -104,8 +103,8 @@ def test_closed_forms() -> None:
     assert spearman(twin=-real, real=real) == pytest.approx(-1.0)
     assert mmrv(twin=real**3, real=real) == 0.0
     assert mmrv(twin=-real, real=real) == pytest.approx(np.mean([0.8, 0.5, 0.4, 0.8]))
-    assert winner_regret(twin=-real, real=real) == pytest.approx(0.8)
-    assert winner_agreement(twin=real**3, real=real) == 1.0
+    assert winner(twin=-real, real=real)[1] == pytest.approx(0.8)
+    assert winner(twin=real**3, real=real)[0] == 1.0
 
 
 def test_mmrv_equals_the_slow_one() -> None:
@@ -119,9 +118,9 @@ def test_the_order_of_arguments_matters_and_is_by_keyword() -> None:
     twin, real = np.array([0.9, 0.5, 0.1]), np.array([0.2, 0.6, 0.4])
     assert mmrv(twin=twin, real=real) == pytest.approx((0.4 + 0.4 + 0.2) / 3)
     assert mmrv(twin=real, real=twin) == pytest.approx((0.8 + 0.4 + 0.8) / 3)
-    assert winner_regret(twin=twin, real=real) == pytest.approx(0.4)
-    assert winner_regret(twin=real, real=twin) == pytest.approx(0.4)
-    for statistic in (pearson, spearman, mmrv, winner_agreement, winner_regret):
+    assert winner(twin=twin, real=real)[1] == pytest.approx(0.4)
+    assert winner(twin=real, real=twin)[1] == pytest.approx(0.4)
+    for statistic in (pearson, spearman, mmrv, winner):
         with pytest.raises(TypeError):
             statistic(twin, real)  # type: ignore[misc]
 
@@ -130,10 +129,10 @@ def test_ties() -> None:
     twin, real = np.array([1.0, 1.0, 0.0]), np.array([0.2, 0.8, 0.0])
     # The worse of the tied pair is charged, the better is not.
     assert mmrv(twin=twin, real=real) == pytest.approx(0.6 / 3)
-    assert winner_agreement(twin=twin, real=real) == 0.5
-    assert winner_regret(twin=twin, real=real) == pytest.approx(0.3)
+    assert winner(twin=twin, real=real)[0] == 0.5
+    assert winner(twin=twin, real=real)[1] == pytest.approx(0.3)
     # Tied on the road: either is the winner.
-    assert winner_agreement(twin=np.array([1.0, 0.9, 0.0]), real=np.array([0.8, 0.8, 0.0])) == 1.0
+    assert winner(twin=np.array([1.0, 0.9, 0.0]), real=np.array([0.8, 0.8, 0.0]))[0] == 1.0
     assert mmrv(twin=np.array([1.0, 0.9]), real=np.array([0.8, 0.8])) == 0.0
 
 
@@ -159,10 +158,10 @@ def test_undefined_correlations_are_refused(statistic) -> None:
 
 def test_constant_scores_have_a_winner_and_violations() -> None:
     flat, real = [0.5] * 3, [0.0, 0.3, 0.9]
-    assert winner_agreement(twin=flat, real=real) == pytest.approx(1 / 3)
-    assert winner_regret(twin=flat, real=real) == pytest.approx(0.5)
+    assert winner(twin=flat, real=real)[0] == pytest.approx(1 / 3)
+    assert winner(twin=flat, real=real)[1] == pytest.approx(0.5)
     assert mmrv(twin=flat, real=real) == pytest.approx((0.9 + 0.6 + 0.0) / 3)
-    for statistic in (mmrv, winner_agreement, winner_regret):
+    for statistic in (mmrv, winner):
         with pytest.raises(UndefinedStatistic, match="1 policies; at least 2"):
             statistic(twin=[0.5], real=[0.5])
 
@@ -188,8 +187,7 @@ def test_rows_are_the_same_statistics() -> None:
                 assert got[i] == pytest.approx(one(twin=twin[i], real=real[i]))
     assert np.isnan(pearson_batched(twin=twin, real=real)[3])
     agreement, regret = winner_batched(twin=twin, real=real)
-    assert agreement[5] == winner_agreement(twin=twin[5], real=real[5])
-    assert regret[5] == winner_regret(twin=twin[5], real=real[5])
+    assert (agreement[5], regret[5]) == winner(twin=twin[5], real=real[5])
 
 
 # ---- simulated coverage; 20,000 experiments: Monte-Carlo error 0.002, three times that is allowed beyond the rule

@@ -30,7 +30,7 @@ from twin.evaluation.statistics import (
     rate_difference,
     rate_over_days,
     spearman,
-    winner_regret,
+    winner,
 )
 from twin.files import read_json
 from twin.reality.lighting import WEATHER
@@ -149,7 +149,7 @@ def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]
         return None
     real = np.array([_mean(policy.real, days) for policy in mine])
     tasks = [np.array([policy.task == task for policy in mine]) for task in dict.fromkeys(p.task for p in mine)]
-    regrets = [winner_regret(twin=twin[of], real=real[of]) for of in tasks if of.sum() > 1]
+    regrets = [winner(twin=twin[of], real=real[of])[1] for of in tasks if of.sum() > 1]
     return Scores(
         policies=len(mine),
         spearman=_defined(spearman, twin, real),

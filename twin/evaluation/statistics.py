@@ -138,20 +138,15 @@ def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
     return float(mmrv_batched(twin=twin, real=real))
 
 
-def winner_agreement(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """1 if the twin's best policy is the road's best, else 0; the mean over policies tied as best in the twin.
-    Raises UndefinedStatistic: fewer than two policies.
+def winner(*, twin: ArrayLike, real: ArrayLike) -> tuple[float, float]:
+    """Agreement and regret of the twin's best policy, means over policies tied as best in the twin.
+
+    Agreement is 1 if it is the road's best, too, else 0; regret is the real rate of the road's best policy minus its
+    own. Raises UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
-    return float(winner_batched(twin=twin, real=real)[0])
-
-
-def winner_regret(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Regret in [0, 1]: real rate of the road's best policy minus that of the twin's best; the mean over twin's ties.
-    Raises UndefinedStatistic: fewer than two policies.
-    """
-    twin, real = _validated(twin, real, needed=2, varied=False)
-    return float(winner_batched(twin=twin, real=real)[1])
+    agreement, regret = winner_batched(twin=twin, real=real)
+    return float(agreement), float(regret)
 
 
 def pearson_batched(*, twin: Array, real: Array) -> Array:
@@ -177,7 +172,7 @@ def mmrv_batched(*, twin: Array, real: Array) -> Array:
 
 
 def winner_batched(*, twin: Array, real: Array) -> tuple[Array, Array]:
-    """`winner_agreement` and `winner_regret` over leading axes, shape (..., n) → (...) each."""
+    """`winner` over leading axes, shape (..., n) → (...) each."""
     twin, real = _rounded(twin), _rounded(real)
     chosen = twin == twin.max(-1, keepdims=True)
     best = real.max(-1, keepdims=True)
