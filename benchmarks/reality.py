@@ -1,10 +1,12 @@
 """Figures of the real test: how fast its rasteriser is, how near to the film, and where its tasks lie.
 
     python benchmarks/reality.py [--scene BUILT_SCENE_WITH_TRUTH] [--json FILE] [--pictures FOLDER]
+    python benchmarks/reality.py --sheet docs/places.jpg
 
 Pictures of 160×90 are compared, before the sensor, with frames of the film's renderer in the film's size that are
 shrunk to it, from a robot's height along the film's path; *small* is the film's renderer at 160×90 itself. With a
-scene, its route is laid on the true one.
+scene, its route is laid on the true one. `--sheet` instead writes one picture with a frame of each of the places 1 to
+30.
 """
 
 import argparse
@@ -26,9 +28,12 @@ from twin.mjcf.world import nearest_on_route
 from twin.reality import filming, true_world
 from twin.reality import place as places
 from twin.reality.comparison import align_rigid, matched_poses
+from twin.reality.drawn_place import build
+from twin.reality.place_spec import draw
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.real_robot import true_route
 from twin.reality.truth import Truth
+from twin.runtime import track
 
 _LIGHTINGS = ("sun", "overcast", "night")
 _EVERY = 12  # frames of the film
@@ -74,12 +79,34 @@ def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
     yield "reality.route_begins_later_m", float(station[0])
 
 
+def contact_sheet(path: Path) -> None:
+    """Writes a frame of each of the places 1 to 30, 6 to a row; the lightings take turns."""
+    width, height = 240, 135
+    frames = []
+    for number in track(list(range(1, 31)), "contact sheet", unit="place"):
+        spec = draw(number)
+        place, plan = build(spec), replace(filming.FilmingPlan.of(spec), width=width, height=height)
+        lighting = plan.lightings[number % len(plan.lightings)]
+        poses = filming.trajectory(plan, place.route, lighting)[1]
+        light, depth = filming.Renderer(lighting, place, plan)(poses[int(len(poses) * (0.15 + 0.12 * (number % 5)))])
+        look = place.lightings[lighting]
+        image = filming.sensor_image(np.random.default_rng(0), filming.apply_haze(light, depth, look), look, 1.0)
+        label = (str(number), (5, 15), cv2.FONT_HERSHEY_DUPLEX, 0.45)
+        frames.append(cv2.putText(np.ascontiguousarray(image), *label, (255, 255, 255), 1, cv2.LINE_AA))
+    rows = [np.hstack(frames[k : k + 6]) for k in range(0, len(frames), 6)]
+    write_image(path, np.vstack(rows))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene with truth")
     add_record_options(parser)
     parser.add_argument("--pictures", type=Path, help="folder for pictures: rasterised, film, difference")
+    parser.add_argument("--sheet", type=Path, help="picture of the places 1 to 30 to write, and nothing else")
     options = parser.parse_args()
+    if options.sheet:
+        contact_sheet(options.sheet)
+        return 0
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Any] = {}

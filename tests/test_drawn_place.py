@@ -159,7 +159,7 @@ def test_the_films_of_a_place_have_their_height_and_passes(places):
 def test_depth_agrees_with_rays_onto_the_ground(places):
     """In a small picture, the points seen on the road lie on the true ground."""
     place = places[5]
-    plan = replace(filming.FilmingPlan.of(draw(5)), width=160, height=90, samples=1)
+    plan = replace(filming.FilmingPlan.of(draw(5)), width=160, height=90, oversize=1.0)
     lighting = plan.lightings[0]
     _, poses = filming.trajectory(plan, place.route, lighting)
     pose = poses[len(poses) // 3]

@@ -10,6 +10,7 @@ import trimesh
 
 from twin.assets.ground import Ground
 from twin.errors import InputError
+from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
@@ -17,7 +18,7 @@ from twin.reality import centerline, filming, place, true_world
 from twin.reality.centerline import RoadLine
 from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
-from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
+from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, fingerprint
 from twin.scene import SceneDir
 
 DEMO = Path(__file__).parent.parent / "scenes" / "demo"
@@ -38,6 +39,13 @@ def truth(campus):
         times, poses = filming.trajectory(plan, campus.route, name)
         films[name] = TrueFilm(times, poses, np.zeros(0, np.int64), np.zeros((0, 90, 160), np.float16))
     return Truth(campus.route, plan.start, plan.length, HALF_WIDTH, plan.intrinsics, (640, 360), films)
+
+
+def test_place_0_is_the_demos(campus):
+    """Its fingerprint, as films of it made since the demo state it."""
+    shipped = read_json(DEMO / "truth" / "truth.json")
+    assert fingerprint(campus) == pytest.approx(shipped["fingerprint"], abs=1e-9)
+    assert campus.number == 0 and "place" not in shipped
 
 
 def test_route_projects_back():

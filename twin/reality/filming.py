@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import av
+import cv2
 import mujoco
 import mujoco_warp
 import numpy as np
@@ -43,6 +44,8 @@ class FilmingPlan:
     height: int = 360
     samples: int = 2
     """Rays per pixel and axis."""
+    oversize: float = 1.0
+    """Factor on the size in which frames are rendered before they are shrunk to the film's."""
     crf: int = 29
     """Quality of the H.264 film; lower is better."""
     camera_height: float = CAMERA_HEIGHT
@@ -67,6 +70,8 @@ class FilmingPlan:
             fps=film.fps,
             width=film.size[0],
             height=film.size[1],
+            samples=1,  # at 1.5 times the size: 2.25 rays per pixel, instead of the 4 of the campus road's films
+            oversize=1.5,
             crf=24,
             camera_height=film.camera_height,
             pitch=film.pitch,
@@ -140,7 +145,8 @@ class Renderer:
         model = spec.compile()
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        self._size = (plan.width, plan.height)
+        self._out = (plan.width, plan.height)
+        self._size = (round(plan.oversize * plan.width), round(plan.oversize * plan.height))
         with wp.ScopedDevice("cpu"):
             self._model = mujoco_warp.put_model(model)
             self._data = mujoco_warp.put_data(model, data)
@@ -170,7 +176,11 @@ class Renderer:
             rgb = wp.zeros((1, height, width), dtype=wp.vec3)
             mujoco_warp.get_rgb(self._context, 0, rgb)
             depth = self._context.depth_data.numpy().reshape(height, width).copy()
-        return rgb.numpy()[0].astype(np.float32), depth
+        light = rgb.numpy()[0].astype(np.float32)
+        if self._size != self._out:
+            light = cv2.resize(light, self._out, interpolation=cv2.INTER_AREA)
+            depth = cv2.resize(depth, self._out, interpolation=cv2.INTER_NEAREST)
+        return light, depth
 
 
 def sensor_image(
@@ -232,7 +242,7 @@ def depth_maps(
     They have a quarter of the film's size, or a third where its height is no multiple of four.
     """
     part = 4 if plan.height % 4 == 0 else 3
-    small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1)
+    small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1, oversize=1.0)
     frames = np.unique(np.linspace(0, len(poses) - 1, 10).round().astype(np.int64))
     render = Renderer(lighting, place, small)
     return frames, np.stack([render(poses[k])[1] for k in frames]).astype(np.float16)

@@ -587,7 +587,7 @@ def _surface(rng: np.random.Generator, paint: np.random.Generator, setting: str,
     age = float(rng.uniform(0.0, 1.0))
     narrow = kind in ("gravel", "concrete") and section.width < 4.2 and section.left == section.right
     patched = {"asphalt": 0.7, "concrete": 0.15, "pavers": 0.1}.get(kind, 0.0)
-    green = _hsv(float(rng.uniform(0.17, 0.29)), float(rng.uniform(0.35, 0.68)), float(rng.uniform(0.26, 0.50)))
+    green = _hsv(float(rng.uniform(0.13, 0.27)), float(rng.uniform(0.25, 0.60)), float(rng.uniform(0.28, 0.54)))
     earth = _hsv(float(rng.uniform(0.06, 0.12)), float(rng.uniform(0.2, 0.5)), float(rng.uniform(0.30, 0.54)))
     bare = float(rng.uniform(0.0, 0.5)) ** 1.5
     coarse, cracks = float(rng.uniform(0.5, 1.3)), 1.6 * age * float(rng.uniform(0.2, 1.0))
@@ -729,7 +729,7 @@ def _trees(rng: np.random.Generator, setting: str, grass: Rgb) -> TreesSpec:
     greens = tuple(
         _hsv(
             float(np.clip(hue + rng.normal(0.0, 0.025), 0.03, 0.40)),
-            float(rng.uniform(0.4, 0.75)),
+            float(rng.uniform(0.3, 0.65)),
             float(np.clip(value + rng.normal(0.0, 0.05), 0.16, 0.6)),
         )
         for _ in range(4)
@@ -805,10 +805,12 @@ def _horizon(rng: np.random.Generator, setting: str) -> HorizonSpec:
         "flat": ((0.01, 0.02), (0.002, 0.005), (0.1, 0.4)),
         "mountains": ((0.12, 0.26), (0.04, 0.10), (0.4, 1.2)),
     }[kind]
-    tint = _shade(rng, {"hills": (0.8, 0.9, 0.9), "mountains": (0.85, 0.88, 0.93)}.get(kind, (0.9, 0.9, 0.85)), 0.12)
-    return HorizonSpec(
-        kind, float(rng.uniform(*height)), float(rng.uniform(*roughness)), float(rng.uniform(*period)), tint
-    )
+    far = float(rng.uniform(0.0, 1.0))  # the farther, the paler and bluer
+    pale = {"trees": 0.3, "flat": 0.6}.get(kind, 0.95) * far
+    base = np.array([0.95, 0.95, 0.85]) * rng.uniform(0.75, 1.15, 3)
+    red, green, blue = ((1.0 - pale) * base + pale * np.array([1.75, 1.72, 1.95])).tolist()
+    elevation, deviation, widest = (float(rng.uniform(*span)) for span in (height, roughness, period))
+    return HorizonSpec(kind, elevation, deviation, widest, (red, green, blue))
 
 
 def _lights(rng: np.random.Generator, lamps: LampsSpec) -> tuple[LightSpec, ...]:

@@ -105,8 +105,8 @@ def add_crowned_tree(
     for tip in clusters:
         ball = rng.normal(size=(per, 3))
         ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-        radius = crown * rng.uniform(0.4, 0.65) * rng.uniform(0.2, 1.0, (per, 1)) ** 0.5
-        centers.append(tip + ball * radius * [1.0, 1.0, 0.8])
+        radius = max(crown, 0.16 * height) * rng.uniform(0.45, 0.7) * rng.uniform(0.2, 1.0, (per, 1)) ** 0.5
+        centers.append(tip + ball * radius * [1.0, 1.0, 0.8 * slender**0.5])
     _grow(place, rng, k, foot, stem * height, thick, wood, np.concatenate(centers), (0.12, 0.30), crown, skin)
 
 

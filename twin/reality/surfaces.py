@@ -167,8 +167,8 @@ def _repair(rng: np.random.Generator, image: Array32, surface: SurfaceSpec, leng
     for _ in range(int(length * surface.cracks)):
         start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
         heading = (np.pi / 2 if rng.random() < 0.45 else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
-        crack(rng, mask, start, heading, rng.uniform(40, 330), rng.uniform(1.0, 3.0))
-    blend(image, (0.08, 0.08, 0.085), 0.85 * cv2.GaussianBlur(mask, (3, 3), 0.6))
+        crack(rng, mask, start, heading, rng.uniform(40, 330), rng.uniform(0.8, 2.2))
+    blend(image, (0.10, 0.10, 0.10), 0.7 * cv2.GaussianBlur(mask, (3, 3), 0.6))
 
 
 def _mark(
