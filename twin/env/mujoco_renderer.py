@@ -20,8 +20,7 @@ from twin.env.irradiance import Irradiance
 from twin.env.obstacle_models import OBSTACLE_GROUP
 from twin.env.weather import Weather
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
-from twin.mjcf.husky import ROBOT_COLLISION_GROUP
-from twin.mjcf.husky_visuals import ROBOT_VISUAL_GROUP, camera_mount_geoms
+from twin.mjcf.husky import ROBOT_COLLISION_GROUP, ROBOT_VISUAL_GROUP, camera_mount_geoms
 from twin.nerf.rendering import FAR, Rendering
 from twin.runtime import available_cores
 from twin.types import Array, Array32
