@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from twin import export
-from twin.assets.splats import Gaussians, gaussians_of_views, select_sharpest
 from twin.assets.views import Views
+from twin.export import Gaussians, gaussians_of_views, select_sharpest
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.geometry.poses import look_at
 

@@ -1,11 +1,14 @@
-"""Settings of `scene.toml`: one frozen dataclass per stage, with units and defaults; `config_file.py` reads them.
+"""Settings of `scene.toml`: one frozen dataclass per stage, with units, ranges and defaults; read by `config_file.py`.
 
 A *source* is one film (or photo folder, or posed image set) under one *lighting*. Several sources may share a lighting.
+Outside the ranges a stage fails for lack of memory, by its arithmetic, or never ends, often minutes into a build.
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from twin.robot import HuskyParams
+from twin.types import Range
 
 TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
 """Given in place of a lighting's name to sample one per episode; see `twin/env/episode_lighting.py`."""
@@ -95,7 +98,7 @@ class SourceConfig:
     """One static mask image, or a folder of masks named like the frames; 0 = ignore."""
     camera: CalibrationConfig | None = None
     """Known intrinsics, held fixed. Calibrate if possible: forward motion biases self-calibration."""
-    camera_height: float = 0.0
+    camera_height: Annotated[float, Range(0)] = 0.0
     """Height of this source's lens above the ground [m], if sources differ; 0 = `metric.camera_height`."""
     keep: tuple[tuple[float, ...], ...] = ()
     """Segments of this film that are used; replaces `capture.keep`."""
@@ -105,20 +108,20 @@ class SourceConfig:
 class CaptureConfig:
     """Selection of frames."""
 
-    frames: int = 0
+    frames: Annotated[int, Range(0)] = 0
     """Number of frames to keep per source: the sharpest of each of that many equal time slots; 0: use `fps`."""
-    fps: float = 2.0
+    fps: Annotated[float, Range(0.001, 1000)] = 2.0
     """Frames to keep per second of video, if `frames` is 0."""
-    max_frames: int = 300
+    max_frames: Annotated[int, Range(2)] = 300
     """Upper bound per source."""
-    max_size: int = 1280
-    """Longer side of a kept frame [px]; larger images are scaled down with their intrinsics."""
-    held_out_every: int = 8
+    max_size: Annotated[int, Range(64)] = 1280
+    """Longer side of a kept frame [px], at least 64 for enough features; larger images are scaled down."""
+    held_out_every: Annotated[int, Range(2)] = 8
     """Every n-th frame of each source is held out from training."""
     keep: tuple[tuple[float, ...], ...] = ()
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
     and disjoint; empty = all. Photos need timestamps."""
-    min_motion: float = 1.0
+    min_motion: Annotated[float, Range(0)] = 1.0
     """Frames with less motion since the last kept one [px, median optical flow at 320 px width] are dropped."""
 
 
@@ -126,16 +129,16 @@ class CaptureConfig:
 class CamerasConfig:
     """Structure from motion."""
 
-    features: int = 3000
+    features: Annotated[int, Range(1, 1_000_000)] = 3000
     """Upper bound of SIFT features per frame."""
-    max_feature_size: int = 1280
+    max_feature_size: Annotated[int, Range(64, 100_000)] = 1280
     """Longer side of the image for feature detection [px]."""
     mapper: str = "auto"
     """auto (global, then incremental), global or incremental."""
-    min_registered: float = 0.6
-    """Fraction of frames that must register; otherwise the stage fails."""
-    max_outlier: float = 0.3
-    """A frame further than this from the path through its neighbors is an outlier [median steps between frames]."""
+    min_registered: Annotated[float, Range(0, 1)] = 0.6
+    """Fraction of frames that must register, or the stage fails."""
+    max_outlier: Annotated[float, Range(0.001)] = 0.3
+    """Distance from the path through its neighbors beyond which a frame is an outlier [median steps of the film]."""
     free_focal: bool = False
     """Ignore given calibrations and self-calibrate (for comparison; a calibrated camera is better)."""
 
@@ -172,9 +175,9 @@ class MarkerConfig:
 class MetricConfig:
     """Sources of the metric scale: one, or several to be compared and combined."""
 
-    camera_height: float = 0.0
+    camera_height: Annotated[float, Range(0)] = 0.0
     """Lens above the ground [m], for a camera carried at constant height. 0 = not given."""
-    camera_height_tolerance: float = 0.01
+    camera_height_tolerance: Annotated[float, Range(0, 1)] = 0.01
     """Standard deviation of the error with which it was measured [m]."""
     distance: DistanceConfig | None = None
     marker: MarkerConfig | None = None
@@ -190,34 +193,34 @@ class MetricConfig:
 class NerfConfig:
     """The radiance field and its training."""
 
-    steps: int = 2000
-    rays: int = 4096
+    steps: Annotated[int, Range(1)] = 2000
+    rays: Annotated[int, Range(1, 2**20)] = 4096
     """Rays per step."""
-    samples: int = 16
+    samples: Annotated[int, Range(1, 1024)] = 16
     """Samples per ray and step."""
-    sightings: float = 0.35
-    """Fraction of each step's rays with depth supervision."""
+    sightings: Annotated[float, Range(0, 0.7)] = 0.35
+    """Fraction of each step's rays with depth supervision; the others belong to triples and single pixels."""
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
-    bake_steps: int = 300
+    bake_steps: Annotated[int, Range(1)] = 300
     """Fine-tuning steps of the baked field, which renders images."""
-    max_bricks: int = 9000
+    max_bricks: Annotated[int, Range(100)] = 9000
     """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field, which determines the
-    cell size; 9,000 take about 105 MB. If this limit would make cells larger than 15 cm, it is raised by a factor of
-    1.39 (146 MB)."""
-    max_width: int = 480
+    cell size; 9,000 take about 105 MB. It is raised by a factor of 1.39 (146 MB) if cells would exceed 15 cm. Fewer
+    than 100 do not cover even the coarsest far grid."""
+    max_width: Annotated[int, Range(32)] = 480
     """Longer side of training images [px]."""
     refine_cameras: bool = False
-    """Refine camera poses while training, for poses less accurate than the images. The field and its scores use the
-    refined poses. Report images and `twin.relight` use the structure-from-motion poses, so they are shifted by the
-    amount that the report lists as `field.cameras_moved`."""
-    learning_rate: float = 3e-2
-    appearance_dim: int = 32
-    levels: int = 8
-    log2_table: int = 18
-    near_half_extent: float = 0.0
+    """Refine camera poses while training, if they are less accurate than the images. The field and its scores use the
+    refined poses; report images and `twin.relight` use the original ones, which differ from them by the report's
+    `field.cameras_moved`."""
+    learning_rate: Annotated[float, Range(1e-6, 1)] = 3e-2
+    appearance_dim: Annotated[int, Range(1, 1024)] = 32
+    levels: Annotated[int, Range(1, 32)] = 8
+    log2_table: Annotated[int, Range(1, 24)] = 18
+    near_half_extent: Annotated[float, Range(0, 100)] = 0.0
     """Half side of the uncontracted near box [m]; 0 = from the cameras."""
-    near_plane: float = 0.3
+    near_plane: Annotated[float, Range(0, 100)] = 0.3
     """Distance from a camera up to which space is empty [m]."""
 
 
@@ -225,25 +228,25 @@ class NerfConfig:
 class MeshConfig:
     """Surface mesh, ground and collision geometry."""
 
-    voxel: float = 0.15
+    voxel: Annotated[float, Range(0.01, 1)] = 0.15
     """Marching-cubes cell [m]."""
-    ground_cell: float = 0.1
+    ground_cell: Annotated[float, Range(0.01, 1)] = 0.1
     """Height field cell [m]."""
-    ground_smoothing: float = 0.25
+    ground_smoothing: Annotated[float, Range(0, 10)] = 0.25
     """Standard deviation of the height field's low-pass filter [m]."""
-    obstacle_height: float = 0.2
+    obstacle_height: Annotated[float, Range(0)] = 0.2
     """Height above the ground from which geometry is an obstacle [m]."""
-    max_height: float = 2.5
+    max_height: Annotated[float, Range(0.1, 100)] = 2.5
     """Height at which obstacles are cut off, above the robot's reach [m]."""
-    max_parts: int = 2000
+    max_parts: Annotated[int, Range(0)] = 2000
     """Upper bound of convex parts."""
-    max_protrusion: float = 0.2
+    max_protrusion: Annotated[float, Range(0.01)] = 0.2
     """Upper bound of a convex part's protrusion from its mesh [m]."""
-    margin: float = 12.0
+    margin: Annotated[float, Range(1, 1000)] = 12.0
     """Distance from the route within which the place is meshed [m]."""
-    views: int = 100
+    views: Annotated[int, Range(1)] = 100
     """Upper bound of filmed poses from which depth is rendered for surface and ground."""
-    view_width: int = 200
+    view_width: Annotated[int, Range(8, 4096)] = 200
     """Width of these renderings [px]."""
 
 
@@ -257,7 +260,7 @@ class RouteConfig:
     """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m off what was filmed."""
     reverse: bool = False
     """Drive against the filmed direction. The camera then looks where nobody filmed."""
-    max_gap: float = 5.0
+    max_gap: Annotated[float, Range(0, 50)] = 5.0
     """Longest unfilmed way between two passes that are joined [m]."""
 
 
@@ -267,13 +270,12 @@ class MjcfConfig:
 
     route: bool = True
     """False for a capture around an object: no route and no Husky."""
-    half_width: float = 1.0
+    half_width: Annotated[float, Range(0.1, 100)] = 1.0
     """Half width of the drivable corridor around the route [m]."""
-    hfield_cell: float = 0.3
+    hfield_cell: Annotated[float, Range(0.01, 10)] = 0.3
     """Cell of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge touches several
-    facets: fewer edges mean less vibration and less computation, and the ground is smoothed to this scale anyway
-    (`mesh.ground_smoothing`)."""
-    corridor_margin: float = 0.0
+    facets, so larger cells vibrate and cost less; the ground is smoothed to this scale (`mesh.ground_smoothing`)."""
+    corridor_margin: Annotated[float, Range(0, 100)] = 0.0
     """Extra clearance between the corridor and convex parts [m]."""
 
 
@@ -281,15 +283,15 @@ class MjcfConfig:
 class ReviewConfig:
     """The review film."""
 
-    speed: float = 1.0
+    speed: Annotated[float, Range(0.01)] = 1.0
     """Speed of the scripted follower [m/s]."""
-    fps: int = 10
-    width: int = 480
+    fps: Annotated[int, Range(1, 240)] = 10
+    width: Annotated[int, Range(1, 4096)] = 480
     """Width of one panel of the film [px]."""
-    render_width: int = 224
+    render_width: Annotated[int, Range(1, 4096)] = 224
     """Longer side of renderings of the radiance field [px]; they are scaled up to the panel."""
-    renders: int = 120
-    """Number of renderings of the radiance field in the film. More give a smoother film and a longer build."""
+    renders: Annotated[int, Range(0)] = 120
+    """Number of renderings of the radiance field in the film; more give a smoother film and a longer build."""
 
 
 OBSTACLE_KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
@@ -337,7 +339,7 @@ class SceneConfig:
     """A whole `scene.toml`."""
 
     name: str = ""
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of all randomness in a build, 0 to 2³¹ − 1."""
     source: tuple[SourceConfig, ...] = ()
     capture: CaptureConfig = field(default_factory=CaptureConfig)

@@ -1,7 +1,7 @@
 """Reads and checks `scene.toml` and `robot.toml` into the dataclasses of `config.py`.
 
-An *override* is a command-line setting `section.key=value`, which replaces that of the file. Unknown keys are errors
-that suggest the nearest valid name, so that a typo never silently becomes a default.
+An *override* is a command-line setting `section.key=value`, which replaces that of the file. An unknown key is an error
+that suggests the nearest valid name; otherwise a typo would silently become a default.
 """
 
 import dataclasses
@@ -33,67 +33,13 @@ from twin.config import (
 from twin.errors import InputError, short_repr
 from twin.files import exists, is_link, parse_toml, read_toml
 from twin.robot import HuskyParams
+from twin.types import Range, setting_ranges
 
 ROBOT_TOML = "robot.toml"
 
 MAX_NAME = 80
 """Upper bound of characters of a name that becomes part of a file name."""
-_INF = math.inf
-# Ranges of values. Outside them a stage fails by arithmetic or memory, or never ends, mostly minutes into a build. An
-# image narrower than 64 px has too few features for reconstruction, the near box is first divided into bricks of
-# 0.24 m, and fewer than 100 bricks do not cover even the coarsest far grid.
-_RANGES: dict[str, dict[str, tuple[float, float]]] = {
-    "capture": {
-        "frames": (0, _INF),
-        "fps": (1e-3, 1e3),
-        "max_frames": (2, _INF),
-        "max_size": (64, _INF),
-        "held_out_every": (2, _INF),
-        "min_motion": (0, _INF),
-    },
-    "cameras": {
-        "features": (1, 1e6),
-        "max_feature_size": (64, 1e5),
-        "min_registered": (0, 1),
-        "max_outlier": (1e-3, _INF),
-    },
-    "metric": {"camera_height": (0, _INF), "camera_height_tolerance": (0, 1)},
-    "nerf": {
-        "steps": (1, _INF),
-        "rays": (1, 2**20),
-        "samples": (1, 1024),
-        "sightings": (0, 0.7),  # the other rays belong to triples and single pixels
-        "bake_steps": (1, _INF),
-        "max_bricks": (100, _INF),
-        "max_width": (32, _INF),
-        "learning_rate": (1e-6, 1),
-        "appearance_dim": (1, 1024),
-        "levels": (1, 32),
-        "log2_table": (1, 24),
-        "near_half_extent": (0, 100),
-        "near_plane": (0, 100),
-    },
-    "mesh": {
-        "voxel": (1e-2, 1),
-        "ground_cell": (1e-2, 1),
-        "ground_smoothing": (0, 10),
-        "obstacle_height": (0, _INF),
-        "max_height": (0.1, 100),
-        "max_parts": (0, _INF),
-        "max_protrusion": (1e-2, _INF),
-        "margin": (1, 1e3),
-        "views": (1, _INF),
-        "view_width": (8, 4096),
-    },
-    "mjcf": {"half_width": (0.1, 100), "hfield_cell": (1e-2, 10), "corridor_margin": (0, 100)},
-    "review": {
-        "speed": (1e-2, _INF),
-        "fps": (1, 240),
-        "width": (1, 4096),
-        "render_width": (1, 4096),
-        "renders": (0, _INF),
-    },
-}
+_SECTIONS = ("capture", "cameras", "metric", "nerf", "mesh", "route", "mjcf", "review")
 
 
 def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
@@ -143,16 +89,13 @@ def merge_robot(robot: dict[str, Any], by_hand: dict[str, Any], where: str) -> d
 
 def _read_table(path: Path) -> dict[str, Any] | None:
     """The table of a TOML file; None if there is no such file."""
-    if path.parent.is_file():
-        raise InputError(f"{path.parent} is a file; give the folder of the scene, {_folder_hint(path.parent)}")
+    folder = path.parent
+    if folder.is_file():
+        hint = folder.parent if folder.name == "scene.toml" else "such as scenes/demo"
+        raise InputError(f"{folder} is a file; give the folder of the scene, {hint}")
     if not exists(path) and not is_link(path):
         return None
     return read_toml(path)
-
-
-def _folder_hint(file: Path) -> str:
-    """Suggests a scene folder when a file was given."""
-    return f"{file.parent}" if file.name == "scene.toml" else "such as scenes/demo"
 
 
 def _apply_override(table: dict[str, Any], override: str) -> None:
@@ -199,32 +142,16 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if not isinstance(value, list):
             raise InputError(f"{where}: expected a list, got {short_repr(value)}")
         return tuple(_convert(typing.get_args(hint)[0], item, where) for item in value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        value = _real(value, where)
+    if hint is float and type(value) is int:
+        try:
+            value = float(value)
+        except OverflowError:
+            raise InputError(f"{where}: expected a number below 1e308, got {short_repr(value)}") from None
     if type(value) is not hint:
         raise InputError(f"{where}: expected {hint.__name__}, got {short_repr(value)}")
     if hint is float and not math.isfinite(value):
         raise InputError(f"{where}: expected a finite number, got {value}")
     return value
-
-
-def _real(value: int, where: str) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        raise InputError(f"{where}: expected a number below 1e308, got {short_repr(value)}") from None
-
-
-def _scale_sources(metric: MetricConfig) -> tuple[str, ...]:
-    """Names of the scale sources that are given: camera_height, distance, gps, marker, poses_are_metric."""
-    given = {
-        "camera_height": metric.camera_height > 0.0,
-        "distance": metric.distance is not None,
-        "gps": metric.gps,
-        "marker": metric.marker is not None,
-        "poses_are_metric": metric.poses_are_metric,
-    }
-    return tuple(name for name, is_given in given.items() if is_given)
 
 
 def _check(config: SceneConfig, path: Path) -> None:
@@ -237,19 +164,22 @@ def _check(config: SceneConfig, path: Path) -> None:
     if not config.name.isprintable() and config.name != path.resolve().parent.name:
         raise InputError(f"{path}: name = {config.name!r}; expected a text without control characters")
     _check_tasks(config.task, path)
-    for section, ranges in _RANGES.items():
-        for key, (low, high) in ranges.items():
-            _check_range(getattr(getattr(config, section), key), low, high, f"{path}: {section}.{key}")
-    _check_range(config.seed, 0, 2**31 - 1, f"{path}: seed")  # COLMAP's range
+    for section in _SECTIONS:
+        settings = getattr(config, section)
+        for key, bounds in setting_ranges(type(settings)).items():
+            _check_range(getattr(settings, key), bounds, f"{path}: {section}.{key}")
+    _check_range(config.seed, setting_ranges(SceneConfig)["seed"], f"{path}: seed")
     for source in config.source:
-        _check_range(source.camera_height, 0, _INF, f"{path}: camera_height of [[source]] {source.path!r}")
+        what = f"{path}: camera_height of [[source]] {source.path!r}"
+        _check_range(source.camera_height, setting_ranges(SourceConfig)["camera_height"], what)
         _check_segments(source.keep, f"{path}: keep of [[source]] {source.path!r}")
     _check_segments(config.capture.keep, f"{path}: capture.keep")
     _check_route(config.route, path)
     _check_obstacles(config.obstacle, path)
     _check_metric(config.metric, path)
-    given = _scale_sources(config.metric)
-    if not given and not any(source.camera_height > 0.0 for source in config.source):
+    metric = config.metric
+    scales = (metric.camera_height > 0.0, metric.distance is not None, metric.gps, metric.marker is not None)
+    if not any(scales) and not metric.poses_are_metric and not any(one.camera_height > 0.0 for one in config.source):
         # Checked here, not minutes into the build.
         raise InputError(
             f"{path}: [metric] gives no scale; give one or more of "
@@ -258,9 +188,10 @@ def _check(config: SceneConfig, path: Path) -> None:
         )
 
 
-def _check_range(value: float, low: float, high: float, what: str) -> None:
+def _check_range(value: float, bounds: Range, what: str) -> None:
+    low, high = bounds.low, bounds.high
     if not low <= value <= high:
-        expected = f"at least {low:,.10g}" if high == _INF else f"{low:,.10g} to {high:,.10g}"
+        expected = f"at least {low:,.10g}" if high == math.inf else f"{low:,.10g} to {high:,.10g}"
         raise InputError(f"{what} = {value:,.10g}; expected {expected}")
 
 
@@ -321,14 +252,13 @@ def _check_route(route: RouteConfig, path: Path) -> None:
         )
     if any(a == b for a, b in pairwise(route.points)):
         raise InputError(f"{path}: route.points names a point twice in a row; give each once")
-    _check_range(route.max_gap, 0, 50, f"{path}: route.max_gap")
 
 
 def _check_metric(metric: MetricConfig, path: Path) -> None:
     if metric.marker is not None:
         family, number, size = metric.marker.family, metric.marker.id, metric.marker.size
         _check_choice(family, MARKER_FAMILIES, f"{path}: metric.marker.family")
-        _check_range(number, 0, MARKER_FAMILIES[family] - 1, f"{path}: metric.marker.id")
+        _check_range(number, Range(0, MARKER_FAMILIES[family] - 1), f"{path}: metric.marker.id")
         if not size > 0.0:
             raise InputError(f"{path}: metric.marker.size = {size:g}; expected the side of the black square [m]")
     if metric.distance is not None:

@@ -1,24 +1,25 @@
 """Constants and parameters of the Clearpath Husky, without MuJoCo.
 
 *Base* is Clearpath's `base_link`: x forward, y left, z up; its origin lies between the wheels, 0.132 m above flat
-ground. A *side* is the front and rear wheel on the left or right, driven by one motor through gear and belt; arrays per
-side are ordered left, right. The *track ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a differential
+ground. A *side* is the front and rear wheel on the left or right, driven by one motor through gear and belt. The *track
+ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a differential
 drive with freely rolling wheels and larger for a skid-steered robot, whose tires scrub sideways.
 
 Source of the constants: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml).
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from twin.errors import InputError
-from twin.types import Array
+from twin.types import Array, Range, setting_ranges
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-"""Order of all wheel arrays; body, joint and encoder of a wheel are named `<name>_wheel`."""
+"""Order of all arrays per wheel; body, joint and encoder of a wheel are named `<name>_wheel`."""
 SIDES = ("left", "right")
-"""Order of arrays per side, and names of the actuators."""
+"""Order of all arrays per side, and names of the actuators."""
 
 CHASSIS_MASS = 46.034  # [kg]
 WHEEL_MASS = 2.637  # [kg]
@@ -33,7 +34,7 @@ GEAR_RATIO = 79.0  # motor turns per wheel turn
 CAMERA_SIZE = (160, 90)
 """Width, height of a policy's images from the front camera [px]."""
 REAR_HEAVY = (-0.085, -0.00065, 0.062)
-"""The published center of mass of the chassis with x and y exchanged [m]."""
+"""The published center of mass of the chassis, with x and y exchanged [m]."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,9 @@ class PixelCamera:
     """Width, height [px]."""
 
     def resized(self, size: tuple[int, int]) -> "PixelCamera":
-        """The same camera at another image size (width, height) [px], scaled by the width.
+        """The same camera at another image size (width, height) [px].
 
-        Pixels keep their shape, so fy scales like fx; if the aspect ratio differs, the height is cropped or extended
-        about its middle.
+        fx and fy scale with the width; another aspect ratio crops or extends the height about its middle.
         """
         scale = size[0] / self.size[0]
         fx, fy, cx, cy = (float(x) * scale for x in self.intrinsics)
@@ -58,96 +58,96 @@ class PixelCamera:
 
 
 ZED2 = PixelCamera((530.0, 530.0, 640.0, 360.0), (1280, 720))
-"""Typical left lens of a ZED 2 at 1280 × 720; prefer the calibration of the actual unit."""
+"""Typical left lens of a ZED 2; prefer the calibration of the actual unit."""
 
 
 @dataclass(frozen=True)
 class HuskyParams:
     """Parameters that differ between robots or are fitted to logs: `[robot]` in `scene.toml`, and `robot.toml`.
 
+    Ranges are wide enough for any Husky, and narrow enough to catch millimetres, radians and percent.
+
     Raises:
         InputError: a value out of range.
     """
 
     # Body.
-    center_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.062)
-    """Center of mass of the chassis in the base [m]. The published (−.00065, −.085, .062) would lie 8.5 cm to the right
-    of a symmetric robot; read as transposed it is rear-heavy (`REAR_HEAVY`) and turns with chi = 1.43. Centered it
-    turns with 1.805, nearer to Clearpath's controller (1.82 to 1.875) and to logs of a real robot (2.15 and more),
-    hence the default."""
-    payload_mass: float = 0.0
+    center_of_mass: Annotated[tuple[float, float, float], Range(-0.5, 0.5)] = (0.0, 0.0, 0.062)
+    """Center of mass of the chassis in the base [m]. The published (−.00065, −.085, .062) is 8.5 cm to the right in a
+    symmetric robot. With x and y exchanged (`REAR_HEAVY`) the robot turns with chi = 1.43; centered, with 1.805, nearer
+    to Clearpath's controller (1.82 to 1.875) and to logs of a real robot (2.15 and more)."""
+    payload_mass: Annotated[float, Range(0, 100)] = 0.0
     """Mass on the top plate [kg]."""
-    payload_position: tuple[float, float, float] = (0.0, 0.0, 0.35)
+    payload_position: Annotated[tuple[float, float, float], Range(-2, 2)] = (0.0, 0.0, 0.35)
     """Center of the payload in the base [m]."""
 
     # Tires.
-    friction: float = 0.7
+    friction: Annotated[float, Range(0.01, 3)] = 0.7
     """Sliding friction coefficient of the tires on any surface."""
-    rolling_resistance: float = 0.015
-    """Rolling resistance coefficient Crr: force / load. Rolling and sliding share a tire's grip: at a fraction s of its
-    grip it slides at Crr / friction · s / √(1 − s²) of its rolling speed, negligible by default."""
-    wheel_radius: tuple[float, float] = (WHEEL_RADIUS, WHEEL_RADIUS)
-    """Effective radius of the left and right tires [m], by pressure and wear. The robot's controller keeps using the
-    nominal radius."""
-    spin_friction: float = 1e-4
-    """Torsional friction of a tire's contact patch: moment / load [m]. Negligible by default, since the scrubbing of
-    four wheels dominates on hard ground; tires that sink in have a long patch."""
-    slip_stiffness: float = 10.0
-    """Stiffness of tire friction relative to that of normal contact (MuJoCo's `impratio`). Below 1 tires creep as on
-    soft ground: force grows with slip speed before they slide."""
-    ground_viscosity: float = 0.0
-    """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]. Each tire is dragged by about
-    2.4 N per Pa s and m/s, so drag grows with speed and turning is harder the faster."""
+    rolling_resistance: Annotated[float, Range(0, 0.5)] = 0.015
+    """Rolling resistance coefficient Crr: force / load. A tire that uses a fraction s of its grip slides at
+    Crr / friction · s / √(1 − s²) of its rolling speed, which is negligible by default."""
+    wheel_radius: Annotated[tuple[float, float], Range(0.1, 0.25)] = (WHEEL_RADIUS, WHEEL_RADIUS)
+    """Effective radius of the left and right tires [m]. The robot's controller uses the nominal radius."""
+    spin_friction: Annotated[float, Range(0, 1)] = 1e-4
+    """Torsional friction of a tire's contact patch: moment / load [m]. On hard ground the scrubbing of four wheels
+    dominates; tires that sink in have a long patch."""
+    slip_stiffness: Annotated[float, Range(0.001, 1_000)] = 10.0
+    """Stiffness of tire friction relative to normal contact (MuJoCo's `impratio`). Below 1, tires creep as on soft
+    ground: force grows with slip speed before they slide."""
+    ground_viscosity: Annotated[float, Range(0, 1_000)] = 0.0
+    """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]; drag of about 2.4 N per tire,
+    Pa s and m/s."""
     wheel_shape: str = "ellipsoid"
     """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
 
     # Drivetrain.
-    servo_gain: float = 1600.0
+    servo_gain: Annotated[float, Range(1, 100_000)] = 1600.0
     """Torque of a side per wheel speed error [N m s/rad]; stiff, as in the motor controllers' encoder loop."""
-    servo_lag: float = 0.0
+    servo_lag: Annotated[float, Range(0, 2)] = 0.0
     """Time constant of the first-order lag of a side's wheel speed command [s]."""
-    motor_inertia: float = 0.15
-    """Inertia of rotors and gears at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the squared gear
-    ratio of 79, shared by two wheels. It also prevents stick-slip flutter of stiffly driven wheels: without it a point
-    turn at 1.8 rad/s on a friction of 1.0 hops (9 m/s² rms at the camera), from 0.1 on there is none."""
-    motor_torque: float = 70.0
+    motor_inertia: Annotated[float, Range(0, 5)] = 0.15
+    """Inertia of rotor and gears at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the squared gear
+    ratio of 79, shared by two wheels. It also prevents stick-slip flutter of stiffly driven wheels: without it the
+    robot hops in a point turn at 1.8 rad/s on a friction of 1.0 (9 m/s² rms at the camera); 0.1 suffices."""
+    motor_torque: Annotated[float, Range(1, 500)] = 70.0
     """Torque limit of a side at its wheels [N m]; not published."""
-    motor_constant: float = 0.035
-    """Torque per current at the motor's shaft, net of losses of gear and belt [N m/A]; not published. With this value
-    the motors' continuous 8 A are 22 N m at the wheels of a side, and 70 N m are 25 A."""
+    motor_constant: Annotated[float, Range(0.0001, 10)] = 0.035
+    """Torque per current at the motor's shaft, net of losses of gear and belt [N m/A]; not published. By default the
+    motor's continuous 8 A give 22 N m at the wheels of a side."""
 
     # Controller.
-    max_speed: float = 1.0
+    max_speed: Annotated[float, Range(0.01, 5)] = 1.0
     """[m/s]"""
-    max_acceleration: float = 3.0
+    max_acceleration: Annotated[float, Range(0.01, 100)] = 3.0
     """[m/s²]"""
-    max_yaw_rate: float = 2.0
+    max_yaw_rate: Annotated[float, Range(0.01, 10)] = 2.0
     """[rad/s]"""
-    max_yaw_acceleration: float = 6.0
+    max_yaw_acceleration: Annotated[float, Range(0.01, 100)] = 6.0
     """[rad/s²]"""
-    max_wheel_speed: float = 1.0
-    """Limit of a tire's circumferential speed [m/s]; beyond it both sides are scaled down alike."""
-    separation_multiplier: float = 1.875
+    max_wheel_speed: Annotated[float, Range(0.01, 5)] = 1.0
+    """Limit of a tire's circumferential speed [m/s], to which both sides are scaled down together."""
+    separation_multiplier: Annotated[float, Range(0.5, 5)] = 1.875
     """Clearpath's `wheel_separation_multiplier`: the controller's estimate of chi."""
-    command_latency: float = 0.0
+    command_latency: Annotated[float, Range(0, 2)] = 0.0
     """Delay from a command to the controller's action [s]."""
 
     # Front camera.
-    camera_height: float = 0.6
+    camera_height: Annotated[float, Range(0.05, 3)] = 0.6
     """Height of the lens above flat ground [m]."""
-    camera_offset: tuple[float, float] = (0.36, 0.0)
+    camera_offset: Annotated[tuple[float, float], Range(-2, 2)] = (0.36, 0.0)
     """Position of the lens forward and left of the base origin [m]."""
-    camera_pitch: float = 5.0
+    camera_pitch: Annotated[float, Range(-90, 90)] = 5.0
     """Downward angle [°]."""
-    camera_yaw: float = 0.0
+    camera_yaw: Annotated[float, Range(-180, 180)] = 0.0
     """Angle to the left [°]."""
-    camera_roll: float = 0.0
+    camera_roll: Annotated[float, Range(-180, 180)] = 0.0
     """Angle of leaning to the right [°]."""
-    camera_intrinsics: tuple[float, ...] = ()
-    """fx, fy, cx, cy at `camera_size` [px]; empty: those of the film in a scene, otherwise those of a ZED 2."""
-    camera_size: tuple[int, int] = ZED2.size
-    """Width, height of native images [px], which `camera_intrinsics` refer to."""
-    camera_latency: float = 0.0
+    camera_intrinsics: Annotated[tuple[float, ...], Range(-100_000, 100_000)] = ()
+    """fx, fy, cx, cy at `camera_size` [px]; if empty, those of the scene's film, or of a ZED 2 without a scene."""
+    camera_size: Annotated[tuple[int, int], Range(1, 20_000)] = ZED2.size
+    """Width, height of native images [px]."""
+    camera_latency: Annotated[float, Range(0, 2)] = 0.0
     """Delay from exposure to the policy's receipt of the image [s]."""
 
     def __post_init__(self) -> None:
@@ -159,12 +159,12 @@ class HuskyParams:
             raise InputError(f"camera_intrinsics = {list(self.camera_intrinsics)}; expected [fx, fy, cx, cy]")
         if self.camera_intrinsics and min(self.camera_intrinsics[:2]) <= 0:
             raise InputError(f"camera_intrinsics = {list(self.camera_intrinsics)}; expected fx, fy > 0 [px]")
-        for name, (low, high) in _RANGES.items():
+        for name, bound in setting_ranges(HuskyParams).items():
             for value in np.atleast_1d(getattr(self, name)).tolist():
-                if not low <= value <= high:
-                    raise InputError(f"{name} = {value:g}; expected {low:g} to {high:g}")
-        if self.wheel_shape not in WHEEL_SHAPES:
-            raise InputError(f"wheel_shape = {self.wheel_shape!r}; expected {' or '.join(WHEEL_SHAPES)}")
+                if not bound.low <= value <= bound.high:
+                    raise InputError(f"{name} = {value:g}; expected {bound.low:g} to {bound.high:g}")
+        if self.wheel_shape not in ("ellipsoid", "cylinder"):
+            raise InputError(f"wheel_shape = {self.wheel_shape!r}; expected ellipsoid or cylinder")
 
     @property
     def camera_position(self) -> tuple[float, float, float]:
@@ -186,39 +186,3 @@ class HuskyParams:
             return fallback
         fx, fy, cx, cy = self.camera_intrinsics
         return PixelCamera((fx, fy, cx, cy), self.camera_size)
-
-
-WHEEL_SHAPES = ("ellipsoid", "cylinder")
-
-# Ranges of values: wide enough for any Husky, narrow enough to catch millimetres, degrees and percent.
-_RANGES: dict[str, tuple[float, float]] = {
-    "center_of_mass": (-0.5, 0.5),
-    "payload_mass": (0.0, 100.0),
-    "payload_position": (-2.0, 2.0),
-    "friction": (0.01, 3.0),
-    "rolling_resistance": (0.0, 0.5),
-    "wheel_radius": (0.1, 0.25),
-    "spin_friction": (0.0, 1.0),
-    "slip_stiffness": (1e-3, 1e3),
-    "ground_viscosity": (0.0, 1e3),
-    "servo_gain": (1.0, 1e5),
-    "servo_lag": (0.0, 2.0),
-    "motor_inertia": (0.0, 5.0),
-    "motor_torque": (1.0, 500.0),
-    "motor_constant": (1e-4, 10.0),
-    "max_speed": (0.01, 5.0),
-    "max_acceleration": (0.01, 100.0),
-    "max_yaw_rate": (0.01, 10.0),
-    "max_yaw_acceleration": (0.01, 100.0),
-    "max_wheel_speed": (0.01, 5.0),
-    "separation_multiplier": (0.5, 5.0),
-    "command_latency": (0.0, 2.0),
-    "camera_height": (0.05, 3.0),
-    "camera_offset": (-2.0, 2.0),
-    "camera_pitch": (-90.0, 90.0),
-    "camera_yaw": (-180.0, 180.0),
-    "camera_roll": (-180.0, 180.0),
-    "camera_intrinsics": (-1e5, 1e5),
-    "camera_size": (1, 20_000),
-    "camera_latency": (0.0, 2.0),
-}

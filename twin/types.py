@@ -1,4 +1,9 @@
-"""Array types shared by all packages; shapes and units are in the docstrings of their users."""
+"""Array types shared by all packages, whose shapes and units their users state, and ranges of settings."""
+
+import math
+import typing
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,3 +15,18 @@ Array32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
 """RGB, shape (height, width, 3), or (n, height, width, 3)."""
 Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a setting, both included: `Annotated[float, Range(0, 1)]`."""
+
+    low: float
+    high: float = math.inf
+
+
+@cache
+def setting_ranges(kind: type) -> dict[str, Range]:
+    """The ranges of a dataclass's fields, by name, for those that have one."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {name: bound for name, hint in hints.items() for bound in getattr(hint, "__metadata__", ())}

@@ -4,8 +4,8 @@
 outside its piece [m]. *Uncovered*: fraction of a piece's surface further than the protrusion bound from every part.
 
 CoACD has crashed, grown shapes, closed doorways and returned different results for one seed. So it runs in child
-processes with one thread and a time limit, its results are cached by a hash of their inputs, and parts that protrude
-too far are split.
+processes with one thread and a time limit, its results are cached by a hash of the input, and parts that protrude too
+far are split.
 """
 
 import argparse
@@ -30,8 +30,8 @@ from twin.files import digest_json
 from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
 
-_MAX_COACD_FACES = 400  # CoACD gets a mesh decimated to this, since its time grows fast; the check uses all faces
-_TIME_LIMIT = 120.0  # [s] per piece; far more than any needs, so that a busy machine does not change the result
+_MAX_COACD_FACES = 400  # meshes for CoACD are decimated to this, since its time grows fast; checks use all faces
+_TIME_LIMIT = 120.0  # [s] per piece, far more than any needs: a busy machine shall not change the result
 _PROCESSES = 2
 _MAX_HULL_VERTICES = 32
 _SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
@@ -77,13 +77,13 @@ class SolidPiece:
     tree: cKDTree
     """Search tree of the samples."""
     inside: Callable[[Array], NDArray[np.bool_]]
-    """Maps points (k, 3) to the mask (k,) of those inside the mesh."""
+    """Maps points (k, 3) to a mask (k,) of those inside the mesh."""
 
     @staticmethod
     def from_mesh(
         vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None
     ) -> "SolidPiece":
-        """Makes a piece from a mesh. `inside` is an optional, faster inside test; the default uses winding numbers."""
+        """Samples a mesh. `inside` is a faster test than the default, which computes winding numbers."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         samples = surface_samples(vertices, faces, _SAMPLE_SPACING)
 
@@ -96,9 +96,8 @@ class SolidPiece:
         """Protrusion of a part [m], overestimated by up to half the sample spacing."""
         points = surface_samples(part.vertices, part.faces, 2 * _SAMPLE_SPACING)
         away = self.tree.query(points)[0]
-        far = np.flatnonzero(away > _SAMPLE_SPACING)
-        outside = far[~self.inside(points[far])]
-        return float(away[outside].max(initial=0.0))
+        far = away > _SAMPLE_SPACING
+        return float(away[far][~self.inside(points[far])].max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -106,8 +105,6 @@ class Decomposition:
     """Convex parts of all pieces, and statistics."""
 
     parts: list[ConvexPart]
-    piece: NDArray[np.int64]
-    """Index of each part's piece, shape (n,)."""
     protrusion: Array
     """Protrusion of each part [m], shape (n,)."""
     uncovered: float
@@ -126,49 +123,38 @@ def decompose(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) ->
     A piece whose hull is within the bound [m] becomes that hull. If CoACD fails on a piece, its hull is split instead.
     `cache` is the folder of earlier CoACD results, created if missing.
     """
-    hulls = [ConvexPart.hull(piece.vertices) for piece in pieces]
-    protrusions = [
-        np.inf if hull is None else piece.protrusion(hull) for hull, piece in zip(hulls, pieces, strict=True)
-    ]
-    complex_ = [i for i, protrusion in enumerate(protrusions) if protrusion > bound]
-    results, cached = _run_coacd([pieces[i] for i in complex_], bound, cache, seed)
-    parts_of = [
-        [(hull, protrusion)] if hull is not None and protrusion <= bound else []
-        for hull, protrusion in zip(hulls, protrusions, strict=True)
-    ]
+    parts_of: list[list[tuple[ConvexPart, float]]] = []
+    for piece in pieces:
+        hull = ConvexPart.hull(piece.vertices)
+        parts_of.append([] if hull is None else [(hull, piece.protrusion(hull))])
+    concave = [i for i, parts in enumerate(parts_of) if not parts or parts[0][1] > bound]
+    results, cached = _run_coacd([pieces[i] for i in concave], bound, cache, seed)
     failed = split = 0
     uncovered = 0.0
-    for i, result in zip(complex_, results, strict=True):
-        hull = hulls[i]
-        coarse = [hull] if hull is not None else []
-        fitted = [split_to_bound(part, pieces[i], bound) for part in result or coarse]
-        fraction = uncovered_fraction(pieces[i], [part for parts in fitted for part, _ in parts], bound)
+    for i, result in zip(concave, results, strict=True):
+        piece, hulls = pieces[i], [hull for hull, _ in parts_of[i]]
+        fitted = [split_to_bound(part, piece, bound) for part in result or hulls]
+        fraction = uncovered_fraction(piece, [part for parts in fitted for part, _ in parts], bound)
         bad = result is None or fraction > _MAX_UNCOVERED
         failed += bad
         if bad and result is not None:
-            fitted = [split_to_bound(part, pieces[i], bound) for part in coarse]
-            fraction = uncovered_fraction(pieces[i], [part for parts in fitted for part, _ in parts], bound)
+            fitted = [split_to_bound(part, piece, bound) for part in hulls]
+            fraction = uncovered_fraction(piece, [part for parts in fitted for part, _ in parts], bound)
         split += sum(len(parts) > 1 for parts in fitted)
-        uncovered += fraction * len(pieces[i].samples)
+        uncovered += fraction * len(piece.samples)
         parts_of[i] = [item for parts in fitted for item in parts]
-    total = max(sum(len(piece.samples) for piece in pieces), 1)
-    return Decomposition(
-        [part for items in parts_of for part, _ in items],
-        np.array([i for i, items in enumerate(parts_of) for _ in items], np.int64),
-        np.array([protrusion for items in parts_of for _, protrusion in items], np.float64),
-        uncovered / total,
-        failed,
-        split,
-        cached,
-    )
+    items = [item for parts in parts_of for item in parts]
+    samples = max(sum(len(piece.samples) for piece in pieces), 1)
+    protrusions = np.array([protrusion for _, protrusion in items], np.float64)
+    return Decomposition([part for part, _ in items], protrusions, uncovered / samples, failed, split, cached)
 
 
 def split_to_bound(
     part: ConvexPart, piece: SolidPiece, bound: float, max_splits: int = _MAX_SPLITS
 ) -> list[tuple[ConvexPart, float]]:
-    """Splits a part until its pieces protrude by at most `bound` [m]; returns the parts with their protrusions [m].
+    """Splits a part until none protrudes by more than `bound` [m]; returns the parts with their protrusions [m].
 
-    A split halves the surface inside the part along its longest axis and takes the hull of each half.
+    A split halves the piece's surface inside the part along its longest axis and takes the hull of each half.
     """
     protrusion = piece.protrusion(part)
     if max_splits == 0 or protrusion <= bound:
@@ -230,7 +216,7 @@ def surface_samples(vertices: Array, faces: NDArray, spacing: float) -> Array:
 def winding_number(points: Array, vertices: Array, faces: NDArray) -> Array:
     """Winding number of a closed mesh around points (k, 3): 1 inside, 0 outside; shape (k,).
 
-    The sum of signed solid angles over 4π (van Oosterom & Strackee 1983, eq. 8).
+    It is the sum of signed solid angles over 4π (van Oosterom & Strackee 1983, eq. 8).
     """
     out = np.zeros(len(points))
     corners = vertices[faces]
@@ -260,7 +246,7 @@ def _run_coacd(
         np.savez(source, vertices=piece.vertices, faces=piece.faces, bound=bound, seed=seed)
     with runtime.bar("convex parts", len(pending), "piece") as bar, ThreadPoolExecutor(_PROCESSES) as pool:
         # Interleaved, so that both children get large and small pieces.
-        queues = [[(job[0], job[1]) for job in pending[k::_PROCESSES]] for k in range(_PROCESSES)]
+        queues = [[job[:2] for job in pending[k::_PROCESSES]] for k in range(_PROCESSES)]
         stopped = threading.Event()
         try:
             list(pool.map(lambda queue: _run_children(queue, bar, stopped), queues))
@@ -274,10 +260,7 @@ def _run_coacd(
 
 
 def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
-    """Runs child processes in sequence until every job has succeeded or crashed its process.
-
-    Returns early if `stopped` is set.
-    """
+    """Runs child processes one after another until every job has a result or failed, or until `stopped` is set."""
     pending = list(jobs)
     while pending:
         command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in pending for path in job)]
@@ -302,7 +285,7 @@ def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: thr
             return
         finished = sum(target.exists() for _, target in pending)
         bar.update(finished - done)
-        # Jobs run in order: the first without a result is the one that crashed or timed out.
+        # Jobs run in order, so the first without a result crashed or timed out.
         pending = [job for job in pending if not job[1].exists()][1:]
 
 
@@ -315,7 +298,7 @@ def _read_parts(path: Path) -> list[ConvexPart] | None:
 
 
 def _decompose_files(paths: list[Path]) -> None:
-    """Decomposes one file after another (in the child process); each result is renamed into place when complete."""
+    """Runs CoACD on files, each followed by the path of its result (in the child process)."""
     import coacd
 
     coacd.set_log_level("off")
@@ -331,7 +314,7 @@ def _decompose_files(paths: list[Path]) -> None:
             coacd.Mesh(vertices, faces),
             threshold=bound,
             real_metric=True,
-            # The pieces are closed already, and the results are checked, so a coarse search suffices: 10 times faster.
+            # Pieces are closed and results are checked, so a coarse search, 10 times as fast, suffices.
             preprocess_mode="off",
             resolution=200,
             mcts_nodes=5,

@@ -1,7 +1,7 @@
 """Ground height field, fitted to rendered depth, sparse points and the camera path.
 
-*Datum*: a measured height z ± σ at (x, y), of one of three kinds: `field` (rendered pixels on near-level surfaces),
-`points` (structure from motion) and `path` (camera centers minus the camera height).
+A height datum is a height z ± σ measured at (x, y), of one of three kinds: `field` (rendered pixels on near-level
+surfaces), `points` (structure from motion) and `path` (camera centers minus the camera height).
 """
 
 from dataclasses import dataclass, replace
@@ -43,11 +43,24 @@ class Ground:
         return _interpolate(self.height, self.origin, self.cell, xy, order=1)
 
     def coarsened(self, cell: float) -> "Ground":
-        """Every n-th node, n = cell / own cell rounded; a remainder at the far edges is cut off."""
+        """Every n-th node, where n = cell / self.cell, rounded; a remainder at the far edges is cut off."""
         n = max(1, round(cell / self.cell))
         rows, columns = ((size - 1) // n * n + 1 for size in self.height.shape)
         nodes = np.s_[:rows:n, :columns:n]
         return Ground(self.height[nodes], self.origin, self.cell * n, self.measured[nodes], self.rgb[nodes])
+
+    def triangles(self, cell: float, max_faces: int) -> tuple[Array, NDArray[np.int64]]:
+        """Vertices (v, 3) [m] and upward faces (f, 3) on every n-th node, at least `cell` [m] wide, ≤ `max_faces`."""
+        rows, columns = self.height.shape
+        step = max(1, round(cell / self.cell), int(np.ceil(np.sqrt(2 * rows * columns / max_faces))))
+        row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))
+        grid_c, grid_r = np.meshgrid(column, row)
+        xy = self.origin + self.cell * np.stack([grid_c, grid_r], -1)
+        vertices = np.concatenate([xy, self.height[grid_r, grid_c][..., None]], -1).reshape(-1, 3)
+        node = np.arange(len(vertices)).reshape(grid_r.shape)
+        a, b, c, d = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
+        faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+        return vertices, faces.astype(np.int64)
 
     def save(self, folder: Path) -> None:
         """Writes `ground.npz`."""
@@ -81,8 +94,7 @@ def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: in
     return map_coordinates(height, at, order=order, mode="nearest").reshape(np.shape(xy)[:-1])
 
 
-# ---- ground fit
-
+# ---- height data
 
 DATA_KINDS = ("field", "points", "path")
 _MIN_UPRIGHT = 0.94  # z of a normal (20° from vertical); steeper surfaces are no ground
@@ -92,18 +104,13 @@ _SIGMA_POINTS = 0.04  # [m] σ of a cell's median sparse point
 _SIGMA_PATH = 0.012  # [m] σ of the path of a rigidly mounted camera
 _LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] beside the path, where the wheels drove
 _CROSS_SLOPE = 0.02  # possible cross slope of a road, which the path does not measure
-_COARSE_NODES, _FINE_NODES = 40_000, 200_000
-_SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed as noise
-_EXTRAPOLATION_LENGTH = 8.0  # [m] over which slopes are continued where there are no data
-_REWEIGHTINGS = 6
-_MAX_CELLS = 1_500_000
+_DATA_CELL = 0.25  # [m] side of the squares with one datum each
 _MAX_DEPTH = 18.0  # [m] ground beyond this depth fills only a few pixel rows
-_MIN_DATA = 50  # data; with fewer the ground is flat
 
 
 @dataclass(frozen=True)
 class HeightData:
-    """k measured heights."""
+    """k height data."""
 
     xyz: Array
     """Shape (k, 3) [m]."""
@@ -119,6 +126,114 @@ class HeightData:
     @staticmethod
     def join(parts: list["HeightData"]) -> "HeightData":
         return HeightData(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("xyz", "sigma", "kind")))
+
+
+def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
+    """One datum per occupied square of side `cell` [m]: mean x and y, median z and smallest σ of its points.
+
+    σ does not fall with the number of points, since errors of neighbors are correlated.
+    """
+    if len(xyz) == 0:
+        return HeightData.empty()
+    key = np.floor(xyz[:, :2] / cell).astype(np.int64)
+    key -= key.min(0)
+    flat = key[:, 0] * (key[:, 1].max() + 1) + key[:, 1]
+    order = np.lexsort((xyz[:, 2], flat))
+    flat, xyz, sigma = flat[order], xyz[order], sigma[order]
+    first = np.flatnonzero(np.diff(flat, prepend=-1))
+    count = np.diff(np.append(first, len(flat)))
+    xy = np.add.reduceat(xyz[:, :2], first, axis=0) / count[:, None]
+    # A single point is less reliable than several.
+    smallest = np.minimum.reduceat(sigma, first) * (1.0 + 1.0 / count)
+    median = xyz[first + count // 2, 2]
+    return HeightData(np.column_stack([xy, median]), smallest, np.full(len(first), kind, np.int8))
+
+
+def _field_data(views: Views) -> tuple[HeightData, Array, NDArray[np.uint8]]:
+    """Data from near-level rendered pixels, one per cell, and points (k, 3) and colors (k, 3) of these pixels."""
+    points, sigmas, colors = [], [], []
+    for i in range(len(views)):
+        depth = views.depth[i]
+        keep = (depth > 0) & (depth < _MAX_DEPTH) & (views.upward[i] > _MIN_UPRIGHT)
+        points.append(views.points(i)[keep])
+        # A depth error of 2 % is an error of slant times as much in height.
+        sigmas.append(np.hypot(_SIGMA_FIELD, 0.02 * depth[keep] * views.slant[i][keep]))
+        colors.append(views.rgb[i][keep])
+    xyz = np.concatenate(points)
+    return cell_medians(xyz, np.concatenate(sigmas), _DATA_CELL, 0), xyz, np.concatenate(colors)
+
+
+def _path_data(
+    cameras: Cameras, ground_height: Array | None, camera_height: float
+) -> tuple[HeightData, dict[str, dict]]:
+    """Data from the camera path minus the camera height, with σ from how steadily each source was carried.
+
+    Args:
+        cameras: n metric cameras.
+        ground_height: Ground height below each camera by the other kinds of data [m], shape (n,); None = unknown.
+        camera_height: The height that set the scale [m]; 0 = the median of each source above `ground_height`.
+    """
+    parts, metrics = [], {}
+    for index in source_frames(cameras):
+        index = index[path_inliers(cameras.positions[index])]
+        position = cameras.positions[index]
+        above = position[:, 2] - (ground_height[index] if ground_height is not None else 0.0)
+        height = camera_height if camera_height > 0 else float(np.median(above))
+        z = position[:, 2] - height
+        level = gaussian_filter1d(z, 2.0, mode="nearest") if len(z) > 4 else z
+        rapid = 1.4826 * float(np.median(np.abs(z - level)))
+        slow = 0.0
+        if ground_height is not None and len(z) > 4:
+            drift = gaussian_filter1d(above, 4.0, mode="nearest")
+            slow = 1.4826 * float(np.median(np.abs(drift - np.median(drift))))
+        # The other kinds of data vary by about 3 cm themselves; the rest is the motion of the camera.
+        sigma = float(np.sqrt(_SIGMA_PATH**2 + rapid**2 + max(0.0, slow**2 - 0.03**2)))
+        metrics[cameras.sources[index[0]]] = {
+            "camera_height_m": height,
+            "rapid_m": rapid,
+            "slow_m": slow,
+            "sigma_m": sigma,
+        }
+        if len(index) >= 2:
+            parts.append(_path_strip(np.column_stack([position[:, :2], z]), sigma))
+    return (HeightData.join(parts) if parts else HeightData.empty()), metrics
+
+
+def _path_strip(xyz: Array, sigma: float) -> HeightData:
+    """Data on the path and beside it, about every 0.25 m except across gaps in the film."""
+    step = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1)
+    typical = np.median(step[step > 0.02]) if (step > 0.02).any() else 0.0
+    points, sigmas = [], []
+    for a, b, length in zip(xyz[:-1], xyz[1:], step, strict=True):
+        if not 0.02 < length <= 4.0 * typical:
+            continue
+        along = (b - a)[:2] / length
+        left = np.array([-along[1], along[0]])
+        count = max(1, round(length / _DATA_CELL))
+        for fraction in (np.arange(count) + 0.5) / count:
+            for offset in _LATERAL_OFFSETS:
+                points.append(np.append((a + fraction * (b - a))[:2] + offset * left, a[2] + fraction * (b - a)[2]))
+                sigmas.append(np.hypot(sigma, _CROSS_SLOPE * abs(offset)))
+    return HeightData(np.array(points).reshape(-1, 3), np.array(sigmas), np.full(len(points), 2, np.int8))
+
+
+def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> float:
+    """Median height of data above the path data within `reach` [m]; 0 with fewer than ten pairs."""
+    if len(path.xyz) == 0 or len(data.xyz) == 0:
+        return 0.0
+    away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=reach)
+    paired = np.isfinite(away)
+    return float(np.median(data.xyz[paired, 2] - path.xyz[nearest[paired], 2])) if paired.sum() >= 10 else 0.0
+
+
+# ---- fit
+
+_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m], and upper bounds
+_MAX_CELLS = 1_500_000
+_SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed as noise
+_EXTRAPOLATION_LENGTH = 8.0  # [m] over which slopes continue without data
+_REWEIGHTINGS = 6
+_MIN_DATA = 50  # with fewer data the ground is flat
 
 
 @dataclass(frozen=True)
@@ -160,8 +275,8 @@ def fit_height(
 
         Σ ρ((h(xᵢ, yᵢ) − zᵢ) / σᵢ) + λ Σ |second differences of h|² + μ Σ |first differences of h|²
 
-    with the Geman-McClure loss ρ, by iteratively reweighted least squares with sparse factorization. The second
-    differences keep slopes and remove bumps; the first differences only limit how far a slope continues without data.
+    with the Geman-McClure loss ρ, by iteratively reweighted least squares with sparse factorization. The second term
+    smooths bumps but not slopes; the last one limits how far a slope continues without data.
 
     At least one datum must be inside the grid. The first weights come from the heights `initial` (rows, columns) [m],
     or are equal. Returns heights (rows, columns) [m], and the final weight of each datum in [0, 1], shape (k,).
@@ -174,12 +289,12 @@ def fit_height(
     robust = np.ones(len(z))
     for iteration in range(iterations):
         if height is not None:
-            # The width of the loss shrinks from 3 σ to 2 σ, so that a poor first solution does not reject good data.
+            # The width of the loss shrinks from 3 σ to 2 σ: a poor first solution shall not reject good data.
             width = (max(3.0 - iteration / 2, 2.0) if initial is None else 2.0) * sigma
             robust = (1.0 + ((height[node] - z) / width) ** 2) ** -2
         weight = robust / sigma**2
         system = (smooth + sparse.diags_array(np.bincount(node, weight, count))).tocsc()
-        # Symmetric positive definite: no pivoting, and an ordering of Aᵀ + A instead of AᵀA, make it 4 times as fast.
+        # Symmetric positive definite: without pivoting, and with an ordering of Aᵀ + A, it is 4 times as fast.
         factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         height = factors.solve(np.bincount(node, weight * z, count))
     assert height is not None
@@ -206,134 +321,20 @@ def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
     return (bend * (xx.T @ xx + yy.T @ yy + 2.0 * xy.T @ xy) + flat * (x.T @ x + y.T @ y)).tocsr()
 
 
-def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
-    """One datum per occupied square of side `cell` [m]: mean x and y, median z and smallest σ of its points.
-
-    σ does not fall with the number of points, since the errors of neighboring pixels and points are correlated.
-    """
-    if len(xyz) == 0:
-        return HeightData.empty()
-    key = np.floor(xyz[:, :2] / cell).astype(np.int64)
-    key -= key.min(0)
-    flat = key[:, 0] * (key[:, 1].max() + 1) + key[:, 1]
-    order = np.lexsort((xyz[:, 2], flat))
-    flat, xyz, sigma = flat[order], xyz[order], sigma[order]
-    first = np.flatnonzero(np.diff(flat, prepend=-1))
-    count = np.diff(np.append(first, len(flat)))
-    middle = first + count // 2
-    xy = np.add.reduceat(xyz[:, :2], first, axis=0) / count[:, None]
-    best = np.minimum.reduceat(sigma, first)
-    # A single point is less reliable than several.
-    few = 1.0 + 1.0 / count
-    return HeightData(np.column_stack([xy, xyz[middle, 2]]), best * few, np.full(len(first), kind, np.int8))
-
-
-def field_data(views: Views, cell: float, far: float) -> tuple[HeightData, Array, NDArray[np.uint8]]:
-    """Data from near-level rendered pixels, one per cell, and the points (k, 3) and colors (k, 3) of these pixels."""
-    points, sigmas, colors = [], [], []
-    for i in range(len(views)):
-        depth = views.depth[i]
-        keep = (depth > 0) & (depth < far) & (views.upward[i] > _MIN_UPRIGHT)
-        points.append(views.points(i)[keep])
-        # The error of a pixel is 2 % of its depth, which is slant times as much in height.
-        sigmas.append(np.hypot(_SIGMA_FIELD, 0.02 * depth[keep] * views.slant[i][keep]))
-        colors.append(views.rgb[i][keep])
-    xyz = np.concatenate(points)
-    return cell_medians(xyz, np.concatenate(sigmas), cell, 0), xyz, np.concatenate(colors)
-
-
-def point_data(points: SparsePoints, cell: float) -> HeightData:
-    """Data from sparse points in at least three frames, one per cell; many are on obstacles, which the gate removes."""
-    keep = (points.track_length >= 3) & (points.error < 2.0)
-    return cell_medians(points.xyz[keep], np.full(keep.sum(), _SIGMA_POINTS), cell, 1)
-
-
-def path_data(
-    cameras: Cameras, ground_height: Array | None, camera_height: float
-) -> tuple[HeightData, dict[str, dict]]:
-    """Data from the camera path minus the camera height, with σ from how steadily each source was carried.
-
-    Args:
-        cameras: Metric cameras.
-        ground_height: Ground height below each camera from the other kinds of data, shape (n,) [m]; None = unknown.
-        camera_height: The height that set the scale [m]; 0 = the median of each source above `ground_height`.
-    """
-    parts, metrics = [], {}
-    for index in source_frames(cameras):
-        index = index[path_inliers(cameras.positions[index])]
-        position = cameras.positions[index]
-        above = position[:, 2] - (ground_height[index] if ground_height is not None else 0.0)
-        height = camera_height if camera_height > 0 else float(np.median(above))
-        z = position[:, 2] - height
-        level = gaussian_filter1d(z, 2.0, mode="nearest") if len(z) > 4 else z
-        rapid = 1.4826 * float(np.median(np.abs(z - level)))
-        slow = 0.0
-        if ground_height is not None and len(z) > 4:
-            drift = gaussian_filter1d(above, 4.0, mode="nearest")
-            slow = 1.4826 * float(np.median(np.abs(drift - np.median(drift))))
-        # The other kinds of data vary by about 3 cm themselves; only the rest comes from carrying the camera.
-        sigma = float(np.sqrt(_SIGMA_PATH**2 + rapid**2 + max(0.0, slow**2 - 0.03**2)))
-        metrics[cameras.sources[index[0]]] = {
-            "camera_height_m": height,
-            "rapid_m": rapid,
-            "slow_m": slow,
-            "sigma_m": sigma,
-        }
-        if len(index) < 2:
-            continue
-        parts.append(_path_strip(np.column_stack([position[:, :2], z]), sigma))
-    return (HeightData.join(parts) if parts else HeightData.empty()), metrics
-
-
-def _path_strip(xyz: Array, sigma: float) -> HeightData:
-    """Data on the path and beside it, about every 0.25 m; none across gaps in the film."""
-    step = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1)
-    typical = np.median(step[step > 0.02]) if (step > 0.02).any() else 0.0
-    points, sigmas = [], []
-    for a, b, length in zip(xyz[:-1], xyz[1:], step, strict=True):
-        if not 0.02 < length <= 4.0 * typical:
-            continue
-        along = (b - a)[:2] / length
-        left = np.array([-along[1], along[0]])
-        for fraction in (np.arange(max(1, round(length / 0.25))) + 0.5) / max(1, round(length / 0.25)):
-            for offset in _LATERAL_OFFSETS:
-                points.append(np.append((a + fraction * (b - a))[:2] + offset * left, a[2] + fraction * (b - a)[2]))
-                sigmas.append(np.hypot(sigma, _CROSS_SLOPE * abs(offset)))
-    return HeightData(np.array(points).reshape(-1, 3), np.array(sigmas), np.full(len(points), 2, np.int8))
-
-
-def within_gate(data: HeightData, level: Array, distance: Array) -> HeightData:
-    """The data within a gate around a first estimate `level` (k,) [m]; it widens with the distance (k,) to the path."""
-    keep = np.abs(data.xyz[:, 2] - level) < _GATE + _GATE_PER_METER * distance
-    return HeightData(data.xyz[keep], data.sigma[keep], data.kind[keep])
-
-
-def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> float:
-    """Median height of data above path data within `reach` [m]; 0 with fewer than ten pairs."""
-    if len(path.xyz) == 0 or len(data.xyz) == 0:
-        return 0.0
-    away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=reach)
-    paired = np.isfinite(away)
-    return float(np.median(data.xyz[paired, 2] - path.xyz[nearest[paired], 2])) if paired.sum() >= 10 else 0.0
-
-
-def fit_coarse_to_fine(data: HeightData, low: Array, high: Array, cell: float) -> tuple[Array, HeightGrid, Array]:
-    """Coarse-to-fine fit over the box `low` to `high`: heights, their grid, and the weight of each datum."""
-    coarse = HeightGrid.covering(low, high, 0.5, _COARSE_NODES)
-    height, _ = fit_height(data, coarse)
-    fine = HeightGrid.covering(low, high, max(0.25, cell), _FINE_NODES)
-    height, weights = fit_height(data, fine, coarse.sample(height, fine.nodes(), order=3), iterations=1)
-    return height, fine, weights
-
-
 def fit_low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig) -> tuple[Array, HeightGrid, Array]:
-    """The fit at `ground_cell`, low-passed by `ground_smoothing`: heights, their grid, and the weight of each datum."""
+    """Coarse-to-fine fit over the box `low` to `high` (x, y), low-passed by `ground_smoothing`.
+
+    Returns heights [m] on a grid of `ground_cell`, the grid, and the weight of each datum.
+    """
     grid = HeightGrid.covering(low, high, config.ground_cell, _MAX_CELLS)
     if len(data.xyz) < _MIN_DATA:
         surface, weights = np.zeros((grid.rows, grid.columns)), np.zeros(len(data.xyz))
     else:
-        solved, fine, weights = fit_coarse_to_fine(data, low, high, grid.cell)
-        surface = fine.sample(solved, grid.nodes(), order=3)
+        coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES)
+        height, _ = fit_height(data, coarse)
+        fine = HeightGrid.covering(low, high, max(0.25, grid.cell), _FINE_NODES)
+        height, weights = fit_height(data, fine, coarse.sample(height, fine.nodes(), order=3), iterations=1)
+        surface = fine.sample(height, grid.nodes(), order=3)
     return gaussian_filter(surface, config.ground_smoothing / grid.cell, mode="nearest"), grid, weights
 
 
@@ -347,24 +348,29 @@ def build_ground(
 ) -> tuple[Ground, dict[str, Any]]:
     """Fits the ground over a box, given by its low and high corners (x, y) [m]; also returns metrics for the report.
 
-    `height` is the camera height that set the scale [m]; 0 = estimated per source; None = the path is not used (an
-    object filmed from around).
+    `height` is the camera height that set the scale [m]; 0 = estimate it per source; None = do not use the path (an
+    object was filmed from around it).
     """
     low, high = box
-    coarse = HeightGrid.covering(low, high, 0.5, _COARSE_NODES)
-    path, path_metrics = path_data(cameras, None, height) if height is not None else (HeightData.empty(), {})
+    coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES)
+    path, path_metrics = _path_data(cameras, None, height) if height is not None else (HeightData.empty(), {})
     level = fit_height(path, coarse, iterations=1)[0] if len(path.xyz) else np.zeros((coarse.rows, coarse.columns))
     tree = cKDTree(path.xyz[:, :2]) if len(path.xyz) else None
-    field, pixels, colors = field_data(views, 0.25, _MAX_DEPTH)
+    field, pixels, colors = _field_data(views)
+    good = (points.track_length >= 3) & (points.error < 2.0)
+    sparse_points = cell_medians(points.xyz[good], np.full(good.sum(), _SIGMA_POINTS), _DATA_CELL, 1)
     visible = []
-    for data in (field, point_data(points, 0.25)):
+    for data in (field, sparse_points):
         away = tree.query(data.xyz[:, :2])[0] if tree is not None else np.zeros(len(data.xyz))
-        visible.append(within_gate(data, coarse.sample(level, data.xyz[:, :2]), away))
+        # Many points are on obstacles, far from the level of the path.
+        gap = np.abs(data.xyz[:, 2] - coarse.sample(level, data.xyz[:, :2]))
+        keep = gap < _GATE + _GATE_PER_METER * away
+        visible.append(HeightData(data.xyz[keep], data.sigma[keep], data.kind[keep]))
     bias = [0.0, 0.0]
     if height is not None and sum(len(data.xyz) for data in visible) >= _MIN_DATA:
         below = coarse.sample(fit_height(HeightData.join(visible), coarse)[0], cameras.positions[:, :2])
-        path, path_metrics = path_data(cameras, below, height)
-        # Each kind has an offset in height (blurred depth, a tilted scale), which would leave a step beside the path.
+        path, path_metrics = _path_data(cameras, below, height)
+        # Each kind has an offset in height (blurred depth, tilted scale), which would leave a step beside the path.
         bias = [bias_to_path(data, path) for data in visible]
         visible = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(visible, bias, strict=True)]
     data = HeightData.join([*visible, path])
@@ -393,7 +399,7 @@ def build_ground(
 
 
 def _mean_colors(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Mean color per cell; cells without pixels get the color of the nearest cell with pixels."""
+    """Mean color per cell; a cell without pixels has the color of the nearest one with pixels."""
     node, inside = grid.index(points[:, :2])
     count = np.bincount(node[inside], minlength=grid.rows * grid.columns)
     mean = np.stack(

@@ -1,21 +1,22 @@
 """Stage `mesh`: collision and visual geometry in meters from the radiance field.
 
-Writes `visual.npz` (colored triangles), `ground.npz` (height field), `parts.npz` (convex parts of the obstacles) and,
-for a drive, `route.npz` (the filmed path on the ground). Steps: render views, fit the ground, fuse the distance field
-above it, extract surface and solids, decompose the solids into convex parts, clear the corridor.
+Renders views of the field, fits the ground, fuses a distance field above it, extracts surface and solids, decomposes
+the solids into convex parts, and clears the corridor. Writes `visual.npz` (colored triangles), `ground.npz` (height
+field), `parts.npz` (convex parts of the obstacles) and, for a drive, `route.npz` (the filmed path on the ground).
 """
 
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from twin import runtime
 from twin.assets import convex, solids, tsdf
-from twin.assets import ground as assets_ground
-from twin.assets.ground import Ground
+from twin.assets.ground import Ground, build_ground
 from twin.assets.tsdf import FREE_SPACE_REACH, color_points
 from twin.assets.views import ColorField, Views, render_views
 from twin.config import SceneConfig
@@ -33,7 +34,7 @@ _SPECK_AREA = 0.25  # [m²] smaller components are floaters
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
-    """Runs the stage, see `twin.build`. Raises InputError: a route is required but the camera hardly moved."""
+    """Runs the stage, see `twin.build`. Raises InputError: a route is wanted but the camera hardly moved."""
     from twin.nerf.field import RadianceField
 
     field = RadianceField.load(scene.stage("field"), device)
@@ -46,38 +47,38 @@ def build_assets(
     field: ColorField, cameras: Cameras, points: SparsePoints, config: SceneConfig, out: Path, cache: Path
 ) -> dict[str, Any]:
     """Writes all files of the stage from any field; returns the metrics."""
-    stopwatch = _Stopwatch()
+    clock = [("start", time.perf_counter())]
     settings = config.mesh
     filmed = filmed_route(cameras, config.route) if config.mjcf.route else None
     route = filmed.line if filmed else None
     path = route if route is not None else cameras.positions[:, :2]
     low, high = path.min(0) - settings.margin, path.max(0) + settings.margin
     if route is None:
-        # Around an object only the near box of the field is resolved; the rest is background.
+        # Around an object, the field beyond its near box is background.
         low, high = np.maximum(low, field.bounds[0, :2]), np.minimum(high, field.bounds[1, :2])
     far = settings.margin + 2.0
     views = render_views(field, cameras, settings.views, settings.view_width, FREE_SPACE_REACH * far)
-    stopwatch.lap("render")
+    clock.append(("render", time.perf_counter()))
     height = _camera_height(config) if route is not None else None
-    ground, ground_metrics = assets_ground.build_ground(views, cameras, points, (low, high), settings, height)
+    ground, ground_metrics = build_ground(views, cameras, points, (low, high), settings, height)
     ground.save(out)
-    stopwatch.lap("ground")
+    clock.append(("ground", time.perf_counter()))
     top = float(ground.height.max()) + settings.max_height + _MARGIN_ABOVE
     box = np.stack([np.append(low, ground.height.min() - _MARGIN_BELOW), np.append(high, top)])
     hits = _surface_points(views, ground, box, far)
     volume = tsdf.fuse_volume(hits, views, box, settings.voxel, far)
-    stopwatch.lap("fuse")
+    clock.append(("fuse", time.perf_counter()))
     visual, visual_metrics = _visual_mesh(volume, views, ground)
     np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
-    stopwatch.lap("surface")
+    clock.append(("surface", time.perf_counter()))
     corridor = None
     if route is not None:
         corridor = solids.Corridor(route, config.mjcf.half_width + config.mjcf.corridor_margin)
         np.savez(out / "route.npz", xy=route, z=ground.at(route))
     pieces, left_out = solids.solid_pieces(volume, ground, corridor, cameras, settings)
-    stopwatch.lap("solids")
+    clock.append(("solids", time.perf_counter()))
     part_metrics = _save_parts(pieces, corridor, ground, config, out, cache)
-    stopwatch.lap("convex")
+    clock.append(("convex", time.perf_counter()))
     return {
         **part_metrics,
         **visual_metrics,
@@ -93,19 +94,8 @@ def build_assets(
         "bounds_m": box.tolist(),
         "route_length_m": path_length(route) if route is not None else None,
         "route": route_metrics(filmed) if filmed else None,
-        "seconds_of": stopwatch.laps,
+        "seconds_of": {name: end - start for (_, start), (name, end) in pairwise(clock)},
     }
-
-
-class _Stopwatch:
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = now - self._last
-        self._last = now
 
 
 def _camera_height(config: SceneConfig) -> float:
@@ -125,18 +115,19 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
 
 
 def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Colored triangles of the obstacles' seen surfaces and of the fitted ground, and metrics."""
+    """Colored triangles of the seen surfaces above the ground and of the ground itself, and metrics."""
     vertices, faces = tsdf.zero_level(volume.distance, volume.origin, volume.voxel)
     above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
     vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band)
-    # The back of the band is no surface: no view sees it.
+    # No view sees the back of the band, which is no surface.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
     vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * volume.band)
-    colors = _fill_colors(vertices, colors, seen)
-    ground_vertices, ground_faces = tsdf.height_mesh(ground, _VISUAL_GROUND_CELL, _VISUAL_FACES // 3)
+    if seen.any():
+        colors[~seen] = colors[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
+    ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, _VISUAL_FACES // 3)
     column, row = np.rint((ground_vertices[:, :2] - ground.origin) / ground.cell).astype(int).T
     rows, columns = ground.height.shape
     ground_colors = ground.rgb[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
@@ -151,16 +142,6 @@ def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dic
         "standing_faces": len(faces),
         "floaters_removed": floaters,
     }
-
-
-def _fill_colors(vertices: Array, colors: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    if known.all() or not known.any():
-        return colors
-    from scipy.spatial import cKDTree
-
-    out = colors.copy()
-    out[~known] = colors[known][cKDTree(vertices[known]).query(vertices[~known])[1]]
-    return out
 
 
 def _save_parts(
@@ -180,19 +161,17 @@ def _save_parts(
         kept, clipped = solids.clear_corridor(decomposition.parts, corridor, ground)
     dropped = len(kept) - config.mesh.max_parts
     if dropped > 0:
-        # Pieces and their parts are sorted by distance: the farthest, least relevant to the robot, are dropped.
+        # Parts are sorted by distance from the path; the farthest are the least relevant to the robot.
         kept = kept[: config.mesh.max_parts]
         runtime.log_line(f"  left out the {dropped} farthest convex parts: mesh.max_parts = {config.mesh.max_parts}")
     parts = [part for _, part in kept]
-    corners = [len(part.vertices) for part in parts]
-    triangles = [len(part.faces) for part in parts]
     empty = np.zeros((0, 3))
     np.savez(
         out / "parts.npz",
         vertices=np.concatenate([empty, *(part.vertices for part in parts)]).astype(np.float32),
         faces=np.concatenate([empty, *(part.faces for part in parts)]).astype(np.int32),
-        vertex_start=np.concatenate([[0], np.cumsum(corners)]).astype(np.int64),
-        face_start=np.concatenate([[0], np.cumsum(triangles)]).astype(np.int64),
+        vertex_start=np.cumsum([0, *(len(part.vertices) for part in parts)]).astype(np.int64),
+        face_start=np.cumsum([0, *(len(part.faces) for part in parts)]).astype(np.int64),
     )
     protrusion = decomposition.protrusion[[i for i, _ in kept]]
     return {
@@ -210,7 +189,7 @@ def _save_parts(
 
 
 def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
-    """RMS slope of the measured ground, and along the route RMS slope and curvature and the coverage beside it."""
+    """RMS slope of the measured ground; along the route RMS slope and curvature, and coverage within 1.5 m."""
     dy, dx = np.gradient(ground.height, ground.cell)
     slope = np.hypot(dx, dy)[ground.measured]
     metrics: dict[str, float | None] = {"slope_rms": float(np.sqrt(np.mean(slope**2))) if len(slope) else None}

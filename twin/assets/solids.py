@@ -1,7 +1,7 @@
 """Closed meshes of the obstacles for the convex decomposition, and the corridor that is kept free of them.
 
-*Solid*: the negative part of the distance field and the hidden space up to `_HIDDEN_DEPTH` behind it, since a film from
-a road shows fronts only and a wall needs thickness to collide with. *Corridor*: the area within a half width of the
+The solid is the negative part of the distance field and the hidden space up to `_HIDDEN_DEPTH` behind it: a film from a
+road shows fronts only, and a wall needs thickness to collide with. The corridor is the area within a half width of the
 filmed route, up to `HEADROOM` above the ground; it is free, since the camera passed through it.
 """
 
@@ -22,8 +22,8 @@ from twin.geometry.route import distance_to_route
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground
-_GROUND_CLEARANCE = 0.1  # [m] above the height field; below this everything is ground
-_MAX_GROUND_GAP = 0.6  # [m] gaps to the ground up to this are closed, so that nothing hovers
+_GROUND_CLEARANCE = 0.1  # [m] above the height field, below which everything is ground
+_MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
 _EMBEDDING = 0.15  # [m] depth of parts below the ground
 _TILE_SIZE = 3.0  # [m] side of the square columns that large obstacles are divided into
 _MIN_VOXELS = 8  # smaller components are noise
@@ -32,7 +32,7 @@ _HIDDEN_DEPTH = 0.3  # [m] behind a surface where hidden space is solid
 _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
 _SMOOTHING = 0.7  # voxels
 _EROSION = 0.06  # [m] inward offset of surfaces, since edges blur outwards and hulls only grow
-_CERTAIN_DEPTH = 0.02  # [m] behind a seen surface; deeper voxels stay solid despite the erosion
+_CERTAIN_DEPTH = 0.02  # [m] behind a seen surface, beyond which voxels stay solid despite the erosion
 _CORRIDOR_SLACK = 0.02  # [m] extra distance of parts, for rounding in later stages
 
 
@@ -52,22 +52,25 @@ def solid_pieces(
     """Closed meshes, at most a tile wide, of all components that reach `obstacle_height` above the ground.
 
     Returns:
-        Pieces, nearest to the path first, and counts of components: `specks` and `low` ones left out, and `standing`.
+        Pieces, nearest to the path first, and the numbers of components that are `standing`, and of the `specks` and
+        `low` ones left out.
     """
     voxel = volume.voxel
-    shape = volume.distance.shape
-    indices = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
-    xy = volume.points(indices[:, :, 0])[..., :2]
-    floor = ground.at(xy)
-    z = volume.origin[2] + voxel * np.arange(shape[2])
-    above = (z[None, None] - floor[..., None]).astype(np.float32)
+    columns = volume.distance.shape[:2]
+    index = np.stack(np.meshgrid(*map(np.arange, columns), indexing="ij"), -1)
+    xy = volume.origin[:2] + voxel * index
+    z = volume.origin[2] + voxel * np.arange(volume.distance.shape[2])
+    above = (z - ground.at(xy)[..., None]).astype(np.float32)
     field = _solid_distance(volume)
     field[above < _GROUND_CLEARANCE] = 0.5 * voxel
     _close_downwards(field, above, voxel)
     field = np.maximum(field, above - config.max_height)
     field = np.maximum(field, -_EMBEDDING - above)
     path = corridor.route[::2] if corridor else cameras.positions[:, :2]
-    distance = distance_transform_edt(~_path_mask(path, volume, shape[:2])) * voxel
+    off_path = np.ones(columns, bool)
+    on_path = np.rint((path - volume.origin[:2]) / voxel).astype(int)
+    off_path[tuple(np.clip(on_path, 0, np.array(columns) - 1).T)] = False
+    distance = distance_transform_edt(off_path) * voxel
     field = np.maximum(field, (distance - config.margin)[..., None].astype(np.float32))
     if corridor is not None:
         near = distance < corridor.reach + 2.0
@@ -96,9 +99,8 @@ def solid_pieces(
                 if block.sum() < _MIN_VOXELS // 2:
                     continue
                 values = field[part][i : i + tile, j : j + tile]
-                piece = _block_piece(
-                    np.where(block, values, np.maximum(values, 0.3 * voxel)), voxel, volume, start + np.array([i, j, 0])
-                )
+                values = np.where(block, values, np.maximum(values, 0.3 * voxel))
+                piece = _block_piece(values, volume, start + np.array([i, j, 0]))
                 if piece is not None:
                     middle = ((piece.vertices.min(0) + piece.vertices.max(0)) / 2)[:2]
                     pieces.append((float(np.linalg.norm(path - middle, axis=1).min()), piece))
@@ -107,10 +109,10 @@ def solid_pieces(
 
 
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
-    """Distance field [m] of the solid, clipped to a voxel and eroded by `_EROSION`; deeper unknown space is free.
+    """Distance field [m] of the solid: the fused field near seen surfaces, clipped to a voxel and eroded by `_EROSION`.
 
-    Near seen surfaces it equals the fused field. Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed:
-    the robot cannot pass them, and each pore costs the decomposition time.
+    Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass them, and each pore costs
+    the decomposition time.
     """
     voxel = volume.voxel
     seen = np.nan_to_num(volume.distance, nan=np.inf) < 0
@@ -123,7 +125,7 @@ def _solid_distance(volume: Volume) -> NDArray[np.float32]:
     field = np.where(np.isfinite(volume.distance), np.clip(volume.distance, -voxel, voxel), smooth)
     field = np.where(closed & ~seen, np.minimum(field, smooth), field)
     field = gaussian_filter(field, _SMOOTHING) + _EROSION
-    # Keeps obstacles as thin as a lamp post.
+    # Keeps obstacles that are as thin as a lamp post.
     return np.where(volume.distance < -_CERTAIN_DEPTH, np.minimum(field, -0.1 * voxel), field).astype(np.float32)
 
 
@@ -135,18 +137,11 @@ def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
     field[fill] = -0.5 * voxel
 
 
-def _path_mask(path: Array, volume: Volume, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    marked = np.zeros(shape, bool)
-    index = np.rint((path - volume.origin[:2]) / volume.voxel).astype(int)
-    index = np.clip(index, 0, np.array(shape) - 1)
-    marked[tuple(index.T)] = True
-    return marked
-
-
-def _block_piece(values: NDArray, voxel: float, volume: Volume, start: NDArray) -> SolidPiece | None:
-    """The closed surface of one block of the field, with free space around it; None if it is empty."""
+def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece | None:
+    """The closed surface of the block of the field that starts at voxel `start`; None if it is empty."""
+    voxel = volume.voxel
     padded = np.pad(values, 1, constant_values=0.5 * voxel)
-    origin = volume.points(start - 1)
+    origin = volume.origin + voxel * (start - 1)
     vertices, faces = zero_level(padded, origin, voxel)
     if len(faces) < 4:
         return None
@@ -160,17 +155,14 @@ def _block_piece(values: NDArray, voxel: float, volume: Volume, start: NDArray) 
 def clear_corridor(
     parts: list[ConvexPart], corridor: Corridor, ground: Ground
 ) -> tuple[list[tuple[int, ConvexPart]], int]:
-    """Removes the portions of convex parts inside the corridor.
-
-    Above the headroom a part stays as it is; below, it is cut along tangents of the corridor until it is clear.
+    """Cuts convex parts below the headroom along tangents of the corridor until they are clear of it.
 
     Returns:
-        The remaining parts with the index of their original, and the number of parts that were cut or dropped.
+        The remaining parts, each with the index of its original, and the number of parts that were cut or dropped.
     """
     out: list[tuple[int, ConvexPart]] = []
     clipped = 0
     reach = corridor.reach + 0.5 * _CORRIDOR_SLACK
-    sagitta = _sagitta(reach)
     for i, part in enumerate(parts):
         if _intrusion(part, corridor.route, reach, ground)[0] <= 0.0:
             out.append((i, part))
@@ -189,7 +181,7 @@ def clear_corridor(
                 out.append((i, lower))
                 break
             # Keep the portion beyond the tangent line, on the side where most of the part is.
-            offset = float(-side @ point - reach - sagitta - 0.25 * _CORRIDOR_SLACK)
+            offset = float(-side @ point - reach - _sagitta(reach) - 0.25 * _CORRIDOR_SLACK)
             lower = clip_part(lower, np.append(-side, 0.0), offset)
     return out, clipped
 
@@ -208,24 +200,28 @@ def clip_part(part: ConvexPart, normal: Array, offset: float) -> ConvexPart | No
 
 
 def _sagitta(reach: float) -> float:
-    """Error [m] of a distance to the points of the route instead of its line, at most: they are `SPACING` apart."""
+    """Largest error [m] of a distance to the points of the route, `SPACING` apart, instead of to its line."""
     return SPACING**2 / (8 * reach)
 
 
 def _intrusion(part: ConvexPart, route: Array, reach: float, ground: Ground) -> tuple[float, Array, Array]:
     """Depth [m] of a part inside the corridor (≤ 0 = clear), the route point there, and the unit vector to the part."""
-    none = (-1.0, np.zeros(2), np.zeros(2))
+    clear = (-1.0, np.zeros(2), np.zeros(2))
     low, high = part.vertices[:, :2].min(0) - reach, part.vertices[:, :2].max(0) + reach
     near = route[((route >= low) & (route <= high)).all(1)]
     if len(near) == 0:
-        return none
+        return clear
     floor = ground.at(near)
     if part.vertices[:, 2].min() > floor.max() + HEADROOM:
-        return none
+        return clear
     below = clip_part(part, np.array([0.0, 0.0, 1.0]), float(floor.max()) + HEADROOM)
     if below is None:
-        return none
-    outline = _outline(below.vertices[:, :2])
+        return clear
+    xy = below.vertices[:, :2]
+    try:
+        outline = xy[ConvexHull(xy).vertices]  # counterclockwise
+    except QhullError:  # all on a line
+        outline = xy[[np.argmin(xy @ [1.0, 0.3]), np.argmax(xy @ [1.0, 0.3])]]
     distance, closest = _distance_to_outline(near, outline)
     worst = int(np.argmin(distance))
     depth = reach + _sagitta(reach) - float(distance[worst])
@@ -235,23 +231,15 @@ def _intrusion(part: ConvexPart, route: Array, reach: float, ground: Ground) -> 
     return depth, point, side / length if length > 1e-9 else np.array([1.0, 0.0])
 
 
-def _outline(xy: Array) -> Array:
-    """Corners of the convex outline of points (k, 2), counterclockwise; the two ends if they are on a line."""
-    try:
-        return xy[ConvexHull(xy).vertices]
-    except QhullError:
-        return xy[[np.argmin(xy @ [1.0, 0.3]), np.argmax(xy @ [1.0, 0.3])]]
-
-
 def _distance_to_outline(points: Array, outline: Array) -> tuple[Array, Array]:
     """Distance (k,) of points (k, 2) to a convex polygon, 0 inside, and the nearest points (k, 2) of its edges."""
-    start, along = outline, np.roll(outline, -1, axis=0) - outline
-    fraction = np.einsum("kij,ij->ki", points[:, None] - start, along) / np.maximum((along**2).sum(1), 1e-18)
-    foot = start + np.clip(fraction, 0.0, 1.0)[..., None] * along
+    along = np.roll(outline, -1, axis=0) - outline
+    toward = points[:, None] - outline
+    fraction = np.einsum("kij,ij->ki", toward, along) / np.maximum((along**2).sum(1), 1e-18)
+    foot = outline + np.clip(fraction, 0.0, 1.0)[..., None] * along
     distance = np.linalg.norm(points[:, None] - foot, axis=-1)
     best = np.argmin(distance, 1)
     rows = np.arange(len(points))
-    toward = points[:, None] - start
     turn = along[:, 0] * toward[..., 1] - along[:, 1] * toward[..., 0]
     left = turn >= 0 if len(outline) > 2 else np.zeros((len(points), 1), bool)
     return np.where(left.all(1), 0.0, distance[rows, best]), foot[rows, best]

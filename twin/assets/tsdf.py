@@ -2,8 +2,8 @@
 
 *Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
 view votes `near` if its surface passes within the band, `free` if it sees further (Curless & Levoy 1996, eqs. 3 and 4,
-with votes for free space). So views that see through a floater outvote the few that show it. The radiance field bridges
-depth edges with a ramp; it is seen edge-on, where votes have little weight, so views past it from elsewhere clear it.
+with votes for free space), so the views through a floater outvote the few that show it. The radiance field bridges
+depth edges with a ramp, which is seen edge-on: its votes have little weight, and views from elsewhere outvote it, too.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -19,7 +19,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
-from twin.assets.ground import Ground
 from twin.assets.views import Views
 from twin.geometry.poses import inverse_pose
 from twin.types import Array
@@ -148,15 +147,14 @@ def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray,
 
     Views vote for surfaces up to the depth `far` [m], and for free space up to `FREE_SPACE_REACH` times as far.
     """
-    device = "cpu"
-    distance = wp.full(len(points), float("nan"), dtype=wp.float32, device=device)
-    near = wp.zeros(len(points), dtype=wp.float32, device=device)
-    free = wp.zeros(len(points), dtype=wp.float32, device=device)
-    slant: wp.array = wp.array(views.slant, dtype=wp.float32, device=device)
-    constants = [far, band, FREE_SPACE_REACH * far, _HALF_WEIGHT_DEPTH, _CLEARANCE, _SAME_SURFACE_RATIO]
-    inputs = [*_camera_arrays(points, views, device), slant, *constants]
-    wp.launch(_fuse_kernel, len(points), inputs, [distance, near, free], device=device)
-    return distance.numpy(), near.numpy(), free.numpy()
+    with wp.ScopedDevice("cpu"):
+        distance = wp.full(len(points), float("nan"), dtype=wp.float32)
+        near, free = (wp.zeros(len(points), dtype=wp.float32) for _ in range(2))
+        slant: wp.array = wp.array(views.slant, dtype=wp.float32)
+        constants = [far, band, FREE_SPACE_REACH * far, _HALF_WEIGHT_DEPTH, _CLEARANCE, _SAME_SURFACE_RATIO]
+        inputs = [*_camera_arrays(points, views), slant, *constants]
+        wp.launch(_fuse_kernel, len(points), inputs, [distance, near, free])
+        return distance.numpy(), near.numpy(), free.numpy()
 
 
 def color_points(
@@ -166,35 +164,34 @@ def color_points(
 
     A view sees a point that faces it if its depth there agrees within `tolerance` [m] plus 5 %.
     """
-    device = "cpu"
-    colors = wp.zeros(len(points), dtype=wp.vec3, device=device)
-    found = wp.zeros(len(points), dtype=wp.float32, device=device)
-    rgb: wp.array = wp.array(views.rgb, dtype=wp.uint8, device=device)
-    positions, *cameras = _camera_arrays(points, views, device)
-    normal_array: wp.array = wp.array(np.asarray(normals, np.float32), dtype=wp.vec3, device=device)
-    centers: wp.array = wp.array(views.camera_to_world[:, :3, 3].astype(np.float32), dtype=wp.vec3, device=device)
-    inputs = [positions, normal_array, centers, *cameras, rgb, tolerance]
-    wp.launch(_color_kernel, len(points), inputs, [colors, found], device=device)
-    return (colors.numpy() + 0.5).astype(np.uint8), found.numpy() > 0
+    with wp.ScopedDevice("cpu"):
+        colors = wp.zeros(len(points), dtype=wp.vec3)
+        found = wp.zeros(len(points), dtype=wp.float32)
+        rgb: wp.array = wp.array(views.rgb, dtype=wp.uint8)
+        positions, *cameras = _camera_arrays(points, views)
+        normal_array: wp.array = wp.array(np.asarray(normals, np.float32), dtype=wp.vec3)
+        centers: wp.array = wp.array(views.camera_to_world[:, :3, 3].astype(np.float32), dtype=wp.vec3)
+        inputs = [positions, normal_array, centers, *cameras, rgb, tolerance]
+        wp.launch(_color_kernel, len(points), inputs, [colors, found])
+        return (colors.numpy() + 0.5).astype(np.uint8), found.numpy() > 0
 
 
-def _camera_arrays(points: Array, views: Views, device: str) -> list[wp.array]:
+def _camera_arrays(points: Array, views: Views) -> list[wp.array]:
     return [
-        wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device),
-        wp.array(inverse_pose(views.camera_to_world).astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(views.intrinsics.astype(np.float32), dtype=wp.vec4, device=device),
-        wp.array(views.depth, dtype=wp.float32, device=device),
+        wp.array(np.asarray(points, np.float32), dtype=wp.vec3),
+        wp.array(inverse_pose(views.camera_to_world).astype(np.float32), dtype=wp.mat44),
+        wp.array(views.intrinsics.astype(np.float32), dtype=wp.vec4),
+        wp.array(views.depth, dtype=wp.float32),
     ]
 
 
 # ---- block-sparse volume
 
-
 _BLOCK = 4  # voxels
 _MAX_VOXELS = 60_000_000
 _BAND_VOXELS = 2.0  # voxels on each side of a surface
-_VOXELS_PER_LAUNCH = 400_000  # voxels per launch
-_FREE_MAJORITY = 0.75  # of the votes; more free votes than this remove a surface
+_VOXELS_PER_LAUNCH = 400_000
+_FREE_MAJORITY = 0.75  # fraction of free votes that removes a surface
 
 
 @dataclass(frozen=True)
@@ -204,7 +201,7 @@ class Volume:
     distance: NDArray[np.float32]
     """[m], shape (x, y, z); NaN where no surface is near, or unseen."""
     hidden: NDArray[np.bool_]
-    """Voxels near a surface without votes; they may be solid."""
+    """Voxels near a surface but without votes, which may be solid."""
     origin: Array
     voxel: float
     outvoted: int
@@ -214,15 +211,11 @@ class Volume:
     def band(self) -> float:
         return _BAND_VOXELS * self.voxel
 
-    def points(self, index: NDArray) -> Array:
-        return self.origin + self.voxel * np.asarray(index)
-
 
 def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float) -> Volume:
     """Fuses views over a box (low and high corner, shape (2, 3)), in blocks of 4³ voxels near surface points (k, 3).
 
-    The grid spacing `voxel` [m] grows where the box would have more than 60 million voxels. Views vote for surfaces up
-    to the depth `far` [m].
+    The spacing `voxel` [m] grows if the box would have more than 60 million voxels. `far`: see `fuse`.
     """
     voxel = max(voxel, float((np.prod(box[1] - box[0]) / _MAX_VOXELS) ** (1 / 3)))
     blocks = np.ceil((box[1] - box[0]) / (voxel * _BLOCK)).astype(int) + 1
@@ -235,18 +228,21 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
     inner = np.stack(np.meshgrid(*[np.arange(_BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3)
     voxels = (np.argwhere(active)[:, None] * _BLOCK + inner).reshape(-1, 3)
     hidden = np.zeros(distance.shape, bool)
-    outvoted = 0
+    outvoted, band = 0, _BAND_VOXELS * voxel
     for start in range(0, len(voxels), _VOXELS_PER_LAUNCH):
         part = voxels[start : start + _VOXELS_PER_LAUNCH]
-        value, near, free = fuse(box[0] + voxel * part, views, _BAND_VOXELS * voxel, far)
+        value, near, free = fuse(box[0] + voxel * part, views, band, far)
         through = (near > 0) & (free > _FREE_MAJORITY * (near + free))
-        outvoted += int((through & (value < _BAND_VOXELS * voxel)).sum())
+        outvoted += int((through & (value < band)).sum())
+        value = np.where(through, np.fmax(value, 0.5 * voxel), value)
         # Free space without near votes bounds surfaces, too.
-        value = np.where(through | ((near == 0) & (free > 0)), np.fmax(value, 0.5 * voxel), value)
-        value = np.where((near == 0) & (free > 0), _BAND_VOXELS * voxel, value)
+        value = np.where((near == 0) & (free > 0), band, value)
         distance[tuple(part.T)] = value
         hidden[tuple(part.T)] = (near == 0) & (free == 0)
     return Volume(distance, hidden, np.asarray(box[0], float), voxel, outvoted)
+
+
+# ---- triangle meshes: vertices (v, 3) [m] and faces (f, 3)
 
 
 def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, NDArray[np.int64]]:
@@ -265,27 +261,16 @@ def compact(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray[np.int6
     return vertices[used], inverse.reshape(-1, 3).astype(np.int64)
 
 
-def face_components(faces: NDArray, count: int) -> NDArray[np.int64]:
-    """Index of the connected component of each face, shape (f,); `count` is the number of vertices."""
-    a, b = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).T
-    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(count, count))
-    return connected_components(graph, directed=False)[1][faces[:, 0]]
-
-
-def face_areas(vertices: Array, faces: NDArray) -> Array:
-    """Areas of the faces [m²], shape (f,)."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
 def remove_specks(vertices: Array, faces: NDArray, min_area: float) -> tuple[Array, NDArray[np.int64], int]:
     """Removes connected components smaller than `min_area` [m²]; also returns their number."""
     if len(faces) == 0:
         return vertices, faces, 0
-    component = face_components(faces, len(vertices))
-    area = np.bincount(component, face_areas(vertices, faces))
-    present = np.bincount(component) > 0
-    small = present & (area < min_area)
+    start, end = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).T
+    edges = coo_array((np.ones(len(start), bool), (start, end)), shape=(len(vertices),) * 2)
+    component = connected_components(edges, directed=False)[1][faces[:, 0]]
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.bincount(component, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    small = (np.bincount(component) > 0) & (area < min_area)
     return *compact(vertices, faces[~small[component]]), int(small.sum())
 
 
@@ -305,17 +290,3 @@ def vertex_normals(vertices: Array, faces: NDArray) -> Array:
     normal = np.cross(b - a, c - a)
     out = np.stack([np.bincount(faces.ravel(), np.repeat(normal[:, k], 3), len(vertices)) for k in range(3)], -1)
     return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
-
-
-def height_mesh(ground: Ground, cell: float, max_faces: int) -> tuple[Array, NDArray[np.int64]]:
-    """Mesh of the ground on every n-th node: upward triangles at least `cell` [m] wide, at most `max_faces`."""
-    rows, columns = ground.height.shape
-    step = max(1, round(cell / ground.cell), int(np.ceil(np.sqrt(2 * rows * columns / max_faces))))
-    row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))
-    grid_c, grid_r = np.meshgrid(column, row)
-    xy = ground.origin + ground.cell * np.stack([grid_c, grid_r], -1)
-    vertices = np.concatenate([xy, ground.height[grid_r, grid_c][..., None]], -1).reshape(-1, 3)
-    node = np.arange(len(vertices)).reshape(grid_r.shape)
-    a, b, c, d = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    return vertices, faces.astype(np.int64)

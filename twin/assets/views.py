@@ -1,6 +1,6 @@
 """Color and depth rendered from the radiance field at training poses: the input of ground, mesh and splats.
 
-*View*: one rendered pose. *Slant*: |n · r| for the surface normal n and the ray r with unit z-depth; a point 1 m of
+A view is one rendered pose. Its slant is |n · r| for the surface normal n and the ray r of unit z-depth: a point 1 m of
 z-depth behind a surface is `slant` meters away from it.
 """
 
@@ -11,36 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
-from twin.geometry.cameras import Cameras, PosedCameras, pixel_grid, scaled_intrinsics, unproject
+from twin.geometry.cameras import Cameras, pixel_grid, scaled_intrinsics, unproject
+from twin.nerf.rendering import RenderableField
 from twin.types import Array
 
 _BATCH = 8
 _METERS_PER_RADIAN = 3.0  # [m per rad] weight of direction in the distance between views
-_FLYING_PIXEL_STEP = 0.06  # relative steps of inverse depth to both neighbors; a pixel above is on no surface
+_FLYING_PIXEL_STEP = 0.06  # relative step of inverse depth to both neighbors, above which a pixel is on no surface
 _MIN_OPACITY = 0.5
 _MIN_SLANT = 0.12  # below this, normals from depth are unreliable
 _MIN_DEPTH = 0.3  # [m] from the lens; nearer depth is discarded
 
 
-class Rendered(Protocol):
-    """Rendered images: RGB (n, h, w, 3), z-depth (n, h, w) [m] and opacity (n, h, w)."""
+class ColorField(RenderableField, Protocol):
+    """A renderable field with a near box; `RadianceField` is one."""
 
     @property
-    def rgb(self) -> NDArray[np.float32]: ...
-    @property
-    def depth(self) -> NDArray[np.float32]: ...
-    @property
-    def opacity(self) -> NDArray[np.float32]: ...
-
-
-class ColorField(Protocol):
-    """The part of the interface of `RadianceField` used here."""
-
-    @property
-    def lightings(self) -> tuple[str, ...]: ...
-    @property
-    def bounds(self) -> Array: ...
-    def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int]) -> Rendered: ...
+    def bounds(self) -> Array:
+        """Low and high corner of the near box [m], shape (2, 3)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -54,7 +43,7 @@ class Views:
     rgb: NDArray[np.uint8]
     """Shape (n, h, w, 3)."""
     depth: NDArray[np.float32]
-    """z-depth [m], shape (n, h, w); 0 where unreliable; that of the background is larger than of any surface."""
+    """z-depth [m], shape (n, h, w); 0 where unreliable, larger than of any surface for the background."""
     slant: NDArray[np.float32]
     """Shape (n, h, w), in [0.12, √(1 + r²)]."""
     upward: NDArray[np.float32]
@@ -72,11 +61,11 @@ class Views:
 
 
 def render_views(
-    field: ColorField, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
+    field: RenderableField, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
 ) -> Views:
     """Renders the field from up to `count` well-distributed training frames, by default under its first lighting.
 
-    Views are `width` [px] wide, with the aspect ratio of the first camera. Depth beyond `far` [m] is background.
+    Views are `width` [px] wide and have the aspect ratio of the first camera. Depth beyond `far` [m] is background.
     """
     chosen = cameras.select(select_spread_frames(cameras, count))
     size = (width, max(2, round(width * float(cameras.sizes[0, 1] / cameras.sizes[0, 0]))))
@@ -97,9 +86,7 @@ def render_views(
 
 def select_spread_frames(cameras: Cameras, count: int) -> NDArray[np.int64]:
     """Sorted indices of up to `count` training frames, chosen by farthest-point sampling in position and direction."""
-    candidates = np.flatnonzero(~cameras.held_out)
-    if len(candidates) == 0:
-        candidates = np.arange(len(cameras))
+    candidates = np.arange(len(cameras)) if cameras.held_out.all() else np.flatnonzero(~cameras.held_out)
     poses = np.concatenate([cameras.positions, _METERS_PER_RADIAN * cameras.camera_to_world[:, :3, 2]], 1)[candidates]
     chosen, gap = [0], np.linalg.norm(poses - poses[0], axis=1)
     while len(chosen) < min(count, len(candidates)):
@@ -111,30 +98,26 @@ def select_spread_frames(cameras: Cameras, count: int) -> NDArray[np.int64]:
 def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.float32]:
     """Sets depth (n, h, w) to 0 where a pixel is too near, half transparent or between two surfaces.
 
-    Depth beyond `far` [m] or of nearly transparent pixels becomes background at 10 · far. The inverse depth of a plane
-    is linear in the image, so a pixel between two surfaces differs from a slope by its second differences.
+    Depth beyond `far` [m] and that of nearly transparent pixels becomes background at 10 · far. The inverse depth of a
+    plane is linear in the image; second differences distinguish a pixel between two surfaces from a slope.
     """
     out = np.where((depth > far) | (opacity < 0.1) | ~np.isfinite(depth), 10.0 * far, depth).astype(np.float32)
     bad = (out < _MIN_DEPTH) | ((opacity < _MIN_OPACITY) & (out < far))
     inverse = 1.0 / np.maximum(out, 1e-3)
     for axis in (1, 2):
-        ahead = np.diff(inverse, axis=axis)
-        first, second = (ahead[:, :-1], ahead[:, 1:]) if axis == 1 else (ahead[..., :-1], ahead[..., 1:])
-        middle = inverse[:, 1:-1] if axis == 1 else inverse[..., 1:-1]
+        across = np.moveaxis(inverse, axis, -1)
+        step = np.diff(across)
+        first, second = step[..., :-1], step[..., 1:]
         # Between its neighbors, far from both, and off the line between them.
-        steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING_PIXEL_STEP * middle
+        steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING_PIXEL_STEP * across[..., 1:-1]
         bent = np.abs(first - second) > 0.3 * np.abs(first + second)
-        flying = steep & bent & (first * second > 0)
-        if axis == 1:
-            bad[:, 1:-1] |= flying
-        else:
-            bad[..., 1:-1] |= flying
+        np.moveaxis(bad, axis, -1)[..., 1:-1] |= steep & bent & (first * second > 0)
     out[bad] = 0.0
     return out
 
 
 def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> tuple[NDArray, NDArray]:
-    """Slant and upward component of the normal, from central differences of inverse depth (n, h, w).
+    """Slant and upward component of the normal, each (n, h, w), from central differences of inverse depth.
 
     A plane n · x = c seen along r = (x, y, 1) has inverse depth q = (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ).
     """

@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 
 from twin.mjcf import husky
-from twin.mjcf.husky_visuals import add_visuals
 
 Color = tuple[float, float, float]
 
@@ -170,8 +169,7 @@ def _husky(shape: ObstacleModel, color: Color) -> None:
     wheels = {}
     for name, center in zip(husky.WHEELS, husky.wheel_centers(), strict=True):
         wheels[name] = base.add_body(name=name, pos=center)
-    params = husky.HuskyParams()
-    add_visuals(spec, base, wheels, params.camera_position, params.wheel_radius, husky.WHEEL_WIDTH)
+    husky.add_visuals(spec, base, wheels, husky.HuskyParams())
     for geom in spec.geoms:
         geom.group = shape.group
     shape.body.add_frame().attach_body(base, f"{shape.body.name}_", "")

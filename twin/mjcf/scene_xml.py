@@ -39,152 +39,8 @@ from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
 from twin.scene import SceneDir
 from twin.types import Array
 
-# ---- portability check
-
-
-_COMPARED_STEPS = 200  # steps simulated for the comparison
-_MAX_DEVIATION = 0.002  # [m] between the robot bases of the compiled model and of the copy
-_XML_PRECISION = 1e-5  # plus this fraction of the coordinates: the XML keeps six digits
-_CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
-
-
-def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
-    """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with the compiled model `built`.
-
-    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s (soft tires on a slope).
-
-    Raises:
-        RuntimeError: the copy is a different model or its robot moves differently (a bug of the exporter).
-    """
-    with tempfile.TemporaryDirectory(prefix="twin-moved-") as temporary:
-        moved = Path(temporary) / "elsewhere"
-        shutil.copytree(folder, moved)
-        copy = mujoco.MjModel.from_xml_path(str(moved / SCENE_XML))
-    metrics: dict[str, Any] = {
-        "geoms": int(copy.ngeom),
-        "xml_bytes": (folder / SCENE_XML).stat().st_size,
-        "assets_bytes": sum(path.stat().st_size for path in (folder / "assets").iterdir()),
-    }
-    sizes = [(model.ngeom, model.nq, model.nu, model.nkey) for model in (built, copy)]
-    if sizes[0] != sizes[1]:
-        raise RuntimeError(
-            f"the moved copy has {sizes[1]} geoms, coordinates, motors and keyframes, expected {sizes[0]}"
-        )
-    if not built.nkey:
-        return metrics
-    data = _reset_to_spawn(copy)
-    metrics["spawn_clearance_m"] = spawn_clearance(copy, data)
-    path, touched = _simulate_parked(copy, data)
-    deviation = float(np.linalg.norm(path - _simulate_parked(built, _reset_to_spawn(built))[0], axis=1).max())
-    if not deviation <= _MAX_DEVIATION + _XML_PRECISION * np.abs(path[0]).max():
-        raise RuntimeError(
-            f"the robot of the moved copy moves differently: {deviation:.4f} m apart in {_COMPARED_STEPS} steps"
-        )
-    drift = float(np.linalg.norm(path[-1] - path[0]))
-    return metrics | {"spawn_touched": sorted(touched), "spawn_drift_m": drift}
-
-
-def robot_geoms(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Mask of the geoms that belong to the robot, shape (ngeom,)."""
-    return model.body_rootid[model.geom_bodyid] == model.body("base_link").id
-
-
-def contact_geom_names(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
-    """Names of the geoms that the robot touches, except the ground."""
-    pairs = data.contact.geom
-    own = robot_geoms(model)[pairs]
-    other = pairs[own[:, 0] != own[:, 1]][~own[own[:, 0] != own[:, 1]]]
-    return {model.geom(int(i)).name for i in np.unique(other)} - {"ground"}
-
-
-def spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
-    """Distance from the robot to the nearest convex part [m]; None if there is none within 5 m."""
-    robot = np.flatnonzero(robot_geoms(model) & (model.geom_contype > 0))
-    parts = np.flatnonzero(model.geom_group == PART_GROUP)
-    center = data.body("base_link").xpos
-    near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + _CLEARANCE_RANGE]
-    distances = [
-        mujoco.mj_geomDistance(model, data, int(a), int(b), _CLEARANCE_RANGE, None) for a in robot for b in near
-    ]
-    nearest = min(distances, default=_CLEARANCE_RANGE)
-    return float(nearest) if nearest < _CLEARANCE_RANGE else None
-
-
-def _reset_to_spawn(model: mujoco.MjModel) -> mujoco.MjData:
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
-    mujoco.mj_forward(model, data)
-    return data
-
-
-def _simulate_parked(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, set[str]]:
-    """Base positions of a robot without commands [m], shape (steps + 1, 3), and the names of what it touched."""
-    path, touched = [data.qpos[:3].copy()], contact_geom_names(model, data)
-    for _ in range(_COMPARED_STEPS):
-        mujoco.mj_step(model, data)
-        path.append(data.qpos[:3].copy())
-        touched |= contact_geom_names(model, data)
-    return np.array(path), touched
-
-
-# ---- asset files
-
-
-_LINES_PER_WRITE = 50_000
-
-
-def write_hfield(path: Path, height: NDArray) -> None:
-    """Writes MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge."""
-    rows, columns = height.shape
-    path.write_bytes(np.array([rows, columns], np.int32).tobytes() + height.astype(np.float32).tobytes())
-
-
-def write_obj(path: Path, vertices: NDArray, faces: NDArray, texcoords: NDArray | None = None) -> None:
-    """Writes a Wavefront OBJ of vertices (v, 3) [m] and faces (f, 3), counter-clockwise seen from outside.
-
-    `texcoords` are the texture coordinates of each face's corners, u from the left, v from the top, shape (f, 3, 2).
-    """
-    with path.open("w", encoding="ascii") as file:
-        _write_lines(file, "v %.5f %.5f %.5f\n", vertices)
-        if texcoords is None:
-            _write_lines(file, "f %d %d %d\n", faces + 1)
-            return
-        flipped = texcoords.reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]  # OBJ measures v from the bottom
-        _write_lines(file, "vt %.6f %.6f\n", flipped)
-        corner = np.arange(1, 3 * len(faces) + 1).reshape(-1, 3)
-        _write_lines(file, "f %d/%d %d/%d %d/%d\n", np.stack([faces + 1, corner], -1).reshape(-1, 6))
-
-
-def _write_lines(file, line: str, rows: NDArray) -> None:
-    for start in range(0, len(rows), _LINES_PER_WRITE):
-        part = rows[start : start + _LINES_PER_WRITE]
-        file.write(line * len(part) % tuple(part.ravel().tolist()))
-
-
-def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Texture with the vertex colors of each face, since MuJoCo has no vertex colors.
-
-    Each face has 2 × 2 texels: its corner colors c₀, c₁, c₂ and c₁ + c₂ − c₀, so that bilinear filtering equals linear
-    interpolation across the triangle (except where the fourth texel is clipped). `colors` (f, 3, 3) uint8 are those of
-    each face's corners. Returns the texture (h, w, 3) and texture coordinates as in `write_obj`.
-    """
-    count = len(colors)
-    across = max(1, int(np.ceil(np.sqrt(count))))
-    down = -(-count // across)
-    c = colors.astype(np.int16)
-    fourth = np.clip(c[:, 1] + c[:, 2] - c[:, 0], 0, 255)
-    tiles = np.zeros((down * across, 2, 2, 3), np.uint8)
-    tiles[:count] = np.stack([c[:, 0], c[:, 1], c[:, 2], fourth], 1).reshape(-1, 2, 2, 3)
-    texture = tiles.reshape(down, across, 2, 2, 3).swapaxes(1, 2).reshape(2 * down, 2 * across, 3)
-    corner = np.stack(np.divmod(np.arange(count), across)[::-1], 1)[:, None] * 2 + [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]]
-    return texture, corner / [2 * across, 2 * down]
-
-
-# ---- scene
-
-
 _HFIELD_BASE = 1.0  # [m] of solid below the lowest point, against tunneling
-_GROUND_OVERLAP = 0.15  # [m] above the height field; visual mesh below this is dropped in favor of its texture
+_GROUND_OVERLAP = 0.15  # [m] above the height field, up to which its texture replaces the visual mesh
 _SETTLE_TIME = 2.0  # [s]
 _MIN_ROUTE = 2.0  # [m]
 _SITE_SPACING = 1.0  # [m] between sites along the route
@@ -208,7 +64,7 @@ class Parts:
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
-    """Runs the stage, see `twin.build`: writes the scene to `out` from the stages `metric` and `mesh`; returns metrics.
+    """Runs the stage, see `twin.build`: writes the scene from the stages `metric` and `mesh`; returns metrics.
 
     Raises:
         InputError: the route is too short, or starts near the edge of the ground, on too steep a slope, or where an
@@ -225,23 +81,21 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
     husky.set_options(spec, config.robot)
-    # Saves computing the poses of thousands of static geoms; bodies with motors (the robot) never sleep.
+    # Saves computing the poses of thousands of static geoms; bodies with motors, as the robot, never sleep.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_sky_and_lights(spec)
     add_ground(spec, ground, assets, config.mjcf.hfield_cell)
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
 
-    route = load_route(mesh / "route.npz") if config.mjcf.route else None
+    route = _load_route(mesh / "route.npz") if config.mjcf.route else None
     metrics: dict[str, Any] = {"parts": len(parts.vertices), "visual_faces": faces, "has_route": route is not None}
     if route is None:
-        built = _write(spec, out)
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
     else:
         camera = config.robot.camera(film_camera(Cameras.load(scene.stage("metric"))))
         spawn, initial_contacts = _add_robot(spec, ground, route, config.robot, camera)
         _add_route(spec, route, config.mjcf.half_width)
-        built = _write(spec, out)
         world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot)
         world.save()
         metrics |= {
@@ -250,14 +104,16 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
             "half_width_m": config.mjcf.half_width,
             "camera_intrinsics_px": world.intrinsics.tolist(),
         }
+    built = spec.compile()
+    (out / SCENE_XML).write_text(spec.to_xml(), encoding="utf-8")
     metrics |= check_portable(out, built)
     if route is not None:
         metrics["spawn_touched"] = sorted(initial_contacts | set(metrics["spawn_touched"]))
     return metrics
 
 
-def load_route(path: Path) -> Array | None:
-    """The route [m], shape (m, 3); None if the mesh stage wrote none."""
+def _load_route(path: Path) -> Array | None:
+    """The route [m], shape (m, 3); None if the stage `mesh` wrote none."""
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as data:
@@ -266,8 +122,7 @@ def load_route(path: Path) -> Array | None:
 
 def film_camera(cameras: Cameras) -> PixelCamera:
     """The physical camera of the first training frame."""
-    training = np.flatnonzero(~cameras.held_out)
-    first = int(training[0]) if len(training) else 0
+    first = int(np.argmin(cameras.held_out))
     (width, height), (fx, fy, cx, cy) = cameras.sizes[first].tolist(), cameras.intrinsics[first].tolist()
     return PixelCamera((fx, fy, cx, cy), (width, height))
 
@@ -275,7 +130,7 @@ def film_camera(cameras: Cameras) -> PixelCamera:
 def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tuple[Array, Array]:
     """Base position [m] and quaternion (wxyz) of a robot on the plane fitted to the ground below its wheels.
 
-    `height_at` maps points (n, 2) to ground heights (n,) [m]; xy (2,) [m] and yaw [rad] are those of the base.
+    `height_at` maps points (n, 2) to ground heights (n,) [m]; `xy` (2,) [m] and `yaw` [rad] are those of the base.
     """
     forward = np.array([np.cos(yaw), np.sin(yaw)])
     left = np.array([-forward[1], forward[0]])
@@ -283,8 +138,7 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
     heights = height_at(xy + local[:, :1] * forward + local[:, 1:] * left)
     (slope_x, slope_y, height), *_ = np.linalg.lstsq(np.column_stack([local, np.ones(4)]), heights, rcond=None)
     x_axis = np.array([*forward, slope_x])
-    y_axis = np.array([*left, slope_y])
-    z_axis = np.cross(x_axis, y_axis)
+    z_axis = np.cross(x_axis, [*left, slope_y])
     z_axis /= np.linalg.norm(z_axis)
     x_axis /= np.linalg.norm(x_axis)
     rotation = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], 1)
@@ -294,7 +148,7 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
 
 
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
-    """Mask of the points (v, 3) within the bounds of the height field and below it or less than 0.15 m above.
+    """Mask of the points (v, 3) within the height field's bounds and less than 0.15 m above it, or below.
 
     Two surfaces within centimeters of each other would flicker, shade each other and hide the robot's wheels.
     """
@@ -305,7 +159,7 @@ def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
 
 
 def drop_unused_vertices(vertices: NDArray, colors: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Removes the vertices that no face uses; returns vertices, colors and faces."""
+    """Vertices, colors and faces without the vertices that no face uses."""
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], colors[used], inverse.reshape(faces.shape)
 
@@ -333,7 +187,7 @@ def _add_sky_and_lights(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient = (0.4, 0.4, 0.42)
     spec.visual.headlight.diffuse = (0.15, 0.15, 0.15)
     spec.visual.headlight.specular = (0, 0, 0)
-    # Clipping planes at 0.1 m and 1 km for any scene size: they are given in multiples of the extent.
+    # Clipping planes, in multiples of the extent: 0.1 m and 1 km for any scene.
     spec.stat.extent = 20.0
     spec.visual.map.znear, spec.visual.map.zfar = 0.005, 50.0
 
@@ -341,8 +195,10 @@ def _add_sky_and_lights(spec: mujoco.MjSpec) -> None:
 def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -> None:
     """Adds the geom `ground`, a height field of `cell` [m] in the ground's colors; writes its files to `assets`."""
     coarse = ground.coarsened(cell)
-    write_hfield(assets / "ground.bin", coarse.height)
-    # One texel per fine cell, the mean of its corners, since the texture spans the field edge to edge; first row at +y.
+    # MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge.
+    size = np.array(coarse.height.shape, np.int32)
+    (assets / "ground.bin").write_bytes(size.tobytes() + coarse.height.astype(np.float32).tobytes())
+    # The texture spans the field edge to edge: a texel per fine cell, the mean of its corners; the first row is at +y.
     finer = round(coarse.cell / ground.cell)
     rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
     rgb = ground.rgb[:rows, :columns].astype(np.uint16)
@@ -364,7 +220,7 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -
 
 
 def _add_textured_material(spec: mujoco.MjSpec, name: str, emission: float) -> None:
-    """Adds a material textured with `assets/<name>.png`; it emits light, since filmed colors include the lighting."""
+    """Adds a material with the texture `<name>.png`; it emits light, since filmed colors include the lighting."""
     spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
     material = spec.add_material(name=name, emission=emission, specular=0.0, shininess=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
@@ -416,8 +272,8 @@ def _add_robot(
     """Adds the Husky at the start of the route, lets it settle, and stores its state as the keyframe `spawn`.
 
     Returns:
-        x, y, z [m] and yaw [rad] at rest, and the names of the geoms except the ground that it touched before settling
-        (they may have pushed it aside).
+        x, y, z [m] and yaw [rad] at rest, and the names of the geoms, except the ground, that it touched at first and
+        that may have pushed it aside.
     """
     length = float(arc_lengths(route)[-1])
     if length < _MIN_ROUTE:
@@ -443,7 +299,7 @@ def _add_robot(
     model = husky.stiffen_for_rest(spec.compile())
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    initial_contacts = contact_geom_names(model, data)
+    initial_contacts = _touched_geoms(model, data)
     mujoco.mj_step(model, data, int(_SETTLE_TIME / husky.TIMESTEP))
     moved = float(np.linalg.norm(data.qpos[:2] - position[:2]))
     if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
@@ -477,7 +333,129 @@ def _add_route(spec: mujoco.MjSpec, route: Array, half_width: float) -> None:
     )
 
 
-def _write(spec: mujoco.MjSpec, out: Path) -> mujoco.MjModel:
-    model = spec.compile()
-    (out / SCENE_XML).write_text(spec.to_xml(), encoding="utf-8")
-    return model
+# ---- mesh files
+
+
+def write_obj(path: Path, vertices: NDArray, faces: NDArray, texcoords: NDArray | None = None) -> None:
+    """Writes a Wavefront OBJ of vertices (v, 3) [m] and faces (f, 3), counter-clockwise seen from outside.
+
+    `texcoords` are the texture coordinates of each face's corners, u from the left, v from the top, shape (f, 3, 2).
+    trimesh would need an own vertex for each of them, in a file almost twice as large.
+    """
+
+    def lines(line: str, rows: NDArray) -> str:
+        return line * len(rows) % tuple(rows.ravel().tolist())
+
+    with path.open("w", encoding="ascii") as file:
+        file.write(lines("v %.5f %.5f %.5f\n", vertices))
+        if texcoords is None:
+            file.write(lines("f %d %d %d\n", faces + 1))
+            return
+        flipped = texcoords.reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]  # OBJ measures v from the bottom
+        file.write(lines("vt %.6f %.6f\n", flipped))
+        corner = np.arange(1, 3 * len(faces) + 1).reshape(-1, 3)
+        file.write(lines("f %d/%d %d/%d %d/%d\n", np.stack([faces + 1, corner], -1).reshape(-1, 6)))
+
+
+def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Texture (h, w, 3) of the faces' corner colors (f, 3, 3), uint8, and coordinates as in `write_obj`.
+
+    MuJoCo has no vertex colors. Each face gets 2 × 2 texels: its corner colors c₀, c₁, c₂ and c₁ + c₂ − c₀, so that
+    bilinear filtering equals linear interpolation across the triangle (unless the fourth texel is clipped).
+    """
+    count = len(colors)
+    across = max(1, int(np.ceil(np.sqrt(count))))
+    down = -(-count // across)
+    c = colors.astype(np.int16)
+    fourth = np.clip(c[:, 1] + c[:, 2] - c[:, 0], 0, 255)
+    tiles = np.zeros((down * across, 2, 2, 3), np.uint8)
+    tiles[:count] = np.stack([c[:, 0], c[:, 1], c[:, 2], fourth], 1).reshape(-1, 2, 2, 3)
+    texture = tiles.reshape(down, across, 2, 2, 3).swapaxes(1, 2).reshape(2 * down, 2 * across, 3)
+    corner = np.stack(np.divmod(np.arange(count), across)[::-1], 1)[:, None] * 2 + [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]]
+    return texture, corner / [2 * across, 2 * down]
+
+
+# ---- portability check
+
+_COMPARED_STEPS = 200
+_MAX_DEVIATION = 0.002  # [m] between the robot bases of the compiled model and of the copy
+_XML_PRECISION = 1e-5  # plus this fraction of the coordinates: the XML keeps six digits
+_CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
+
+
+def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
+    """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with the compiled model `built`.
+
+    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s (soft tires on a slope).
+
+    Raises:
+        RuntimeError: the copy is a different model or its robot moves differently, which is a bug.
+    """
+    with tempfile.TemporaryDirectory(prefix="twin-moved-") as temporary:
+        moved = Path(temporary) / "elsewhere"
+        shutil.copytree(folder, moved)
+        copy = mujoco.MjModel.from_xml_path(str(moved / SCENE_XML))
+    metrics: dict[str, Any] = {
+        "geoms": int(copy.ngeom),
+        "xml_bytes": (folder / SCENE_XML).stat().st_size,
+        "assets_bytes": sum(path.stat().st_size for path in (folder / "assets").iterdir()),
+    }
+    sizes = [(model.ngeom, model.nq, model.nu, model.nkey) for model in (built, copy)]
+    if sizes[0] != sizes[1]:
+        raise RuntimeError(
+            f"the moved copy has {sizes[1]} geoms, coordinates, motors and keyframes, expected {sizes[0]}"
+        )
+    if not built.nkey:
+        return metrics
+    data = _reset_to_spawn(copy)
+    metrics["spawn_clearance_m"] = _spawn_clearance(copy, data)
+    path, touched = _simulate_parked(copy, data)
+    deviation = float(np.linalg.norm(path - _simulate_parked(built, _reset_to_spawn(built))[0], axis=1).max())
+    if not deviation <= _MAX_DEVIATION + _XML_PRECISION * np.abs(path[0]).max():
+        raise RuntimeError(
+            f"the robot of the moved copy moves differently: {deviation:.4f} m apart in {_COMPARED_STEPS} steps"
+        )
+    drift = float(np.linalg.norm(path[-1] - path[0]))
+    return metrics | {"spawn_touched": sorted(touched), "spawn_drift_m": drift}
+
+
+def _robot_geoms(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Mask of the robot's geoms, shape (ngeom,)."""
+    return model.body_rootid[model.geom_bodyid] == model.body("base_link").id
+
+
+def _touched_geoms(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
+    """Names of the geoms that the robot touches, except the ground."""
+    pairs = data.contact.geom
+    own = _robot_geoms(model)[pairs]
+    other = pairs[~own & own.any(1, keepdims=True)]
+    return {model.geom(int(i)).name for i in np.unique(other)} - {"ground"}
+
+
+def _spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
+    """Distance from the robot to the nearest convex part [m]; None if there is none within 5 m."""
+    robot = np.flatnonzero(_robot_geoms(model) & (model.geom_contype > 0))
+    parts = np.flatnonzero(model.geom_group == PART_GROUP)
+    center = data.body("base_link").xpos
+    near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + _CLEARANCE_RANGE]
+    pairs = [(int(a), int(b)) for a in robot for b in near]
+    distances = [mujoco.mj_geomDistance(model, data, a, b, _CLEARANCE_RANGE, None) for a, b in pairs]
+    nearest = min(distances, default=_CLEARANCE_RANGE)
+    return float(nearest) if nearest < _CLEARANCE_RANGE else None
+
+
+def _reset_to_spawn(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def _simulate_parked(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, set[str]]:
+    """Base positions of a robot without commands [m], shape (steps + 1, 3), and names of the geoms it touched."""
+    path, touched = [data.qpos[:3].copy()], _touched_geoms(model, data)
+    for _ in range(_COMPARED_STEPS):
+        mujoco.mj_step(model, data)
+        path.append(data.qpos[:3].copy())
+        touched |= _touched_geoms(model, data)
+    return np.array(path), touched

@@ -32,7 +32,7 @@ class World:
     spawn: tuple[float, float, float, float]
     """x, y, z of the robot's base origin [m] at rest at the start, and its yaw [rad]."""
     folder: Path
-    """Holds `scene.xml`, `assets/` and `world.json`."""
+    """The folder of `scene.xml`, `assets/` and `world.json`."""
     camera: PixelCamera = ZED2
     """The front camera at its native size."""
     robot: HuskyParams = field(default_factory=HuskyParams)
@@ -133,20 +133,17 @@ def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
 def nearest_on_route(
     route: Array, xy: Array, around: tuple[Array | float, Array | float] | None = None
 ) -> tuple[Array, Array]:
-    """Nearest points of the route.
+    """Arc lengths of the points of the route nearest to `xy`, and cross-track errors [m], both of shape (...).
 
     Args:
         route: Shape (m, ≥2).
-        xy: Query points, shape (..., 2).
-        around: Lowest and highest arc length to search [m], each a number or of shape (...), for a route that meets
+        xy: Shape (..., 2) [m].
+        around: Lowest and highest arc length to search [m], each a number or of shape (...), for a route that crosses
             itself; the whole route by default.
-
-    Returns:
-        Arc length of the nearest point [m] and cross-track error [m], both of shape (...).
     """
     knots, xy = arc_lengths(route), np.asarray(xy)
     low, high = (knots[0], knots[-1]) if around is None else around
-    # The consecutive segments that overlap each range, padded to the longest such run.
+    # The run of segments that overlap each range, padded to the longest run.
     first = np.broadcast_to(np.searchsorted(knots[1:], low), xy.shape[:-1])
     last = np.broadcast_to(np.searchsorted(knots[:-1], high, "right"), xy.shape[:-1])
     run = first[..., None] + np.arange(np.max(last - first, initial=1))

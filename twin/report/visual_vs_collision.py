@@ -206,10 +206,9 @@ def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_])
 
 
 def _collision_surface(ground: Ground, parts: Parts) -> Any:
-    from twin.assets.tsdf import height_mesh  # slow to import
     from twin.geometry.mesh_rays import Surface
 
-    vertices, faces = height_mesh(ground, ground.cell, 2 * ground.height.size)
+    vertices, faces = ground.triangles(ground.cell, 2 * ground.height.size)
     corners, triangles = trimesh.util.append_faces([vertices, *parts.vertices], [faces, *parts.faces])
     return Surface(np.asarray(corners, np.float64), np.asarray(triangles))
 
@@ -249,12 +248,7 @@ def gap_row(views: GeometryViews, k: int) -> Image:
     panels = (
         (views.rgb[k], "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
         (depth_colors(views.visual_depth[k]), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
-        (
-            depth_colors(views.collision_depth[k]),
-            "collision",
-            "depth",
-            caption_line(_PANEL_WIDTH, "ground and parts"),
-        ),
+        (depth_colors(views.collision_depth[k]), "collision", "depth", caption_line(_PANEL_WIDTH, "ground and parts")),
         (colors, "gap", f"up to {MAX_DEPTH:g} m", scale),
     )
-    return panel_row([titled_panel(fit(picture, size), *texts) for picture, *texts in panels])
+    return panel_row([titled_panel(fit(image, size), title, note, below) for image, title, note, below in panels])

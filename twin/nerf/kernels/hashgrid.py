@@ -22,7 +22,7 @@ _PRIME_Z = wp.uint32(805459861)
 
 @wp.struct
 class HashCell:
-    """A cell of a level: its lowest vertex, and the weights of the upper (b) and lower (a = 1 − b) vertices per axis."""
+    """A cell of a level: its lowest vertex, and weights of the upper (b) and lower (a = 1 − b) vertices per axis."""
 
     x: wp.int32
     y: wp.int32
