@@ -1,6 +1,6 @@
-"""Bakes a radiance field: samples it into bricks around surfaces, fine-tunes these on the training frames, quantizes.
+"""Bakes a radiance field: samples it into bricks around surfaces, fine-tunes and quantizes the samples.
 
-Terms as in `kernels/bricks.py`. Fine-tuning changes the samples only; networks and embeddings stay as trained.
+Terms as in `kernels/bricks.py`. Fine-tuning fits the samples to the training frames; networks and embeddings stay.
 """
 
 import time
@@ -50,8 +50,8 @@ def bake(
         pixels: The frames it was trained on.
         seed: Seed of the fine-tuning batches.
         steps: Fine-tuning steps, at least 1.
-        max_bricks: Cells grow until there are at most this many bricks (9,000 are 105 MB), or 1.39 times as many where
-            cells would exceed 15 cm, as on a long road.
+        max_bricks: Cells grow until there are at most this many bricks (9,000 are 105 MB), or `_EXTRA_BRICKS` times as
+            many if cells would exceed `_LARGE_CELL`, as on a long road.
 
     Raises:
         InputError: no training camera sees a surface in the field.

@@ -1,6 +1,6 @@
 """Training data of a field: pixels of the training frames, and depth supervision.
 
-Depth supervision is a pixel (not rounded) with a known distance along its ray. Its sources are sparse points in the
+Depth supervision is a pixel (not rounded) with a known distance along its ray. Its kinds are sparse points in the
 frames they were matched in, the ground under the camera path ahead (if the camera height is constant), and stereo.
 """
 
@@ -109,7 +109,7 @@ class TrainingPixels:
         return join_depths(found)
 
     def _depths_of_path(self, camera_height: float) -> DepthSupervision:
-        """Depth supervision from the ground under the path ahead, while nearly straight: driven over, so visible."""
+        """Depth supervision from the ground under the path ahead while it is nearly straight, so that it is visible."""
         found = []
         for source in dict.fromkeys(self.cameras.sources):
             frames = np.flatnonzero([s == source for s in self.cameras.sources])
@@ -155,17 +155,20 @@ class TrainingPixels:
             return rng.integers(len(self.colors), size=n)
         return self.unmasked_index[rng.integers(len(self.unmasked_index), size=n)]
 
-    def _pixels(self, flat: NDArray[np.int64]) -> tuple[NDArray, ...]:
+    def _place(self, flat: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
+        """Frame, row and column of indices into `colors`."""
         frame = np.searchsorted(self.start, flat, side="right") - 1
-        row, column = np.divmod(flat - self.start[frame], self.width[frame])
+        return frame, *np.divmod(flat - self.start[frame], self.width[frame])
+
+    def _pixels(self, flat: NDArray[np.int64]) -> tuple[NDArray, ...]:
+        frame, row, column = self._place(flat)
         pixel = np.stack([column + 0.5, row + 0.5], -1)
         return frame, pixel, self.colors[flat].astype(np.float32) / 255.0, np.zeros(len(flat), np.float32)
 
     def _triples(self, rng: np.random.Generator, n: int) -> tuple[NDArray, ...]:
         """Three pixels in a line, the middle one second; all three are the middle one if one is outside or masked."""
         middle = self._random(rng, n)
-        frame = np.searchsorted(self.start, middle, side="right") - 1
-        row, column = np.divmod(middle - self.start[frame], self.width[frame])
+        frame, row, column = self._place(middle)
         reach = rng.uniform(1.0, np.maximum(2.0, _TRIPLE_SPACING * self.width[frame]))
         angle = rng.uniform(0.0, np.pi, n)
         dx, dy = np.rint(reach * np.cos(angle)).astype(int), np.rint(reach * np.sin(angle)).astype(int)

@@ -1,8 +1,8 @@
 """Evaluation of a field on held-out frames, and a control experiment: places rendered under other lightings.
 
 The embedding of a held-out frame is fitted on one half of the image, left or right, starting from its lighting's, and
-scored on the other half; the score is the mean of both ways. Nothing else is fitted. *Unfitted* scores use the
-lighting's embedding as it is; *wrong* scores use those of the other lightings, unfitted.
+scored on the other half; the score is the mean of both ways. *Unfitted* scores use the lighting's embedding itself;
+*wrong* scores use those of the other lightings, unfitted.
 """
 
 from functools import cache
@@ -120,20 +120,18 @@ def cross_lighting(
 ) -> dict[str, Any] | None:
     """Renders training poses under every lighting, not only their own; None with fewer than two lightings.
 
-    Only an image's mean color counts (RGB in [0, 1], over unmasked pixels). No film shows the same place at the same
-    time under two lightings, so the reference for lighting j is the nearest frame filmed under j.
+    An image counts by its mean color alone (RGB in [0, 1], over unmasked pixels). No film shows a place under two
+    lightings, so the reference for lighting j is the nearest frame filmed under j.
 
     Keys, with Euclidean color distances in RGB:
 
     * `poses`: number of poses, each rendered under every lighting.
     * `filmed_colour[i]`: mean color of the film at the poses of lighting i.
     * `mean_colour[i][j]`: mean color of the poses of lighting i, rendered under j.
-    * `to_shown_rms[j]`: poses filmed under other lightings are rendered under j; rms distance of their mean colors to
-      `filmed_colour[j]`.
-    * `to_filmed_rms[j]`: rms distance of the same images to `filmed_colour` of the lighting of their pose.
-    * `colour_follows[j]`: share of those renderings whose color is closer to that of the nearest frame filmed under j
-      than to that of their own filmed frame: 1 if the lighting decides the color, 0 if the pose does. A tie counts one
-      half, so equal lightings give about one half.
+    * `to_shown_rms[j]`: rms distance between `filmed_colour[j]` and the poses of other lightings, rendered under j.
+    * `to_filmed_rms[j]`: rms distance between these images and `filmed_colour` of the lighting of their pose.
+    * `colour_follows[j]`: share of these images that are closer to the nearest frame filmed under j than to their own
+      filmed frame: 1 if the lighting decides the color, 0 if the pose does; a tie counts one half.
     * `follows_by_pair[i][j]`: the same for the poses of lighting i alone.
     * `depth_moves_m`: greatest change of any pixel's depth between two lightings [m], 0 by construction.
     """
@@ -164,9 +162,9 @@ def cross_lighting(
     film = np.array([own[light == j].mean(0) for j in range(len(lightings))])
     out: dict[str, Any] = {
         "poses": len(poses),
-        "filmed_colour": {name: film[j].round(4).tolist() for j, name in enumerate(lightings)},
+        "filmed_colour": {name: _rounded(film[j]) for j, name in enumerate(lightings)},
         "mean_colour": {
-            name: {other: shown[light == i, j].mean(0).round(4).tolist() for j, other in enumerate(lightings)}
+            name: {other: _rounded(shown[light == i, j].mean(0)) for j, other in enumerate(lightings)}
             for i, name in enumerate(lightings)
         },
     }
@@ -191,6 +189,10 @@ def cross_lighting(
 def mean_color(image: NDArray, mask: NDArray[np.bool_]) -> Array:
     """Mean color (3,) of an image (h, w, 3) where the mask (h, w) is true, or of all of it if it is true nowhere."""
     return np.asarray(image[mask] if mask.any() else image.reshape(-1, 3), np.float64).mean(0)
+
+
+def _rounded(color: Array) -> list[float]:
+    return [round(float(value), 4) for value in color]
 
 
 def _distance(a: Array, b: Array) -> Array:

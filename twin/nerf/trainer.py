@@ -74,7 +74,7 @@ def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor
 
 
 def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
-    """Mean cost of opaque rays above the horizon, where a plain sky fits anywhere, and of transparent ones below.
+    """Mean cost of opaque rays above the horizon, as a plain sky fits at any distance, and of transparent ones below.
 
     Takes the opacity of rays (n,) and the vertical component `up` (n,) of their directions.
     """
