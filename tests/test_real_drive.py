@@ -324,7 +324,7 @@ def test_only_a_policy_file_drives(what, tmp_path, capsys):
 class Recorder:
     """Stands for a raster of full size; notes where it was asked to look from, and at what light."""
 
-    def __init__(self, model, intrinsics, size, shadow_range) -> None:
+    def __init__(self, model, intrinsics, size, shadow_range=None) -> None:
         self.poses, self.size = [], size
         Recorder.last = self
 

@@ -166,7 +166,8 @@ def _check(config: SceneConfig, path: Path) -> None:
     _check_tasks(config.task, path)
     for section in _SECTIONS:
         settings = getattr(config, section)
-        for key, bounds in setting_ranges(type(settings)).items():
+        kind: type = type(settings)
+        for key, bounds in setting_ranges(kind).items():
             _check_range(getattr(settings, key), bounds, f"{path}: {section}.{key}")
     _check_range(config.seed, setting_ranges(SceneConfig)["seed"], f"{path}: seed")
     for source in config.source:
