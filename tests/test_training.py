@@ -222,8 +222,8 @@ def test_impossible_configurations_are_refused(wrong):
 def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     from twin.learn.training import train as run
 
-    def interrupt(now) -> None:
-        if now.steps == 120:
+    def interrupt(steps, recent) -> None:
+        if steps == 120:
             signal.raise_signal(signal.SIGTERM)
 
     with pytest.raises(KeyboardInterrupt):
@@ -231,7 +231,7 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     head = json.loads((tmp_path / "state" / "state.json").read_text())
     assert (head["steps"], head["replay"]["pos"]) == (120, 30)
     seen = []
-    run(twin.load_scene(scene), tmp_path, SHORT, lambda now: seen.append(now.steps))
+    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps))
     assert seen[0] == 124 and seen[-1] == SHORT.steps
 
 
