@@ -222,7 +222,7 @@ def test_impossible_configurations_are_refused(wrong):
 def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     from twin.learn.training import train as run
 
-    def interrupt(steps, _recent) -> None:
+    def interrupt(steps, recent) -> None:
         if steps == 120:
             signal.raise_signal(signal.SIGTERM)
 
@@ -231,7 +231,7 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     head = json.loads((tmp_path / "state" / "state.json").read_text())
     assert (head["steps"], head["replay"]["pos"]) == (120, 30)
     seen = []
-    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, _recent: seen.append(steps))
+    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps))
     assert seen[0] == 124 and seen[-1] == SHORT.steps
 
 
