@@ -184,11 +184,10 @@ class _FineTuner:
     ):
         self.field, self.pixels, self.steps, self.values, self.seed = field, pixels, steps, values, seed
         device = field.device
+        self.index: Any = kernels.BrickIndex()
         near, far = brick_indices(layout, *slots)
-        self.index: list[Any] = [
-            wp.array(near, dtype=wp.int32, device=device),
-            wp.array(far, dtype=wp.int32, device=device),
-        ]
+        self.index.near = wp.array(near, dtype=wp.int32, device=device)
+        self.index.far = wp.array(far, dtype=wp.int32, device=device)
         self.gradient, self.second = torch.zeros_like(values), torch.zeros(*values.shape[:2], 2, device=device)
         self.w_values, self.w_gradient = warp_view(values, volume.Channels), warp_view(self.gradient, volume.Channels)
         self.w_second = warp_view(self.second, wp.vec2f)
@@ -225,7 +224,7 @@ class _FineTuner:
         wp.launch(
             kernels.interpolate,
             count * _SAMPLES,
-            [ws.w_positions, *self.index, self.w_values, _EMPTY_RAW_DENSITY, samples.start],
+            [ws.w_positions, self.index, self.w_values, _EMPTY_RAW_DENSITY, samples.start],
             [ws.w_outputs],
             device=f.device,
         )
@@ -244,7 +243,7 @@ class _FineTuner:
         return float((error.detach() ** 2).mean())
 
     def _update(self, part: int, rate: float, step: int) -> None:
-        gradients = [self.ws.w_positions, *self.index, self.ws.w_outputs_grad, part, _SHARDS]
+        gradients = [self.ws.w_positions, self.index, self.ws.w_outputs_grad, part, _SHARDS]
         wp.launch(
             kernels.interpolate_backward,
             self.rays * _SAMPLES,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError, short_repr
 from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import hashgrid
+from twin.nerf.kernels import hashgrid, space
 from twin.runtime import available_cores
 from twin.warp_runtime import wp
 
@@ -137,30 +137,16 @@ def near_box_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: 
     return NearBox(tuple(map(float, center)), tuple(map(float, half)))  # type: ignore[arg-type]
 
 
-@dataclass(frozen=True)
-class OpacityGrids:
-    """Sizes of the two opacity grids, in cells per axis."""
+def opacity_grid_sizes(near_box: NearBox) -> list[tuple[tuple[int, ...], float]]:
+    """Cells per axis, and side of a cell inside the near box [m], of the near and the far opacity grid.
 
-    near_shape: tuple[int, int, int]
-    far_shape: tuple[int, int, int]
-    near_cell: float
-    """Side of a cell [m]."""
-    far_cell: float
-    """Side of a cell, measured inside the near box [m]."""
-
-
-def opacity_grids(near_box: NearBox) -> OpacityGrids:
-    """Sizes of cubic grids over the near box (near) and the contracted cube, twice as wide (far)."""
-    box = 2.0 * np.array(near_box.half)
-
-    def divide(sides: NDArray[np.float64], cells: int) -> tuple[tuple[int, int, int], float]:
+    The near grid covers the near box, the far grid the contracted cube, which is twice as wide.
+    """
+    out = []
+    for sides, cells in ((2.0 * np.array(near_box.half), _NEAR_CELLS), (4.0 * np.array(near_box.half), _FAR_CELLS)):
         cell = float((sides.prod() / cells) ** (1 / 3))
-        x, y, z = (int(n) for n in np.maximum(np.ceil(sides / cell), 4))
-        return (x, y, z), cell
-
-    near_shape, near_cell = divide(box, _NEAR_CELLS)
-    far_shape, far_cell = divide(2.0 * box, _FAR_CELLS)
-    return OpacityGrids(near_shape, far_shape, near_cell, far_cell)
+        out.append((tuple(int(n) for n in np.maximum(np.ceil(sides / cell), 4)), cell))
+    return out
 
 
 def level_cells(near_box: NearBox, levels: int, growth: float) -> NDArray[np.float32]:
@@ -225,12 +211,14 @@ class Workspace:
         self.w_camera = warp_view(self.camera, wp.int32)
         self.pixel, self.w_pixel = new(wp.vec2f, rays, 2)
         self.targets, self.w_targets = new(wp.float32, rays)
-        self.cosines, self.w_cosines = new(wp.float32, rays)
-        self.origins, self.w_origins = new(wp.vec3f, rays, 3)
-        self.directions, self.w_directions = new(wp.vec3f, rays, 3)
-        self.edges, self.w_edges = new(wp.float32, rays, samples + 1)
-        self.distances, self.w_distances = new(wp.float32, rays, samples)
-        self.lengths, self.w_lengths = new(wp.float32, rays, samples)
+        self.w_rays: Any = space.Rays()
+        self.origins, self.w_rays.origins = new(wp.vec3f, rays, 3)
+        self.directions, self.w_rays.directions = new(wp.vec3f, rays, 3)
+        self.cosines, self.w_rays.cosines = new(wp.float32, rays)
+        self.w_strata: Any = volume.Strata()
+        self.edges, self.w_strata.edges = new(wp.float32, rays, samples + 1)
+        self.distances, self.w_strata.distances = new(wp.float32, rays, samples)
+        self.lengths, self.w_strata.lengths = new(wp.float32, rays, samples)
         self.positions, self.w_positions = new(wp.vec3f, rows, 3)
         self.w_ray_positions = by_ray(self.positions, wp.vec3f)
         self.features = torch.zeros(rows, width, device=device)

@@ -31,7 +31,7 @@ from twin.nerf.buffers import (
     level_cells,
     level_shapes,
     load_training_kernels,
-    opacity_grids,
+    opacity_grid_sizes,
     resolve_device,
     warp_view,
 )
@@ -77,14 +77,17 @@ class RadianceField:
         self.device = "cpu" if table.device.type == "cpu" else "cuda"
         load_training_kernels(self.device)
         self.w_table = warp_view(table, hashgrid.Feature)
-        self.w_near_grid, self.w_far_grid = (warp_view(grid, wp.float32) for grid in grids)
         cells = level_cells(layout.near_box, layout.levels, layout.growth)
-        self.w_cells: Any = wp.array(cells, dtype=wp.vec3f, device=self.device)
-        self.w_shapes: Any = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.device)
-        self.mask = wp.uint32(2**layout.log2_table - 1)
-        self.center = wp.vec3f(*layout.centre)
-        self.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        self.grid_sizes = opacity_grids(layout.near_box)
+        self.w_levels: Any = hashgrid.Levels()
+        self.w_levels.cells = wp.array(cells, dtype=wp.vec3f, device=self.device)
+        self.w_levels.shapes = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.device)
+        self.w_levels.mask = wp.uint32(2**layout.log2_table - 1)
+        self.w_grids: Any = sampler.OpacityGrids()
+        self.w_grids.near, self.w_grids.far = (warp_view(grid, wp.float32) for grid in grids)
+        (_, self.w_grids.near_cell), (_, self.w_grids.far_cell) = opacity_grid_sizes(layout.near_box)
+        self.contraction: Any = space.Contraction()
+        self.contraction.center = wp.vec3f(*layout.centre)
+        self.contraction.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
         self._spare: dict[tuple[int, int, int], list[Workspace]] = {}
 
     @property
@@ -112,7 +115,7 @@ class RadianceField:
             space.pixel_rays,
             count,
             [ws.w_camera, ws.w_pixel, cameras.rotation, cameras.position, cameras.intrinsics, start],
-            [ws.w_origins, ws.w_directions, ws.w_cosines],
+            [ws.w_rays],
             device=self.device,
         )
 
@@ -125,11 +128,10 @@ class RadianceField:
             sampler.sample_rays,
             count,
             [
-                *(ws.w_origins, ws.w_directions, ws.w_targets, self.center, self.inverse_half),
-                *(self.w_near_grid, self.w_far_grid, self.grid_sizes.near_cell, self.grid_sizes.far_cell),
+                *(ws.w_rays, ws.w_targets, self.contraction, self.w_grids),
                 *(self.layout.near_plane, floor, target_mass, jitter, start),
             ],
-            [ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_ray_positions],
+            [ws.w_strata, ws.w_ray_positions],
             device=self.device,
         )
 
@@ -138,7 +140,7 @@ class RadianceField:
         wp.launch(
             hashgrid.encode,
             count,
-            [ws.w_positions, self.w_table, self.w_cells, self.w_shapes, self.mask, start],
+            [ws.w_positions, self.w_table, self.w_levels, start],
             [ws.w_features],
             device=self.device,
         )
@@ -150,7 +152,7 @@ class RadianceField:
         wp.launch(
             volume.composite,
             count,
-            [ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, self.layout.density_unit, start],
+            [ws.w_ray_outputs, ws.w_strata, self.layout.density_unit, start],
             [ws.w_weights, ws.w_composited, ws.w_inverse, ws.w_median],
             device=self.device,
         )
@@ -173,7 +175,7 @@ class RadianceField:
             volume.composite_backward,
             count,
             [
-                *(ws.w_ray_outputs, ws.w_edges, ws.w_distances, ws.w_lengths, ws.w_weights, ws.w_targets),
+                *(ws.w_ray_outputs, ws.w_strata, ws.w_weights, ws.w_targets),
                 *(ws.w_composited_grad, ws.w_inverse_grad, self.layout.density_unit),
                 *(distortion, depth, depth_reach, log_offset, start),
             ],
@@ -195,7 +197,7 @@ class RadianceField:
                 wp.launch(
                     space.contract_points,
                     n,
-                    [warp_view(meters, wp.vec3f), self.center, self.inverse_half, 0],
+                    [warp_view(meters, wp.vec3f), self.contraction],
                     [ws.w_positions],
                     device=self.device,
                 )
@@ -332,9 +334,10 @@ def untrained_field(layout: Layout, appearance: Appearance, seed: int, device: s
     parameters = network.initial_parameters(
         layout.levels * hashgrid.FEATURES, layout.hidden, layout.appearance_dim, seed
     )
-    sizes = opacity_grids(layout.near_box)
-    near = torch.full(sizes.near_shape, -math.expm1(-layout.density_unit * sizes.near_cell), device=device)
-    far = torch.full(sizes.far_shape, -math.expm1(-layout.density_unit * sizes.far_cell), device=device)
+    near, far = (
+        torch.full(shape, -math.expm1(-layout.density_unit * cell), device=device)
+        for shape, cell in opacity_grid_sizes(layout.near_box)
+    )
     moved = Appearance(
         appearance.lightings,
         appearance.frames,

@@ -58,7 +58,7 @@ class PoseRefinement:
             hashgrid.encode_positions_backward,
             count * ws.samples,
             [
-                *(ws.w_positions, field.w_table, field.w_cells, field.w_shapes, field.mask, start * ws.samples),
+                *(ws.w_positions, field.w_table, field.w_levels, start * ws.samples),
                 ws.w_features_grad,
             ],
             [self._w_positions_grad],
@@ -68,7 +68,7 @@ class PoseRefinement:
             space.rays_backward,
             count,
             [
-                *(ws.w_origins, ws.w_directions, ws.w_distances, field.center, field.inverse_half, start),
+                *(ws.w_rays, ws.w_strata.distances, field.contraction, start),
                 self._w_ray_positions_grad,
             ],
             self._w_ray_grad,

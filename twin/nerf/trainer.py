@@ -294,8 +294,7 @@ class Trainer:
                 sampler.update_grids,
                 self.rays * ws.samples,
                 [
-                    *(ws.w_positions, ws.w_densities, f.grid_sizes.near_cell, f.grid_sizes.far_cell),
-                    *(_RISE, _FALL, task - levels, 2, f.w_near_grid, f.w_far_grid),
+                    *(ws.w_positions, ws.w_densities, _RISE, _FALL, task - levels, 2, f.w_grids),
                 ],
                 device=self.device,
             )
@@ -304,7 +303,7 @@ class Trainer:
         wp.launch(
             hashgrid.encode_backward,
             (1, ws.features.shape[0]),
-            [ws.w_positions, f.w_cells, f.w_shapes, f.mask, task, ws.w_features_grad, self.moments[0]],
+            [ws.w_positions, f.w_levels, task, ws.w_features_grad, self.moments[0]],
             device=self.device,
         )
         wp.launch(

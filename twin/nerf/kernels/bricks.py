@@ -56,6 +56,14 @@ class Bricks:
 
 
 @wp.struct
+class BrickIndex:
+    """Slots of the near and the far grid's bricks."""
+
+    near: wp.array3d(dtype=wp.int32)
+    far: wp.array3d(dtype=wp.int32)
+
+
+@wp.struct
 class BrickPosition:
     """Slot of a grid position (< 0: none), its cell's lowest corner, and the position in the cell."""
 
@@ -72,16 +80,16 @@ def corner_index(x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
 
 
 @wp.func
-def locate(g: wp.vec3f, near_index: wp.array3d(dtype=wp.int32), far_index: wp.array3d(dtype=wp.int32)) -> BrickPosition:
+def locate(g: wp.vec3f, index: BrickIndex) -> BrickPosition:
     out = BrickPosition()
     b = near_box_position(g)
     p = wp.vec3f(0.0, 0.0, 0.0)
     if inside_near_box(b):
-        p = wp.cw_mul(b, wp.vec3f(wp.vec3i(near_index.shape[0], near_index.shape[1], near_index.shape[2])))
-        out.slot = near_index[int(p[0]), int(p[1]), int(p[2])]
+        p = wp.cw_mul(b, wp.vec3f(wp.vec3i(index.near.shape[0], index.near.shape[1], index.near.shape[2])))
+        out.slot = index.near[int(p[0]), int(p[1]), int(p[2])]
     else:
-        p = wp.cw_mul(g, wp.vec3f(wp.vec3i(far_index.shape[0], far_index.shape[1], far_index.shape[2])))
-        out.slot = far_index[int(p[0]), int(p[1]), int(p[2])]
+        p = wp.cw_mul(g, wp.vec3f(wp.vec3i(index.far.shape[0], index.far.shape[1], index.far.shape[2])))
+        out.slot = index.far[int(p[0]), int(p[1]), int(p[2])]
     c = (p - wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))) * _SIDE
     x = wp.min(int(c[0]), CELLS - 1)
     y = wp.min(int(c[1]), CELLS - 1)
@@ -111,8 +119,7 @@ def corner_offset(n: wp.int32) -> wp.int32:
 @wp.kernel(enable_backward=False)
 def interpolate(
     positions: wp.array(dtype=wp.vec3f),
-    near_index: wp.array3d(dtype=wp.int32),
-    far_index: wp.array3d(dtype=wp.int32),
+    index: BrickIndex,
     values: wp.array2d(dtype=Channels),
     empty_raw: wp.float32,
     start: wp.int32,
@@ -120,7 +127,7 @@ def interpolate(
 ):
     """Raw density and features at grid positions, from float samples; raw density `empty_raw` outside bricks."""
     i = start + wp.tid()
-    position = locate(positions[i], near_index, far_index)
+    position = locate(positions[i], index)
     out = Channels()
     if position.slot < 0:
         out[0] = empty_raw
@@ -133,8 +140,7 @@ def interpolate(
 @wp.kernel(enable_backward=False)
 def interpolate_backward(
     positions: wp.array(dtype=wp.vec3f),
-    near_index: wp.array3d(dtype=wp.int32),
-    far_index: wp.array3d(dtype=wp.int32),
+    index: BrickIndex,
     outputs_grad: wp.array(dtype=Channels),
     part: wp.int32,
     parts: wp.int32,
@@ -145,7 +151,7 @@ def interpolate_backward(
     g = outputs_grad[i]
     if wp.dot(g, g) < _MIN_GRADIENT:
         return
-    position = locate(positions[i], near_index, far_index)
+    position = locate(positions[i], index)
     if position.slot >= 0 and position.slot % parts == part:
         for n in range(8):
             wp.atomic_add(gradient, position.slot, position.corner + corner_offset(n), g * corner_weight(position, n))
@@ -154,8 +160,7 @@ def interpolate_backward(
 @wp.kernel(enable_backward=False)
 def adam_step(
     positions: wp.array(dtype=wp.vec3f),
-    near_index: wp.array3d(dtype=wp.int32),
-    far_index: wp.array3d(dtype=wp.int32),
+    index: BrickIndex,
     outputs_grad: wp.array(dtype=Channels),
     part: wp.int32,
     parts: wp.int32,
@@ -175,7 +180,7 @@ def adam_step(
     g = outputs_grad[i]
     if wp.dot(g, g) < _MIN_GRADIENT:
         return
-    position = locate(positions[i], near_index, far_index)
+    position = locate(positions[i], index)
     if position.slot < 0 or position.slot % parts != part:
         return
     slot = position.slot

@@ -18,6 +18,18 @@ RAW_LIMIT = 14.0
 """Raw densities are clamped to this, which is opaque at any sampling distance."""
 
 
+@wp.struct
+class Strata:
+    """Strata of n rays."""
+
+    edges: wp.array2d(dtype=wp.float32)
+    """[m], shape (n, K + 1)."""
+    distances: wp.array2d(dtype=wp.float32)
+    """Sampled distances [m], shape (n, K)."""
+    lengths: wp.array2d(dtype=wp.float32)
+    """[contracted m], shape (n, K)."""
+
+
 @wp.func
 def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
     """Density [1/contracted m] of a raw output; `unit` is the density at 0."""
@@ -26,10 +38,7 @@ def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
 
 @wp.kernel(enable_backward=False)
 def sample_densities(
-    outputs: wp.array(dtype=Channels),
-    unit: wp.float32,
-    start: wp.int32,
-    densities: wp.array(dtype=wp.float32),
+    outputs: wp.array(dtype=Channels), unit: wp.float32, start: wp.int32, densities: wp.array(dtype=wp.float32)
 ):
     """Densities of samples [1/contracted m]."""
     i = start + wp.tid()
@@ -39,9 +48,7 @@ def sample_densities(
 @wp.kernel(enable_backward=False)
 def composite(
     outputs: wp.array2d(dtype=Channels),
-    edges: wp.array2d(dtype=wp.float32),
-    distances: wp.array2d(dtype=wp.float32),
-    lengths: wp.array2d(dtype=wp.float32),
+    strata: Strata,
     unit: wp.float32,
     start: wp.int32,
     weights: wp.array2d(dtype=wp.float32),
@@ -55,18 +62,18 @@ def composite(
     total = Channels()
     inverse = float(0.0)
     median = float(-1.0)
-    for k in range(distances.shape[1]):
+    for k in range(strata.distances.shape[1]):
         out = outputs[i, k]
         sigma = density_of(out[0], unit)
-        optical = sigma * lengths[i, k]
+        optical = sigma * strata.lengths[i, k]
         through = wp.exp(-optical)
         w = transmittance * (1.0 - through)
         weights[i, k] = w
         total += out * w
-        inverse += w / distances[i, k]
+        inverse += w / strata.distances[i, k]
         if median < 0.0 and transmittance * through < 0.5:
             share = wp.log(transmittance / 0.5) / optical
-            median = edges[i, k] + share * (edges[i, k + 1] - edges[i, k])
+            median = strata.edges[i, k] + share * (strata.edges[i, k + 1] - strata.edges[i, k])
         transmittance *= through
     total[0] = 1.0 - transmittance
     composited[i] = total
@@ -77,9 +84,7 @@ def composite(
 @wp.kernel(enable_backward=False)
 def composite_backward(
     outputs: wp.array2d(dtype=Channels),
-    edges: wp.array2d(dtype=wp.float32),
-    distances: wp.array2d(dtype=wp.float32),
-    lengths: wp.array2d(dtype=wp.float32),
+    strata: Strata,
     weights: wp.array2d(dtype=wp.float32),
     targets: wp.array(dtype=wp.float32),
     composited_grad: wp.array(dtype=Channels),
@@ -100,7 +105,7 @@ def composite_backward(
         moving all weight to it, capped to limit the effect of wrong targets.
     """
     i = start + wp.tid()
-    count = distances.shape[1]
+    count = strata.distances.shape[1]
     target = targets[i]
     gradient = composited_grad[i]
     opacity_gradient = gradient[0]
@@ -112,7 +117,7 @@ def composite_backward(
     for k in range(count):
         w = weights[i, k]
         all_w += w
-        all_ws += w * wp.log(distances[i, k] + log_offset)
+        all_ws += w * wp.log(strata.distances[i, k] + log_offset)
     sum_w = all_w
     sum_ws = all_ws
 
@@ -122,12 +127,12 @@ def composite_backward(
         k = count - 1 - reverse
         out = outputs[i, k]
         w = weights[i, k]
-        t = distances[i, k]
+        t = strata.distances[i, k]
         s = wp.log(t + log_offset)
         sum_w -= w
         sum_ws -= w * s
         spread = s * (2.0 * sum_w + w - all_w) - (2.0 * sum_ws + w * s - all_ws)
-        width = wp.log((edges[i, k + 1] + log_offset) / (edges[i, k] + log_offset))
+        width = wp.log((strata.edges[i, k + 1] + log_offset) / (strata.edges[i, k] + log_offset))
         gw = opacity_gradient + inverse_gradient / t + distortion * (2.0 * spread + 0.6666667 * w * width)
         if target > 0.0:
             gw += depth * (wp.min(wp.abs(t / target - 1.0), depth_reach) - depth_reach)
@@ -139,7 +144,7 @@ def composite_backward(
         slope = gw * (left - w) - behind
         behind += gw * w
         if out[0] < RAW_LIMIT:
-            grad[0] = slope * sigma * lengths[i, k]
+            grad[0] = slope * sigma * strata.lengths[i, k]
         else:
             grad[0] = 0.0
         outputs_grad[i, k] = grad

@@ -21,6 +21,18 @@ _PRIME_Z = wp.uint32(805459861)
 
 
 @wp.struct
+class Levels:
+    """The levels of a grid."""
+
+    cells: wp.array(dtype=wp.vec3f)
+    """Cells per axis."""
+    shapes: wp.array(dtype=wp.vec4i)
+    """Vertices per axis, and 1 if the level is stored densely."""
+    mask: wp.uint32
+    """Rows of a hashed level's table, a power of 2, minus 1."""
+
+
+@wp.struct
 class HashCell:
     """A cell of a level: its lowest vertex, and weights of the upper (b) and lower (a = 1 − b) vertices per axis."""
 
@@ -45,17 +57,15 @@ def cell_at(position: wp.vec3f, cells: wp.vec3f) -> HashCell:
 
 
 @wp.func
-def vertex_index(cell: HashCell, n: wp.int32, shape: wp.vec4i, mask: wp.uint32) -> wp.int32:
-    """Row of a cell's vertex n = x + 2·y + 4·z in the level's table (Müller et al. 2022, eq. 4).
-
-    `shape` is (nx, ny, nz, dense?).
-    """
+def vertex_index(cell: HashCell, n: wp.int32, levels: Levels, level: wp.int32) -> wp.int32:
+    """Row of a cell's vertex n = x + 2·y + 4·z in the level's table (Müller et al. 2022, eq. 4)."""
+    shape = levels.shapes[level]
     x = cell.x + (n & 1)
     y = cell.y + ((n >> 1) & 1)
     z = cell.z + (n >> 2)
     if shape[3] == 1:
         return x + shape[0] * (y + shape[1] * z)
-    return wp.int32((wp.uint32(x) ^ (wp.uint32(y) * _PRIME_Y) ^ (wp.uint32(z) * _PRIME_Z)) & mask)
+    return wp.int32((wp.uint32(x) ^ (wp.uint32(y) * _PRIME_Y) ^ (wp.uint32(z) * _PRIME_Z)) & levels.mask)
 
 
 @wp.func
@@ -70,32 +80,25 @@ def vertex_weight(cell: HashCell, n: wp.int32) -> wp.float32:
 def encode(
     positions: wp.array(dtype=wp.vec3f),
     table: wp.array2d(dtype=Feature),
-    cells: wp.array(dtype=wp.vec3f),
-    shapes: wp.array(dtype=wp.vec4i),
-    mask: wp.uint32,
+    levels: Levels,
     start: wp.int32,
     features: wp.array2d(dtype=Feature),
 ):
-    """Trilinear features of grid positions [start, start + dim), shape (n, levels).
-
-    `cells` is the number of cells per axis and level; `shapes` is as in `vertex_index`.
-    """
+    """Trilinear features of grid positions [start, start + dim), shape (n, levels)."""
     i = start + wp.tid()
     p = positions[i]
-    for level in range(cells.shape[0]):
-        cell = cell_at(p, cells[level])
+    for level in range(levels.cells.shape[0]):
+        cell = cell_at(p, levels.cells[level])
         value = Feature()
         for n in range(8):
-            value += table[level, vertex_index(cell, n, shapes[level], mask)] * vertex_weight(cell, n)
+            value += table[level, vertex_index(cell, n, levels, level)] * vertex_weight(cell, n)
         features[i, level] = value
 
 
 @wp.kernel(enable_backward=False)
 def encode_backward(
     positions: wp.array(dtype=wp.vec3f),
-    cells: wp.array(dtype=wp.vec3f),
-    shapes: wp.array(dtype=wp.vec4i),
-    mask: wp.uint32,
+    levels: Levels,
     first_level: wp.int32,
     features_grad: wp.array2d(dtype=Feature),
     table_grad: wp.array2d(dtype=Feature),
@@ -103,19 +106,17 @@ def encode_backward(
     """Adds the gradient of `encode` to `table_grad`; launched over (levels, n) from `first_level` on."""
     k, i = wp.tid()
     level = first_level + k
-    cell = cell_at(positions[i], cells[level])
+    cell = cell_at(positions[i], levels.cells[level])
     g = features_grad[i, level]
     for n in range(8):
-        wp.atomic_add(table_grad, level, vertex_index(cell, n, shapes[level], mask), g * vertex_weight(cell, n))
+        wp.atomic_add(table_grad, level, vertex_index(cell, n, levels, level), g * vertex_weight(cell, n))
 
 
 @wp.kernel(enable_backward=False)
 def encode_positions_backward(
     positions: wp.array(dtype=wp.vec3f),
     table: wp.array2d(dtype=Feature),
-    cells: wp.array(dtype=wp.vec3f),
-    shapes: wp.array(dtype=wp.vec4i),
-    mask: wp.uint32,
+    levels: Levels,
     start: wp.int32,
     features_grad: wp.array2d(dtype=Feature),
     positions_grad: wp.array(dtype=wp.vec3f),
@@ -124,17 +125,17 @@ def encode_positions_backward(
     i = start + wp.tid()
     p = positions[i]
     total = wp.vec3f()
-    for level in range(cells.shape[0]):
-        cell = cell_at(p, cells[level])
+    for level in range(levels.cells.shape[0]):
+        cell = cell_at(p, levels.cells[level])
         a = cell.a
         b = cell.b
         v = Eight()
         for n in range(8):
-            v[n] = wp.dot(features_grad[i, level], table[level, vertex_index(cell, n, shapes[level], mask)])
+            v[n] = wp.dot(features_grad[i, level], table[level, vertex_index(cell, n, levels, level)])
         dx = ((v[1] - v[0]) * a[1] + (v[3] - v[2]) * b[1]) * a[2] + ((v[5] - v[4]) * a[1] + (v[7] - v[6]) * b[1]) * b[2]
         dy = ((v[2] - v[0]) * a[0] + (v[3] - v[1]) * b[0]) * a[2] + ((v[6] - v[4]) * a[0] + (v[7] - v[5]) * b[0]) * b[2]
         dz = ((v[4] - v[0]) * a[0] + (v[5] - v[1]) * b[0]) * a[1] + ((v[6] - v[2]) * a[0] + (v[7] - v[3]) * b[0]) * b[1]
-        total += wp.cw_mul(wp.vec3f(dx, dy, dz), cells[level])
+        total += wp.cw_mul(wp.vec3f(dx, dy, dz), levels.cells[level])
     positions_grad[i] = total
 
 

@@ -9,7 +9,8 @@ quantiles of the bins' weights; it is sampled once, and the sample stands for it
 # Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
 # mypy: ignore-errors
 # ruff: noqa: RUF046
-from twin.nerf.kernels.space import expansion, grid_position, max_norm
+from twin.nerf.kernels.composite import Strata
+from twin.nerf.kernels.space import Contraction, Rays, expansion, grid_position, max_norm, unit_position
 from twin.warp_runtime import wp
 
 BINS = 256
@@ -23,6 +24,16 @@ _OPAQUE = 0.02  # transmittance from which a ray counts as blocked
 _DOUBT_SHARE = 0.35
 _DOUBT = 0.25
 _WIDENING = 0.02  # least bin length as a share of the distance
+
+
+@wp.struct
+class OpacityGrids:
+    """Opacity grids over the near box and the contracted cube, and the sides of their cells inside the near box [m]."""
+
+    near: wp.array3d(dtype=wp.float32)
+    far: wp.array3d(dtype=wp.float32)
+    near_cell: wp.float32
+    far_cell: wp.float32
 
 
 @wp.func
@@ -47,39 +58,29 @@ def inside_near_box(n: wp.vec3f) -> wp.bool:
 
 @wp.kernel(enable_backward=False)
 def sample_rays(
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
+    rays: Rays,
     targets: wp.array(dtype=wp.float32),
-    center: wp.vec3f,
-    inverse_half: wp.vec3f,
-    near_grid: wp.array3d(dtype=wp.float32),
-    far_grid: wp.array3d(dtype=wp.float32),
-    near_cell: wp.float32,
-    far_cell: wp.float32,
+    box: Contraction,
+    grids: OpacityGrids,
     near: wp.float32,
     floor: wp.float32,
     target_mass: wp.float32,
     seed: wp.int32,
     start: wp.int32,
-    edges: wp.array2d(dtype=wp.float32),
-    distances: wp.array2d(dtype=wp.float32),
-    lengths: wp.array2d(dtype=wp.float32),
+    strata: Strata,
     positions: wp.array2d(dtype=wp.vec3f),
 ):
-    """Samples K strata per ray: edges (n, K + 1) [m], sampled distances (n, K) [m], contracted lengths (n, K)
-    [contracted m], and grid positions (n, K).
+    """Samples K strata per ray, and their grid positions (n, K).
 
     Args:
         targets: Known distance of a surface [m], 0 = unknown; its bin gets `target_mass` of extra weight.
-        near_grid, far_grid: Opacity grids over the near box and the contracted cube.
-        near_cell, far_cell: Side of their cells inside the near box [m].
         near: Distance at which rays start [m].
         floor: Weight spread evenly over all bins, beside at most 1 of the surfaces.
         seed: Seed of the jitter within strata; negative takes their middles.
     """
     i = start + wp.tid()
-    o = origins[i]
-    d = directions[i]
+    o = rays.origins[i]
+    d = rays.directions[i]
     target = targets[i]
     weights = wp.zeros(shape=256, dtype=wp.float32)
     bounds = wp.zeros(shape=257, dtype=wp.float32)
@@ -91,23 +92,23 @@ def sample_rays(
     beyond = int(0)
     bounds[0] = t
     while n < BINS:
-        u = wp.cw_mul(o + d * t - center, inverse_half)
+        u = unit_position(box, o + d * t)
         m = max_norm(u)
         if m > _FAR:
             break
-        length = near_cell
+        length = grids.near_cell
         if m > 1.0:
-            length = far_cell * expansion(u)
+            length = grids.far_cell * expansion(u)
         step = wp.max(_STEP * length, _WIDENING * t)
-        g = grid_position(wp.cw_mul(o + d * (t + 0.5 * step) - center, inverse_half))
+        g = grid_position(unit_position(box, o + d * (t + 0.5 * step)))
         opacity = float(0.0)
         b = near_box_position(g)
         if inside_near_box(b):
-            c = grid_cell(b, near_grid)
-            opacity = near_grid[c[0], c[1], c[2]]
+            c = grid_cell(b, grids.near)
+            opacity = grids.near[c[0], c[1], c[2]]
         else:
-            c = grid_cell(g, far_grid)
-            opacity = far_grid[c[0], c[1], c[2]]
+            c = grid_cell(g, grids.far)
+            opacity = grids.far[c[0], c[1], c[2]]
         opacity *= wp.min(1.0, step / length)
         doubt = _DOUBT * opacity
         weights[n] = (1.0 - _DOUBT_SHARE) * transmittance * opacity + _DOUBT_SHARE * doubting * doubt
@@ -138,12 +139,12 @@ def sample_rays(
         weights[b] = p
         total += p
 
-    count = distances.shape[1]
+    count = strata.distances.shape[1]
     share = total / wp.float32(count)
     rng = wp.rand_init(seed, i)
     b = int(0)
     passed = float(0.0)  # weight of the bins before b
-    edges[i, 0] = near
+    strata.edges[i, 0] = near
     for k in range(count):
         jitter = float(0.5)
         if seed >= 0:
@@ -153,16 +154,16 @@ def sample_rays(
             passed += weights[b]
             b += 1
         s = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((target_weight - passed) / weights[b], 0.0, 1.0)
-        u = wp.cw_mul(o + d * s - center, inverse_half)
-        distances[i, k] = s
+        u = unit_position(box, o + d * s)
+        strata.distances[i, k] = s
         positions[i, k] = grid_position(u)
         target_weight = wp.float32(k + 1) * share
         while b + 1 < n and passed + weights[b] < target_weight:
             passed += weights[b]
             b += 1
         edge = bounds[b] + (bounds[b + 1] - bounds[b]) * wp.clamp((target_weight - passed) / weights[b], 0.0, 1.0)
-        edges[i, k + 1] = edge
-        lengths[i, k] = (edge - edges[i, k]) / expansion(u)
+        strata.edges[i, k + 1] = edge
+        strata.lengths[i, k] = (edge - strata.edges[i, k]) / expansion(u)
 
 
 @wp.func
@@ -186,14 +187,11 @@ def update_cell(
 def update_grids(
     positions: wp.array(dtype=wp.vec3f),
     densities: wp.array(dtype=wp.float32),
-    near_cell: wp.float32,
-    far_cell: wp.float32,
     rise: wp.float32,
     fall: wp.float32,
     part: wp.int32,
     parts: wp.int32,
-    near_grid: wp.array3d(dtype=wp.float32),
-    far_grid: wp.array3d(dtype=wp.float32),
+    grids: OpacityGrids,
 ):
     """Moves sampled cells towards the opacity of their samples, at rate `rise` up and `fall` down.
 
@@ -203,6 +201,6 @@ def update_grids(
     g = positions[i]
     b = near_box_position(g)
     if inside_near_box(b):
-        update_cell(near_grid, b, densities[i] * near_cell, rise, fall, part, parts)
+        update_cell(grids.near, b, densities[i] * grids.near_cell, rise, fall, part, parts)
     else:
-        update_cell(far_grid, g, densities[i] * far_cell, rise, fall, part, parts)
+        update_cell(grids.far, g, densities[i] * grids.far_cell, rise, fall, part, parts)

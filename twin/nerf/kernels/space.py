@@ -14,6 +14,33 @@ from twin.warp_runtime import wp
 _TOP = 1.0 - 1.0e-6  # greatest coordinate of a grid position
 
 
+@wp.struct
+class Contraction:
+    """The near box as the contraction needs it."""
+
+    center: wp.vec3f
+    """[m]"""
+    inverse_half: wp.vec3f
+    """Over the half sides [1/m]."""
+
+
+@wp.struct
+class Rays:
+    """Rays of a batch."""
+
+    origins: wp.array(dtype=wp.vec3f)
+    """[m]"""
+    directions: wp.array(dtype=wp.vec3f)
+    """Unit vectors."""
+    cosines: wp.array(dtype=wp.float32)
+    """Cosines of the angle to the optical axis: z-depth = distance × cosine."""
+
+
+@wp.func
+def unit_position(box: Contraction, x: wp.vec3f) -> wp.vec3f:
+    return wp.cw_mul(x - box.center, box.inverse_half)
+
+
 @wp.func
 def max_norm(u: wp.vec3f) -> wp.float32:
     return wp.max(wp.max(wp.abs(u[0]), wp.abs(u[1])), wp.abs(u[2]))
@@ -59,16 +86,10 @@ def grid_position_backward(u: wp.vec3f, g: wp.vec3f) -> wp.vec3f:
 
 
 @wp.kernel(enable_backward=False)
-def contract_points(
-    points: wp.array(dtype=wp.vec3f),
-    center: wp.vec3f,
-    inverse_half: wp.vec3f,
-    start: wp.int32,
-    positions: wp.array(dtype=wp.vec3f),
-):
+def contract_points(points: wp.array(dtype=wp.vec3f), box: Contraction, positions: wp.array(dtype=wp.vec3f)):
     """Grid positions of points [m]."""
-    i = start + wp.tid()
-    positions[i] = grid_position(wp.cw_mul(points[i] - center, inverse_half))
+    i = wp.tid()
+    positions[i] = grid_position(unit_position(box, points[i]))
 
 
 @wp.kernel(enable_backward=False)
@@ -79,32 +100,25 @@ def pixel_rays(
     position: wp.array(dtype=wp.vec3f),
     intrinsics: wp.array(dtype=wp.vec4f),
     start: wp.int32,
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
-    cosines: wp.array(dtype=wp.float32),
+    rays: Rays,
 ):
-    """Rays through pixels (u, v) [px]: origin [m], unit direction, and cosine of the angle to the optical axis.
-
-    `rotation`, `position` and `intrinsics` (fx, fy, cx, cy) are per camera; z-depth = distance × cosine.
-    """
+    """Rays through pixels (u, v) [px]; `rotation`, `position` and `intrinsics` (fx, fy, cx, cy) are per camera."""
     i = start + wp.tid()
     c = camera[i]
     k = intrinsics[c]
     p = pixel[i]
     local = wp.vec3f((p[0] - k[2]) / k[0], (p[1] - k[3]) / k[1], 1.0)
     length = wp.length(local)
-    origins[i] = position[c]
-    directions[i] = rotation[c] * (local / length)
-    cosines[i] = 1.0 / length
+    rays.origins[i] = position[c]
+    rays.directions[i] = rotation[c] * (local / length)
+    rays.cosines[i] = 1.0 / length
 
 
 @wp.kernel(enable_backward=False)
 def rays_backward(
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
+    rays: Rays,
     distances: wp.array2d(dtype=wp.float32),
-    center: wp.vec3f,
-    inverse_half: wp.vec3f,
+    box: Contraction,
     start: wp.int32,
     positions_grad: wp.array2d(dtype=wp.vec3f),
     origins_grad: wp.array(dtype=wp.vec3f),
@@ -112,14 +126,14 @@ def rays_backward(
 ):
     """Gradients with respect to origins and directions of rays [start, start + dim), at fixed sample distances [m]."""
     i = start + wp.tid()
-    o = origins[i]
-    d = directions[i]
+    o = rays.origins[i]
+    d = rays.directions[i]
     by_origin = wp.vec3f()
     by_direction = wp.vec3f()
     for k in range(distances.shape[1]):
         t = distances[i, k]
-        u = wp.cw_mul(o + d * t - center, inverse_half)
-        g = wp.cw_mul(grid_position_backward(u, positions_grad[i, k]), inverse_half)
+        u = unit_position(box, o + d * t)
+        g = wp.cw_mul(grid_position_backward(u, positions_grad[i, k]), box.inverse_half)
         by_origin += g
         by_direction += g * t
     origins_grad[i] = by_origin
