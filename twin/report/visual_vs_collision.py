@@ -237,22 +237,22 @@ _PANEL_WIDTH = 320  # [px] of a panel
 
 def gap_row(views: GeometryViews, k: int) -> Image:
     """Panels of view k: field, visual depth, collision depth, and the gap in colors."""
-    height, width = views.visual_depth.shape[1:]
-    size = (_PANEL_WIDTH, round(_PANEL_WIDTH * height / width))
-    near = (views.visual_depth < MAX_DEPTH) & (views.collision_depth < MAX_DEPTH)
-    gap = np.where(near, views.collision_depth - views.visual_depth, 0.0)
+    visual, collision = views.visual_depth[k], views.collision_depth[k]
+    size = (_PANEL_WIDTH, round(_PANEL_WIDTH * visual.shape[0] / visual.shape[1]))
+    near = (visual < MAX_DEPTH) & (collision < MAX_DEPTH)
+    gap = np.where(near, collision - visual, 0.0)
     colors = colored("coolwarm", np.clip(0.5 + 0.5 * gap / _MAX_GAP, 0.0, 1.0))
     colors[~near] = PANEL_BACKGROUND
     labels = [(0.0, f"−{_MAX_GAP * 100:g} cm"), (0.5, "0"), (1.0, f"+{_MAX_GAP * 100:g} cm")]
     scale = scale_bar(_PANEL_WIDTH, colored("coolwarm", np.linspace(0, 1, _PANEL_WIDTH - 16)[None]), labels)
     panels = (
         (views.rgb[k], "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
-        (depth_colors(views.visual_depth[k]), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
+        (depth_colors(visual), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
         (
-            depth_colors(views.collision_depth[k]),
+            depth_colors(collision),
             "collision",
             "depth",
-            caption_line(_PANEL_WIDTH, "ground and parts"),
+            caption_line(_PANEL_WIDTH, "ground and convex parts"),
         ),
         (colors, "gap", f"up to {MAX_DEPTH:g} m", scale),
     )
