@@ -237,9 +237,8 @@ _PANEL_WIDTH = 320  # [px] of a panel
 
 def gap_row(views: GeometryViews, k: int) -> Image:
     """Panels of view k: field, visual depth, collision depth, and the gap in colors."""
-    height, width = views.visual_depth.shape[1:]
-    size = (_PANEL_WIDTH, round(_PANEL_WIDTH * height / width))
     visual, collision = views.visual_depth[k], views.collision_depth[k]
+    size = (_PANEL_WIDTH, round(_PANEL_WIDTH * visual.shape[0] / visual.shape[1]))
     near = (visual < MAX_DEPTH) & (collision < MAX_DEPTH)
     gap = np.where(near, collision - visual, 0.0)
     colors = colored("coolwarm", np.clip(0.5 + 0.5 * gap / _MAX_GAP, 0.0, 1.0))
@@ -249,7 +248,7 @@ def gap_row(views: GeometryViews, k: int) -> Image:
     panels = (
         (views.rgb[k], "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
         (depth_colors(visual), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
-        (depth_colors(collision), "collision", "depth", caption_line(_PANEL_WIDTH, "ground and parts")),
+        (depth_colors(collision), "collision", "depth", caption_line(_PANEL_WIDTH, "ground and convex parts")),
         (colors, "gap", f"up to {MAX_DEPTH:g} m", scale),
     )
     return panel_row([titled_panel(fit(image, size), title, note, below) for image, title, note, below in panels])
