@@ -51,10 +51,7 @@ def filmed_route(cameras: Cameras) -> Array:
 
 
 def check_no_jumps(cameras: Cameras) -> None:
-    """Rejects a film of several passes as soon as its cameras are metric; a path too short for a route passes.
-
-    Raises InputError: the path of the route jumps, see `path_jumps`; the message names the frames.
-    """
+    """Raises InputError if the path of the route jumps, see `path_jumps`; a path too short for a route passes."""
     _, length, index = _longest_route(cameras)
     if length >= _MIN_LENGTH:
         _check_source_jumps(cameras, index)
