@@ -47,7 +47,7 @@ def test_noise_and_an_outlier_are_smoothed_away():
     assert np.abs(turning).max() < np.deg2rad(6.0)
 
 
-def test_standing_and_rocking_leave_no_trace():
+def test_stops_and_rocking_are_removed():
     rng = np.random.default_rng(2)
     path = np.stack([np.arange(0.0, 20.0, 0.5), np.zeros(40)], -1)
     standing = path[20] + 0.03 * rng.standard_normal((15, 2))
