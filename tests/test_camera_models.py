@@ -1,4 +1,4 @@
-"""From a distorted picture to the pinhole's."""
+"""Undistortion of images to a pinhole."""
 
 from pathlib import Path
 

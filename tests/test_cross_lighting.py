@@ -1,4 +1,4 @@
-"""The cross-lighting control, on fields of which it is known whether the light asked for decides their colour."""
+"""The cross-lighting control on fields whose colors are known to depend, or not, on the lighting."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def quiet():
 
 
 class Stubborn(ChequeredField):
-    """Shows its first lighting whatever it is asked for, and stands further away in the second one."""
+    """A field that always shows its first lighting, and lies further away in the second one."""
 
     def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
         seen = super().render(cameras, self.lightings[0], size)
@@ -46,7 +46,7 @@ def test_equal_lightings_are_a_draw(tmp_path: Path) -> None:
     assert found is not None and found["colour_follows"] == {"day": 0.5, "again": 0.5}
 
 
-def test_a_field_that_ignores_the_light_is_found_out(tmp_path: Path) -> None:
+def test_a_field_that_ignores_the_lighting_is_detected(tmp_path: Path) -> None:
     brightness = {"day": 1.0, "night": 0.3}
     cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField(brightness))
     found = cross_lighting(Stubborn(brightness), cameras)
@@ -55,7 +55,7 @@ def test_a_field_that_ignores_the_light_is_found_out(tmp_path: Path) -> None:
     assert found["depth_moves_m"] == pytest.approx(0.25, abs=1e-3)
 
 
-def test_one_lighting_has_nothing_to_cross(tmp_path: Path) -> None:
+def test_one_lighting_gives_no_result(tmp_path: Path) -> None:
     field = ChequeredField({"day": 1.0})
     assert cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field)) is None
 

@@ -1,4 +1,4 @@
-"""Whatever a user may get wrong: one clear line, exit status 2, earlier results intact."""
+"""Invalid input of every kind: one clear line, exit status 2, earlier results intact."""
 
 import json
 import os
@@ -178,13 +178,13 @@ def test_a_path_of_the_scene_that_is_no_file(tmp_path, monkeypatch, capsys, what
 
 
 @pytest.mark.parametrize("kind", ["auto", "video", "images", "colmap", "transforms"])
-def test_a_device_or_a_pipe_said_to_be_a_source_of_any_kind(tmp_path, capsys, kind):
+def test_a_device_or_a_pipe_as_a_source_of_any_kind(tmp_path, capsys, kind):
     root = _scene(tmp_path, f'[[source]]\npath = "input/odd"\nkind = "{kind}"\n{_METRIC}')
     _special(root / "input", "pipe")
     _fails(capsys, root, "is a pipe", until="capture")
 
 
-def test_a_folder_with_a_pipe_and_a_loop_in_it_is_read_past_them(tmp_path):
+def test_pipes_and_link_loops_in_a_folder_are_skipped(tmp_path):
     root = _scene(tmp_path, "")
     (root / "input/photos").mkdir()
     write_image(root / "input/photos/a.png", _noise(0))
@@ -243,7 +243,7 @@ def test_values_of_the_wrong_type_in_a_transforms_json(tmp_path, key):
         "\xff",
     ],
 )
-def test_a_transforms_json_that_is_no_such_json(tmp_path, text):
+def test_a_transforms_json_of_another_structure(tmp_path, text):
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=r"transforms\.json"):
         read_transforms(tmp_path / "transforms.json")
@@ -289,7 +289,7 @@ def test_a_colmap_model_of_text(tmp_path):
 
 
 @pytest.mark.parametrize("count", [2**63, 2**64 - 1, 3])
-def test_a_binary_colmap_model_that_promises_more_than_it_holds(tmp_path, count):
+def test_a_binary_colmap_model_with_too_large_counts(tmp_path, count):
     write_image(tmp_path / "a.png", _noise(0))
     camera = struct.pack("<iiQQ4d", 1, 1, 320, 180, 300, 300, 160, 90)
     image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0"
@@ -313,7 +313,7 @@ def test_a_binary_colmap_model_that_promises_more_than_it_holds(tmp_path, count)
 
 
 @pytest.mark.parametrize("path", [".", "../model", "./model/../model"])
-def test_a_posed_set_around_or_beside_the_scene_is_what_is_read_of_it(tmp_path, path):
+def test_the_digests_of_a_posed_set_outside_the_scene_cover_the_files_read(tmp_path, path):
     root = tmp_path / "scene"
     root.mkdir()
     model = _colmap((root / path).resolve())
@@ -334,7 +334,7 @@ def test_a_posed_set_around_or_beside_the_scene_is_what_is_read_of_it(tmp_path, 
 
 
 def _forged(path, width, height):
-    """A PNG of a few bytes whose header promises a huge picture."""
+    """A PNG of a few bytes whose header declares a huge picture."""
 
     def chunk(kind, data):
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,4 +1,4 @@
-"""Image sets in every dialect come out as files, lenses and OpenCV poses; what is wrong is said in one line."""
+"""Image sets of every format become files, lenses and OpenCV poses; an error is one line."""
 
 import json
 import math
@@ -122,7 +122,7 @@ def test_a_binary_model_cut_anywhere_is_refused(tmp_path: Path, file: str) -> No
         ("1 PINHOLE 64 48 50 50 32 24", "# c\n\nhello\n", "line 3"),
     ],
 )
-def test_a_wrong_text_model_is_refused_where_it_is_wrong(tmp_path: Path, cameras: str, images: str, words: str) -> None:
+def test_a_wrong_text_model_is_refused_with_its_line(tmp_path: Path, cameras: str, images: str, words: str) -> None:
     (tmp_path / "cameras.txt").write_text(f"# a comment\n{cameras}\n" if cameras != "garbage" else cameras)
     (tmp_path / "images.txt").write_text(images)
     with pytest.raises(InputError, match=words) as caught:
@@ -146,7 +146,7 @@ def test_a_quaternion_turns_as_rodrigues_does() -> None:
     np.testing.assert_allclose(rotation, expected, atol=1e-12)
 
 
-def test_nerfstudio_dialect(tmp_path: Path) -> None:
+def test_nerfstudio_format(tmp_path: Path) -> None:
     names = _images(tmp_path / "images")
     top = {"fl_x": 60.0, "fl_y": 61.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48, "k1": 0.1, "p2": 0.01}
     _transforms(tmp_path, [f"images/{name}" for name in names], camera_model="OPENCV", **top)
@@ -165,7 +165,7 @@ def test_a_camera_per_image_overrides_the_shared_one(tmp_path: Path) -> None:
     assert lenses[1].params == (60.0, 60.0, 32.0, 24.0) and lenses[2].params == (80.0, 80.0, 30.0, 24.0)
 
 
-def test_instant_ngp_dialect(tmp_path: Path) -> None:
+def test_instant_ngp_format(tmp_path: Path) -> None:
     """An angle of view, names without a suffix, an image that does not exist, no image size."""
     _images(tmp_path / "train", 3)
     path = _transforms(tmp_path, [f"./train/im{i}" for i in range(4)], camera_angle_x=0.8, aabb_scale=16)
@@ -176,7 +176,7 @@ def test_instant_ngp_dialect(tmp_path: Path) -> None:
     np.testing.assert_allclose(images.lenses[0].params, (focal, focal, 32.0, 24.0))
 
 
-def test_what_nerfstudio_did_to_the_world_is_undone(tmp_path: Path) -> None:
+def test_the_world_transform_of_nerfstudio_is_undone(tmp_path: Path) -> None:
     names, scale = _images(tmp_path), 0.25
     applied = np.array([[0.0, 1, 0, 2], [0, 0, -1, 3], [-1, 0, 0, 4]])
     frames = []
@@ -240,13 +240,13 @@ def test_a_wrong_transforms_json_is_refused_in_one_line(tmp_path: Path, what: st
 
 
 @pytest.mark.parametrize("text", ["", '{"frames": [', "[1, 2]", "\x00\x01", '{"frames": 3}'])
-def test_what_is_no_transforms_json_is_refused(tmp_path: Path, text: str) -> None:
+def test_invalid_json_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(InputError, match=r"transforms\.json"):
         read_transforms(tmp_path)
 
 
-def test_kinds_are_told_apart(tmp_path: Path) -> None:
+def test_kinds_of_sources(tmp_path: Path) -> None:
     _colmap(tmp_path / "colmap", False)
     _images(tmp_path / "photos")
     _transforms(tmp_path / "photos", ["im0.png"], fl_x=60.0)
@@ -280,12 +280,12 @@ def test_exif_gives_focal_length_place_and_time(tmp_path: Path) -> None:
     gps[ExifTags.GPS.GPSLongitudeRef], gps[ExifTags.GPS.GPSLongitude] = "E", (151.0, 12.0, 0.0)
     gps[ExifTags.GPS.GPSAltitudeRef], gps[ExifTags.GPS.GPSAltitude] = b"\x01", 4.5
     Image.new("RGB", (400, 300)).save(tmp_path / "a.jpg", exif=exif)
-    facts = read_exif(tmp_path / "a.jpg")
-    assert facts.orientation == 6
-    np.testing.assert_allclose(facts.gps, (-33.86, 151.2, -4.5))
-    assert facts.time is not None and facts.time % 60 == pytest.approx(30.25)
+    exif_found = read_exif(tmp_path / "a.jpg")
+    assert exif_found.orientation == 6
+    np.testing.assert_allclose(exif_found.gps, (-33.86, 151.2, -4.5))
+    assert exif_found.time is not None and exif_found.time % 60 == pytest.approx(30.25)
     # 28 mm of a 43.27 mm diagonal is 323.6 of a 500 px diagonal.
-    assert facts.focal == pytest.approx(28.0 / math.hypot(36, 24) * 500 / 400)
+    assert exif_found.focal == pytest.approx(28.0 / math.hypot(36, 24) * 500 / 400)
 
 
 def test_exif_focal_length_from_the_pitch_of_the_sensor() -> None:
@@ -296,10 +296,12 @@ def test_exif_focal_length_from_the_pitch_of_the_sensor() -> None:
     assert focal_from_exif({tag.FocalLength: 5.0}, 400, 300) is None
 
 
-def test_a_photo_without_a_header_knows_nothing(tmp_path: Path) -> None:
+def test_a_photo_without_a_header(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
-    facts = read_exif(tmp_path / "a.png")
-    assert (facts.focal, facts.time, facts.orientation) == (None, None, 1) and all(map(math.isnan, facts.gps))
+    exif_found = read_exif(tmp_path / "a.png")
+    assert (exif_found.focal, exif_found.time, exif_found.orientation) == (None, None, 1) and all(
+        map(math.isnan, exif_found.gps)
+    )
 
 
 def test_scaling_a_lens_scales_what_it_projects() -> None:
@@ -327,8 +329,8 @@ def test_an_impossible_calibration_is_refused(model: str, params: tuple, size: t
         checked_lens(model, params, *size, "scene.toml")
 
 
-def test_a_flattened_picture_is_what_a_pinhole_sees() -> None:
-    """A smooth pattern painted on the plane z = 1, seen through the lens, then flattened: the pinhole's own view."""
+def test_an_undistorted_picture_equals_the_pinhole_view() -> None:
+    """A smooth pattern painted on the plane z = 1, seen through the lens, then undistorted: the pinhole's view."""
     lens = checked_lens("OPENCV", (150.0, 150.0, 80.0, 60.0, -0.4, 0.1, 0.0, 0.0), 160, 120, "test")
 
     def pattern(rays: np.ndarray) -> np.ndarray:
@@ -349,7 +351,7 @@ def test_aspect_is_compared_to_a_rounded_pixel() -> None:
     assert not same_aspect((960, 540), (1080, 1920)) and not same_aspect((640, 480), (640, 360))
 
 
-def test_a_camera_model_colmap_does_not_know(tmp_path: Path) -> None:
+def test_an_unknown_camera_model_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ", 1, 1, 99, 64, 48) + bytes(32))
     (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 0))
     with pytest.raises(InputError, match="camera model number 99"):

@@ -1,4 +1,4 @@
-"""Films: which frames are kept, how they are turned, scaled, masked and split, and which input is refused."""
+"""Films: frame selection, rotation, scaling, masks, the held-out split and refused input."""
 
 import struct
 from pathlib import Path
@@ -71,25 +71,25 @@ def test_slots_follow_the_clock_of_a_film_with_a_variable_rate(tmp_path: Path) -
     # Ten frames in the first second, then one each second: equal slots in time are not equal counts.
     times = [100 * i for i in range(10)] + [1000 * i for i in range(1, 8)]
     film(tmp_path / "a.mkv", views([6 * i for i in range(len(times))]), times)
-    facts = probe(tmp_path / "a.mkv")
-    np.testing.assert_allclose(facts.times, np.array(times) / 1000.0, atol=2e-3)
+    timing = probe(tmp_path / "a.mkv")
+    np.testing.assert_allclose(timing.times, np.array(times) / 1000.0, atol=2e-3)
     capture, _, _ = captured(tmp_path, [SourceConfig(path="a.mkv")], frames=7)
     assert (capture.times < 0.95).sum() == 1 and len(capture.names) == 7
 
 
 @pytest.mark.parametrize("slots", [1, 3, 7, 20, 80])
 def test_every_frame_has_one_slot_and_slots_are_in_order(slots: int) -> None:
-    facts = FilmTiming(np.round(np.arange(80) / 15.0, 3), 0.0, 80)  # millisecond stamps, as Matroska has them
-    found = [slot_of(i, float(t), facts, slots) for i, t in enumerate(facts.times)]
+    timing = FilmTiming(np.round(np.arange(80) / 15.0, 3), 0.0, 80)  # millisecond stamps, as Matroska has them
+    found = [slot_of(i, float(t), timing, slots) for i, t in enumerate(timing.times)]
     assert found == sorted(found) and set(found) == set(range(slots))
     counts = np.bincount(found)
     assert counts.max() - counts.min() <= 1
 
 
 def test_damaged_frames_leave_gaps_in_the_index() -> None:
-    facts = FilmTiming(np.arange(10) / 10.0, 0.0, 10)
-    assert [frame_index(t, facts, last) for t, last in ((0.0, -1), (0.301, 0), (0.5, 3), (None, 5))] == [0, 3, 5, 6]
-    assert frame_index(0.5, facts, 7) == 8  # a clock that stutters never gives an index twice
+    timing = FilmTiming(np.arange(10) / 10.0, 0.0, 10)
+    assert [frame_index(t, timing, last) for t, last in ((0.0, -1), (0.301, 0), (0.5, 3), (None, 5))] == [0, 3, 5, 6]
+    assert frame_index(0.5, timing, 7) == 8  # a clock that stutters never gives an index twice
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_smaller_frame_has_smaller_intrinsics(tmp_path: Path) -> None:
 
 
 def test_a_mask_hides_what_moves_with_the_camera(tmp_path: Path) -> None:
-    """A camera that drives behind a bonnet filling most of the picture: still, unless the bonnet is masked."""
+    """A camera that drives behind a bonnet that fills most of the picture: still, unless the bonnet is masked."""
     frames = views([5 * i for i in range(8)])
     for frame in frames:
         frame[30:] = wall(1)[30:HEIGHT, :WIDTH]
@@ -209,9 +209,9 @@ def test_no_frame_predicted_from_a_damaged_one_is_used(tmp_path: Path) -> None:
     path = film(tmp_path / "a.mp4", views([7 * i for i in range(60)]), gop="12")
 
     def decoded() -> tuple[dict[int, np.ndarray], FilmStatistics]:
-        facts, count, index, pictures = probe(path), FilmStatistics(), -1, {}
+        timing, count, index, pictures = probe(path), FilmStatistics(), -1, {}
         for stamp, frame in decode(path, count):
-            index = frame_index(None if stamp is None else stamp - facts.start, facts, index)
+            index = frame_index(None if stamp is None else stamp - timing.start, timing, index)
             pictures[index] = upright(frame)
         return pictures, count
 
@@ -232,7 +232,7 @@ def test_no_frame_predicted_from_a_damaged_one_is_used(tmp_path: Path) -> None:
             np.testing.assert_array_equal(picture, sound[index])
 
 
-def test_one_frame_or_nothing_to_see_is_refused(tmp_path: Path) -> None:
+def test_one_frame_or_blank_frames_are_refused(tmp_path: Path) -> None:
     film(tmp_path / "one.mp4", views([0]))
     refused(tmp_path, SourceConfig(path="one.mp4"), r"one\.mp4.*need 2")
     film(tmp_path / "black.mp4", [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 5)
@@ -278,9 +278,7 @@ def test_sources_have_unique_plain_names() -> None:
         (SourceConfig(path="a.mp4", lighting="day+randomised"), "choose a plain name"),
     ],
 )
-def test_a_lighting_that_would_mean_something_else_is_refused_before_anything_is_read(
-    tmp_path: Path, source: SourceConfig, words: str
-) -> None:
+def test_a_reserved_lighting_name_is_refused_before_reading(tmp_path: Path, source: SourceConfig, words: str) -> None:
     refused(tmp_path, source, words)  # none of these files exists
 
 
@@ -325,8 +323,8 @@ def test_only_the_parts_of_a_film_that_are_kept_are_read(tmp_path: Path) -> None
     assert capture.names[0].startswith("a/0000") and capture.names[len(times) - 1] == f"a/{times[-1] * 15:06.0f}"
     times = capture.times[capture.source_index == 1]
     assert len(times) == 5 and times.min() >= 2.999
-    facts = metrics["sources"]["b"]
-    assert facts["decoded"] == facts["promised"] == 15 and facts["duration_s"] == 1.0
+    timing = metrics["sources"]["b"]
+    assert timing["decoded"] == timing["promised"] == 15 and timing["duration_s"] == 1.0
 
 
 def test_as_many_slots_as_frames_keeps_every_frame_of_a_part(tmp_path: Path) -> None:
@@ -335,6 +333,6 @@ def test_as_many_slots_as_frames_keeps_every_frame_of_a_part(tmp_path: Path) -> 
     assert capture.names == tuple(f"a/{i:06d}" for i in range(15, 22))
 
 
-def test_parts_that_hold_nothing_are_refused(tmp_path: Path) -> None:
+def test_segments_without_frames_are_refused(tmp_path: Path) -> None:
     film(tmp_path / "a.mp4", views([4 * i for i in range(30)]))
     refused(tmp_path, SourceConfig(path="a.mp4", keep=((5.0, 9.0),)), r"leaves 0 of 30 frames.*0 to 1\.93 s")

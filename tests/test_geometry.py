@@ -1,3 +1,5 @@
+"""Poses, cameras, projection and image files."""
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

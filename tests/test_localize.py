@@ -20,7 +20,7 @@ def scene(tmp_path_factory):
 
 
 def error(found, pose: np.ndarray) -> tuple[float, float]:
-    """Of position [m] and rotation [°]."""
+    """Error of position [m] and rotation [°]."""
     turned = rotation_angle(found.camera_to_world[:3, :3].T @ pose[:3, :3])
     return float(np.linalg.norm(found.camera_to_world[:3, 3] - pose[:3, 3])), float(np.degrees(turned))
 
@@ -38,12 +38,12 @@ def test_a_new_view_in_other_light_is_found_with_the_scenes_camera(scene):
 
 
 def test_another_camera_is_found_with_its_focal_length(scene):
-    """A larger picture of another shape and focal length, unknown or roughly told by its header."""
+    """A larger picture of another shape and focal length, unknown or roughly given by its header."""
     size, intrinsics, pose = (480, 480), np.array([520.0, 520.0, 240.0, 240.0]), pose_at(2.1, 0.1, -0.3)
     photo = picture(pose, size, intrinsics)
-    for facts, said in ((NOTHING, "estimated"), (PhotoExif(1.05, NOTHING.gps, None, 1), "EXIF")):
-        found = register_photo(photo, facts, scene)
-        assert found.lens_from == said
+    for exif, origin in ((NOTHING, "estimated"), (PhotoExif(1.05, NOTHING.gps, None, 1), "EXIF")):
+        found = register_photo(photo, exif, scene)
+        assert found.lens_from == origin
         assert found.lens.intrinsics[0] == pytest.approx(520.0, rel=0.03)
         metres, degrees = error(found, pose)
         assert metres < 0.15
@@ -59,8 +59,8 @@ def test_a_photo_of_something_else_is_refused(scene):
 
 
 def test_the_photos_own_header_comes_before_the_scenes_cameras(scene):
-    said = [origin for _, _, origin in candidate_lenses(SIZE, PhotoExif(0.8, NOTHING.gps, None, 1), scene)]
-    assert said == ["EXIF", "the calibration of 'day'", "the camera of 'day'", "estimated"]
+    origins = [origin for _, _, origin in candidate_lenses(SIZE, PhotoExif(0.8, NOTHING.gps, None, 1), scene)]
+    assert origins == ["EXIF", "the calibration of 'day'", "the camera of 'day'", "estimated"]
     halved, held, _ = candidate_lenses((160, 120), NOTHING, scene)[0]
     assert held
     assert halved.params == pytest.approx(tuple(K / 2))

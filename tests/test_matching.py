@@ -1,4 +1,4 @@
-"""Which frames are matched with which, and which lie off the path their neighbours draw."""
+"""The pairs of frames that are matched, and the outliers of a path."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_sequence_stays_within_a_source() -> None:
     assert all(source[i] == source[j] and i < j and j - i in SEQUENCE_STEPS for i, j in pairs)
 
 
-def test_films_at_different_speeds_are_tied_where_they_show_the_same() -> None:
+def test_films_of_different_speeds_are_paired_at_the_same_places() -> None:
     # The second film shows at frame q what the first shows at p = q² / 40: slow first, fast later.
     source = np.array([0] * 40 + [1] * 40)
     same = {int(q * q / 40): q for q in range(40)}
@@ -34,12 +34,12 @@ def test_films_at_different_speeds_are_tied_where_they_show_the_same() -> None:
     assert (5, 75) not in pairs
 
 
-def test_without_anchors_films_are_tied_by_share_of_length() -> None:
+def test_without_anchors_films_are_paired_by_fraction_of_length() -> None:
     pairs = expanded_pairs(np.array([0] * 10 + [1] * 19), {(0, 20)}, {}, min_inliers=25)
     assert all((i, 10 + 2 * i) in pairs for i in range(10))
 
 
-def test_near_cameras_that_nothing_ties_are_paired() -> None:
+def test_near_cameras_that_were_never_matched_are_paired() -> None:
     # Out along x for 30 frames and back beside it, looking the same way: the ends of the film meet its start.
     out = [look_at(np.array([x, 0.0, 1]), np.array([x, 9.0, 1])) for x in range(30)]
     back = [look_at(np.array([x, 0.5, 1]), np.array([x, 9.5, 1])) for x in range(29, -1, -1)]
@@ -70,7 +70,7 @@ def test_signatures_find_the_same_place_under_another_light() -> None:
 
 
 def _turning_path(count: int = 50) -> np.ndarray:
-    """30 m straight, then a right turn of 6 m radius, about a metre per frame, with centimetres of shake."""
+    """30 m straight, then a right turn of 6 m radius, about a metre per frame, with centimeters of shake."""
     s = np.linspace(0.0, 48.0, count)
     angle = np.clip((s - 30.0) / 6.0, 0.0, np.pi / 2)
     past = np.maximum(s - 30.0 - 3.0 * np.pi, 0.0)

@@ -1,4 +1,4 @@
-"""Stage `metric`: from a reconstruction turned, scaled and placed at will back to the level, metric world of before."""
+"""Stage `metric`: a reconstruction in a random frame is transformed back to the level, metric world."""
 
 import dataclasses
 from pathlib import Path
@@ -401,7 +401,7 @@ def test_up_from_cameras(tmp_path: Path) -> None:
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_wrong_choices_are_one_line_with_a_cure(tmp_path: Path) -> None:
+def test_invalid_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     film = _path(count=10)
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(0))
     cases: list[tuple[dict, str]] = [

@@ -1,4 +1,4 @@
-"""Photos and posed image sets: which are kept, what their headers and poses are taken for, which are refused."""
+"""Photos and posed image sets: selection, EXIF headers, poses and refused input."""
 
 import json
 from pathlib import Path
@@ -82,7 +82,7 @@ def test_poses_and_intrinsics_of_images_half_their_size(tmp_path: Path) -> None:
     np.testing.assert_allclose(capture.sources[0].camera_params, (150.0, 155.0, 79.0, 61.0, 0.1, 0.0, 0.0, 0.0))
 
 
-def test_lenses_that_differ_in_distortion_are_flattened(tmp_path: Path) -> None:
+def test_images_of_different_distortions_are_undistorted(tmp_path: Path) -> None:
     _posed(tmp_path, [{"k1": -0.3}, {"k1": -0.2}, {"k1": 0.0, "k2": 0.0}], fl_x=150.0, w=WIDTH, h=HEIGHT)
     capture, _, out = captured(tmp_path, [SourceConfig(path="posed")])
     assert capture.sources[0].camera_model == "PINHOLE" and capture.intrinsics is not None
@@ -91,7 +91,7 @@ def test_lenses_that_differ_in_distortion_are_flattened(tmp_path: Path) -> None:
     assert (read_image(out / "images/posed/000000.png") != views([0])[0]).any()
 
 
-def test_poses_count_only_where_every_source_brings_them(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_poses_are_used_only_if_every_source_has_them(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     _posed(tmp_path, [{}] * 3, fl_x=150.0)
     film(tmp_path / "film.mp4", views([5 * i for i in range(6)]))
     capture, metrics, _ = captured(tmp_path, [SourceConfig(path="posed"), SourceConfig(path="film.mp4")], frames=6)
@@ -106,7 +106,7 @@ def test_photo_times_need_a_clock_that_rises() -> None:
         assert photo_times(clock, [0, 2, 3]) == [0.0, 2.0, 3.0]
 
 
-def test_a_regular_choice_has_both_ends() -> None:
+def test_evenly_spaced_items_include_both_ends() -> None:
     assert evenly_spaced(10, 4).tolist() == [0, 3, 6, 9] and evenly_spaced(3, 4).tolist() == [0, 1, 2]
 
 

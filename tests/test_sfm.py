@@ -1,4 +1,4 @@
-"""Stage `cameras`: the whole of it on a small rendered street, what it refuses, and how its worker ends."""
+"""Stage `cameras` on a small rendered street, its errors, and how its worker ends."""
 
 import contextlib
 import dataclasses
@@ -180,9 +180,9 @@ def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) ->
     image = model.images[int(matcher.image_ids[5])]
     moved = np.linalg.inv(poses[5] @ np.block([[np.eye(3), np.full((3, 1), 2 * step)], [np.zeros((1, 3)), 1.0]]))
     model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(moved[:3]))
-    facts: dict = {}
-    repaired = mapper.without_outliers(model, 0.3, facts)
-    assert facts == {"outliers": [], "registered_anew": [matcher.capture.names[5]]}
+    summary: dict = {}
+    repaired = mapper.without_outliers(model, 0.3, summary)
+    assert summary == {"outliers": [], "registered_anew": [matcher.capture.names[5]]}
     frames, poses = sfm._poses(repaired, matcher)
     true = np.array([street.truth[matcher.capture.names[i]] for i in frames])
     fit = umeyama(poses[:, :3, 3], true[:, :3, 3])
@@ -213,7 +213,7 @@ def test_one_frame_is_refused(tmp_path: Path) -> None:
         _run(_capture_of(tmp_path / "s", [noise]), tmp_path / "out")
 
 
-def test_frames_of_nothing_in_common_are_refused(tmp_path: Path) -> None:
+def test_frames_without_overlap_are_refused(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     noise = [np.kron(rng.integers(0, 255, (60, 80, 3)), np.ones((4, 4, 1))).astype(np.uint8) for _ in range(4)]
     with pytest.raises(InputError, match="film slower"):

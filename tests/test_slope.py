@@ -1,4 +1,4 @@
-"""What a window of a log begins with: the slope that an accelerometer tells, and what the wheels did before."""
+"""Initial conditions of a log's windows: the slope estimated from accelerations, and the wheels' preceding motion."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_slopes_are_the_gaussian_posterior():
 
 
 @pytest.mark.parametrize("truth", [rollout.SlopeModel(0.3, 12.0, 0.2), rollout.SlopeModel(0.2, 6.0, 0.5)])
-def test_how_rough_ground_and_imu_are_is_found(truth):
+def test_the_noise_of_ground_and_imu_is_estimated(truth):
     rng = np.random.default_rng(1)
     n, keep = 600, np.exp(-1 / truth.windows)
     turn, follows = rng.uniform(-1.5, 1.5, n), np.arange(n) % 50 > 0
@@ -75,11 +75,11 @@ def test_how_rough_ground_and_imu_are_is_found(truth):
     assert found.steepness == pytest.approx(truth.steepness, rel=0.3)
     assert found.noise == pytest.approx(truth.noise, rel=0.1)
     assert found.windows == pytest.approx(truth.windows, rel=0.5)
-    told, _ = rollout.smooth_slopes(found, readings, turn, follows)
-    assert np.abs(told - slopes).mean() < 0.7 * np.abs(readings - slopes).mean()
+    smoothed, _ = rollout.smooth_slopes(found, readings, turn, follows)
+    assert np.abs(smoothed - slopes).mean() < 0.7 * np.abs(readings - slopes).mean()
 
 
-def test_before_a_window_is_the_one_it_follows():
+def test_the_preceding_window():
     wheels = np.arange(3 * logs.SAMPLES * 2, dtype=float).reshape(3, logs.SAMPLES, 2)
     before = replace(windows_of(wheels), follows=np.array([False, True, False])).preceding_wheels
     np.testing.assert_array_equal(before[1], np.concatenate([wheels[0], wheels[1, :1]]))
@@ -87,7 +87,7 @@ def test_before_a_window_is_the_one_it_follows():
         np.testing.assert_array_equal(before[i], np.repeat(wheels[i, :1], logs.SAMPLES + 1, 0))
 
 
-def test_a_reading_that_cannot_be_ground_spoils_no_other():
+def test_an_outlying_reading_affects_no_other():
     rng = np.random.default_rng(3)
     n = 60
     windows = replace(windows_of(np.full((n, logs.SAMPLES, 2), [2.0, 3.0])), follows=np.arange(n) > 0)
@@ -102,7 +102,7 @@ def test_a_reading_that_cannot_be_ground_spoils_no_other():
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_readings_without_noise_are_taken(value):
+def test_readings_without_noise_are_kept(value):
     n = 400
     wheels = np.full((n, logs.SAMPLES, 2), 3.0)
     windows = replace(windows_of(wheels), follows=np.arange(n) > 0, acceleration=np.full_like(wheels, value))
@@ -115,12 +115,12 @@ def test_readings_without_noise_are_taken(value):
         assert found == pytest.approx(exact, abs=0.02)
 
 
-def test_wheels_do_what_they_did_before_the_window():
-    """Through a lagging servo, too; then come the commands."""
+def test_wheels_continue_their_preceding_motion():
+    """Also through a lagging servo; then the commands follow."""
     params = replace(SOFT, servo_lag=0.2)
     count = logs.SAMPLES + 1
     before = np.stack([np.linspace(6.0, -2.0, count), 1.0 + np.sin(np.arange(count) / 4)], -1)[None]
-    told = np.full((1, 225, 2), 2.0)
+    commands = np.full((1, 225, 2), 2.0)
     model = rollout.plane_model(params)
     lead = rollout._lag_compensated(before, round(logs.PERIOD / model.opt.timestep), params.servo_lag)
     data = mujoco.MjData(model)
@@ -133,28 +133,28 @@ def test_wheels_do_what_they_did_before_the_window():
         done.append(data.qvel[joints[[0, 1]]].copy())
     assert np.abs(np.array(done)[24::25] - before[0, 1:]).max() < 0.05
     level = np.zeros((1, 2))
-    out = rollout.simulate_windows(params, told, before, level)
+    out = rollout.simulate_windows(params, commands, before, level)
     assert out.wheels[0, 0] == pytest.approx(before[0, -1], abs=0.05)
     assert out.wheels[0, -1] == pytest.approx([2.0, 2.0], abs=0.05)
     # The body moves as it had come to, in the samples before time starts as well.
-    held = rollout.simulate_windows(params, told, np.repeat(before[:, -1:], count, 1), level)
+    held = rollout.simulate_windows(params, commands, np.repeat(before[:, -1:], count, 1), level)
     early = [np.diff(o.poses[0, : rollout.LEAD_SAMPLES + 1, 2]) / logs.PERIOD for o in (out, held)]
     assert np.abs(early[0] - early[1]).max() > 0.05
 
 
 def test_the_fit_begins_each_window_as_the_log_does(monkeypatch):
-    """Of the windows fitted to, which follow others that are not."""
+    """For fitted windows that follow windows outside the fit."""
     rng = np.random.default_rng(0)
     n = 12
     wheels = np.repeat(rng.uniform(-3, 3, (n, 1, 2)), logs.SAMPLES, 1)
     windows = replace(windows_of(wheels), follows=np.arange(n) > 0)
     seen = []
 
-    def noted(params, told, before, slope, timestep=None):
+    def noted(params, commands, before, slope, timestep=None):
         seen.append(before)
         k = logs.SAMPLES + drivetrain.EXTRA_SAMPLES
         shapes = (rollout.LEAD_SAMPLES + k, 3), (k, 2), (k - 1, 2)
-        return rollout.Rollouts(*(np.zeros((len(told), *shape)) for shape in shapes))
+        return rollout.Rollouts(*(np.zeros((len(commands), *shape)) for shape in shapes))
 
     monkeypatch.setattr(tires, "simulate_windows", noted)
     params = HuskyParams()
@@ -165,8 +165,8 @@ def test_the_fit_begins_each_window_as_the_log_does(monkeypatch):
 
 
 def test_a_slope_pulls_downhill():
-    """A robot that scrubs, and so turns, before a window as in it, creeps down the slope that its accelerometer tells,
-    however it stands on it when the window begins."""
+    """A robot that turns by scrubbing, before a window as in it, creeps down the slope that its accelerometer measures,
+    whatever its heading when the window begins."""
     n = 12
     wheels = np.full((n, logs.SAMPLES, 2), [-3.0, 3.0])
     turning = kinematics.IcrModel(y_left=0.56, y_right=-0.56)  # as SOFT turns
@@ -177,9 +177,9 @@ def test_a_slope_pulls_downhill():
     down = downhill[:, None] * np.exp(-1j * poses[:, : logs.SAMPLES, 2])
     slopes = rollout.slope_gravity(replace(windows, acceleration=-np.stack([down.real, down.imag], -1)), turning)
     assert np.hypot(*slopes.T) == pytest.approx(np.ones(n), abs=0.1)
-    told = np.full((n, 225, 2), [-3.0, 3.0])
+    commands = np.full((n, 225, 2), [-3.0, 3.0])
     driven = [
-        tires.simulate_windows(SOFT, told, windows.preceding_wheels, s, 0.005).poses for s in (0 * slopes, slopes)
+        tires.simulate_windows(SOFT, commands, windows.preceding_wheels, s, 0.005).poses for s in (0 * slopes, slopes)
     ]
     still, moved = (logs.resample_poses(poses, np.zeros(n), rollout.LEAD_SAMPLES) for poses in driven)
     shift = (moved - still)[:, -1, :2] @ [1, 1j]

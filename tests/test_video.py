@@ -1,4 +1,4 @@
-"""Films: what was written is what a player gets, and half a film is never left behind."""
+"""The video writer: decoded frames equal the written ones, and an error leaves no partial file."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
 
-def test_an_error_leaves_neither_half_a_film_nor_a_lost_old_one(tmp_path: Path) -> None:
+def test_an_error_leaves_no_partial_film_and_keeps_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     path.write_bytes(b"the old film")
     with pytest.raises(RuntimeError, match="stop"), VideoWriter(path, (32, 32), fps=5) as film:

@@ -54,7 +54,6 @@ class Lens:
 
     @property
     def camera(self) -> pycolmap.Camera:
-        """The lens as a COLMAP camera."""
         return pycolmap.Camera(model=self.model, params=list(self.params), width=self.width, height=self.height)
 
     @property
@@ -164,10 +163,7 @@ def undistorted(image: Image, lens: Lens, nearest: bool = False) -> tuple[Image,
 
 
 def write_pinhole_image(raw: Path, target: Path, pixel_map: PixelMap | None, mask: bool = False) -> None:
-    """Writes one image or mask without distortion; without a pixel map the file is hard-linked or copied.
-
-    Raises InputError: the raw image cannot be read.
-    """
+    """Writes one image or mask without distortion; without a pixel map the file is hard-linked or copied."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if pixel_map is None:
         try:

@@ -101,11 +101,11 @@ def below_path(points: Array, centers: Array, up: Array) -> tuple[NDArray[np.int
 def find_road(points: Array, centers: Array, up: Array) -> Road | None:
     """The lowest well-supported layer of points below a path, or None.
 
-    The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h (seen more than
-    45° below the horizon, at any scale). The lowest layer with at least half of the best support is the road, since
-    nothing solid lies below a road; a layer with many points below it is not the road (the camera circled an
-    object). A road without texture has no points, so the search goes on to larger offsets, where the verges are; if no
-    layer has enough points, the best supported one is returned.
+    The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h, that is, more
+    than 45° below the horizon. The road is the lowest layer with at least half of the best support, since nothing solid
+    lies below a road. A layer above many points is no road: the camera circled an object. A road without texture has no
+    points, so the search goes on to larger offsets, where the verges are. If no layer has enough points, the best
+    supported one is returned.
     """
     if not len(points):
         return None
@@ -173,8 +173,7 @@ def _road_normal(road: Array, centers: Array, up: Array) -> Array | None:
         weight = 1.0 / np.maximum(residual, 1.4826 * np.median(residual) + 1e-12)
     if variances[1] < _MIN_VARIANCE_RATIO * variances[0]:
         return None
-    normal = axes[:, 0]
-    return normal if normal @ up > 0 else -normal
+    return axes[:, 0] if axes[:, 0] @ up > 0 else -axes[:, 0]
 
 
 def heights_above_road(points: Array, centers: Array, up: Array, drop: float, min_points: int = 6) -> Array | None:

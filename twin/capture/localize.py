@@ -152,10 +152,7 @@ class LocalizationMap:
 
 
 def solve_photo(job: dict[str, Any], work: Path) -> None:
-    """Runs a job of `register_photo`; writes `result.json` to `work`.
-
-    Raises InputError: fewer than `MIN_INLIERS` inliers.
-    """
+    """Runs a job of `register_photo`; writes `result.json` to `work`."""
     scene_map = LocalizationMap(Path(job["metric"]))
     pixels, descriptors = scene_map.features(work / "photo.png")
     pairs = _trusted_pairs(_match_similar_frames(scene_map, descriptors, show_bars=True))
@@ -346,10 +343,7 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
 
 
 def solve_film(job: dict[str, Any], work: Path) -> None:
-    """Runs a job of `register_film`; writes `result.json` to `work`.
-
-    Raises InputError: no frame could be localized, or the focal length is not determined.
-    """
+    """Runs a job of `register_film`; writes `result.json` to `work`."""
     scene_map, lens, seed = LocalizationMap(Path(job["metric"])), lens_from_json(job["lens"]), job["seed"]
     free_focal = not job["held"]
     matches: list[tuple[Array, Array]] = []
@@ -408,12 +402,9 @@ def _localize_frame(image: Array, points: Array, lens: Lens, seed: int, free_foc
 
 
 def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float, float]:
-    """The focal length that minimizes the robust cost over all frames, and its standard error [px].
+    """The focal length that minimizes the robust cost over all frames, by a parabola, and its standard error [px].
 
-    A parabola is fitted through the costs. Each frame counts as a single (x, y) measurement, because its inliers'
-    errors are correlated.
-
-    Raises InputError: the frames do not determine the focal length.
+    Each frame counts as a single (x, y) measurement, because its inliers' errors are correlated.
     """
     robust_scale, center = _ROBUST_SCALE * max(lens.width, lens.height), lens.params[0]
     for _ in range(_MAX_ITERATIONS):
@@ -436,5 +427,4 @@ def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float,
 
 
 def _with_focal(lens: Lens, focal: float) -> Lens:
-    """A SIMPLE_PINHOLE lens with another focal length [px]."""
     return replace(lens, params=(focal, *lens.params[1:]))

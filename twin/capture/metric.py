@@ -35,14 +35,9 @@ _FLOOR_QUANTILE = 0.02  # without a road the floor is at this quantile of the po
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
-    """Transforms cameras and points to the level, metric frame.
+    """Transforms cameras and points to the level, metric frame; writes `Cameras`, `SparsePoints` and `metric.json`.
 
-    Writes `Cameras`, `SparsePoints` and `metric.json`.
-
-    Returns:
-        The content of `metric.json`: scale_source, scale, scale_uncertainty (relative), gravity_source,
-        gravity_uncertainty_deg, camera_height_median_m, camera_height_spread_m, path_length_m, floor_source, the
-        similarity from the reconstruction, and the notes of the `Scale`.
+    Returns the content of `metric.json`, see `_metrics`.
 
     Raises InputError: no scale given, or the data lack the evidence for it.
     """

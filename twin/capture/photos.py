@@ -245,10 +245,7 @@ def _load_ahead(
 
 
 def _in_kept_segments(task: SourceTask, images: ImageSet) -> NDArray[np.int64]:
-    """Indices of the photos inside the segments of the source to use; all photos without segments.
-
-    Raises InputError: segments are given, but the photos' times do not rise, or fewer than two photos are inside.
-    """
+    """Indices of the photos inside the segments of the source to use; all photos without segments."""
     count = len(images.paths)
     if not task.segments:
         return np.arange(count)

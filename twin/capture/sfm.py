@@ -46,8 +46,7 @@ _NEAR_STEPS = 3.0  # distance [median steps] up to which cameras that were never
 _NEAR_PAIRS = 4
 _POSED_PAIRS = 10
 _REMAPPING_FRACTION = 0.05  # newly verified pairs [fraction of all] from which the second round maps again
-_TRACKS_PER_VIEW = 300
-"""Tracks per frame for the first solution; retriangulation adds the others. Saves 40 % of the time."""
+_TRACKS_PER_VIEW = 300  # for the first solution; retriangulation adds the others. Saves 40 % of the time
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] between the rays to a point
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment
@@ -60,9 +59,7 @@ _REFINEMENTS = 30
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     """Reconstructs the cameras of a capture; writes `Cameras`, `SparsePoints`, `images/` and `masks/` to `out`.
 
-    Returns:
-        registered, total, reprojection_error_px, mean_track_length, points, focal_px (per source), pairs,
-        verified_pairs, outliers (names), mapper, registered_per_source.
+    Returns metrics, see `_metrics`.
 
     Raises InputError: no texture, no overlap, or fewer frames registered than `cameras.min_registered`.
     """
@@ -170,10 +167,7 @@ def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, summary: 
 
 
 def solve_mapping(job: dict[str, Any], work: Path) -> None:
-    """Runs the job of `run`; writes `result.npz` and `result.json` to `work`.
-
-    Raises InputError: too few frames, no texture, or no model found.
-    """
+    """Runs the job of `run`; writes `result.npz` and `result.json` to `work`."""
     stage = Path(job["capture"])
     capture = Capture.load(stage)
     pycolmap.set_random_seed(job["seed"])

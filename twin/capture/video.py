@@ -158,13 +158,10 @@ def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
 
 
 def slot_of(index: int, time: float, timing: FilmTiming, slots: int) -> int:
-    """The slot of a frame.
-
-    With as many slots as frames, each frame has its own. Otherwise slots have equal durations; half a frame interval is
-    added so that rounding of time stamps never moves a frame across the border of a slot.
-    """
+    """The slot of a frame: one of equal durations, or its own with as many slots as frames."""
     if slots >= len(timing.times):
         return index
+    # Half a frame interval is added so that rounding of time stamps never moves a frame across the border of a slot.
     return min(int((time + 0.5 * timing.interval) / timing.duration * slots), slots - 1)
 
 
@@ -179,10 +176,7 @@ def in_segments(times: Array, segments: tuple[tuple[float, ...], ...]) -> NDArra
 def _joined_segments(
     timing: FilmTiming, segments: tuple[tuple[float, ...], ...], path: Path
 ) -> tuple[FilmTiming, NDArray[np.int64]]:
-    """The timing of the kept segments joined, and each film frame's position in them (−1 if cut out).
-
-    Raises InputError: fewer than two frames are in the segments.
-    """
+    """The timing of the kept segments joined, and each film frame's position in them (−1 if cut out)."""
     used = in_segments(timing.times, segments)
     if segments and used.sum() < 2:
         raise InputError(
@@ -255,8 +249,8 @@ def read_film(
         if size != count.size:
             image = np.asarray(resize(image, *size), np.uint8)
         height = max(1, round(size[1] * FLOW_WIDTH / size[0]))
-        gray = cv2.cvtColor(np.asarray(resize(image, FLOW_WIDTH, height), np.uint8), cv2.COLOR_RGB2GRAY)
-        small: Image = np.asarray(gray, np.uint8)
+        small_rgb = np.asarray(resize(image, FLOW_WIDTH, height), np.uint8)
+        small = np.asarray(cv2.cvtColor(small_rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         mask = mask_of(candidate.index, *size)
         small_mask = None
         if mask is not None:
@@ -334,13 +328,10 @@ def damage_note(path: Path, count: FilmStatistics) -> str | None:
 
 
 def decode(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
-    """Decodes a film from front to back and skips damaged frames.
+    """Yields a film's undamaged frames from front to back, each after its time stamp in the stream [s] or None.
 
     A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from the
     damage to the next key frame are skipped, and the B frames before it that depend on it.
-
-    Yields:
-        The frame's time stamp in its stream [s] (None if it has none), and the frame.
     """
     with av.open(str(path)) as container:
         stream = _video_stream(container, path)

@@ -34,7 +34,7 @@ _CURES = {
     "SIGTERM": "stopped from outside: build again",
 }
 _DISK_FULL = ("no space left on device", "disk is full", "sqlite_full")
-_MAPPING_LOG_STEPS = (
+_MAPPING_LOG_STEPS = (  # parts of COLMAP's log lines that advance the mapping bar
     "Rotation averaging done",
     "Track establishment done",
     "Global positioning done",
@@ -44,7 +44,6 @@ _MAPPING_LOG_STEPS = (
     "Iterative bundle adjustment done",
     "refinement done",
 )
-"""Parts of COLMAP's log lines that advance the mapping bar."""
 
 
 # ---- in the parent
@@ -53,10 +52,7 @@ _MAPPING_LOG_STEPS = (
 def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any], folder: Path) -> None:
     """Runs `solve(job, folder)` in a worker with progress bars; the folder also gets the job and COLMAP's log.
 
-    Raises:
-        InputError: the worker reported bad input or died of a signal inside COLMAP.
-        OSError: the disk is full.
-        RuntimeError: the worker failed for any other reason (a bug).
+    Raises InputError (bad input, or a signal inside COLMAP), OSError (full disk) or RuntimeError (a bug).
     """
     job_file = folder / "job.json"
     job_file.write_text(json.dumps(job), encoding="utf-8")
@@ -156,7 +152,6 @@ def _keep_log(stream: IO[str], path: Path, bars: _ProgressBars, recent: deque[st
 
 
 def send_message(**message: Any) -> None:
-    """Sends a message from the worker to its parent."""
     print(json.dumps(message), flush=True)
 
 
