@@ -17,6 +17,7 @@ import pytest
 
 from twin import build as verb
 from twin.config import CaptureConfig, MjcfConfig, NerfConfig, SceneConfig, SourceConfig
+from twin.files import digest_json
 from twin.scene import SceneDir, Stamp
 
 _TOML = '[[source]]\npath = "input/a.txt"\n[metric]\ncamera_height = 1.0\n'
@@ -86,7 +87,7 @@ def test_a_field_is_made_anew_where_a_drive_becomes_none():
     (stage,) = (one for one in verb.PIPELINE if one.name == "field")
     stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
     drive, object_filmed, wider = (
-        verb.stage_key(verb._depends(stage, SceneConfig(mjcf=mjcf), {}, stamps))
+        digest_json(verb._depends(stage, SceneConfig(mjcf=mjcf), {}, stamps))
         for mjcf in (MjcfConfig(), MjcfConfig(route=False), MjcfConfig(half_width=2.0))
     )
     assert drive != object_filmed and drive == wider
@@ -99,7 +100,7 @@ def test_refinement_makes_a_field_anew_and_fields_of_before_stay():
         verb._depends(stage, SceneConfig(nerf=NerfConfig(refine_cameras=on)), {}, stamps) for on in (False, True)
     )
     assert "refine_cameras" not in plain["config"]["nerf"]  # as keys were before there was such a setting
-    assert verb.stage_key(plain) != verb.stage_key(refined)
+    assert digest_json(plain) != digest_json(refined)
 
 
 def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):
@@ -120,7 +121,7 @@ def test_changed_input_version_damage_and_force(pipeline, monkeypatch):
     result = pipeline.scene.stage("cameras") / "result.txt"
     result.write_text(result.read_text()[::-1])  # of the same size
     assert _rerun(pipeline) == ["cameras"]
-    stamp = pipeline.scene.stamp("capture")
+    stamp = pipeline.scene.stage("capture") / "stamp.json"
     stamp.write_text(stamp.read_text().replace('"capture"', '"capturf"', 1))
     assert _rerun(pipeline) == ["capture"]
 

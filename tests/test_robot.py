@@ -9,10 +9,10 @@ from tiny_world import tiny_config, tiny_scene
 from twin.build import PIPELINE, _depends
 from twin.config_file import load_config
 from twin.errors import InputError
+from twin.files import digest_json
 from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
 from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
-from twin.scene import stage_key
 
 _SCENE = """
 [[source]]
@@ -76,7 +76,7 @@ def test_the_stamp_of_stage_mjcf_notices_a_changed_robot(tmp_path):
     stage = next(stage for stage in PIPELINE if stage.name == "mjcf")
 
     def key(config) -> str:
-        return stage_key(_depends(replace(stage, upstream=()), config, {}, {}))
+        return digest_json(_depends(replace(stage, upstream=()), config, {}, {}))
 
     plain = key(config_of(tmp_path))
     assert key(config_of(tmp_path, "command_latency = 0.1")) != plain
