@@ -51,21 +51,23 @@ class Campaign:
         twin: Twin,
         task: str,
         path: Path,
-        policies: dict[str, tuple[str, bool]],
+        sources: dict[str, str],
+        trust: bool,
         processes: int,
-        ray: str | None = None,
+        ray: str | None,
     ) -> None:
         """
         Args:
             twin: A built scene.
             task: See `twin.load`.
             path: The table.
-            policies: Source and trust by name.
+            sources: Sources of the policies by name.
+            trust: Allows policy files to run code.
             processes: Number of local worker processes.
             ray: Address of a Ray cluster to use instead of them.
         """
-        self._scene, self.task, self.path, self._policies = str(twin.scene.root.resolve()), task, path, policies
-        self._processes, self._ray = processes, ray
+        self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
+        self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
         self._done = {_key(t): t for t in _read_table(path)}
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
@@ -75,25 +77,15 @@ class Campaign:
         for name, lighting, seeds in wanted:
             left = [seed for seed in seeds if (name, self.task, lighting, seed) not in self._done]
             for k in range(0, len(left), CHUNK):
-                source, trust = self._policies[name]
-                chunk = EpisodeChunk(self._scene, self.task, source, trust, lighting, tuple(left[k : k + CHUNK]))
-                chunks.append((name, chunk))
+                road, part = (self._scene, self.task), tuple(left[k : k + CHUNK])
+                chunks.append((name, EpisodeChunk(*road, self._sources[name], self._trust, lighting, part)))
         with runtime.bar(what, len(keys), "episode") as bar:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
             driven = self._campaign([chunk for _, chunk in chunks])
             for (name, chunk), outcomes in zip(chunks, driven, strict=True):
+                road = name, self.task, chunk.lighting
                 trials = [
-                    Trial(
-                        name,
-                        self.task,
-                        chunk.lighting,
-                        o.seed,
-                        o.cause,
-                        round(o.progress, 3),
-                        o.steps,
-                        round(o.trust, 4),
-                    )
-                    for o in outcomes
+                    Trial(*road, o.seed, o.cause, round(o.progress, 3), o.steps, round(o.trust, 4)) for o in outcomes
                 ]
                 self._append(trials)
                 bar.update(len(trials))
@@ -135,22 +127,23 @@ def validate(
     """
     twin = load_scene(root)
     folder = twin.scene.validation
-    policies = _policies(root, sources, trust)
+    policies = _named(root, sources, trust)
     lightings = tuple(dict.fromkeys(lightings))
     with exclusive_lock(folder.with_name(".validation.lock"), f"policies are being driven for {folder}"):
         _drop_partial_row(folder / "episodes.csv")
         _drop_partial_row(folder / "worst.csv")
         _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
-        todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
+        how = policies, trust, processes, ray
+        todo = Campaign(twin, task, folder / "episodes.csv", *how)
         wanted = [(name, one, lighting_seeds(one, episodes)) for name in policies for one in lightings]
         driven = todo.drive(wanted, "validate")
         if worst:
-            searched = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
+            searched = Campaign(twin, task, folder / "worst.csv", *how)
             for name in policies:
                 _search_worst_lighting(searched, name, episodes)
         results = _write_results(twin)
         if films:
-            for name, (source, _) in policies.items():
+            for name, source in policies.items():
                 _write_films(root, folder, source, trust, [t for t in driven if t.policy == name])
             results = _write_results(twin)
         return results
@@ -247,9 +240,8 @@ def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None
         trials = search.drive(wanted, f"worst lighting of {len(candidates)}")
         for trial in trials:
             trials_by_lighting[trial.lighting].append(trial)
-        scores = {name: _score(trials_by_lighting[name]) for name in candidates}
         kept = _SEARCH_KEPT if len(candidates) > _SEARCH_KEPT else 1
-        candidates = sorted(candidates, key=lambda name: scores[name])[:kept]
+        candidates = sorted(candidates, key=lambda name: _score(trials_by_lighting[name]))[:kept]
         seeds = range(seeds.stop, seeds.stop + 2 * len(seeds))
     # The minimum over many noisy scores is biased, hence an independent evaluation.
     final = range(_FINAL_SEED, _FINAL_SEED + episodes)
@@ -260,21 +252,18 @@ def _score(trials: Sequence[Trial]) -> tuple[float, float]:
     return sum(t.success for t in trials) / len(trials), sum(t.progress for t in trials) / len(trials)
 
 
-def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tuple[str, bool]]:
-    """Source and trust by the name in tables; loads each policy once to report errors early."""
-    out: dict[str, tuple[str, bool]] = {}
+def _named(root: Path, sources: Sequence[str], trust: bool) -> dict[str, str]:
+    """Sources of policies by their name in tables; loads each policy once to report errors early."""
+    out: dict[str, str] = {}
     for source in sources:
         where = find_policy(root, source)
         name = load_policy(where, trust).name
-        if out.get(name, (where, trust)) != (where, trust):
-            raise InputError(f"two policies are named {name!r}: {out[name][0]} and {where}; rename one")
-        out[name] = (where, trust)
+        if out.setdefault(name, where) != where:
+            raise InputError(f"two policies are named {name!r}: {out[name]} and {where}; rename one")
     return out
 
 
-def _check_same(
-    folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, tuple[str, bool]]
-) -> None:
+def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, str]) -> None:
     """Records digests of policies and of roads (task and lighting). Raises InputError if one in the tables changed."""
     path = folder / "validated.json"
     recorded: dict[str, Any] = {"roads": {}, "policies": {}}
@@ -292,7 +281,7 @@ def _check_same(
                 "or twin's sampling of episodes changed; move it away to validate again"
             )
         recorded["roads"][road] = digest
-    for name, (source, _) in policies.items():
+    for name, source in policies.items():
         digest = _digest(Path(source), source)
         if name in driven and recorded["policies"].get(name) != digest:
             raise InputError(
