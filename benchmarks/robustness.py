@@ -164,7 +164,7 @@ def _filmed(folder: Path) -> Path:
 def _results(root: Path, stages: tuple[str, ...]) -> dict[str, str]:
     from twin.scene import SceneDir
 
-    return {name: json.loads(SceneDir(root).stamp(name).read_text())["result"] for name in stages}
+    return {name: json.loads((SceneDir(root).stage(name) / "stamp.json").read_text())["result"] for name in stages}
 
 
 def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:

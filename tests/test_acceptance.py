@@ -44,7 +44,7 @@ ALIGNED = Subject(
 """Ground and controller as a log may show them."""
 
 
-def test_the_subject_s_own_ground_and_controller_are_measured():
+def test_ground_and_controller_of_the_given_robot_are_used():
     for model in (ALIGNED.plane(), on_ground(grounds.level(), ALIGNED.params)):
         assert (model.opt.impratio, model.opt.viscosity) == (0.025, 4.0)
     assert ALIGNED.turn(1.0).wheel_difference == pytest.approx(0.5 * 1.4 * TRACK, rel=0.02)
@@ -57,7 +57,7 @@ def test_the_subject_s_own_ground_and_controller_are_measured():
     assert fastest == pytest.approx(0.4, rel=0.02)
 
 
-def test_a_number_that_is_none_fails():
+def test_nan_fails():
     assert not Row("X", "", float("nan"), -1e9, 1e9).passed
     assert Row("X", "", 1.0, 1.0, 1.0).passed
 

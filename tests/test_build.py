@@ -1,4 +1,4 @@
-"""The laws of the build verb, on a pipeline of stages that take no time."""
+"""The verb `build`, on a pipeline of stages that take no time."""
 
 import errno
 import importlib
@@ -17,6 +17,7 @@ import pytest
 
 from twin import build as verb
 from twin.config import CaptureConfig, MjcfConfig, NerfConfig, SceneConfig, SourceConfig
+from twin.files import digest_json
 from twin.scene import SceneDir, Stamp
 
 _TOML = '[[source]]\npath = "input/a.txt"\n[metric]\ncamera_height = 1.0\n'
@@ -24,7 +25,7 @@ _TOML = '[[source]]\npath = "input/a.txt"\n[metric]\ncamera_height = 1.0\n'
 
 @pytest.fixture
 def pipeline(monkeypatch, tmp_path):
-    """A scene, and a pipeline capture → cameras → field whose stages write down that they ran."""
+    """A scene, and a pipeline capture → cameras → field whose stages record that they ran."""
     ran: list[str] = []
     reads = {"capture": "capture.fps", "cameras": "cameras.features", "field": "nerf.steps"}
     upstream = {"capture": (), "cameras": ("capture",), "field": ("cameras",)}
@@ -68,8 +69,8 @@ def test_runs_once_then_only_what_a_change_touches(pipeline):
     assert _rerun(pipeline, "seed=5") == ["capture", "cameras", "field"]
 
 
-def test_what_a_stage_reads_of_the_configuration_is_in_a_key():
-    """Its own, or that of a stage before it, through whose result it comes."""
+def test_settings_of_a_stage_are_in_its_key():
+    """In its own key, or in that of an upstream stage."""
     sections = {f.name for f in verb.dataclasses.fields(SceneConfig)} - {"name", "seed"}
     keys: dict[str, set[str]] = {}
     for stage in verb.PIPELINE:
@@ -81,25 +82,25 @@ def test_what_a_stage_reads_of_the_configuration_is_in_a_key():
         assert not missing, f"{stage.name} reads {missing}"
 
 
-def test_a_field_is_made_anew_where_a_drive_becomes_none():
+def test_a_scene_without_a_route_needs_another_field():
     """Without a route the camera's height is not held to be constant."""
     (stage,) = (one for one in verb.PIPELINE if one.name == "field")
     stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
     drive, object_filmed, wider = (
-        verb.stage_key(verb._depends(stage, SceneConfig(mjcf=mjcf), {}, stamps))
+        digest_json(verb._depends(stage, SceneConfig(mjcf=mjcf), {}, stamps))
         for mjcf in (MjcfConfig(), MjcfConfig(route=False), MjcfConfig(half_width=2.0))
     )
     assert drive != object_filmed and drive == wider
 
 
-def test_refinement_makes_a_field_anew_and_fields_of_before_stay():
+def test_pose_refinement_changes_the_key_and_older_fields_stay_valid():
     (stage,) = (one for one in verb.PIPELINE if one.name == "field")
     stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
     plain, refined = (
         verb._depends(stage, SceneConfig(nerf=NerfConfig(refine_cameras=on)), {}, stamps) for on in (False, True)
     )
     assert "refine_cameras" not in plain["config"]["nerf"]  # as keys were before there was such a setting
-    assert verb.stage_key(plain) != verb.stage_key(refined)
+    assert digest_json(plain) != digest_json(refined)
 
 
 def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):
@@ -120,12 +121,12 @@ def test_changed_input_version_damage_and_force(pipeline, monkeypatch):
     result = pipeline.scene.stage("cameras") / "result.txt"
     result.write_text(result.read_text()[::-1])  # of the same size
     assert _rerun(pipeline) == ["cameras"]
-    stamp = pipeline.scene.stamp("capture")
+    stamp = pipeline.scene.stage("capture") / "stamp.json"
     stamp.write_text(stamp.read_text().replace('"capture"', '"capturf"', 1))
     assert _rerun(pipeline) == ["capture"]
 
 
-def test_images_that_a_transforms_json_names_are_input_wherever_they_lie(tmp_path):
+def test_images_listed_in_transforms_json_are_inputs_in_any_folder(tmp_path):
     root, elsewhere = tmp_path / "scene", tmp_path / "photos"
     (root / "input").mkdir(parents=True)
     elsewhere.mkdir()
@@ -193,7 +194,7 @@ def test_bad_input_exits_2_and_a_bug_keeps_its_traceback(pipeline, capsys):
 
 
 def test_a_killed_build_resumes_and_a_second_one_refuses(pipeline, tmp_path):
-    """Kill −9 in the middle of a stage; the folder it wrote goes, finished stages stay, the result is the same."""
+    """Kill −9 in the middle of a stage; the partial folder is removed, finished stages stay, the result is the same."""
     script = textwrap.dedent(
         """
         import sys, time, types
@@ -245,7 +246,7 @@ def test_a_kill_between_the_two_renames_loses_nothing(pipeline):
     assert Stamp.load(final) is not None
 
 
-def test_parts_of_films_are_in_the_key_only_where_they_are_given():
+def test_segments_of_films_are_in_the_key_only_if_given():
     def settings(source, capture):
         config = SceneConfig(source=(source,), capture=capture)
         return verb._depends(verb.PIPELINE[0], config, {}, {})["config"]

@@ -9,7 +9,7 @@ from twin.__main__ import main
 from twin.commands import VERBS
 
 
-def test_the_map_has_every_verb(capsys):
+def test_help_lists_every_verb(capsys):
     for arguments in ([], ["--help"]):
         assert main(arguments) == 0
         shown = capsys.readouterr().out
@@ -24,7 +24,7 @@ def test_an_unknown_verb_is_one_line(capsys):
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_is_reached(verb, capsys):
+def test_every_verb_has_help(verb, capsys):
     with pytest.raises(SystemExit) as end:
         main([verb, "--help"])
     assert end.value.code == 0
@@ -78,14 +78,14 @@ def test_help_agrees_with_what_the_verbs_take(capsys):
     assert f"(default: {' '.join(DEFAULT_LIGHTINGS)})" in _help(capsys, "validate")
 
 
-def test_a_lighting_that_reality_does_not_have_is_one_line(tmp_path, capsys):
+def test_an_unknown_lighting_of_reality_is_one_line(tmp_path, capsys):
     for given in (["film", "--lightings", "noon"], ["photo", "--lighting", "noon"]):
         assert main(["reality", *given, "--out", str(tmp_path / "out")]) == 2
         told = capsys.readouterr().err
         assert told.startswith("error: no lighting 'noon'") and told.count("\n") == 1
 
 
-def test_a_training_in_a_scene_that_is_not_built_leaves_nothing(tmp_path, capsys):
+def test_training_in_a_scene_that_is_not_built_leaves_no_files(tmp_path, capsys):
     (tmp_path / "scene.toml").write_text('name = "bare"\n[[source]]\npath = "a.mp4"\n')
     assert main(["train", str(tmp_path), "--run", "first"]) == 2
     told = capsys.readouterr().err

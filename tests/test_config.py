@@ -93,17 +93,17 @@ def test_bad_input_is_one_line_with_a_cure(tmp_path, text, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-def test_missing_file_names_the_verb_that_writes_one(tmp_path):
+def test_missing_file_suggests_the_verb_new(tmp_path):
     with pytest.raises(InputError, match=r"twin\.new"):
         load_config(tmp_path / "scene.toml")
 
 
-def test_parts_of_films(tmp_path):
+def test_segments_of_films(tmp_path):
     config = load_config(_write(tmp_path, _MINIMAL + "keep = [[0, 3], [4.5, 6]]\n"), ("capture.keep=[[1, 2]]",))
     assert config.source[0].keep == ((0.0, 3.0), (4.5, 6.0)) and config.capture.keep == ((1.0, 2.0),)
 
 
-def test_what_may_be_chosen_is_what_the_libraries_have():
+def test_choices_match_the_libraries():
     cv2, lens = (pytest.importorskip(n) for n in ("cv2", "twin.capture.camera_models"))
     models = set(lens.pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
     assert set(CAMERA_MODELS) == models
@@ -127,7 +127,7 @@ def test_overrides(tmp_path):
 
 
 def _numbers():
-    """Section, key and value of every number of the sections that a stage reads, by its default."""
+    """Section, key and default of every number that a stage reads."""
     config = SceneConfig()
     for section in _SECTIONS:
         for key, value in dataclasses.asdict(getattr(config, section)).items():
@@ -135,7 +135,7 @@ def _numbers():
                 yield section, key, value
 
 
-def test_every_number_has_a_range_and_is_kept_to_it(tmp_path):
+def test_every_number_has_a_range_that_is_checked(tmp_path):
     path = _write(tmp_path, _MINIMAL)
     for section, key, default in _numbers():
         bounds = setting_ranges(type(getattr(SceneConfig(), section)))[key]
@@ -166,7 +166,7 @@ def test_a_file_given_for_a_scene_is_one_line(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("setting", ["nerf.bake_steps=0", "nerf.sightings=1.0", "nerf.levels=0", "mesh.views=0"])
-def test_a_number_that_no_stage_could_work_with_ends_the_build_before_it_begins(tmp_path, capsys, setting):
+def test_a_number_out_of_range_is_refused_before_the_build(tmp_path, capsys, setting):
     _write(tmp_path, _MINIMAL)
     assert build.main([str(tmp_path), "--set", setting]) == 2
     error = capsys.readouterr().err

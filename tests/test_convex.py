@@ -1,4 +1,4 @@
-"""Closed meshes into convex parts, and the corridor that is cut free of them."""
+"""Convex decomposition of closed meshes, and clearing the corridor of its parts."""
 
 from pathlib import Path
 
@@ -81,7 +81,7 @@ def test_winding_number_is_one_inside_and_zero_outside():
     np.testing.assert_allclose(winding_number(points, *_ell()), inside, atol=1e-6)
 
 
-def test_samples_are_on_the_surface_and_no_further_apart_than_asked():
+def test_samples_are_on_the_surface_and_within_the_spacing():
     part = _box((0, 0, 0), (1, 1, 1))
     samples = surface_samples(part.vertices, part.faces, 0.1)
     assert np.abs(samples - 0.5).max(1) == pytest.approx(0.5)
@@ -89,7 +89,7 @@ def test_samples_are_on_the_surface_and_no_further_apart_than_asked():
     assert np.linalg.norm(wanted[:, None] - samples, axis=-1).min(1).max() < 0.1
 
 
-def test_the_hull_of_an_ell_sticks_out_as_far_as_geometry_says():
+def test_hull_of_an_ell_protrudes_by_the_exact_distance():
     piece = SolidPiece.from_mesh(*_ell())
     hull = ConvexPart.hull(piece.vertices)
     assert hull is not None
@@ -101,7 +101,7 @@ def test_the_hull_of_an_ell_sticks_out_as_far_as_geometry_says():
     assert 0.2 < uncovered_fraction(piece, [_box((0, 0, 0), (2, 0.6, 1))], 0.05) < 0.6
 
 
-def test_halving_alone_comes_close_and_tells_how_close():
+def test_splitting_alone_reduces_and_reports_protrusion():
     piece = SolidPiece.from_mesh(*_ell())
     hull = ConvexPart.hull(piece.vertices)
     assert hull is not None
@@ -114,7 +114,7 @@ def test_halving_alone_comes_close_and_tells_how_close():
     assert uncovered_fraction(piece, [part for part, _ in halves], BOUND) < 0.08
 
 
-def test_decomposition_covers_its_pieces_within_the_bound_and_is_remembered(tmp_path: Path):
+def test_decomposition_covers_its_pieces_within_the_bound_and_is_cached(tmp_path: Path):
     crate = _box((5, 5, 0), (6, 6, 1))
     pieces = [SolidPiece.from_mesh(crate.vertices, crate.faces), SolidPiece.from_mesh(*_ell())]
     made = decompose(pieces, BOUND, tmp_path, seed=0)
@@ -132,7 +132,7 @@ def test_decomposition_covers_its_pieces_within_the_bound_and_is_remembered(tmp_
     assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(made.parts, again.parts, strict=True))
 
 
-def test_a_cut_keeps_exactly_its_side():
+def test_clipping_keeps_exactly_one_side():
     part = _box((0, 0, 0), (1, 1, 1))
     normal = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
     corner = clip_part(part, normal, 0.5 / np.sqrt(2))
@@ -143,7 +143,7 @@ def test_a_cut_keeps_exactly_its_side():
     assert clip_part(part, normal, -0.1) is None
 
 
-def test_the_corridor_is_cleared_and_the_rest_stays():
+def test_corridor_is_cleared_and_the_rest_stays():
     route = right_turn(length=40.0, straight=15.0, step=0.25)
     corridor = Corridor(route, 1.0)
     parts = [

@@ -1,4 +1,4 @@
-"""What twin wrote and somebody damaged, sealed anew or without a stamp: each reader says so in one line."""
+"""Damaged results of stages, with a valid stamp or without: every reader raises an error of one line."""
 
 import json
 
@@ -55,7 +55,7 @@ def _copied(build, stage, tmp_path):
 
 
 @pytest.mark.parametrize(("reader", "stage", "name"), READERS)
-def test_what_is_cut_empty_or_gone(build, tmp_path, reader, stage, name):
+def test_truncated_empty_or_missing_files(build, tmp_path, reader, stage, name):
     folder = _copied(build, stage, tmp_path)
     reader.load(folder)  # whole it is read
     data = (folder / name).read_bytes()
@@ -93,7 +93,7 @@ def test_arrays_that_are_missing_pickled_or_of_another_shape(build, tmp_path, re
         (BakedField, "3_field", "baked.json", "lightings", [1, 2]),
     ],
 )
-def test_json_of_another_kind(build, tmp_path, reader, stage, name, key, value):
+def test_json_values_of_wrong_type(build, tmp_path, reader, stage, name, key, value):
     folder = _copied(build, stage, tmp_path)
     (folder / name).write_text(json.dumps(json.loads((folder / name).read_text()) | {key: value}))
     with pytest.raises(InputError):
@@ -103,13 +103,13 @@ def test_json_of_another_kind(build, tmp_path, reader, stage, name, key, value):
 @pytest.mark.parametrize(
     "line", ["x,1,0.0", "1,,0.0", "1,2,0.0", "1", "1,1,far", "5,1,0.0\n1,1,0.0", "1,1," + "9" * 200_000]
 )
-def test_episodes_of_a_training_that_are_damaged(tmp_path, line):
+def test_damaged_episodes_of_a_training(tmp_path, line):
     (tmp_path / "episodes.csv").write_text(f"step,success,start_m\n{line}\n")
     with pytest.raises(InputError, match=r"episodes\.csv"):
         read_episodes(tmp_path)
 
 
-def test_what_was_noted_of_a_validation(tmp_path):
+def test_damaged_records_of_a_validation(tmp_path):
     (tmp_path / "validation").mkdir()
     assert training_summaries(tmp_path, ["x" * 300, "a\x00b"]) == {}  # a table may have any name
     for text in ("[]", "{}", '{"policies": 3}', "{"):

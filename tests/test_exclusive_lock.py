@@ -10,7 +10,7 @@ from twin.errors import InputError
 from twin.runtime import exclusive_lock
 
 
-def test_the_lock_names_its_holder_and_goes_with_it(tmp_path):
+def test_the_error_names_the_holder_and_a_kill_releases_the_lock(tmp_path):
     path = tmp_path / "new" / ".lock"
     code = (
         "import sys; from pathlib import Path; from twin.runtime import exclusive_lock\n"

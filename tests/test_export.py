@@ -1,4 +1,4 @@
-"""Export: splats lie on what the views show and look like it in MuJoCo's own renderer; the mesh gets its colours."""
+"""Export: splats lie on the surfaces of the views and render like them in MuJoCo; colors of the mesh."""
 
 import mujoco
 import numpy as np
@@ -15,7 +15,7 @@ FOCAL = 40.0
 
 
 def _views(eyes) -> Views:
-    """Views of the floor z = 0 in quarters of four colours, from above at a slant."""
+    """Views of the floor z = 0 in quarters of four colors, from above at a slant."""
     poses = np.array([look_at(np.array(eye), np.array([0.0, 0.1, 0.0])) for eye in eyes])
     k = np.tile([FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2], (len(poses), 1))
     v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
@@ -50,7 +50,7 @@ def test_gaussians_are_flat_disks_on_the_surface() -> None:
     assert np.abs(splats.rgb - _colour(splats.positions) / 255.0)[away].max() < 1e-3
 
 
-def test_of_points_in_one_cell_the_sharpest_stays() -> None:
+def test_the_sharpest_point_of_a_cell_is_kept() -> None:
     points = np.array([[0.001, 0, 0], [0.002, 0, 0], [0.004, 0.001, 0], [0.5, 0, 0]])
     assert select_sharpest(points, np.array([0.009, 0.005, 0.03, 0.03])).tolist() == [1, 3]
     rng = np.random.default_rng(0)
@@ -98,7 +98,7 @@ def test_splats_look_like_the_views_in_mujocos_renderer() -> None:
 
 
 def _read(ply: bytes) -> Gaussians:
-    """What a viewer makes of the file."""
+    """The file as a viewer reads it."""
     head, _, body = ply.partition(b"end_header\n")
     names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property")]
     d = np.frombuffer(body, [(name, "<f4") for name in names])
@@ -116,7 +116,7 @@ def _read(ply: bytes) -> Gaussians:
     )
 
 
-def test_vertices_have_the_colours_of_what_is_seen_there() -> None:
+def test_vertices_have_the_colors_of_the_views() -> None:
     vertices = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [0.3, 0.31, -0.5]])
     colours = export.vertex_colors(_views(EYES), vertices)
     assert np.abs(colours[:3].astype(int) - _colour(vertices[:3])).max() <= 1
@@ -131,7 +131,7 @@ def test_vertices_have_the_colours_of_what_is_seen_there() -> None:
         (["--ply", "a.ply"], "no scene.toml"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch, capsys, arguments, words) -> None:
+def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, words) -> None:
     monkeypatch.chdir(tmp_path)
     assert export.main(["nowhere", *arguments]) == 2
     assert words in capsys.readouterr().err and not list(tmp_path.iterdir())

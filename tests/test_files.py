@@ -1,4 +1,4 @@
-"""Files that may be anything: one line says what is wrong, nothing hangs, nothing runs, and what was there stays."""
+"""Arbitrary files: errors are one line, nothing hangs, no code runs, and former contents stay."""
 
 import json
 import os
@@ -23,7 +23,7 @@ _DEEP = 100_000
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "null", "zero", "dangling", "loop", "nothing", "long", "nul"])
 @pytest.mark.parametrize("reader", [files.read_json, files.read_toml, files.load_arrays, files.load_tensors, read_log])
-def test_what_is_no_file_is_one_line(tmp_path, kind, reader):
+def test_errors_for_missing_or_special_files_are_one_line(tmp_path, kind, reader):
     path = tmp_path / "some.csv"
     if kind == "pipe":
         os.mkfifo(path)
@@ -60,7 +60,7 @@ def test_what_is_no_file_is_one_line(tmp_path, kind, reader):
         '"\x00"',
     ],
 )
-def test_json_that_no_reader_can_use_is_one_line(tmp_path, text):
+def test_errors_for_bad_json_are_one_line(tmp_path, text):
     path = tmp_path / "some.json"
     path.write_text(text)
     with pytest.raises(InputError, match=re.escape(str(path))) as refused:
@@ -80,14 +80,14 @@ def test_json_that_no_reader_can_use_is_one_line(tmp_path, text):
         "a = {b" + ".b" * _DEEP + " = 1}",
     ],
 )
-def test_toml_that_no_reader_can_use_is_one_line(tmp_path, text):
+def test_errors_for_bad_toml_are_one_line(tmp_path, text):
     path = tmp_path / "some.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=re.escape(str(path))):
         files.read_toml(path)
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_write_and_read_round_trip(tmp_path):
     value = {"state": 2**127, "low": -1.5e-300, "text": "é", "deep": [[[1]]]}
     files.write_json(tmp_path / "a.json", value)
     assert files.read_json(tmp_path / "a.json") == value
@@ -97,7 +97,7 @@ def test_what_was_written_is_read(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "a.npz"]
 
 
-def test_arrays_that_run_code_or_promise_too_much_are_refused(tmp_path):
+def test_pickled_and_oversized_arrays_are_refused(tmp_path):
     class Planted:
         def __reduce__(self):
             return Path.touch, (tmp_path / "ran",)
@@ -114,7 +114,7 @@ def test_arrays_that_run_code_or_promise_too_much_are_refused(tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_write_that_fails_leaves_what_was_there(tmp_path):
+def test_a_failed_write_leaves_the_former_file(tmp_path):
     path = tmp_path / "a.json"
     files.write_json(path, 1)
     with pytest.raises(ValueError):
@@ -125,7 +125,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path):
     assert files.read_json(path) == 1 and [one.name for one in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_allocated_bytes_are_there_and_keep_what_was(tmp_path):
+def test_allocation_keeps_contents(tmp_path):
     path = tmp_path / "tape"
     path.write_bytes(b"kept")
     files.allocate(path, 1 << 20)
@@ -133,7 +133,7 @@ def test_allocated_bytes_are_there_and_keep_what_was(tmp_path):
 
 
 @given(st.text())
-def test_any_text_is_a_toml_string(text):
+def test_toml_string_round_trip(text):
     whole = text.encode("utf-8", "replace").decode()
     assert tomllib.loads(f"a = {files.toml_string(text)}")["a"] == whole
 
@@ -141,7 +141,7 @@ def test_any_text_is_a_toml_string(text):
 @pytest.mark.parametrize(
     "name", ["", "../validation", "/tmp/x", "a/b", ".", "..", ".hidden", "a\0", "a b", "x" * 81, "é" * 90, "a\n"]
 )
-def test_a_name_is_no_path(tmp_path, name):
+def test_a_path_is_refused_as_a_name(tmp_path, name):
     with pytest.raises(InputError, match="--run"):
         run_folder(SceneDir(tmp_path), name)
     assert check_name("first-2.b_é", "--run") == "first-2.b_é"
@@ -184,7 +184,7 @@ def test_a_damaged_stage_names_its_file(tmp_path):
 
 
 @pytest.mark.parametrize("count", ["9223372036854775808", "9" * 5000, "1000001", "-1", "1.5", "٣"])
-def test_counts_of_trials_are_numbers_that_somebody_may_have_driven(tmp_path, count):
+def test_implausible_counts_of_trials_are_refused(tmp_path, count):
     path = tmp_path / "real.csv"
     path.write_text(f"policy,lighting,trials,successes\nfirst,day,{count},0\n")
     with pytest.raises(InputError, match="line 2: trials") as refused:
@@ -192,7 +192,7 @@ def test_counts_of_trials_are_numbers_that_somebody_may_have_driven(tmp_path, co
     assert len(str(refused.value)) < len(str(path)) + 200
 
 
-def test_tables_that_are_none(tmp_path):
+def test_bad_tables_are_refused(tmp_path):
     path = tmp_path / "episodes.csv"
     for content in (b"\xff\xfe", b"\0" * 100, b'"' + b"x" * 10**6, b"policy," * 10**5):
         path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""The ground: reading between its cells, and fitting it to noisy heights."""
+"""The ground: interpolation between its nodes, and the fit to noisy heights."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ def _ground(height):
 
 
 def _bent(xy):
-    """Bilinear in x and y, and different along each: a grid read bilinearly has it exactly."""
+    """A bilinear function of x and y, which bilinear interpolation of a grid reproduces exactly."""
     x, y = xy[..., 0], xy[..., 1]
     return 0.3 + 0.1 * x - 0.04 * y + 0.02 * x * y
 
@@ -29,7 +29,7 @@ def _noisy(rng, count, low, high, sigma):
     return np.column_stack([xy, z])
 
 
-def test_heights_between_cells_are_bilinear_and_end_at_the_edge():
+def test_interpolation_is_bilinear_and_clamped_to_the_edge():
     rows, columns = 9, 14
     x, y = np.meshgrid(-3.0 + 0.25 * np.arange(columns), 2.0 + 0.25 * np.arange(rows))
     ground = _ground(_bent(np.stack([x, y], -1)))
@@ -39,7 +39,7 @@ def test_heights_between_cells_are_bilinear_and_end_at_the_edge():
     np.testing.assert_allclose(ground.at(np.array([9.0, 9.0])), ground.height[-1, -1], atol=1e-12)
 
 
-def test_saved_and_loaded_is_the_same(tmp_path: Path):
+def test_save_and_load_round_trip(tmp_path: Path):
     ground = _ground(np.random.default_rng(2).standard_normal((4, 6)))
     ground.save(tmp_path)
     back = Ground.load(tmp_path)
@@ -48,7 +48,7 @@ def test_saved_and_loaded_is_the_same(tmp_path: Path):
         assert np.asarray(getattr(back, name)).dtype == np.asarray(value).dtype
 
 
-def test_fit_finds_hills_under_noise_and_things_that_stand():
+def test_fit_recovers_hills_despite_noise_and_obstacles():
     rng = np.random.default_rng(3)
     low, high = np.array([-8.0, -5.0]), np.array([8.0, 5.0])
     xyz = _noisy(rng, 3000, low, high, 0.03)
@@ -62,7 +62,7 @@ def test_fit_finds_hills_under_noise_and_things_that_stand():
     assert np.median(weights[~standing]) > 0.6 and weights[standing].max() < 0.1
 
 
-def test_a_slope_goes_on_through_a_gap():
+def test_a_slope_continues_through_a_gap():
     rng = np.random.default_rng(4)
     xy = rng.uniform([-8.0, -4.0], [8.0, 4.0], (1500, 2))
     xy = xy[np.abs(xy[:, 0]) > 1.5]
@@ -72,7 +72,7 @@ def test_a_slope_goes_on_through_a_gap():
     assert np.abs(height - 0.1 * grid.nodes()[..., 0] - 0.2).max() < 0.02
 
 
-def test_cells_hold_the_median_of_their_points():
+def test_cell_data_are_medians():
     z = np.array([0.1, 0.12, 5.0, 0.4])
     xy = np.array([[0.1, 0.1], [0.2, 0.1], [0.1, 0.2], [1.1, 0.1]])
     data = cell_medians(np.column_stack([xy, z]), np.array([0.03, 0.05, 0.04, 0.03]), 0.25, 1)
@@ -82,7 +82,7 @@ def test_cells_hold_the_median_of_their_points():
     assert (data.kind == 1).all()
 
 
-def test_bias_is_what_lies_beside_the_path_only():
+def test_bias_uses_only_data_beside_the_path():
     rng = np.random.default_rng(5)
     path = HeightData(
         np.column_stack([np.arange(0.0, 10.0, 0.25), np.zeros((40, 2))]), np.ones(40), np.full(40, 2, np.int8)

@@ -1,4 +1,4 @@
-"""The order of the package: directions of imports, no circles, one name for one thing."""
+"""Structure of the package: no import cycles, unique names, a head in every module."""
 
 import ast
 from collections import defaultdict
@@ -23,14 +23,14 @@ def _imports(module: str) -> set[str]:
     return (out & set(MODULES)) - {module}
 
 
-def test_no_import_circles():
+def test_no_import_cycles():
     graph = {module: _imports(module) for module in MODULES}
     while leaves := [module for module, below in graph.items() if not below]:
         for leaf in leaves:
             del graph[leaf]
         for below in graph.values():
             below.difference_update(leaves)
-    assert graph == {}, "these modules are in circles, or above them"
+    assert graph == {}, "these modules are in cycles, or above them"
 
 
 def test_no_two_modules_share_a_name():
@@ -51,6 +51,6 @@ def test_no_two_classes_share_a_name():
 
 
 def test_every_module_has_a_head():
-    """One that says what is in it; the empty ones that only make a folder a package need none."""
+    """Empty modules, which only make a folder a package, need none."""
     sources = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
     assert not [module for module, text in sources.items() if text and not ast.get_docstring(ast.parse(text))]

@@ -1,4 +1,4 @@
-"""The Husky's model: figures, names, sensors, camera, and the stand-alone file. How it drives: `test_acceptance.py`."""
+"""The Husky's model: constants, names, sensors, camera, standalone file. Its motion: `test_acceptance.py`."""
 
 import mujoco
 import numpy as np
@@ -11,7 +11,7 @@ from twin.mjcf.husky import HUSKY_XML, add_husky, center_of_mass, coulomb_track_
 from twin.robot import GEAR_RATIO, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams, PixelCamera
 
 
-def test_names_are_as_promised():
+def test_names():
     model = mujoco.MjModel.from_xml_path(str(HUSKY_XML))
     for name in ("front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"):
         assert model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE
@@ -46,7 +46,7 @@ def test_payload_moves_the_centre_of_mass():
     assert tensor[2, 2] == pytest.approx(yaw, rel=1e-6)
 
 
-def test_published_inertia_survives():
+def test_inertia_is_the_published_one():
     model = on_plane()
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.body("base_link").iquat)
@@ -56,7 +56,7 @@ def test_published_inertia_survives():
     np.testing.assert_allclose(tensor, expected, atol=1e-6)
 
 
-def test_looks_weigh_and_touch_nothing():
+def test_visual_geoms_have_no_mass_and_no_contacts():
     model = on_plane()
     looks = model.geom_group == 1
     assert looks.sum() > 20
@@ -83,7 +83,7 @@ def test_lag_is_first_order():
         np.testing.assert_allclose(data.qvel[6:], 3.0 * share, rtol=0.05)
 
 
-def test_a_smaller_wheel_steers_to_its_side():
+def test_the_robot_turns_to_the_side_of_smaller_wheels():
     model = on_plane(HuskyParams(wheel_radius=(0.160, 0.165)))
     run = drive(model, 0.5, 0.0)
     speed = 0.5 / WHEEL_RADIUS
@@ -115,7 +115,7 @@ def test_sensors_and_currents():
     np.testing.assert_allclose(physics.motor_current, physics.motor_torque / (GEAR_RATIO * 0.035))
 
 
-def test_belt_keeps_a_side_s_wheels_together():
+def test_belt_couples_the_wheels_of_a_side():
     physics = HuskyPhysics(on_plane())
     for _ in range(20):
         physics.command(0.5, 0.8)
@@ -157,8 +157,8 @@ def test_tyre_mesh_has_the_wheel_s_size():
         np.testing.assert_allclose(extent, [WHEEL_WIDTH, 2 * radius, 2 * radius], rtol=0.02)
 
 
-def test_shipped_file_is_what_the_code_makes():
-    """Compiled, so that another MuJoCo's way of writing XML is no difference. `python -m twin.mjcf.husky` renews it."""
+def test_shipped_file_is_up_to_date():
+    """Compares compiled models, since MuJoCo versions format XML differently. `python -m twin.mjcf.husky` renews it."""
     shipped = mujoco.MjModel.from_xml_path(str(HUSKY_XML))
     made = mujoco.MjModel.from_xml_string(standalone_xml())
     assert shipped.names == made.names
@@ -171,8 +171,8 @@ def test_shipped_file_is_what_the_code_makes():
     assert "worldbody" in HUSKY_XML.read_text() and "plane" not in HUSKY_XML.read_text()
 
 
-def test_shipped_file_attaches_and_drives_like_the_code_s():
-    """On a plane of somebody else's, through `MjSpec.attach` and `set_options`, against the model the table judges."""
+def test_shipped_file_attaches_and_drives_like_the_model():
+    """Attached to another model by `MjSpec.attach`, with `set_options`, against the model of the acceptance table."""
     spec = mujoco.MjSpec()
     set_options(spec)
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1), pos=(0, 0, 0.5))

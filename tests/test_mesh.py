@@ -1,4 +1,4 @@
-"""The mesh stage on a place that is known exactly: a road, a wall, a post and a crate that reaches into the way."""
+"""The mesh stage on a known place: a road, a wall, a post, and a crate that reaches into the corridor."""
 
 import json
 from pathlib import Path
@@ -66,7 +66,7 @@ def _post_front(low, high):
     return np.column_stack([np.full(8, POST.x - POST.radius), np.full(8, POST.y), z])
 
 
-def test_files_have_their_layout(made):
+def test_layout_of_files(made):
     folder, facts = made
     visual, parts, route = (_load(folder, name) for name in ("visual", "parts", "route"))
     assert {k: v.dtype.name for k, v in visual.items()} == {"vertices": "float32", "faces": "int32", "colors": "uint8"}
@@ -86,13 +86,13 @@ def test_files_have_their_layout(made):
     json.dumps(facts, allow_nan=False)
 
 
-def test_route_is_the_straight_that_was_filmed(made):
+def test_route_is_the_filmed_line(made):
     route = _load(made[0], "route")["xy"]
     assert np.allclose(route[[0, -1]], [[0, 0], [12, 0]], atol=0.05) and np.abs(route[:, 1]).max() < 0.02
     assert made[1]["route_length_m"] == pytest.approx(12.0, abs=0.1)
 
 
-def test_ground_is_that_of_the_place(made):
+def test_ground_matches_the_place(made):
     ground = Ground.load(made[0])
     x, y = np.meshgrid(np.arange(0.0, 12.0, 0.2), np.arange(-2.0, 2.0, 0.2))
     xy = np.stack([x, y], -1)
@@ -101,7 +101,7 @@ def test_ground_is_that_of_the_place(made):
     assert ground.measured.any() and not ground.measured.all()
 
 
-def test_wall_and_post_are_there_to_see_and_to_touch(made):
+def test_wall_and_post_are_in_both_meshes(made):
     folder, _ = made
     parts, vertices = _parts(folder), _load(folder, "visual")["vertices"].astype(float)
     for points in (_wall_front(), _post_front(0.2, 0.45)):
@@ -109,12 +109,12 @@ def test_wall_and_post_are_there_to_see_and_to_touch(made):
         assert np.linalg.norm(points[:, None] - vertices, axis=-1).min(1).max() < 0.2
 
 
-def test_a_thin_post_is_there_to_its_height(made):
+def test_a_thin_post_has_its_full_height(made):
     points = _post_front(0.8, 1.6)
     assert np.any([inside_hull(part, points, 0.2) for part in _parts(made[0])], axis=0).all()
 
 
-def test_nothing_stands_where_nothing_is(made):
+def test_no_parts_in_free_space(made):
     folder, facts = made
     corners = np.concatenate([part.vertices for part in _parts(folder)])
     corners = corners[corners[:, 2] > PLACE.ground(corners[:, :2]) + 0.2]
@@ -123,7 +123,7 @@ def test_nothing_stands_where_nothing_is(made):
     assert facts["parts_beyond_bound"] == 0 and facts["max_protrusion_m"] <= 0.2
 
 
-def test_no_part_is_in_the_corridor_although_a_crate_is(made):
+def test_no_part_is_in_the_corridor(made):
     folder, _ = made
     route = _load(folder, "route")["xy"]
     rng = np.random.default_rng(0)
@@ -134,4 +134,4 @@ def test_no_part_is_in_the_corridor_although_a_crate_is(made):
     parts = _parts(folder)
     assert not any(inside_hull(part, points).any() for part in parts)
     behind = np.array([[CRATE.x, CRATE.y - 0.2, 0.4]])
-    assert any(inside_hull(part, behind, 0.1)[0] for part in parts), "what of the crate is beside the way must stay"
+    assert any(inside_hull(part, behind, 0.1)[0] for part in parts), "the crate must stay beside the corridor"

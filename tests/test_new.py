@@ -1,4 +1,4 @@
-"""The verb that starts a scene: what it writes can be loaded and built."""
+"""The verb `new`: its scenes can be loaded and built."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def _uncommented(text: str, line: str) -> str:
 
 
 @pytest.mark.parametrize("arguments", [["absent.mp4"], ["text.mp4"], ["day.mp4", "--camera-height", "-1"]])
-def test_new_refuses_what_cannot_be_built(
+def test_new_refuses_unusable_films(
     tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -55,7 +55,7 @@ def test_new_refuses_what_cannot_be_built(
 
 
 def _transforms(folder: Path, name: str = "transforms.json", prefix: str = "images/") -> Path:
-    """A posed image set of three views, its images where `prefix` says."""
+    """A posed image set of three views, its images at `prefix`."""
     frames = []
     for i, picture in enumerate(views([0, 9, 18])):
         write_image(folder / prefix / f"{i}.png", picture)
@@ -124,13 +124,13 @@ def test_a_posed_image_set_without_its_images_is_refused(tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize("name", ["training", "any", "day+randomised"])
-def test_a_lighting_s_name_means_no_other_light(tmp_path: Path, name: str) -> None:
+def test_a_reserved_name_is_changed(tmp_path: Path, name: str) -> None:
     day = film(tmp_path / f"{name}.mp4", views([5 * i for i in range(4)]))
     assert new_main([str(tmp_path / "scene"), str(day), "--camera-height", "1.2"]) == 0
     assert build(tmp_path / "scene", until="capture")["capture"]["frames"] >= 2
 
 
-def test_a_folder_is_copied_without_what_is_no_file(tmp_path):
+def test_special_files_of_a_folder_are_not_copied(tmp_path):
     photos = tmp_path / "photos"
     write_image(photos / "a.png", np.zeros((8, 8, 3), np.uint8))
     os.mkfifo(photos / "b.png")
@@ -141,14 +141,14 @@ def test_a_folder_is_copied_without_what_is_no_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["x" * 200, "\u6f22" * 60, ".hidden", "a\nb", "a\\b"])
-def test_a_film_of_any_name_becomes_a_lighting_that_is_taken(tmp_path, name):
+def test_any_film_name_becomes_a_valid_lighting(tmp_path, name):
     write_image(tmp_path / name / "a.png", np.zeros((8, 8, 3), np.uint8))
     config = load_config(new_scene(tmp_path / "scene", [tmp_path / name], 1.2))
     assert 1 <= len(config.source[0].lighting) <= 80
 
 
 def test_an_option_whose_value_is_two_dashes_is_refused(tmp_path, capsys):
-    """argparse makes an empty list of it."""
+    """argparse would return an empty list."""
     with pytest.raises(SystemExit) as end:
         new_main([str(tmp_path / "scene"), "film.mp4", "--camera-height=--"])
     assert end.value.code == 2 and "--camera-height: expected one argument" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A robot's own values: where they may be said, which wins, what is refused, and that they arrive."""
+"""Parameters of a robot: where they are read from, their precedence and checks, and that the scene uses them."""
 
 from dataclasses import replace
 
@@ -9,10 +9,10 @@ from tiny_world import tiny_config, tiny_scene
 from twin.build import PIPELINE, _depends
 from twin.config_file import load_config
 from twin.errors import InputError
+from twin.files import digest_json
 from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
 from twin.robot import CAMERA_SIZE, ZED2, HuskyParams, PixelCamera
-from twin.scene import stage_key
 
 _SCENE = """
 [[source]]
@@ -29,7 +29,7 @@ def config_of(folder, robot_toml: str | None = None, section: str = "", override
     return load_config(folder / "scene.toml", overrides)
 
 
-def test_scene_before_robot_before_default(tmp_path):
+def test_scene_toml_precedes_robot_toml_and_defaults(tmp_path):
     assert config_of(tmp_path).robot == HuskyParams()
     robot = config_of(tmp_path, "friction = 0.6\nservo_lag = 0.1\n", "[robot]\nfriction = 0.5\n").robot
     assert robot == HuskyParams(friction=0.5, servo_lag=0.1)
@@ -60,7 +60,7 @@ def test_lists_and_whole_numbers(tmp_path):
         ("friction = [", r"not valid TOML"),
     ],
 )
-def test_nonsense_is_refused(tmp_path, robot_toml, message):
+def test_bad_values_are_refused(tmp_path, robot_toml, message):
     with pytest.raises(InputError, match=message):
         config_of(tmp_path, robot_toml)
 
@@ -72,11 +72,11 @@ def test_wrong_section_is_refused_by_name(tmp_path):
         config_of(tmp_path, None, "[robot]\ncamera_hight = 0.5\n")
 
 
-def test_the_stamp_of_stage_mjcf_notices_a_changed_robot(tmp_path):
+def test_a_changed_robot_changes_the_key_of_stage_mjcf(tmp_path):
     stage = next(stage for stage in PIPELINE if stage.name == "mjcf")
 
     def key(config) -> str:
-        return stage_key(_depends(replace(stage, upstream=()), config, {}, {}))
+        return digest_json(_depends(replace(stage, upstream=()), config, {}, {}))
 
     plain = key(config_of(tmp_path))
     assert key(config_of(tmp_path, "command_latency = 0.1")) != plain
@@ -84,7 +84,7 @@ def test_the_stamp_of_stage_mjcf_notices_a_changed_robot(tmp_path):
 
 
 def test_resized_camera_sees_the_same():
-    """A point seen at a pixel of the big picture is seen at the corresponding one of the small, cut evenly."""
+    """A point has corresponding pixels in the large image and in the small one, which is cropped evenly."""
     big = PixelCamera((500.0, 510.0, 330.0, 250.0), (640, 480))
     small = big.resized(CAMERA_SIZE)
     x, y = 0.3, -0.2

@@ -1,4 +1,4 @@
-"""However a verb is stopped: one line and 128 + n, nothing half-written, and no process outlives it.
+"""A stopped verb prints one line, exits with 128 + n, leaves no partial file, and no process outlives it.
 
 A verb runs in a process of its own. It is stopped as soon as it has started processes, which is when it has most to
 lose.
@@ -43,7 +43,7 @@ class Case:
 
 
 def _corridor(root: Path) -> Path:
-    """A place that a photo can be registered in, with a field that knows two lightings."""
+    """A place in which a photo can be registered, with a field of two lightings."""
     scene = filmed_corridor(root)
     frames = tuple(f"day/{i:06d}" for i in range(4))
     appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, 0)
@@ -58,7 +58,7 @@ def _corridor(root: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def cases(tmp_path_factory) -> dict[str, Case]:
-    """The verbs that start processes, each with a scene of its own."""
+    """The verbs that start processes, each with its own scene."""
     folder = tmp_path_factory.mktemp("stopping")
     filmed = folder / "filmed"
     (filmed / "input").mkdir(parents=True)
@@ -163,14 +163,14 @@ def _runs(work, *arguments: str) -> int:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_a_signal_is_one_line_and_the_handlers_come_back(capfd, number):
+def test_a_signal_is_one_line_and_handlers_are_restored(capfd, number):
     before = signal.getsignal(number)
     assert _runs(lambda: signal.raise_signal(number)) == 128 + number
     assert capfd.readouterr().err == "stopped; run it again to go on\n"
     assert signal.getsignal(number) is before
 
 
-def test_what_was_to_be_ignored_stays_ignored():
+def test_ignored_signals_stay_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         assert _runs(lambda: signal.raise_signal(signal.SIGHUP)) == 0
@@ -178,7 +178,7 @@ def test_what_was_to_be_ignored_stays_ignored():
         signal.signal(signal.SIGHUP, before)
 
 
-def test_colmap_does_not_take_our_signals(tmp_path):
+def test_colmap_keeps_our_signal_handlers(tmp_path):
     script = (
         "import os, signal, twin.capture.formats, twin.capture.matching;"
         "from twin.commands import *;"
@@ -188,7 +188,7 @@ def test_colmap_does_not_take_our_signals(tmp_path):
     assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, "stopped; run it again to go on\n")
 
 
-def test_a_reader_that_goes_ends_a_verb_quietly(tmp_path):
+def test_a_broken_pipe_ends_a_verb_quietly(tmp_path):
     script = "import sys; from twin.commands import *; sys.exit(run(Parser(), lambda o: print('x' * 10**6), []))"
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout and process.stderr
@@ -207,7 +207,7 @@ def test_wrong_arguments_are_one_line(capsys):
 @pytest.mark.parametrize(
     "value", ["x" * 10**6, "1" * 10**4, list(range(10**5)), "a'b" * 1000, "\x1b[31m\n" * 10**4, "ab " * 10**4]
 )
-def test_a_refusal_repeats_eighty_characters_of_a_value(capsys, value):
+def test_errors_cut_values_at_eighty_characters(capsys, value):
     print_error(InputError(f"scene.toml: key = {value!r}; expected a number"))
     said = capsys.readouterr().err
     assert said.startswith("error: scene.toml: key = ") and said.endswith("; expected a number\n")

@@ -1,4 +1,4 @@
-"""Votes of views: what is seen edge-on counts little, and free space is believed further out than surfaces."""
+"""Votes of views: surfaces seen edge-on have little weight, and free votes reach further than surface votes."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def vote(z: float, *seen: tuple[float, float]) -> tuple[float, float, float]:
     return tuple(float(values[0]) for values in found)
 
 
-def test_two_that_see_a_surface_outvote_one_that_looks_through_unless_they_see_it_edge_on():
+def test_two_surface_votes_outvote_a_free_vote_unless_edge_on():
     behind = 0.25  # [m] the point lies so far behind the surface
     square = vote(5.0, (5.0 - behind, 1.0), (5.0 - behind, 1.0), (9.0, 1.0))
     lean = 0.12
@@ -39,7 +39,7 @@ def test_two_that_see_a_surface_outvote_one_that_looks_through_unless_they_see_i
     assert edge_on[1] == pytest.approx(lean**2 * square[1], rel=1e-4)
 
 
-def test_free_space_is_believed_further_out_than_surfaces():
+def test_free_votes_reach_further_than_surface_votes():
     assert vote(1.5 * FAR, (1.5 * FAR, 1.0))[1:] == (0.0, 0.0)
     near, free = vote(1.5 * FAR, (3.0 * FAR, 1.0))[1:]
     assert near == 0.0 and free > 0.0

@@ -1,4 +1,4 @@
-"""The exported scene: heights, parts, colours and intrinsics survive the way into a folder that can be moved."""
+"""The exported scene has the heights, parts, colors and intrinsics of its sources, and its folder can be moved."""
 
 import re
 import zipfile
@@ -53,7 +53,7 @@ def test_metrics(exported):
     assert metrics["spawn_drift_m"] < 0.001
 
 
-def test_heights_are_right_to_a_millimetre(exported):
+def test_heights_are_right_to_a_millimeter(exported):
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     data = mujoco.MjData(model)
@@ -67,7 +67,7 @@ def test_heights_are_right_to_a_millimetre(exported):
 
 
 def test_coarse_height_field_keeps_nodes_and_colours_in_place(tmp_path):
-    """Nodes of the coarse field are nodes of the fine one; the texture has a texel per fine cell of what is left."""
+    """Nodes of the coarse field are nodes of the fine one; the texture has a texel per fine cell of the rest."""
     ground = tiny_ground()
     rgb = np.random.default_rng(5).integers(0, 255, (*ground.height.shape, 3)).astype(np.uint8)
     ground = type(ground)(ground.height, ground.origin, ground.cell, ground.measured, rgb)
@@ -106,7 +106,7 @@ def test_level_ground_is_level(tmp_path):
     assert World.load(out).spawn[2] == pytest.approx(0.7 + BASE_HEIGHT, abs=0.004)
 
 
-def test_parts_stand_where_they_stood(exported):
+def test_parts_keep_their_places(exported):
     """MuJoCo moves a mesh to its own centre and axes; in the world its corners must be back in place."""
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
@@ -150,7 +150,7 @@ def test_loads_from_a_zip_unpacked_elsewhere(exported, tmp_path):
     assert str(folder) not in text and str(folder) not in (folder / "world.json").read_text()
 
 
-def test_world_comes_back_as_saved(exported):
+def test_world_save_and_load_round_trip(exported):
     folder, _ = exported
     world = World.load(folder)
     np.testing.assert_allclose(world.route[:, :2], tiny_route())
@@ -199,7 +199,7 @@ def test_a_route_that_starts_off_the_ground_is_refused(tmp_path):
         run(scene, tiny_config(), out)
 
 
-def test_a_film_that_went_nowhere_is_refused(tmp_path):
+def test_a_route_that_is_too_short_is_refused(tmp_path):
     scene = tiny_scene(tmp_path)
     xy = tiny_route()[:4]
     np.savez(scene.stage("mesh") / "route.npz", xy=xy, z=tiny_ground().at(xy))
@@ -209,14 +209,14 @@ def test_a_film_that_went_nowhere_is_refused(tmp_path):
         run(scene, tiny_config(), out)
 
 
-def test_what_the_robot_touches_at_the_start_is_named(tmp_path):
+def test_geoms_touched_at_the_start_are_reported(tmp_path):
     scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tyres
     out = scene.stage("mjcf")
     out.mkdir()
     assert run(scene, tiny_config(), out)["spawn_touched"] == ["part_0000"]
 
 
-def test_a_start_inside_something_solid_is_refused(tmp_path):
+def test_a_start_inside_a_part_is_refused(tmp_path):
     scene = tiny_scene(tmp_path, boxes=((0.4, 0.3, 0.5),))
     out = scene.stage("mjcf")
     out.mkdir()
@@ -225,7 +225,7 @@ def test_a_start_inside_something_solid_is_refused(tmp_path):
 
 
 def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
-    """The tiny scene on a plane that falls towards the robot's back, and what its export says."""
+    """The tiny scene on a plane that falls towards the robot's back, and the error of its export."""
     scene = tiny_scene(tmp_path, **scene_arguments)
     flat = tiny_ground()
     x = np.broadcast_to(np.arange(flat.height.shape[1]) * flat.cell, flat.height.shape)
@@ -252,7 +252,7 @@ def test_a_robot_fitted_on_soft_ground_starts_on_a_slope(tmp_path, degrees, serv
     assert world.model().opt.impratio == pytest.approx(1 / 40)  # what is shipped is as soft as was fitted
 
 
-def test_something_solid_at_the_start_is_refused_on_soft_ground_too(tmp_path):
+def test_a_start_inside_a_part_is_refused_on_soft_ground(tmp_path):
     with pytest.raises(InputError, match=r"an obstacle is there: raise mesh\.obstacle_height"):
         on_a_slope(tmp_path, 2.0, SOFT, boxes=((0.4, 0.3, 0.2),))
 
@@ -270,8 +270,8 @@ def test_a_start_too_steep_for_the_tyres_is_refused_for_that(tmp_path):
         ('cone="elliptic"', 'cone="pyramidal"'),
     ],
 )
-def test_a_copy_that_moves_otherwise_is_a_bug_of_the_exporter(tmp_path, written, instead):
-    """On a steep start, so that the robot's weight tells on the tyres."""
+def test_a_copy_that_moves_differently_is_a_bug(tmp_path, written, instead):
+    """On a steep start, where the robot's weight loads the tires."""
     out, _ = on_a_slope(tmp_path, 25.0, HuskyParams())
     built = World.load(out).model()
     assert check_portable(out, built)["spawn_drift_m"] < 0.005
@@ -312,7 +312,7 @@ def test_tiles_interpolate_corner_colours_exactly():
 
 
 def test_texture_coordinates_survive_the_obj(exported):
-    """Colour looked up through the compiled model equals the mesh's own at a face's corner."""
+    """The color looked up through the compiled model equals the mesh's own at a face's corner."""
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     with np.load(folder.parent / "4_mesh" / "visual.npz") as data:
@@ -330,7 +330,7 @@ def test_texture_coordinates_survive_the_obj(exported):
     np.testing.assert_array_equal(texture[row, column], colors[faces])
 
 
-def test_ground_covers_what_lies_on_it():
+def test_vertices_near_the_ground_are_covered():
     ground = tiny_ground()
     points = np.array([[1.0, 1.0, 0.05], [1.0, 1.0, 0.5], [1.0, 1.0, -1.0], [50.0, 1.0, 0.0]])
     points[:3, 2] += ground.at(points[:3, :2])
@@ -370,15 +370,15 @@ def test_headings_and_turns():
     np.testing.assert_allclose(right[3], [route[3, 0], -1.0, 0.0])
 
 
-def test_tiny_world_is_drivable_model(tmp_path):
+def test_tiny_world_is_a_drivable_model(tmp_path):
     world = tiny_world(tmp_path)
     data = mujoco.MjData(world.model())
     mujoco.mj_resetDataKeyframe(world.model(), data, 0)
     np.testing.assert_allclose(data.qpos[:3], world.spawn[:3], atol=1e-4)
 
 
-def test_many_points_are_projected_as_each_alone():
-    """On a route that meets itself, of uneven segments, each point within a range of its own."""
+def test_projection_is_vectorized():
+    """A route of uneven segments that meets itself, and a range for each point."""
     rng = np.random.default_rng(0)
     angle = np.sort(rng.uniform(0.0, 4.0 * np.pi, 160))
     route = np.stack([3.0 * np.sin(angle), 2.0 * np.sin(2.0 * angle)], -1)  # an eight, twice around

@@ -1,4 +1,4 @@
-"""twin: a filmed place as a MuJoCo digital twin that a driving policy is trained and judged in."""
+"""twin: a filmed place as a MuJoCo digital twin, in which driving policies are trained and evaluated."""
 
 # zlib before anything that may load pycolmap: the other order corrupts PNG and zlib for the whole process.
 import zlib  # noqa: F401
@@ -24,7 +24,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Imports public names when they are first used, so that `twin --help` waits for nothing heavy."""
+    """Imports public names at their first use, so that `twin --help` imports nothing heavy."""
     if name == "__version__":
         from importlib import metadata
 
@@ -39,7 +39,7 @@ def __getattr__(name: str) -> Any:
     return value
 
 
-# Where gymnasium.make("twin/Drive-v0") finds the environment, without any of it being imported here.
+# For gymnasium.make("twin/Drive-v0"); imports nothing of the environment.
 gymnasium.register(
     "twin/Drive-v0", entry_point="twin.env.gym_env:DriveEnv", vector_entry_point="twin.env.gym_env:DriveVectorEnv"
 )

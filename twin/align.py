@@ -5,11 +5,11 @@
     python -m twin.align husky drive.npz --out aligned
 
 From a log, system identification fits the controller's limits and latency, the servo's lag, tires, ground, center of
-mass and effective wheel radii to one half and scores them on the other, against a kinematic model fitted to the same
+mass and effective wheel radii to one half, and scores them on the other against a kinematic model fitted to the same
 half. Each value has a standard error; parameters that the log does not determine keep their values and are listed.
 Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json` and four figures.
 
-From a film by the robot's front camera, driving in the built place, the camera's extrinsics (height, yaw, pitch, roll)
+From a film that the robot's front camera records in the built place, the camera's extrinsics (height, yaw, pitch, roll)
 are fitted, and its focal length unless `[robot] camera_intrinsics` is given. They go to the same `robot.toml`;
 `alignment/camera.png` shows the film beside the twin's images.
 """
@@ -18,7 +18,6 @@ import argparse
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -36,22 +35,21 @@ from twin.sysid.logs import check_log, read_log
 if TYPE_CHECKING:
     from twin.sysid.camera_extrinsics import CameraCalibration
 
-FILM_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
-"""File suffixes of films."""
 RESULT_FOLDER = "alignment"
 """Folder of figures beside `robot.toml`."""
-_INTRINSICS_FIELDS = ("camera_intrinsics", "camera_size")
 PUBLISHED_ROBOT = "husky"
 """Given instead of a scene for the published robot."""
+_FILM_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
+_INTRINSICS_FIELDS = ("camera_intrinsics", "camera_size")
 
 
 def align_to_log(
     target: str, log: Path, out: Path | None = None, use_slope: bool = True
 ) -> tuple[Identification, Path]:
-    """Fits the robot of a scene, or the published one, to a log; writes the results and returns their folder.
+    """Fits a robot to a log; writes the results and returns their folder.
 
     Args:
-        target: Folder of a scene, a `robot.toml`, or `PUBLISHED`.
+        target: Folder of a scene, a `robot.toml`, or `PUBLISHED_ROBOT`.
         log: See `twin.sysid.logs`.
         out: Folder for the results; by default the scene's.
         use_slope: Use the log's accelerations, if it has any.
@@ -81,11 +79,7 @@ def align_to_log(
 
 
 def align_camera(target: str, film: Path) -> "tuple[CameraCalibration, Path]":
-    """Fits the camera of a scene's robot to a film; writes the results and returns their folder.
-
-    Args:
-        target: Folder of a built scene.
-        film: Film by the robot's front camera, driving in the place.
+    """Fits the camera of a built scene's robot to a film; writes the results and returns their folder.
 
     Raises:
         InputError: unknown scene or film, no writable folder, or an unusable film.
@@ -93,11 +87,12 @@ def align_camera(target: str, film: Path) -> "tuple[CameraCalibration, Path]":
     from twin.sysid.camera_extrinsics import calibrate_camera, write_camera_comparison
 
     root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
-    if not SceneDir(root).config_file.exists():
+    scene = SceneDir(root)
+    if not scene.config_file.exists():
         raise InputError(f"{target}: a film needs a built scene to be localized in; give the scene's folder")
     if not film.is_file():
         raise InputError(f"{film}: no such film")
-    scene, by_hand = SceneDir(root), _scene_robot_table(root)
+    by_hand = _scene_robot_table(root)
     params = load_config(scene.config_file).robot
     given = {name: by_hand[name] for name in _INTRINSICS_FIELDS if name in by_hand}
     lens = parse_table(HuskyParams, given, str(scene.config_file))
@@ -140,17 +135,10 @@ def _check_writable(folder: Path, cure: str = "give another folder with --out") 
         raise InputError(f"{folder}: cannot be written to: {error}; {cure}") from None
 
 
-def overridden_fields(folder: Path, identified: Iterable[str]) -> list[str]:
-    """Fitted fields that `[robot]` of a `scene.toml` in the folder overrides."""
-    return sorted(set(_scene_robot_table(folder)) & set(identified))
-
-
 def _scene_robot_table(folder: Path) -> dict[str, Any]:
     """`[robot]` of the `scene.toml` in a folder; empty if there is none."""
     path = SceneDir(folder).config_file
-    if not path.exists():
-        return {}
-    return read_toml(path).get("robot", {})
+    return read_toml(path).get("robot", {}) if path.exists() else {}
 
 
 def summary(result: Identification) -> str:
@@ -167,13 +155,12 @@ def summary(result: Identification) -> str:
     rows.append("fitted:" if result.identified else "fitted: nothing, as the log determines no parameter")
     rows += _fitted(result.identified)
     if result.refused:
-        rows.append("unchanged, as this log does not determine them:")
-        rows += [f"  {line}" for line in result.refused]
+        rows += ["unchanged, as this log does not determine them:", *(f"  {line}" for line in result.refused)]
     return "\n".join(rows)
 
 
 def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
-    """A line per field with value and standard error."""
+    """Lines of the fields with value and standard error."""
     rows = []
     for name, (value, error) in identified.items():
         text = ", ".join(f"{v:.4g}" for v in value) if isinstance(value, tuple) else f"{value:.4g}"
@@ -183,7 +170,7 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
 
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    if options.log.suffix.lower() in FILM_SUFFIXES:
+    if options.log.suffix.lower() in _FILM_SUFFIXES:
         if options.out or options.level:
             raise InputError(f"{options.log} is a film; --out and --level are for logs")
         camera, folder = align_camera(options.robot, options.log)
@@ -191,7 +178,7 @@ def command(options: argparse.Namespace) -> None:
     else:
         result, folder = align_to_log(options.robot, options.log, options.out, not options.level)
         identified, lines = result.identified, summary(result)
-    overridden = overridden_fields(folder, identified)
+    overridden = sorted(set(_scene_robot_table(folder)) & set(identified))
     if not options.quiet:
         print(lines)
         if overridden:

@@ -1,8 +1,8 @@
-"""The verb that turns a filmed place into a drivable twin, stage by stage, skipping what is up to date.
+"""Verb: turns a filmed place into a drivable twin, stage by stage, and skips stages that are up to date.
 
     python -m twin.build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
 
-A stage runs in `build/<folder>.partial`, which is renamed when it is complete. See `twin.scene` for when it runs again.
+A stage writes `build/<folder>.partial`, which is renamed when it is complete. `twin.scene` defines when it runs again.
 """
 
 import argparse
@@ -20,18 +20,9 @@ from twin import commands, runtime
 from twin.config import MetricConfig, RouteConfig, SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError
-from twin.files import digest_file, is_link, remove, write_json
+from twin.files import digest_file, digest_json, is_folder, is_link, remove, write_json
 from twin.runtime import PeakMemory, exclusive_lock
-from twin.scene import (
-    SceneDir,
-    Stamp,
-    commit_stage,
-    package_versions,
-    recover_stages,
-    replace_file,
-    stage_key,
-    write_stamp,
-)
+from twin.scene import SceneDir, Stamp, commit_stage, package_versions, recover_stages, replace_file, write_stamp
 
 
 @dataclass(frozen=True)
@@ -40,18 +31,16 @@ class Stage:
 
     name: str
     module: str
-    """Module with the stage's `run(scene, config, out) -> metrics`; imported only when the stage runs."""
+    """Module of the stage's `run(scene, config, out) -> metrics`, imported when the stage runs."""
     version: int
-    """Incremented when a code change alters the result for the same input."""
+    """Incremented when a change of the code alters the result."""
     config: tuple[str, ...]
-    """Sections of `scene.toml`, or `section.key`, that the stage reads."""
+    """Sections, or `section.key`, of `scene.toml` that the stage reads."""
     upstream: tuple[str, ...]
     """Stages whose results this stage reads."""
 
 
-_MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")
-"""Settings that stage mesh reads, too; the other mjcf settings affect stage mjcf only."""
-
+_MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the mjcf settings that stage mesh reads
 PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
@@ -68,18 +57,12 @@ PIPELINE = (
     ),
 )
 
-_ON_DEVICE = ("field", "mesh")
-"""Stages that take a device."""
-
+_ON_DEVICE = ("field", "mesh")  # stages that take a device
+_WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders of a scene that are never inputs
+# Durations [s] on the demo with 2 cores; only their ratios matter, since the pace of a build is measured. No time left
+# is shown before stages worth 30 s have run, since the first one is too short to estimate the pace.
 _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
-"""Durations [s] on the demo with 2 cores; only their ratios matter, since the pace of a build is measured."""
-
 _LEAST_TIMED = 30.0
-"""No remaining time is shown until stages worth this many typical seconds have run, because the first stage is too
-short to estimate the pace."""
-
-_WRITTEN = ("build", "runs", "validation", "forecast", "lightings")
-"""Folders of a scene that twin writes; their files are never inputs."""
 
 
 def build(
@@ -92,14 +75,14 @@ def build(
     """Builds the scene at `root` and returns its report (also written to `build/report.json`).
 
     Args:
-        root: The scene folder, with `scene.toml` in it.
+        root: The folder with `scene.toml`.
         until: Last stage to run; None = all.
         force: Stages to run again although they are up to date.
         overrides: `section.key=value` settings that take precedence over `scene.toml`.
-        device: cpu or cuda, for the stages that compute the field; None: cuda where it is usable.
+        device: cpu or cuda, for field and mesh; None: cuda where it is usable.
 
     Raises:
-        InputError: Bad input; what was built before stays as it was.
+        InputError: bad input; earlier results stay as they are.
     """
     scene = SceneDir(root)
     config = load_config(scene.config_file, overrides)
@@ -108,7 +91,8 @@ def build(
 
         resolve_device(device)  # before anything is built
     inputs = input_digests(scene, config)
-    _check_folder(scene.build)
+    if (is_link(scene.build) and not scene.build.exists()) or (scene.build.exists() and not scene.build.is_dir()):
+        raise InputError(f"{scene.build} is not a folder; move it away: builds are written there")
     scene.build.mkdir(exist_ok=True)
     with exclusive_lock(scene.build / ".lock", f"{scene.root} is being built"):
         recover_stages(scene)
@@ -117,7 +101,7 @@ def build(
         for stage in PIPELINE:
             depends = _depends(stage, config, inputs, stamps)
             stamp = None if stage.name in force else Stamp.load(scene.stage(stage.name))
-            skipped[stage.name] = stamp is not None and stamp.key == stage_key(depends)
+            skipped[stage.name] = stamp is not None and stamp.key == digest_json(depends)
             if stamp is None or not skipped[stage.name]:
                 done = {name: it.seconds for name, it in stamps.items() if not skipped[name]}
                 _announce(stage, done, until)
@@ -131,12 +115,9 @@ def build(
 
 
 def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
-    """Says which stage begins and, once the pace is known, how long the rest of the build takes.
+    """Logs which stage begins and, once the pace is known, how long the rest of the build takes.
 
-    Args:
-        stage: The stage.
-        done: Durations [s] of the stages that this build ran before it.
-        until: Last stage to run; None = all.
+    `done` has the durations [s] of the stages that this build ran before it.
     """
     names = [one.name for one in PIPELINE]
     names = names[: names.index(until) + 1] if until else names
@@ -149,23 +130,17 @@ def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
     runtime.log_line(f"stage {number + 1} of {len(names)}: {stage.name}{left}")
 
 
-def _check_folder(folder: Path) -> None:
-    if (is_link(folder) and not folder.exists()) or (folder.exists() and not folder.is_dir()):
-        raise InputError(f"{folder} is not a folder; move it away: builds are written there")
-
-
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
-    """SHA-256 of every file that the sources are read from, by path relative to the scene.
+    """SHA-256 of every file of the sources, by path relative to the scene.
 
-    For a source folder inside the scene, all files are hashed except twin's own output. For a folder that contains the
-    scene, or a posed image set outside it, only the files that are read are hashed.
+    Of a folder that contains the scene, and of a posed image set outside it, only the files that are read are hashed;
+    of other folders all files, without twin's own output.
 
     Raises:
         InputError: a source is missing, or neither a file nor a folder.
     """
     from twin.capture.formats import is_image
     from twin.capture.frames import source_files
-    from twin.files import is_folder
 
     files: set[Path] = set()
     for source in config.source:
@@ -174,29 +149,24 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
             is_folder(path, f"create {path}, or correct the path {name!r} in {scene.config_file}")
         path = scene.root / source.path
         images = scene.root / source.images if source.images else None
-        read = source_files(path, source.kind, images)
-        files.update(read)
+        files.update(source_files(path, source.kind, images))
         posed = path.suffix == ".json" or (path.is_dir() and any(path.glob("cameras.*")))
-        # A posed image set's other files lie beside it, so the top-level scene folder that contains it is hashed.
-        parts = Path(os.path.normpath(source.path)).parts
-        for folder in (
-            scene.root.joinpath(*parts[:1]) if posed and not Path(source.path).is_absolute() else path,
-            images,
-        ):
-            if folder is not None:
-                files.update(_files_below(folder, scene))
-        if source.mask:
-            mask = scene.root / source.mask
-            files.update(
-                [mask]
-                if not mask.is_dir()
-                else _files_below(mask, scene) or [file for file in mask.iterdir() if is_image(file)]
-            )
+        if posed and not Path(source.path).is_absolute():
+            # The other files of a posed image set lie beside it, below the same top-level folder of the scene.
+            path = scene.root.joinpath(*Path(os.path.normpath(source.path)).parts[:1])
+        files.update(_files_below(path, scene))
+        if images:
+            files.update(_files_below(images, scene))
+        mask = scene.root / source.mask
+        if source.mask and mask.is_dir():
+            files.update(_files_below(mask, scene) or filter(is_image, mask.iterdir()))
+        elif source.mask:
+            files.add(mask)
     return {os.path.relpath(file, scene.root): digest_file(file) for file in sorted(files)}
 
 
 def _files_below(folder: Path, scene: SceneDir) -> list[Path]:
-    """The regular files below a folder, without twin's output; empty if the folder contains the scene itself."""
+    """The regular files below a folder, without twin's output; none if the folder contains the scene itself."""
     root, top = scene.root.resolve(), folder.resolve()
     written = {(root / name) for name in _WRITTEN}
     if not folder.is_dir() or root.is_relative_to(top) or top in written:
@@ -215,7 +185,7 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for name in stage.config:
         section, _, key = name.partition(".")
         settings[name] = table[section][key] if key else table[section]
-    # Drop settings added in later versions while they have no effect, so that older results stay valid.
+    # Settings that were added later and have no effect are left out, so that older results stay valid.
     for one in (settings.get("capture", {}), *settings.get("source", ())):
         if "keep" in one and not one["keep"]:
             del one["keep"]
@@ -283,10 +253,7 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
 def publish(scene: SceneDir, report: dict[str, Any]) -> None:
     """Writes `report.json` and, if the build is complete, `report.html` with its film beside it.
 
-    Args:
-        scene: A built scene.
-        report: The report without `truth` (comparison with the ground truth, if there is one) and `cautions`; this
-            function adds both.
+    Adds `truth` (the comparison with the ground truth, if there is one) and `cautions` to the report.
     """
     from twin.report.build_report import load_truth_comparison
     from twin.report.build_sections import cautions
@@ -306,38 +273,32 @@ def summary(report: dict[str, Any]) -> str:
     """The text printed at the end of a build: a row per stage, then a line per caution of the report."""
     from twin.report.build_sections import cautions
 
-    def pick(*path: str) -> Any:
-        value: Any = report
-        for key in path:
-            value = value.get(key) if isinstance(value, dict) else None
-        return value
-
-    def number(value: Any, form: str) -> str:
+    def number(stage: str, key: str, form: str) -> str:
+        value = report.get(stage, {}).get(key)
         return form.format(value) if isinstance(value, int | float) else "not measured"
 
-    psnr = pick("field", "psnr") or {}
-    follower = pick("review", "follower") or {}
+    cameras, metric = report.get("cameras", {}), report.get("metric", {})
+    psnr = report.get("field", {}).get("psnr") or {}
+    review = "no route to drive"
+    if follower := report.get("review", {}).get("follower"):
+        review = "goal reached" if follower.get("reached_goal") else "goal NOT reached"
+        review += f", touched {', '.join(follower.get('touched') or ['nothing'])}"
     figures = {
-        "capture": number(pick("capture", "frames"), "{} frames kept"),
-        "cameras": f"{pick('cameras', 'registered')} of {pick('cameras', 'total')} frames registered, "
-        + number(pick("cameras", "reprojection_error_px"), "{:.2f} px"),
-        "metric": f"scale from {pick('metric', 'scale_source')}"
-        + number(pick("metric", "scale_uncertainty"), " ± {:.1%}"),
+        "capture": number("capture", "frames", "{} frames kept"),
+        "cameras": f"{cameras.get('registered')} of {cameras.get('total')} frames registered, "
+        + number("cameras", "reprojection_error_px", "{:.2f} px"),
+        "metric": f"scale from {metric.get('scale_source')}" + number("metric", "scale_uncertainty", " ± {:.1%}"),
         "field": "held-out PSNR " + ", ".join(f"{name} {value:.1f} dB" for name, value in psnr.items()),
-        "mesh": number(pick("mesh", "parts"), "{} convex parts"),
-        "mjcf": number(pick("mjcf", "route_length_m"), "route {:.1f} m"),
-        "review": "no route to drive"
-        if not follower
-        else ("goal reached" if follower.get("reached_goal") else "goal NOT reached")
-        + (", touched " + ", ".join(follower["touched"]) if follower.get("touched") else ", touched nothing"),
+        "mesh": number("mesh", "parts", "{} convex parts"),
+        "mjcf": number("mjcf", "route_length_m", "route {:.1f} m"),
+        "review": review,
     }
     lines = [f"{'stage':<9} {'seconds':>8}  result"]
     for name, stage in report["stages"].items():
         note = " (up to date)" if stage["skipped"] else ""
         lines.append(f"{name:<9} {stage['seconds']:>8.1f}  {figures[name]}{note}")
     lines.append(f"{'total':<9} {report['seconds']:>8.1f}  peak memory {report['peak_memory_bytes'] / 2**30:.2f} GiB")
-    told = cautions(report)
-    lines += [f"{'caution':<9} {it['title']}: {it['what']} What helps: {it['cure']}" for it in told]
+    lines += [f"{'caution':<9} {it['title']}: {it['what']} What helps: {it['cure']}" for it in cautions(report)]
     return "\n".join(lines)
 
 

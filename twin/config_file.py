@@ -56,10 +56,12 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
     if isinstance(table.get("robot", {}), dict):
         table["robot"] = merge_robot(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), str(path))
     config = parse_table(SceneConfig, table, str(path))
-    if not config.name:
-        config = dataclasses.replace(config, name=path.resolve().parent.name)
-    _check(config, path)
-    return config
+    folder = path.resolve().parent.name
+    try:
+        _check(config, folder)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return config if config.name else dataclasses.replace(config, name=folder)
 
 
 def read_robot(path: Path) -> dict[str, Any]:
@@ -154,182 +156,176 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     return value
 
 
-def _check(config: SceneConfig, path: Path) -> None:
-    if not config.source:
-        raise InputError(f"{path}: no [[source]] given; add one per film, with path = and lighting =")
+def _check(config: SceneConfig, folder: str) -> None:
+    """Raises InputError for settings that a stage could not work with, before the build begins."""
+    _require(config.source, "no [[source]] given; add one per film, with path = and lighting =")
     for source in config.source:
-        _check_source(source, path)
-    _check_choice(config.cameras.mapper, MAPPERS, f"{path}: cameras.mapper")
-    _check_choice(config.metric.up, UPS, f"{path}: metric.up")
-    if not config.name.isprintable() and config.name != path.resolve().parent.name:
-        raise InputError(f"{path}: name = {config.name!r}; expected a text without control characters")
-    _check_tasks(config.task, path)
+        _check_source(source)
+    _check_choice(config.cameras.mapper, MAPPERS, "cameras.mapper")
+    _check_choice(config.metric.up, UPS, "metric.up")
+    printable = config.name.isprintable() or config.name == folder
+    _require(printable, f"name = {config.name!r}; expected a text without control characters")
+    _check_tasks(config.task)
     for section in _SECTIONS:
         settings = getattr(config, section)
         kind: type = type(settings)
         for key, bounds in setting_ranges(kind).items():
-            _check_range(getattr(settings, key), bounds, f"{path}: {section}.{key}")
-    _check_range(config.seed, setting_ranges(SceneConfig)["seed"], f"{path}: seed")
+            _check_range(getattr(settings, key), bounds, f"{section}.{key}")
+    _check_range(config.seed, setting_ranges(SceneConfig)["seed"], "seed")
     for source in config.source:
-        what = f"{path}: camera_height of [[source]] {source.path!r}"
-        _check_range(source.camera_height, setting_ranges(SourceConfig)["camera_height"], what)
-        _check_segments(source.keep, f"{path}: keep of [[source]] {source.path!r}")
-    _check_segments(config.capture.keep, f"{path}: capture.keep")
-    _check_route(config.route, path)
-    _check_obstacles(config.obstacle, path)
-    _check_metric(config.metric, path)
+        what = f"of [[source]] {source.path!r}"
+        bounds = setting_ranges(SourceConfig)["camera_height"]
+        _check_range(source.camera_height, bounds, f"camera_height {what}")
+        _check_segments(source.keep, f"keep {what}")
+    _check_segments(config.capture.keep, "capture.keep")
+    _check_route(config.route)
+    _check_obstacles(config.obstacle)
+    _check_metric(config.metric)
     metric = config.metric
-    scales = (metric.camera_height > 0.0, metric.distance is not None, metric.gps, metric.marker is not None)
-    if not any(scales) and not metric.poses_are_metric and not any(one.camera_height > 0.0 for one in config.source):
-        # Checked here, not minutes into the build.
-        raise InputError(
-            f"{path}: [metric] gives no scale; give one or more of "
-            "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
-            "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true"
-        )
+    scales = (metric.camera_height > 0.0, metric.distance, metric.gps, metric.marker, metric.poses_are_metric)
+    _require(
+        any(scales) or any(source.camera_height > 0.0 for source in config.source),
+        "[metric] gives no scale; give one or more of "
+        "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
+        "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true",
+    )
+
+
+def _require(condition: object, message: str) -> None:
+    if not condition:
+        raise InputError(message)
 
 
 def _check_range(value: float, bounds: Range, what: str) -> None:
     low, high = bounds.low, bounds.high
-    if not low <= value <= high:
-        expected = f"at least {low:,.10g}" if high == math.inf else f"{low:,.10g} to {high:,.10g}"
-        raise InputError(f"{what} = {value:,.10g}; expected {expected}")
+    expected = f"at least {low:,.10g}" if high == math.inf else f"{low:,.10g} to {high:,.10g}"
+    _require(low <= value <= high, f"{what} = {value:,.10g}; expected {expected}")
 
 
-def _check_source(source: SourceConfig, path: Path) -> None:
-    if not source.path:
-        raise InputError(f"{path}: a [[source]] has no path; give the video or the image folder")
+def _check_source(source: SourceConfig) -> None:
+    _require(source.path, "a [[source]] has no path; give the video or the image folder")
     for key in ("path", "images", "mask"):
-        if "\0" in getattr(source, key):
-            raise InputError(f"{path}: {key} = {getattr(source, key)!r}; expected a path, which has no NUL")
+        value = getattr(source, key)
+        _require("\0" not in value, f"{key} = {value!r}; expected a path, which has no NUL")
     what = f"of [[source]] {source.path!r}"
-    _check_choice(source.kind, KINDS, f"{path}: kind")
+    _check_choice(source.kind, KINDS, "kind")
     if source.lighting:
-        check_lighting(source.lighting, f"{path}: lighting {what}")
-    camera = source.camera
-    if camera is not None:
-        _check_choice(camera.model, CAMERA_MODELS, f"{path}: camera.model {what}")
-        if len(camera.params) != CAMERA_MODELS[camera.model]:
-            raise InputError(
-                f"{path}: camera.params {what} has {len(camera.params)} numbers; {camera.model} has "
-                f"{CAMERA_MODELS[camera.model]}, in COLMAP's order"
-            )
-        if min(camera.width, camera.height) < 0 or (camera.width > 0) != (camera.height > 0):
-            raise InputError(
-                f"{path}: camera {what} is for {camera.width}x{camera.height} px; give the width and the height that "
-                "the calibration is for, or neither"
-            )
+        check_lighting(source.lighting, f"lighting {what}")
+    if source.camera is not None:
+        model, count = source.camera.model, len(source.camera.params)
+        _check_choice(model, CAMERA_MODELS, f"camera.model {what}")
+        _require(
+            count == CAMERA_MODELS[model],
+            f"camera.params {what} has {count} numbers; {model} has {CAMERA_MODELS[model]}, in COLMAP's order",
+        )
+        width, height = source.camera.width, source.camera.height
+        _require(
+            min(width, height) >= 0 and (width > 0) == (height > 0),
+            f"camera {what} is for {width}x{height} px; give the width and the height that the calibration is for, or "
+            "neither",
+        )
 
 
 def check_lighting(name: str, what: str) -> None:
     """Raises InputError for a name that a lighting cannot have; `what` opens the message."""
-    if set(name) & set(":/") or name.endswith(RANDOMIZED):
-        raise InputError(f"{what} = {name!r}: ':', '/' and '{RANDOMIZED}' are reserved; choose a plain name")
-    if name in RESERVED_LIGHTINGS:
-        raise InputError(
-            f"{what} = {name!r} is reserved for a lighting sampled at random; choose another name, such as morning"
-        )
+    _require(
+        not set(name) & set(":/") and not name.endswith(RANDOMIZED),
+        f"{what} = {name!r}: ':', '/' and '{RANDOMIZED}' are reserved; choose a plain name",
+    )
+    _require(
+        name not in RESERVED_LIGHTINGS,
+        f"{what} = {name!r} is reserved for a lighting sampled at random; choose another name, such as morning",
+    )
     _check_name(name, what)
 
 
-def _check_tasks(tasks: tuple[TaskConfig, ...], path: Path) -> None:
+def _check_tasks(tasks: tuple[TaskConfig, ...]) -> None:
     for task in tasks:
-        if not task.name or task.start < 0.0 or not task.length > 0.0:
-            raise InputError(
-                f"{path}: a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
-                "expected a name, start ≥ 0 and length > 0 [m]"
-            )
-        _check_name(task.name, f"{path}: [[task]] name")
-    _check_unique([task.name for task in tasks], "[[task]]", path)
-
-
-def _check_route(route: RouteConfig, path: Path) -> None:
-    if route.passes and route.points:
-        raise InputError(f"{path}: [route] gives passes and points; give one of them")
-    if len(route.points) == 1 or any(len(point) != 2 for point in route.points):
-        raise InputError(
-            f"{path}: route.points = {short_repr([list(point) for point in route.points])}; expected two or more "
-            "[x, y] [m], such as [[0, 0], [12.5, 1.0]]"
+        _require(
+            task.name and task.start >= 0.0 and task.length > 0.0,
+            f"a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
+            "expected a name, start ≥ 0 and length > 0 [m]",
         )
-    if any(a == b for a, b in pairwise(route.points)):
-        raise InputError(f"{path}: route.points names a point twice in a row; give each once")
+        _check_name(task.name, "[[task]] name")
+    _check_unique([task.name for task in tasks], "[[task]]")
 
 
-def _check_metric(metric: MetricConfig, path: Path) -> None:
+def _check_route(route: RouteConfig) -> None:
+    _require(not (route.passes and route.points), "[route] gives passes and points; give one of them")
+    _require(
+        len(route.points) != 1 and all(len(point) == 2 for point in route.points),
+        f"route.points = {short_repr([list(point) for point in route.points])}; expected two or more [x, y] [m], such "
+        "as [[0, 0], [12.5, 1.0]]",
+    )
+    twice = any(a == b for a, b in pairwise(route.points))
+    _require(not twice, "route.points names a point twice in a row; give each once")
+
+
+def _check_metric(metric: MetricConfig) -> None:
     if metric.marker is not None:
-        family, number, size = metric.marker.family, metric.marker.id, metric.marker.size
-        _check_choice(family, MARKER_FAMILIES, f"{path}: metric.marker.family")
-        _check_range(number, Range(0, MARKER_FAMILIES[family] - 1), f"{path}: metric.marker.id")
-        if not size > 0.0:
-            raise InputError(f"{path}: metric.marker.size = {size:g}; expected the side of the black square [m]")
+        family, size = metric.marker.family, metric.marker.size
+        _check_choice(family, MARKER_FAMILIES, "metric.marker.family")
+        _check_range(metric.marker.id, Range(0, MARKER_FAMILIES[family] - 1), "metric.marker.id")
+        _require(size > 0.0, f"metric.marker.size = {size:g}; expected the side of the black square [m]")
     if metric.distance is not None:
-        distance = metric.distance
-        if not distance.metres > 0.0:
-            raise InputError(
-                f"{path}: metric.distance.metres = {distance.metres:g}; expected the metres between the points a and b"
-            )
-        for key in ("a", "b", *(("a2", "b2") if distance.frame_b else ())):
-            if len(getattr(distance, key)) != 2:
-                raise InputError(
-                    f"{path}: metric.distance.{key} = {list(getattr(distance, key))}; expected [u, v] [px]"
-                )
-        if "/" not in distance.frame_a:
-            raise InputError(
-                f"{path}: metric.distance.frame_a = {distance.frame_a!r}; expected a frame such as 'day/000012', as in "
-                "build/2_cameras/images"
-            )
+        metres, frame = metric.distance.metres, metric.distance.frame_a
+        _require(metres > 0.0, f"metric.distance.metres = {metres:g}; expected the metres between the points a and b")
+        for key in ("a", "b", *(("a2", "b2") if metric.distance.frame_b else ())):
+            pixel = getattr(metric.distance, key)
+            _require(len(pixel) == 2, f"metric.distance.{key} = {list(pixel)}; expected [u, v] [px]")
+        _require(
+            "/" in frame,
+            f"metric.distance.frame_a = {frame!r}; expected a frame such as 'day/000012', as in build/2_cameras/images",
+        )
 
 
 def _check_choice(value: str, choices: Iterable[str], what: str) -> None:
     names = list(choices)
-    if value in names:
-        return
-    lower = {name.lower(): name for name in names}
-    near = difflib.get_close_matches(value.lower()[:MAX_NAME], list(lower), n=1)
-    hint = f"did you mean {lower[near[0]]!r}?" if near else f"expected {', '.join(names[:-1])} or {names[-1]}"
-    raise InputError(f"{what} = {value!r}; {hint}")
+    if value not in names:
+        lower = {name.lower(): name for name in names}
+        near = difflib.get_close_matches(value.lower()[:MAX_NAME], list(lower), n=1)
+        hint = f"did you mean {lower[near[0]]!r}?" if near else f"expected {', '.join(names[:-1])} or {names[-1]}"
+        raise InputError(f"{what} = {value!r}; {hint}")
 
 
 def _check_name(name: str, what: str) -> None:
     """Raises InputError for a name that cannot be part of a file name."""
-    invalid = not name.isprintable() or "/" in name or "\\" in name or name.startswith(".") or not name.strip()
-    if invalid or len(name) > MAX_NAME or len(name.encode()) > 2 * MAX_NAME:
-        raise InputError(
-            f"{what} = {name!r}; files are named after it: expected at most {MAX_NAME} characters without slashes "
-            "and line ends, and no dot to begin with"
-        )
+    valid = name.isprintable() and not set(name) & set("/\\") and not name.startswith(".") and name.strip()
+    _require(
+        valid and len(name) <= MAX_NAME and len(name.encode()) <= 2 * MAX_NAME,
+        f"{what} = {name!r}; files are named after it: expected at most {MAX_NAME} characters without slashes "
+        "and line ends, and no dot to begin with",
+    )
 
 
-def _check_unique(names: list[str], what: str, path: Path) -> None:
+def _check_unique(names: list[str], what: str) -> None:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: two {what} are named {twice!r}; give each a different name")
+        raise InputError(f"two {what} are named {twice!r}; give each a different name")
 
 
 def _check_segments(parts: tuple[tuple[float, ...], ...], what: str) -> None:
     end = 0.0
     for part in parts:
-        if len(part) != 2 or not end <= part[0] < part[1]:
-            raise InputError(
-                f"{what} = {short_repr([list(one) for one in parts])}; expected pairs [from, to] in seconds, "
-                "0 ≤ from < to, in order and apart, such as [[0, 62.5]]"
-            )
+        _require(
+            len(part) == 2 and end <= part[0] < part[1],
+            f"{what} = {short_repr([list(one) for one in parts])}; expected pairs [from, to] in seconds, "
+            "0 ≤ from < to, in order and apart, such as [[0, 62.5]]",
+        )
         end = part[1]
 
 
-def _check_obstacles(obstacles: tuple[ObstacleConfig, ...], path: Path) -> None:
+def _check_obstacles(obstacles: tuple[ObstacleConfig, ...]) -> None:
     for one in obstacles:
-        _check_choice(one.kind, OBSTACLE_KINDS, f"{path}: [[obstacle]] kind")
+        _check_choice(one.kind, OBSTACLE_KINDS, "[[obstacle]] kind")
         if one.name:
-            _check_name(one.name, f"{path}: [[obstacle]] name")
-        for key, lengths, meaning in (("to", (0, 2), "station and lateral [m]"), ("color", (0, 3), "red, green, blue")):
-            if len(getattr(one, key)) not in lengths:
-                raise InputError(f"{path}: [[obstacle]] {key} = {list(getattr(one, key))}; expected {meaning}")
-        if len(one.size) not in (0, 3) or any(not side > 0.0 for side in one.size):
-            raise InputError(f"{path}: [[obstacle]] size = {list(one.size)}; expected length, width, height > 0 [m]")
-        if not all(0.0 <= c <= 1.0 for c in one.color):
-            raise InputError(f"{path}: [[obstacle]] color = {list(one.color)}; expected values from 0 to 1")
-        if one.to and not one.speed > 0.0:
-            raise InputError(f"{path}: [[obstacle]] speed = {one.speed}; expected more than 0 where it moves")
-    names = [one.name or f"{one.kind}_{k}" for k, one in enumerate(obstacles)]
-    _check_unique(names, "[[obstacle]]", path)
+            _check_name(one.name, "[[obstacle]] name")
+        to, color, size = list(one.to), list(one.color), list(one.size)
+        _require(len(to) in (0, 2), f"[[obstacle]] to = {to}; expected station and lateral [m]")
+        _require(len(color) in (0, 3), f"[[obstacle]] color = {color}; expected red, green, blue")
+        sides = len(size) in (0, 3) and all(side > 0.0 for side in size)
+        _require(sides, f"[[obstacle]] size = {size}; expected length, width, height > 0 [m]")
+        _require(all(0.0 <= c <= 1.0 for c in color), f"[[obstacle]] color = {color}; expected values from 0 to 1")
+        moves = one.speed > 0.0 or not one.to
+        _require(moves, f"[[obstacle]] speed = {one.speed}; expected more than 0 where it moves")
+    _check_unique([one.name or f"{one.kind}_{k}" for k, one in enumerate(obstacles)], "[[obstacle]]")

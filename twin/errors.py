@@ -10,7 +10,7 @@ _MAX_VALUE = 80  # characters of a value in a message
 _MAX_WORD = 300  # characters of a word, such as a path
 _MAX_MESSAGE = 1500  # characters of a message
 _LONG_VALUES = (
-    # In quotes: an apostrophe within a word opens none.
+    # In quotes; an apostrophe within a word is no quote.
     re.compile(rf"(?<!\w)'([^']{{{_MAX_VALUE - 3}}})[^']{{4,}}'(?!\w)"),
     re.compile(rf'(?<!\w)"([^"]{{{_MAX_VALUE - 3}}})[^"]{{4,}}"(?!\w)'),
 )
@@ -19,10 +19,7 @@ _LONG_WORD = re.compile(rf"(\S{{{_MAX_WORD - 63}}})\S{{4,}}(\S{{60}})")
 
 
 class InputError(ValueError):
-    """Wrong input. The message is one line with the value, the expectation and the cure; verbs exit with status 2.
-
-    Quoted values are cut at 80 characters, paths at 300.
-    """
+    """Wrong input: one line with the value, the expectation and the cure. Verbs print it and exit with status 2."""
 
     def __init__(self, message: object = "") -> None:
         super().__init__(shortened(str(message)))
@@ -42,7 +39,7 @@ def shortened(message: str) -> str:
 
 
 def short_repr(value: Any) -> str:
-    """`repr` of a value from a file, cut at 80 characters; it never raises."""
+    """`repr` of a value from a file, cut at 80 characters; never raises."""
     try:
         text = repr(value)
     except RecursionError:

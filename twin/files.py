@@ -1,7 +1,7 @@
 """Checked reading and atomic writing of files.
 
 Readers accept regular files only, so that none blocks on a pipe, and raise `InputError` with the file's name for any
-defect. Writers write `<name>.partial` and rename it: a full disk or a kill leaves the former file unchanged.
+defect. Writers write a `.partial` file and rename it: a full disk or a kill leaves the former file unchanged.
 """
 
 import contextlib
@@ -30,9 +30,6 @@ from safetensors.numpy import load_file
 
 from twin.errors import InputError
 
-PARTIAL = ".partial"
-"""Suffix of files and folders that are being written."""
-
 _MAX_TEXT = 64 << 20  # [bytes] of a JSON or CSV file
 _MAX_DIGITS = 40  # of an integer in JSON; a random generator's state has 39
 _MAX_ARRAYS = 2 << 30  # [bytes] of all arrays of a file, uncompressed
@@ -52,11 +49,7 @@ _FILE_KINDS = {
 
 
 def regular_file(path: Path) -> Path:
-    """Returns the path of a regular file, or of a link to one.
-
-    Raises:
-        InputError: a missing file, a dangling link, a folder, a pipe, a device, or an invalid file name.
-    """
+    """Returns the path of a regular file, or of a link to one. Raises InputError for anything else."""
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
@@ -68,7 +61,7 @@ def regular_file(path: Path) -> Path:
 
 
 def exists(path: Path) -> bool:
-    """True if the path exists; False for an invalid file name, where Path.exists raises."""
+    """True if the path exists; False for an invalid file name, for which Path.exists raises."""
     try:
         return path.exists()
     except OSError:
@@ -94,8 +87,7 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
 def read_text(path: Path, most: int = _MAX_TEXT) -> str:
     """The contents of a UTF-8 text file, with or without a byte-order mark.
 
-    Raises:
-        InputError: as `regular_file`, or for text that is not UTF-8 or has more than `most` bytes.
+    Raises InputError as `read_bytes` does, or for text that is not UTF-8.
     """
     try:
         return read_bytes(path, most).decode("utf-8-sig")
@@ -104,11 +96,7 @@ def read_text(path: Path, most: int = _MAX_TEXT) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file with finite numbers and integers of at most 40 digits.
-
-    Raises:
-        InputError: as `regular_file`, or for other content.
-    """
+    """The value in a JSON file with finite numbers and integers of at most 40 digits. Raises InputError for others."""
     return parse_json(read_text(path), path)
 
 
@@ -136,7 +124,7 @@ def _json_float(text: str) -> float:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file with 64-bit integers. Raises InputError as `regular_file` does, or for other content."""
+    """The table in a TOML file with 64-bit integers. Raises InputError for other files."""
     return parse_toml(read_text(path, _MAX_TOML), path)
 
 
@@ -165,12 +153,7 @@ def _check_numbers(value: Any) -> None:
 def load_arrays(path: Path, most: int = _MAX_ARRAYS) -> dict[str, NDArray]:
     """The arrays of an npz file; nothing in it can run code.
 
-    Args:
-        path: The file.
-        most: Upper bound of all arrays together, uncompressed [bytes].
-
-    Raises:
-        InputError: as `regular_file`, or for a damaged file, pickled objects, or more than `most` bytes.
+    Raises InputError as `regular_file` does, or for a damaged file, pickled objects, or more than `most` bytes in all.
     """
     with wrap_read_errors(regular_file(path), "expected arrays as numpy.savez writes them, without pickled objects"):
         with zipfile.ZipFile(path) as archive:
@@ -184,7 +167,7 @@ def load_arrays(path: Path, most: int = _MAX_ARRAYS) -> dict[str, NDArray]:
 
 
 def _check_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    """Raises ValueError if an array's header declares more data than the file has, before it is allocated."""
+    """Raises ValueError if an array's header declares more data than the file has, so that it is not allocated."""
     if not entry.filename.endswith(".npy"):
         return
     with archive.open(entry) as file:
@@ -196,7 +179,7 @@ def _check_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
 
 @contextlib.contextmanager
 def wrap_read_errors(path: Path, cure: str) -> Iterator[None]:
-    """Converts errors in reading a file's contents into an InputError with the file's name and the cure."""
+    """Converts errors in reading a file into an InputError with the file's name and the cure."""
     try:
         yield
     except InputError:
@@ -211,26 +194,26 @@ def wrap_read_errors(path: Path, cure: str) -> Iterator[None]:
 
 
 def load_tensors(path: Path) -> dict[str, NDArray]:
-    """The arrays of a safetensors file. Raises InputError as `regular_file` does, or for other content."""
+    """The arrays of a safetensors file. Raises InputError for other files."""
     with wrap_read_errors(regular_file(path), "expected a safetensors file"):
         return load_file(path)
 
 
 def toml_string(text: str) -> str:
-    """A text as TOML's basic string: quotes, backslashes and control characters escaped, lone surrogates replaced."""
+    """A text as a basic string of TOML, with escaped special characters; lone surrogates are replaced."""
     text = text.encode("utf-8", "replace").decode("utf-8")
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def check_shapes(arrays: Mapping[str, tuple[NDArray, tuple[int, ...], str]]) -> None:
-    """Raises ValueError if an array, given by name as (array, shape, `dtype.kind`), has another shape or kind."""
+    """Raises ValueError if an array, given by name as (array, shape, dtype.kind), has another shape or kind."""
     for name, (array, shape, kind) in arrays.items():
         if array.shape != shape or array.dtype.kind != kind:
             raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {shape} of kind {kind!r}")
 
 
 def require_text(value: Any) -> str:
-    """Returns a value from a JSON file if it is a text. Raises TypeError otherwise."""
+    """Returns a value from a JSON file if it is a text, otherwise raises TypeError."""
     if not isinstance(value, str):
         raise TypeError(f"{type(value).__name__} where a text is expected")
     return value
@@ -255,11 +238,11 @@ def digest_json(value: Any) -> str:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path that replaces `path` when the block ends and is removed if the block fails.
+    """A temporary path that replaces `path` when the block ends, or is removed if the block fails.
 
-    It has the suffix of `path`, since writers of films and arrays choose the format by it.
+    It has the suffix of `path`, by which writers of films and arrays choose the format.
     """
-    partial = path.with_name(f".{path.stem[:200]}{PARTIAL}{path.suffix}")
+    partial = path.with_name(f".{path.stem[:200]}.partial{path.suffix}")
     try:
         yield partial
         partial.replace(path)
@@ -297,17 +280,10 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
 
 
 def allocate(path: Path, size: int) -> None:
-    """Allocates disk space for a file up to a size and keeps its contents.
+    """Allocates disk space for a file up to `size` [bytes]; keeps its contents, or creates it.
 
-    Memory-mapping a sparse file ends the process by SIGBUS when the disk is full. On copy-on-write file systems a full
-    disk may still do so later.
-
-    Args:
-        path: The file; created if it does not exist.
-        size: [bytes]
-
-    Raises:
-        OSError: the disk is full; a newly created file is removed.
+    Otherwise a full disk ends a process that writes to the memory-mapped file by SIGBUS. On copy-on-write file systems
+    it may still do so. Raises OSError if the disk is full; a newly created file is removed.
     """
     existed = path.exists()
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -326,7 +302,7 @@ def allocate(path: Path, size: int) -> None:
 
 
 def remove(path: Path) -> None:
-    """Removes a file, a link (not its target), or a folder with its contents; a missing path is no error."""
+    """Removes a file, a link (not its target), or a folder with its contents, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -345,20 +321,10 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path, cure: str) -> bool:
-    """True for a folder, False for a regular file.
-
-    Args:
-        path: The path to check.
-        cure: Ends the error message.
-
-    Raises:
-        InputError: the path is neither: it is missing, a dangling link, a pipe, a device, or an invalid file name.
-    """
-    try:
+    """True for a folder, False for a regular file. Raises InputError for anything else; `cure` ends the message."""
+    with contextlib.suppress(OSError, ValueError):  # `regular_file` raises
         if stat.S_ISDIR(path.stat().st_mode):
             return True
-    except (OSError, ValueError):
-        pass  # `regular_file` raises
     try:
         regular_file(path)
     except InputError as error:
@@ -367,7 +333,7 @@ def is_folder(path: Path, cure: str) -> bool:
 
 
 def require_folder(path: Path, cure: str) -> Path:
-    """Returns the path of a folder. Raises InputError for anything else; `cure` ends the message."""
+    """Returns the path of a folder. Raises InputError as `is_folder` does, or for a file."""
     if not is_folder(path, cure):
         raise InputError(f"{path} is a file; {cure}")
     return path

@@ -3,9 +3,9 @@
     python -m twin.film scenes/demo --task right_turn --lighting night --obstacles 4
     python -m twin.film scenes/demo --policy first --task straight --lighting held-out --seed 7 --out drive.mp4
 
-The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is scripted
-unless a policy is given, in any form that `twin.validate` accepts; it then uses the policy's environment options. Task,
-lighting and seed determine the episode: those of a row of `validation/episodes.csv` reproduce that episode.
+The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is
+scripted, or a policy that `twin.validate` accepts, in an environment with the policy's options. Task, lighting and seed
+determine the episode: those of a row of `validation/episodes.csv` reproduce it.
 """
 
 import argparse
@@ -22,10 +22,10 @@ from twin.env.suite import load
 from twin.errors import InputError
 from twin.loading import load_scene
 
-_MAX_DIGITS = 6  # of the number of obstacles
-
 if TYPE_CHECKING:
     from twin.env.episode import Episode
+
+_MAX_DIGITS = 6  # of the number of obstacles
 
 
 def film(
@@ -37,19 +37,16 @@ def film(
     trust: bool = False,
     **options: Any,
 ) -> tuple[Path, "Episode"]:
-    """Drives one episode and films it.
+    """Drives one episode and films it; returns the film's path and the episode.
 
     Args:
         root: A built scene.
         task: See `twin.load`.
-        policy: A run's name, or see `twin.learn.policy.load_policy`; the scripted driver where None.
+        policy: A run's name, or see `twin.learn.policy.load_policy`; None: the scripted driver.
         seed: Seed of the episode.
         out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder.
         trust: Allows a policy file to run code.
         options: See `twin.env.options.Options`; by default those of the policy.
-
-    Returns:
-        The film's path and the episode.
 
     Raises:
         InputError: an unknown scene, task, policy or option, or a negative seed.
@@ -82,17 +79,9 @@ def film(
         episode = record_episode(environment, driver, watch)
     path = out or root / "films" / film_name(task, episode.lighting, seed)
     path.parent.mkdir(parents=True, exist_ok=True)
-    drive_task = environment.task
-    write_episode_video(
-        path,
-        episode,
-        images,
-        drive_task.world,
-        drive_task.half_width,
-        (drive_task.segment.start, drive_task.segment.end),
-        load_ground_and_parts(scene.scene),
-        f"{task.replace('_', ' ')}: {driver_name}",
-    )
+    driven, geometry = environment.task, load_ground_and_parts(scene.scene)
+    limits, title = (driven.segment.start, driven.segment.end), f"{task.replace('_', ' ')}: {driver_name}"
+    write_episode_video(path, episode, images, driven.world, driven.half_width, limits, geometry, title)
     return path, episode
 
 
@@ -103,11 +92,12 @@ def film_name(task: str, lighting: str, seed: int) -> str:
 
 def command(given: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    options = {
-        "lighting_drift": given.drift,
-        "randomise": given.randomise,
-        "obstacles": _obstacles(given.obstacles),
-    }
+    obstacles = given.obstacles
+    if obstacles != "scene":
+        if not obstacles.isdecimal() or len(obstacles) > _MAX_DIGITS:  # isdigit accepts "²"
+            raise InputError(f"--obstacles {obstacles!r}: expected a number, or 'scene' for those of scene.toml")
+        obstacles = int(obstacles)
+    options = {"lighting_drift": given.drift, "randomise": given.randomise, "obstacles": obstacles}
     if given.lighting:
         from twin.config import Condition
         from twin.env.domain_randomization import condition_options
@@ -116,14 +106,6 @@ def command(given: argparse.Namespace) -> None:
     path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
     if not given.quiet:
         print(f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}")
-
-
-def _obstacles(text: str) -> str | int:
-    if text == "scene":
-        return text
-    if not text.isdecimal() or len(text) > _MAX_DIGITS:  # isdigit accepts "²"
-        raise InputError(f"--obstacles {text!r}: expected a number, or 'scene' for those of scene.toml")
-    return int(text)
 
 
 main = partial(commands.main, "film")

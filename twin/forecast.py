@@ -3,7 +3,7 @@
     python -m twin.forecast SCENE [--real results.csv]
 
 reads `validation/episodes.csv` of `twin.validate` and the user's real trials, and writes `forecast.json`,
-`forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials it ranks the policies in the twin only.
+`forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials it only ranks the policies in the twin.
 """
 
 import argparse
@@ -20,12 +20,12 @@ from twin.scene import SceneDir
 
 
 def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
-    """Computes and writes the forecast of the scene at `root`.
+    """Computes and writes the forecast of a scene.
 
     Args:
         root: The scene folder.
         real: `results.csv` of real trials, if any.
-        seed: Seed of the resampling; the same seed gives the same forecast.
+        seed: Seed of the resampling.
 
     Raises:
         InputError: nothing has been validated, or a table is wrong; nothing is written.

@@ -27,31 +27,29 @@ class Twin:
         """Cameras of the filmed frames: metric poses, z up."""
         from twin.geometry.cameras import Cameras
 
-        return Cameras.load(self._folder("metric"))
+        return Cameras.load(require_stage(self.scene, "metric"))
 
     def field(self, device: str = "cpu") -> BakedField:
         """The baked radiance field with the filmed lightings and those added by `twin.relight`; needs no torch.
 
-        Args:
-            device: cpu or cuda.
+        `device` is cpu or cuda.
         """
         from twin.nerf.baked import BakedField
         from twin.nerf.lightings import added_lightings
 
-        field = BakedField.load(self._folder("field"), device)
+        field = BakedField.load(require_stage(self.scene, "field"), device)
         field.add_lightings(*added_lightings(self.scene, field.lightings_by_name.vectors.shape[1]))
         return field
 
     def radiance_field(self, device: str | None = None) -> RadianceField:
-        """The radiance field as trained, in torch: slower and slightly finer than `field`, same lightings.
+        """The radiance field as trained, in torch: slower and slightly finer than `field`, with the same lightings.
 
-        Args:
-            device: cpu or cuda; None: cuda where it is usable.
+        `device` is cpu or cuda; None: cuda where it is usable.
         """
         from twin.nerf.field import RadianceField
         from twin.nerf.lightings import added_lightings
 
-        field = RadianceField.load(self._folder("field"), device)
+        field = RadianceField.load(require_stage(self.scene, "field"), device)
         fresh, stale, _ = added_lightings(self.scene, field.appearance.vectors.shape[1])
         field.add_lightings(fresh, stale)
         return field
@@ -60,16 +58,13 @@ class Twin:
         """The MJCF scene with route, corridor and goal."""
         from twin.mjcf.world import World
 
-        return World.load(self._folder("mjcf"))
+        return World.load(require_stage(self.scene, "mjcf"))
 
     def report(self) -> dict[str, Any]:
         """`report.json` of the last build."""
         if not self.scene.report_json.exists():
             raise InputError(f"{self.scene.report_json} is missing; run python -m twin.build {self.scene.root}")
         return read_json(self.scene.report_json)
-
-    def _folder(self, stage: str) -> Path:
-        return require_stage(self.scene, stage)
 
 
 def load_scene(path: str | Path) -> Twin:

@@ -6,7 +6,7 @@ writes `scenes/my_road/scene.toml` with the common settings and copies the films
 `python -m twin.build scenes/my_road` builds it.
 
 A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the deepest
-folder that contains all of its files; they are copied with their paths relative to it.
+folder that contains all of its files; they are copied with their paths relative to the root.
 """
 
 import argparse
@@ -63,15 +63,12 @@ half_width = 1.0               # half the width of the drivable corridor around 
 
 
 def new_scene(root: Path, films: list[Path], camera_height: float | None = None) -> Path:
-    """Writes a scene folder: copies of the films under `input/`, then `scene.toml`.
+    """Writes a scene folder: copies of the films under `input/`, then `scene.toml`, whose path is returned.
 
     Args:
         root: The scene folder; created if it does not exist.
         films: Films, image folders or posed image sets; one source and one lighting each.
-        camera_height: Lens above the ground [m]; without it the user completes the line.
-
-    Returns:
-        The path of `scene.toml`.
+        camera_height: Lens above the ground [m]; None: left for the user to fill in.
 
     Raises:
         InputError: an existing scene, an unreadable film, missing images of a posed image set, or an invalid height.
@@ -96,16 +93,16 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
         path = _import_film(film, inputs)
         lighting = _lighting(path, detect_kind(film))
         text += _SOURCE.format(path=toml_string(("input" / path).as_posix()), lighting=toml_string(lighting))
-    given = f"{camera_height:<14g}" if camera_height is not None else None
-    line = f"camera_height = {given} # lens above the ground [m], carried at a constant height"
-    if given is None:
+    if camera_height is None:
         line = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another source below"
+    else:
+        line = f"camera_height = {camera_height:<14g} # lens above the ground [m], carried at a constant height"
     write_text(scene.config_file, text + _REST.format(camera_height=line))
     return scene.config_file
 
 
 def _import_film(film: Path, inputs: Path) -> Path:
-    """Path relative to `input/` of a film, folder or posed image set, copied there unless it is there already."""
+    """Copies a film, folder or posed image set to `input/`, unless it is there already; returns its relative path."""
     film, inputs = (Path(os.path.normpath(path.absolute())) for path in (film, inputs))
     if film.is_relative_to(inputs):
         return film.relative_to(inputs)
@@ -113,12 +110,12 @@ def _import_film(film: Path, inputs: Path) -> Path:
 
 
 def _copy_film(film: Path, inputs: Path) -> Path:
-    """Copies a film or folder to `input/` and returns its relative path; an identical copy is reused."""
+    """Copies a film or folder to `input/`, or reuses an identical copy; returns its relative path."""
     copy, number = inputs / film.name, 2
     while copy.exists() and not _is_same(film, copy):
         copy, number = inputs / f"{film.stem}_{number}{film.suffix}", number + 1
     if not copy.exists():
-        aside = copy.with_name(copy.name + ".partial")  # an interrupted copy never passes for a film
+        aside = copy.with_name(copy.name + ".partial")  # so that an interrupted copy is not taken for a film
         if film.is_dir():
             shutil.rmtree(aside, ignore_errors=True)
             shutil.copytree(film, aside, ignore=_not_copied)
@@ -129,7 +126,7 @@ def _copy_film(film: Path, inputs: Path) -> Path:
 
 
 def _not_copied(folder: str, names: list[str]) -> list[str]:
-    """Entries of a folder that are not copied: pipes, devices, dangling links, links to folders (perhaps cyclic)."""
+    """Entries of a folder that are not copied: pipes, devices, dangling links, links to folders (may be cyclic)."""
     paths = [Path(folder) / name for name in names]
     return [path.name for path in paths if not is_file(path) and (path.is_symlink() or not path.is_dir())]
 
@@ -186,7 +183,7 @@ def _posed_files(film: Path) -> tuple[Path, list[Path]]:
 
 
 def _lighting(path: Path, kind: str) -> str:
-    """Derives a lighting's name from the film's file name, or from the name of a posed image set's root folder."""
+    """A lighting's name, derived from the film's file name or from the root folder of a posed image set."""
     name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
     name = "".join(c if c.isprintable() and c not in ":/\\" else "_" for c in name).lstrip(".") or "film"
     name = name.replace(RANDOMIZED, RANDOMIZED.replace("+", "_"))

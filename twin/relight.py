@@ -2,10 +2,10 @@
 
     python -m twin.relight scenes/demo photo.jpg --name afternoon
 
-localizes the photo (`capture/localize.py`), then fits an appearance embedding and fog so that renderings of the frozen
-field match it. The lighting is saved as `<scene>/lightings/afternoon.json`, with a labelled image beside it: the photo,
-the field under the fitted lighting, and under the most similar filmed one. Afterwards `twin.load_scene(scene).field()`
-has it as `lighting="afternoon"` or `"sun:afternoon:0.5"`; environments apply its fog to their images.
+localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen field match it. The
+lighting is saved as `<scene>/lightings/afternoon.json`, with a labelled image beside it: the photo, the field under the
+fitted lighting, and under the most similar filmed one. Afterwards `twin.load_scene(scene).field()` has it as
+`lighting="afternoon"` or `"sun:afternoon:0.5"`; environments apply its fog to their images.
 """
 
 import argparse
@@ -32,7 +32,7 @@ _RAYS = 10_000  # upper bound of fitted rays, spread evenly
 _START_RAYS = 1000  # for choosing the most similar filmed frame
 _FOG_GAIN = 0.2  # [dB] by which fog must improve the other half of the image
 _GAP = 4  # [px] between the images
-_LABEL_SIZE = 13  # [px] of text in the images; usual labels fit into the 270 px of an upright photo
+_LABEL_SIZE = 13  # [px] of text in the images; usual labels fit into an upright photo of 270 px
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class PhotoFit:
     embedding: NDArray[np.float32]
     """Appearance embedding, shape (dim,)."""
     fog: Fog
-    """Clear if fog does not improve the fit."""
+    """No fog if it does not improve the fit."""
     images: tuple[NDArray, NDArray, NDArray]
     """Photo, field under the fitted lighting and fog, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
     psnr_nearest: float
@@ -60,8 +60,7 @@ class PhotoFit:
 def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArray) -> PhotoFit:
     """Fits the appearance embedding and fog of a photo with the field frozen.
 
-    Cross-validation decides on fog: it is kept only if the fit to one half of the image then improves the other half by
-    `_FOG_GAIN`.
+    Fog is kept only if, in fits to one half of the image, it improves the other half by `_FOG_GAIN`.
 
     Args:
         field: A `RadianceField`.
@@ -94,8 +93,8 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     filmed = {name: render(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
-    # Starting from the most similar frame instead of a lighting suits other views of the place better: by up to 1.7 dB
-    # on the demo, and never worse by more than 0.2 dB.
+    # A start from the most similar frame instead of a lighting suits other views of the place better: by up to 1.7 dB
+    # on the demo, at worst by −0.2 dB.
     some = slice(None, None, max(1, height * width // _START_RAYS))
     starts = [*field.appearance.named().vectors, *field.appearance.named().frame_vectors]
     renders = [field.color(features[some], harmonics[some], one) for one in starts]
@@ -116,7 +115,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
 
 def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
-    """The picture of a fit: photo, fitted lighting and nearest filmed one side by side, each with a label."""
+    """Labelled image of a fit: photo, fitted lighting and nearest filmed lighting side by side."""
     from twin.report.video_layout import draw_label
 
     height, width = relit.images[0].shape[:2]
@@ -135,7 +134,7 @@ def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
 
 
 def relight(root: Path, photo: Path, name: str) -> AddedLighting:
-    """Adds the lighting of a photo to the scene at `root` under a name, and returns it.
+    """Adds the lighting of a photo to a scene under a name, and returns it.
 
     Raises:
         InputError: no built scene, an unusable photo, a photo that cannot be localized, or an invalid name.

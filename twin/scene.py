@@ -2,7 +2,7 @@
 
 scenes/<name>/
   scene.toml            the only hand-written file
-  robot.toml            optional: robot parameters, as `[robot]` of scene.toml
+  robot.toml            optional: robot parameters, as in `[robot]` of scene.toml
   input/                films or photos; only `twin.new` writes here
   build/
     1_capture/ ... 6_review/   one folder per stage, written as `<folder>.partial` and renamed when done
@@ -11,9 +11,9 @@ scenes/<name>/
   validation/           episodes.csv, cells.csv, validation.html, films/: policies evaluated in the twin
   forecast/             forecast.json .csv .html: forecast of success on the real road
 
-A stage's *key* is the hash of everything its result depends on: its config sections, the digests of its input files,
-the *results* (content digests) of its upstream stages, its version and the seed. A stage folder is up to date if its
-stamp has the present key and all its files are as written. Package versions are recorded, but are not part of the key.
+A stage's *key* is the hash of all that its result depends on: its config sections, the digests of its input files, the
+*results* (content digests) of its upstream stages, its version and the seed. A stage folder is up to date if its stamp
+has the present key and its files match the stamp. Package versions are recorded, but are not part of the key.
 """
 
 import os
@@ -71,9 +71,6 @@ class SceneDir:
         """The folder of a stage while it is written."""
         return self.build / f"{STAGES[name]}.partial"
 
-    def stamp(self, name: str) -> Path:
-        return self.stage(name) / "stamp.json"
-
     @property
     def report_json(self) -> Path:
         return self.build / "report.json"
@@ -129,14 +126,9 @@ _MAX_NAME = 80  # characters; a file system takes 255 bytes, including what twin
 
 
 def check_name(name: str, what: str) -> str:
-    """Returns `name` if it can be the name of a file or folder.
+    """Returns a name of letters, digits and `_ . -`, for a file or folder.
 
-    Args:
-        name: Letters, digits and `_ . -`, the first a letter, a digit or `_`; at most 80 characters.
-        what: Origin of the name, such as `--run`, which opens the error message.
-
-    Raises:
-        InputError: another name, such as a path.
+    Raises InputError for any other, such as a path; `what`, the origin of the name such as `--run`, opens the message.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{what} {name!r}: expected a name of letters, digits and _ . - only, no path")
@@ -146,7 +138,7 @@ def check_name(name: str, what: str) -> str:
 
 
 def run_folder(scene: SceneDir, name: str) -> Path:
-    """The folder of a training run. Raises InputError for an invalid name; see `check_name`."""
+    """The folder of a training run. Raises InputError for an invalid name."""
     return scene.root / "runs" / check_name(name, "--run")
 
 
@@ -177,7 +169,7 @@ class Stamp:
     device: str
     packages: dict[str, str]
     sha256: dict[str, str] = field(default_factory=dict)
-    """Digest of every file; empty in older stamps, whose folders are compared with `result` as a whole."""
+    """Digest of every file; empty in older stamps, whose folders are compared with `result`."""
     itself: str = ""
     """Digest of all fields above; empty in older stamps."""
 
@@ -187,10 +179,7 @@ class Stamp:
 
     @staticmethod
     def load(folder: Path) -> "Stamp | None":
-        """The stamp of a finished stage folder; None if it is missing, damaged, or does not match its files.
-
-        All files are read.
-        """
+        """The stamp of a finished stage folder; None if it is missing, damaged, or does not match the files."""
         try:
             return Stamp.verified(folder)
         except InputError:
@@ -198,14 +187,9 @@ class Stamp:
 
     @staticmethod
     def verified(folder: Path, max_hashed: int | None = None) -> "Stamp":
-        """The stamp of a finished stage folder, which fits its files.
+        """The stamp of a finished stage folder. Raises InputError if it is missing or does not match the files.
 
-        Args:
-            folder: Folder of the stage.
-            max_hashed: Larger files are compared by size only [bytes]; None: all are read.
-
-        Raises:
-            InputError: a file is damaged or missing.
+        Files larger than `max_hashed` [bytes] are compared by size only.
         """
         path = folder / "stamp.json"
         with wrap_read_errors(path, _CURE):
@@ -230,82 +214,67 @@ class Stamp:
         return digest_json({name: value for name, value in asdict(self).items() if name != "itself"})
 
 
-def stage_key(depends: dict[str, Any]) -> str:
-    return digest_json(depends)
-
-
 def digest_folder(folder: Path) -> tuple[str, dict[str, int], dict[str, str]]:
-    """Content digest of a folder, sizes [bytes] of its files, and digests of its files."""
+    """Content digest of a folder, and size [bytes] and digest of each file in it."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "stamp.json")
-    names = [path.relative_to(folder).as_posix() for path in files]
-    digests = [digest_file(path) for path in files]
-    sizes = [path.stat().st_size for path in files]
-    return (
-        digest_json([names, digests]),
-        dict(zip(names, sizes, strict=True)),
-        dict(zip(names, digests, strict=True)),
-    )
+    sizes = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+    digests = {name: digest_file(folder / name) for name in sizes}
+    return digest_json([list(digests), list(digests.values())]), sizes, digests
 
 
 def write_stamp(folder: Path, stage: str, depends: dict[str, Any] | None = None, **more: Any) -> Stamp:
     """Writes the stamp of a stage folder for its present files.
 
-    Args:
-        folder: Folder of the stage.
-        stage: Name of the stage.
-        depends: Dependencies that form the key.
-        more: Fields of `Stamp`: metrics, seconds, peak_memory_bytes, device.
+    `more` are fields of `Stamp`: metrics, seconds, peak_memory_bytes, device.
     """
     depends = depends or {}
     result, files, sha256 = digest_folder(folder)
     fields = {"metrics": {}, "seconds": 0.0, "peak_memory_bytes": 0, "device": "auto", **more}
     stamp = Stamp(
-        stage, stage_key(depends), result, depends, files, packages=package_versions(), sha256=sha256, **fields
+        stage, digest_json(depends), result, depends, files, packages=package_versions(), sha256=sha256, **fields
     )
     stamp.save(folder)
     return stamp
 
 
 @lru_cache(maxsize=64)
-def _verified_stamp(folder: Path, _stamped: tuple[int, int]) -> Stamp:
+def _verified_once(folder: Path, _stamped: tuple[int, int]) -> Stamp:
     return Stamp.verified(folder, _MAX_HASHED)
 
 
-def require_stage(scene: SceneDir, stage: str) -> Path:
-    """The folder of a built stage, after its files were compared with its stamp.
-
-    A process compares the files of a stage once. Files above 256 MiB are compared by size only; the next build, which
-    reads everything, finds changes that keep the size.
-
-    Raises:
-        InputError: the stage has not been built, or one of its files is damaged.
-    """
+def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
     folder = scene.stage(stage).resolve()
     path = folder / "stamp.json"
     if not path.exists():
         raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run python -m twin.build {scene.root}")
     facts = regular_file(path).stat()
-    _verified_stamp(folder, (facts.st_mtime_ns, facts.st_size))
+    return _verified_once(folder, (facts.st_mtime_ns, facts.st_size))
+
+
+def require_stage(scene: SceneDir, stage: str) -> Path:
+    """The folder of a built stage, after its files were compared with its stamp, which a process does once.
+
+    Files above 256 MiB are compared by size only; the next build, which reads everything, finds other changes.
+
+    Raises:
+        InputError: the stage has not been built, or one of its files is damaged.
+    """
+    _verified_stamp(scene, stage)
     return scene.stage(stage)
 
 
 def stage_result(scene: SceneDir, stage: str) -> str:
     """Content digest of a built stage. Raises InputError as `require_stage` does."""
-    require_stage(scene, stage)
-    facts = scene.stamp(stage).stat()
-    return _verified_stamp(scene.stage(stage).resolve(), (facts.st_mtime_ns, facts.st_size)).result
+    return _verified_stamp(scene, stage).result
 
 
 def package_versions() -> dict[str, str]:
-    """Installed versions of the packages that affect results."""
+    """Versions of the packages that affect results."""
     return {name: metadata.version(name) for name in _PACKAGES}
 
 
 def commit_stage(scene: SceneDir, stage: str) -> None:
-    """Replaces the folder of a stage by its stamped partial folder.
-
-    A kill between the two renames leaves the former folder as `<folder>.old`, which `recover_stages` restores.
-    """
+    """Replaces the folder of a stage by its stamped partial folder; `recover_stages` repairs an interrupted call."""
     partial, final = scene.partial(stage), scene.stage(stage)
     old = final.with_name(final.name + ".old")
     remove(old)
@@ -316,7 +285,7 @@ def commit_stage(scene: SceneDir, stage: str) -> None:
 
 
 def recover_stages(scene: SceneDir) -> None:
-    """Cleans up after a killed build: removes partial folders and restores results that were being replaced."""
+    """Cleans up after a killed build: removes partial folders, and restores results that were being replaced."""
     for stage in STAGES:
         final = scene.stage(stage)
         old = final.with_name(final.name + ".old")

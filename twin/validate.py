@@ -1,10 +1,10 @@
-"""Verb: evaluates the success rates of policies in a built scene, per lighting.
+"""Verb: measures the success rates of policies in a built scene, per lighting.
 
     python -m twin.validate scenes/demo --task straight --policy scenes/demo/runs/first --episodes 100
     python -m twin.validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst --films
 
 A policy is a run (name or folder), a checkpoint of one, an ONNX file or `module:function`. All policies drive the same
-episodes. Episodes in `validation/episodes.csv` are not driven again, so a stopped validation continues.
+episodes. Those in `validation/episodes.csv` are not driven again, so a stopped validation continues.
 `validation/validation.html` shows the results.
 """
 
@@ -40,12 +40,12 @@ from twin.runtime import exclusive_lock
 from twin.scene import SceneDir
 
 DEFAULT_LIGHTINGS = (HELD_OUT, str(Condition(HELD_OUT, True)))
-"""Unseen light alone, and unseen light with domain randomization, which is closer to a real road."""
+"""Unseen light alone, and with domain randomization, which is closer to a real road."""
 
 _FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # see `lighting_seeds`
-_SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # of the search for the worst lighting and of its final evaluation
-_MAX_PROCESSES = 1024
+_SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # of the search for the worst lighting, and of its final evaluation
 _SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # sampled, episodes in each, kept after the first round
+_MAX_PROCESSES = 1024
 
 Key = tuple[str, str, str, int]
 
@@ -58,51 +58,42 @@ class Campaign:
         twin: Twin,
         task: str,
         path: Path,
-        policies: dict[str, tuple[str, bool]],
+        sources: dict[str, str],
+        trust: bool,
         processes: int,
-        ray: str | None = None,
+        ray: str | None,
     ) -> None:
         """
         Args:
             twin: A built scene.
             task: See `twin.load`.
             path: The table.
-            policies: Source and trust by name.
+            sources: Sources of the policies by name.
+            trust: Allows policy files to run code.
             processes: Number of local worker processes.
-            ray: Address of a Ray cluster to use instead.
+            ray: Address of a Ray cluster to use instead of them.
         """
-        self._scene, self.task, self.path, self._policies = str(twin.scene.root.resolve()), task, path, policies
-        self._processes, self._ray = processes, ray
-        self._done = {_key(t): t for t in read_trials(path)} if path.exists() and _has_rows(path) else {}
+        self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
+        self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
+        self._done = {_key(t): t for t in _read_table(path)}
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
-        """Trials of (policy, lighting, seeds), in that order; missing ones are driven and added to the table."""
+        """Trials of (policy, lighting, seeds), in that order; drives missing ones and adds them to the table."""
         keys = [(name, self.task, lighting, seed) for name, lighting, seeds in wanted for seed in seeds]
         chunks: list[tuple[str, EpisodeChunk]] = []
         for name, lighting, seeds in wanted:
             left = [seed for seed in seeds if (name, self.task, lighting, seed) not in self._done]
             for k in range(0, len(left), CHUNK):
-                source, trust = self._policies[name]
-                chunk = EpisodeChunk(
-                    self._scene, self.task, source, trust, Condition.parse(lighting), tuple(left[k : k + CHUNK])
-                )
-                chunks.append((name, chunk))
+                road, part = (self._scene, self.task), tuple(left[k : k + CHUNK])
+                condition = Condition.parse(lighting)
+                chunks.append((name, EpisodeChunk(*road, self._sources[name], self._trust, condition, part)))
         with runtime.bar(what, len(keys), "episode") as bar:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
             driven = self._campaign([chunk for _, chunk in chunks])
             for (name, chunk), outcomes in zip(chunks, driven, strict=True):
+                road = name, self.task, str(chunk.condition)
                 trials = [
-                    Trial(
-                        name,
-                        self.task,
-                        str(chunk.condition),
-                        o.seed,
-                        o.cause,
-                        round(o.progress, 3),
-                        o.steps,
-                        round(o.trust, 4),
-                    )
-                    for o in outcomes
+                    Trial(*road, o.seed, o.cause, round(o.progress, 3), o.steps, round(o.trust, 4)) for o in outcomes
                 ]
                 self._append(trials)
                 bar.update(len(trials))
@@ -139,43 +130,42 @@ def validate(
     """Drives missing episodes and writes `validation/`; returns the contents of its `summary.json`.
 
     Raises:
-        InputError: unknown policy, scene, task or lighting; a table with episodes of other policies under the same
-            names or of another build; an episode with another outcome when it is driven again for its film; another
-            process that writes the same tables.
+        InputError: unknown policy, scene, task or lighting; tables of another build, or of other policies with the same
+            names; an episode that ends differently when it is filmed; another process that writes the same tables.
     """
     twin = load_scene(root)
     folder = twin.scene.validation
-    policies = _policies(root, sources, trust)
+    policies = _named(root, sources, trust)
     lightings = tuple(dict.fromkeys(lightings))
     with exclusive_lock(folder.with_name(".validation.lock"), f"policies are being driven for {folder}"):
         _drop_partial_row(folder / "episodes.csv")
         _drop_partial_row(folder / "worst.csv")
         _check_same(folder, twin, task, (*lightings, *(["drawn_"] if worst else [])), policies)
-        todo = Campaign(twin, task, folder / "episodes.csv", policies, processes, ray)
+        how = policies, trust, processes, ray
+        todo = Campaign(twin, task, folder / "episodes.csv", *how)
         wanted = [(name, one, lighting_seeds(one, episodes)) for name in policies for one in lightings]
         driven = todo.drive(wanted, "validate")
         if worst:
-            searched = Campaign(twin, task, folder / "worst.csv", policies, processes, ray)
+            searched = Campaign(twin, task, folder / "worst.csv", *how)
             for name in policies:
                 _search_worst_lighting(searched, name, episodes)
         results = _write_results(twin)
         if films:
-            for name, (source, _) in policies.items():
+            for name, source in policies.items():
                 _write_films(root, folder, source, trust, [t for t in driven if t.policy == name])
             results = _write_results(twin)
         return results
 
 
 def _write_results(twin: Twin) -> dict:
-    """Writes `cells.csv`, `summary.json`, maps and page from the tables; returns the summary."""
+    """Writes `cells.csv`, `summary.json`, maps and the page from the tables; returns the summary."""
     folder, trials = twin.scene.validation, read_trials(twin.scene.episodes_csv)
     write_text(twin.scene.cells_csv, cells_csv(tally(trials)))
     results = summarize(trials)
     results["training"] = training_summaries(twin.scene.root, dict.fromkeys(t.policy for t in trials))
     results["worst"] = _worst_lightings(folder / "worst.csv")
     results["robot_known"] = measured_parameters(twin.world().robot)
-    films = folder / "films" / "films.json"
-    results["films"] = _read_films(films)
+    results["films"] = _read_films(folder)
     write_json(folder / "summary.json", results)
     _draw_maps(twin, folder, trials)
     runs = dict.fromkeys(trained["run"] for trained in results["training"].values())
@@ -185,8 +175,8 @@ def _write_results(twin: Twin) -> dict:
 
 
 def _worst_lightings(path: Path) -> list[dict]:
-    """A cell for every policy and task with a search: the final evaluation in the worst lighting."""
-    trials = read_trials(path) if path.exists() and _has_rows(path) else []
+    """The final evaluation in the worst lighting, a cell for every policy and task with a search."""
+    trials = _read_table(path)
     cells = summarize([t for t in trials if t.seed >= _FINAL_SEED])["cells"]
     return [
         c | {"of": len({t.lighting for t in trials if (t.policy, t.task) == (c["policy"], c["task"])})} for c in cells
@@ -198,8 +188,7 @@ def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Seq
     from twin.film import film, film_name
     from twin.report.video_writer import last_frame_jpeg
 
-    recorded = folder / "films" / "films.json"
-    before = _read_films(recorded)
+    before = _read_films(folder)
     chosen: dict[Trial, list[str]] = {}
     for kind, trial in (("typical", typical_episode(trials)), ("worst", worst_episode(trials))):
         chosen.setdefault(trial, []).append(kind)
@@ -225,11 +214,12 @@ def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Seq
         files = {"file": path.relative_to(folder).as_posix(), "poster": poster.relative_to(folder).as_posix()}
         mine.append(entry | files)
     key = trials[0].policy, trials[0].task
-    write_json(recorded, [one for one in before if (one["policy"], one["task"]) != key] + mine)
+    write_json(folder / "films" / "films.json", [one for one in before if (one["policy"], one["task"]) != key] + mine)
 
 
-def _read_films(path: Path) -> list[dict]:
-    """The entries of `films.json`, if there is one. Raises InputError for contents not written by `_write_films`."""
+def _read_films(folder: Path) -> list[dict]:
+    """The entries of `films.json`; none without the file. Raises InputError if `_write_films` did not write it."""
+    path = folder / "films" / "films.json"
     if not path.exists():
         return []
     with wrap_read_errors(path, "delete it, and the films are recorded again"):
@@ -243,18 +233,15 @@ def _read_films(path: Path) -> list[dict]:
 def lighting_seeds(lighting: str, episodes: int) -> range:
     """Seeds of a lighting's episodes, the same for every policy and different for every lighting.
 
-    A seed also determines start, robot, weather and distractors: a seed shared by ten lightings would be little more
-    than one episode, and a confidence interval for ten would be too narrow.
+    A seed also determines start, robot, weather and distractors: episodes of ten lightings with the same seed would be
+    correlated, and a confidence interval for ten too narrow.
     """
     first = _FIRST_SEED + _PER_LIGHTING * (crc32(lighting.encode()) % _BLOCKS)
     return range(first, first + episodes)
 
 
 def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None:
-    """Searches a policy's worst among sampled lightings by successive halving, then evaluates it in new episodes.
-
-    Ties in success are broken by progress.
-    """
+    """Finds a policy's worst of sampled lightings by successive halving, and evaluates it in new episodes."""
     seeds = range(_SEARCH_SEED, _SEARCH_SEED + _SEARCH_EPISODES)
     candidates = [f"drawn_{k}" for k in range(_SEARCH_LIGHTINGS)]
     trials_by_lighting: dict[str, list[Trial]] = {name: [] for name in candidates}
@@ -263,9 +250,8 @@ def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None
         trials = search.drive(wanted, f"worst lighting of {len(candidates)}")
         for trial in trials:
             trials_by_lighting[trial.lighting].append(trial)
-        scores = {name: _score(trials_by_lighting[name]) for name in candidates}
         kept = _SEARCH_KEPT if len(candidates) > _SEARCH_KEPT else 1
-        candidates = sorted(candidates, key=lambda name: scores[name])[:kept]
+        candidates = sorted(candidates, key=lambda name: _score(trials_by_lighting[name]))[:kept]
         seeds = range(seeds.stop, seeds.stop + 2 * len(seeds))
     # The minimum over many noisy scores is biased, hence an independent evaluation.
     final = range(_FINAL_SEED, _FINAL_SEED + episodes)
@@ -276,30 +262,26 @@ def _score(trials: Sequence[Trial]) -> tuple[float, float]:
     return sum(t.success for t in trials) / len(trials), sum(t.progress for t in trials) / len(trials)
 
 
-def _policies(root: Path, sources: Sequence[str], trust: bool) -> dict[str, tuple[str, bool]]:
-    """Source and trust by name in tables; each policy is loaded once to report errors early."""
-    out: dict[str, tuple[str, bool]] = {}
+def _named(root: Path, sources: Sequence[str], trust: bool) -> dict[str, str]:
+    """Sources of policies by their name in tables; loads each policy once to report errors early."""
+    out: dict[str, str] = {}
     for source in sources:
         where = find_policy(root, source)
         name = load_policy(where, trust).name
-        if out.get(name, (where, trust)) != (where, trust):
-            raise InputError(f"two policies are named {name!r}: {out[name][0]} and {where}; rename one")
-        out[name] = (where, trust)
+        if out.setdefault(name, where) != where:
+            raise InputError(f"two policies are named {name!r}: {out[name]} and {where}; rename one")
     return out
 
 
-def _check_same(
-    folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, tuple[str, bool]]
-) -> None:
-    """Records digests of policies and roads (task and lighting). Raises InputError if one in the tables has changed."""
+def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, str]) -> None:
+    """Records digests of policies and of roads (task and lighting). Raises InputError if one in the tables changed."""
     path = folder / "validated.json"
     recorded: dict[str, Any] = {"roads": {}, "policies": {}}
     if path.exists():
         with wrap_read_errors(path, f"move {folder} away to validate again"):
             stored = dict(read_json(path))
             recorded |= {name: dict(stored[name]) for name in recorded if name in stored}
-    tables = [folder / "episodes.csv", folder / "worst.csv"]
-    trials = [trial for table in tables if table.exists() and _has_rows(table) for trial in read_trials(table)]
+    trials = [*_read_table(folder / "episodes.csv"), *_read_table(folder / "worst.csv")]
     driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}
     for lighting in lightings:
         road, digest = _road(task, lighting), fingerprint(twin, task, Condition.parse(lighting))
@@ -309,7 +291,7 @@ def _check_same(
                 "or twin's sampling of episodes changed; move it away to validate again"
             )
         recorded["roads"][road] = digest
-    for name, (source, _) in policies.items():
+    for name, source in policies.items():
         digest = _digest(Path(source), source)
         if name in driven and recorded["policies"].get(name) != digest:
             raise InputError(
@@ -327,7 +309,7 @@ def _road(task: str, lighting: str) -> str:
 
 
 def _digest(path: Path, source: str) -> str:
-    """Digest of a policy's files, or of the name of a callable, whose code is unknown."""
+    """Digest of a policy's files, or of the name of a function, whose code is unknown."""
     if path.is_dir():
         return digest_file(path / JSON)  # it contains the digest of the weights
     return digest_file(path) if path.is_file() else digest_json(source)
@@ -357,8 +339,9 @@ def _drop_partial_row(path: Path) -> None:
             path.write_bytes(whole) if whole else path.unlink()
 
 
-def _has_rows(path: Path) -> bool:
-    return path.read_bytes().count(b"\n") > 1
+def _read_table(path: Path) -> list[Trial]:
+    """The trials in a table; none if it is missing or has no rows."""
+    return read_trials(path) if path.exists() and path.read_bytes().count(b"\n") > 1 else []
 
 
 def command(given: argparse.Namespace) -> None:

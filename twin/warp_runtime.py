@@ -1,7 +1,4 @@
-"""Warp, started without noise. Modules with kernels import `wp` from here.
-
-Warp's C library prints a warning where there is no CUDA driver, which none of its settings silences.
-"""
+"""Warp without its warning about a missing CUDA driver, which no setting silences; `wp` is imported from here."""
 
 import contextlib
 import os
@@ -18,7 +15,7 @@ _EXPECTED = b"Could not find or load the NVIDIA CUDA driver"
 
 @contextlib.contextmanager
 def _without_the_warning() -> Iterator[None]:
-    """Holds back what the block prints on standard error, and passes on every line but the expected one."""
+    """Captures what the block prints on standard error, and passes on all but the expected line."""
     try:
         sys.stderr.flush()
         real = os.dup(2)
