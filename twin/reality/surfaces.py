@@ -53,8 +53,9 @@ def road(
             manhole(image, center, int(rng.uniform(0.22, 0.36) / pixel))
             if section.kerb_height > 0.0:
                 gully(image, int(np.clip(station + 4.0, 1.0, length - 1.0) / pixel), rng.random() < 0.5, pixel)
-    leaves = np.array([[0.55, 0.42, 0.16], [0.42, 0.28, 0.12], [0.38, 0.42, 0.18], [0.6, 0.5, 0.25]], np.float32)
-    speckle(rng, image, int(length * surface.litter), (1.0, 4.0), leaves)
+    fallen = np.array([[0.55, 0.42, 0.16], [0.42, 0.28, 0.12], [0.38, 0.42, 0.18], [0.45, 0.44, 0.42]], np.float32)
+    fallen = fallen[rng.permutation(4)[: int(rng.integers(1, 4))]] * rng.uniform(0.5, 1.1, 3).astype(np.float32)
+    speckle(rng, image, int(length * surface.litter), (0.8, float(rng.uniform(1.4, 3.2))), fallen)
     return np.clip(image, 0.02, 1.0)
 
 
@@ -108,7 +109,7 @@ def _slab_field(
         c = c + 0.5 * (r.astype(int) % 2)
     i, j = r.astype(int), c.astype(int)
     tones = rng.normal(1.0, spread, (int(i.max()) + 1, int(j.max()) + 1)).astype(np.float32)
-    warm = rng.normal(0.0, 0.35 * spread, tones.shape).astype(np.float32)
+    warm = rng.normal(0.0, 0.15 * spread, tones.shape).astype(np.float32)
     image *= tones[i, j][..., None] * (1.0 + warm[i, j][..., None] * np.array([1.0, 0.0, -1.0], np.float32))
     seams = ((r % 1.0) * unit[0] < gap) | ((c % 1.0) * unit[1] < gap)
     moss = np.clip(0.7 + 0.3 * fbm(rng, image.shape[:2], 60, 4.0), 0.2, 1.0)
