@@ -73,9 +73,7 @@ def _road_and_camera(light: Lighting, number: int) -> tuple[TrueRoad, RealCamera
     road, size = _true_road(number), husky.params.camera_size
     intrinsics = road.intrinsics(size)
     model = true_world.world_spec(light, road.place).compile()
-    raster = (
-        Rasterizer(model, intrinsics, size, shadow_range(road.place)) if number else Rasterizer(model, intrinsics, size)
-    )
+    raster = Rasterizer(model, intrinsics, size, shadow_range(road.place))
     return road, RealCamera(raster, light, husky, intrinsics, size, np.random.default_rng([SEED, 43]))
 
 
