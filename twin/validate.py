@@ -91,9 +91,9 @@ class Campaign:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
             driven = self._campaign([chunk for _, chunk in chunks])
             for (name, chunk), outcomes in zip(chunks, driven, strict=True):
-                road = name, self.task, str(chunk.condition)
+                drive = name, self.task, str(chunk.condition)
                 trials = [
-                    Trial(*road, o.seed, o.cause, round(o.progress, 3), o.steps, round(o.trust, 4)) for o in outcomes
+                    Trial(*drive, o.seed, o.cause, round(o.progress, 3), o.steps, round(o.trust, 4)) for o in outcomes
                 ]
                 self._append(trials)
                 bar.update(len(trials))

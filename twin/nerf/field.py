@@ -84,7 +84,8 @@ class RadianceField:
         self.w_levels.mask = wp.uint32(2**layout.log2_table - 1)
         self.w_grids: Any = sampler.OpacityGrids()
         self.w_grids.near, self.w_grids.far = (warp_view(grid, wp.float32) for grid in grids)
-        (_, self.w_grids.near_cell), (_, self.w_grids.far_cell) = opacity_grid_sizes(layout.near_box)
+        cells_of_grids: Any = opacity_grid_sizes(layout.near_box)
+        (_, self.w_grids.near_cell), (_, self.w_grids.far_cell) = cells_of_grids
         self.contraction: Any = space.Contraction()
         self.contraction.center = wp.vec3f(*layout.centre)
         self.contraction.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))

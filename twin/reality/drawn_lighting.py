@@ -75,7 +75,8 @@ def _scaled(color: Rgb, factor: float) -> Rgb:
 
 def place_sky(spec: PlaceSpec, lighting: Lighting) -> NDArray[np.uint8]:
     """The cube map of the sky of a place under a lighting."""
-    tinted = replace(lighting, skyline=tuple(a * b for a, b in zip(lighting.skyline, spec.horizon.tint, strict=True)))
+    red, green, blue = (a * b for a, b in zip(lighting.skyline, spec.horizon.tint, strict=True))
+    tinted = replace(lighting, skyline=(red, green, blue))
     seed = SEED + 1000 * spec.number
     return sky_cube_map(tinted, seed, skyline=skyline(spec.horizon, stream(spec.number, "horizon", 1)))
 

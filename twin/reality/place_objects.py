@@ -6,7 +6,7 @@ small to matter). Stations and laterals are those of `centerline.py`.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from twin.reality import primitives
 from twin.reality.primitives import MeshPart
 from twin.types import Array
-
-if TYPE_CHECKING:
-    from twin.reality.lighting import Lighting
 
 SEED = 20  # of the place, its textures, sky and films
 ATLAS_CELL = 256  # [px] per side of a cell
@@ -31,7 +28,7 @@ CELLS = (
 """Names of the cells that every atlas begins with, row by row."""
 
 
-class Road(Protocol):
+class DrivenLine(Protocol):
     """A driven line and the ground around it."""
 
     @property
@@ -116,13 +113,13 @@ class PlaceObject:
 class KnownPlace:
     """A whole place: its road, its objects, and all that a picture of it needs."""
 
-    route: Road
+    route: DrivenLine
     layout: GroundLayout
     textures: Callable[[], dict[str, NDArray[np.uint8]]]
     """Returns all textures by name, uint8 RGB."""
-    lightings: "Mapping[str, Lighting]"
-    """Lightings of its films by name."""
-    sky: "Callable[[Lighting], NDArray[np.uint8]]"
+    lightings: Mapping[str, Any]
+    """`Lighting`s of its films by name."""
+    sky: Callable[[Any], NDArray[np.uint8]]
     """Returns the cube map of the sky under a lighting; see `lighting.sky_cube_map`."""
     number: int = 0
     seed: tuple[int, ...] = (SEED,)

@@ -6,6 +6,7 @@
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +70,11 @@ class Truth:
         arrays = {f"{key}_{name}": value for name, film in self.films.items() for key, value in vars(film).items()}
         np.savez_compressed(folder / "truth.npz", intrinsics=self.intrinsics, **arrays)
         road = asdict(self.route) if isinstance(self.route, RoadLine) else self.number
-        head = {"route" if self.number == 0 else "place": road, "start": self.start, "length": self.length}
+        head: dict[str, Any] = {
+            "route" if self.number == 0 else "place": road,
+            "start": self.start,
+            "length": self.length,
+        }
         head |= {"half_width": self.half_width}
         if self.number > 0:
             head |= {"lightings": self.lightings, "camera_height": self.camera_height}
