@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_review import ChequeredField, make_cameras
+from test_review import CheckeredField, make_cameras
 
 from twin.geometry.cameras import PosedCameras
 from twin.nerf.evaluate import cross_lighting, mean_color
@@ -19,7 +19,7 @@ def quiet():
     set_quiet(False)
 
 
-class Stubborn(ChequeredField):
+class Stubborn(CheckeredField):
     """A field that always shows its first lighting, and lies further away in the second one."""
 
     def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
@@ -28,7 +28,7 @@ class Stubborn(ChequeredField):
 
 
 def test_colour_follows_the_light_where_only_brightness_differs(tmp_path: Path) -> None:
-    field = ChequeredField({"day": 1.0, "night": 0.3})
+    field = CheckeredField({"day": 1.0, "night": 0.3})
     found = cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field), max_poses=10)
     assert found is not None and found["poses"] == 10
     assert found["colour_follows"] == {"day": 1.0, "night": 1.0}
@@ -41,14 +41,14 @@ def test_colour_follows_the_light_where_only_brightness_differs(tmp_path: Path) 
 
 
 def test_equal_lightings_are_a_draw(tmp_path: Path) -> None:
-    field = ChequeredField({"day": 0.8, "again": 0.8})
+    field = CheckeredField({"day": 0.8, "again": 0.8})
     found = cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field))
     assert found is not None and found["colour_follows"] == {"day": 0.5, "again": 0.5}
 
 
 def test_a_field_that_ignores_the_lighting_is_detected(tmp_path: Path) -> None:
     brightness = {"day": 1.0, "night": 0.3}
-    cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField(brightness))
+    cameras = make_cameras(tmp_path / "build" / "2_metric", CheckeredField(brightness))
     found = cross_lighting(Stubborn(brightness), cameras)
     assert found is not None
     assert found["colour_follows"]["night"] == 0.0  # places filmed by day stay as they were
@@ -56,7 +56,7 @@ def test_a_field_that_ignores_the_lighting_is_detected(tmp_path: Path) -> None:
 
 
 def test_one_lighting_gives_no_result(tmp_path: Path) -> None:
-    field = ChequeredField({"day": 1.0})
+    field = CheckeredField({"day": 1.0})
     assert cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field)) is None
 
 

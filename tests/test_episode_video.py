@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_review import ChequeredField, make_cameras
+from test_review import CheckeredField, make_cameras
 from tqdm import tqdm
 
 from twin.env.drivers import RecordedDrive
@@ -84,7 +84,7 @@ def test_a_long_drive_is_shown_faster(instants: int, fps: int) -> None:
     ("outcome", "instants"), [("goal", 101), ("touched", 101), ("off_corridor", 101), ("timeout", 101), ("touched", 1)]
 )
 def test_the_drive_is_filmed_within_its_budget(tmp_path: Path, outcome: str, instants: int) -> None:
-    field = ChequeredField({"day": 1.0, "night": 0.25})
+    field = CheckeredField({"day": 1.0, "night": 0.25})
     cameras = make_cameras(tmp_path / "build" / "2_metric", field)
     field.asked.clear()
     drive = drive_along(np.linspace(0, 10, instants), np.zeros(instants), np.zeros(instants), outcome, ("tree",))
@@ -105,4 +105,4 @@ def test_the_drive_is_filmed_within_its_budget(tmp_path: Path, outcome: str, ins
     assert 0 < studio.renders <= 12
     assert field.asked[0] == "day" and field.asked[-1] == ("night" if instants > 1 else "day")
     assert len(list(read_frames(tmp_path / "film.mp4"))) == writer.frames > len(indices)
-    assert {picture.section for picture in studio.pictures} == {"poster", "review"}
+    assert {picture["section"] for picture in studio.pictures} == {"poster", "review"}

@@ -1,4 +1,4 @@
-"""Figures: they show the numbers they are given, follow the page's colours, and cannot break the page."""
+"""Figures: they show the numbers they are given, follow the page's colors, and cannot break the page."""
 
 import re
 from html.parser import HTMLParser
@@ -63,11 +63,11 @@ def every_figure() -> dict[str, figures.Figure]:
     )
     parts = [np.array([[1.0, 2.0], [2.0, 2.0], [2.0, 3.0]])]
     points = rng.normal(size=(300, 3)) * 5
-    colours = rng.integers(0, 255, (300, 3)).astype(np.uint8)
+    colors = rng.integers(0, 255, (300, 3)).astype(np.uint8)
     half = np.arange(10) % 2 == 0
     return {
-        "place": figures.place_map(positions, ["a"] * 5 + ["b"] * 5, half, points, colours, route, 1.0),
-        "bare place": figures.place_map(positions, ["a"] * 10, half, points[:0], colours[:0]),
+        "place": figures.place_map(positions, ["a"] * 5 + ["b"] * 5, half, points, colors, route, 1.0),
+        "bare place": figures.place_map(positions, ["a"] * 10, half, points[:0], colors[:0]),
         "ground": figures.ground_map(ground, route, route, 1.0, parts),
         "bare ground": figures.ground_map(ground, route, None, 0.0, []),
         "training": figures.curve_chart({"": ([0, 10, 20], [10.0, 15.0, 17.0])}, "step", "PSNR [dB]"),

@@ -50,8 +50,8 @@ from twin.report.video_writer import read_frames, video_info
 from twin.scene import SceneDir
 
 
-class ChequeredField:
-    """A radiance field of a chequered floor at z = 0 under a sky; a lighting is a brightness."""
+class CheckeredField:
+    """A radiance field of a checkered floor at z = 0 under a sky; a lighting is a brightness."""
 
     def __init__(self, brightness: dict[str, float]):
         self.brightness = brightness
@@ -78,12 +78,12 @@ class ChequeredField:
         depth = np.where(down, -pose[2, 3] / np.where(down, rays[..., 2], -1.0), FAR)
         floor = pose[:3, 3] + rays * depth[..., None]
         odd = (np.floor(floor[..., 0]) + np.floor(floor[..., 1])) % 2
-        colour = np.stack([0.3 + 0.4 * odd, 0.35 + 0.3 * odd, 0.3 + 0.2 * odd], -1)
-        rgb = level * np.where(down[..., None], colour, [0.5, 0.7, 1.0])
+        color = np.stack([0.3 + 0.4 * odd, 0.35 + 0.3 * odd, 0.3 + 0.2 * odd], -1)
+        rgb = level * np.where(down[..., None], color, [0.5, 0.7, 1.0])
         return rgb, depth, down.astype(float)
 
 
-def make_cameras(folder: Path, field: ChequeredField, frames: int = 12, size: tuple[int, int] = (96, 54)) -> Cameras:
+def make_cameras(folder: Path, field: CheckeredField, frames: int = 12, size: tuple[int, int] = (96, 54)) -> Cameras:
     """Saved cameras on a straight path under each lighting, with images of the field; a metric stage's result."""
     lightings = [name for name in field.lightings for _ in range(frames)]
     x = np.tile(np.linspace(0.0, 22.0, frames), len(field.lightings))
@@ -110,7 +110,7 @@ def make_cameras(folder: Path, field: ChequeredField, frames: int = 12, size: tu
 
 def config(**review: float) -> SceneConfig:
     small = {"width": 160, "render_width": 48, "renders": 20, "fps": 5} | review
-    return SceneConfig(name="chequers", source=(SourceConfig("a.mp4"),), review=ReviewConfig(**small))  # type: ignore[arg-type]
+    return SceneConfig(name="checkers", source=(SourceConfig("a.mp4"),), review=ReviewConfig(**small))  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def scene(tmp_path: Path) -> SceneDir:
 
 
 def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path: Path) -> None:
-    field = ChequeredField({"day": 1.0, "night": 0.25})
+    field = CheckeredField({"day": 1.0, "night": 0.25})
     make_cameras(scene.stage("metric"), field)
     field.asked.clear()
     out = tmp_path / "out"
@@ -141,7 +141,7 @@ def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path
 
 
 def test_a_route_that_was_not_wanted_is_told_apart(scene: SceneDir, tmp_path: Path) -> None:
-    field = ChequeredField({"day": 1.0})
+    field = CheckeredField({"day": 1.0})
     make_cameras(scene.stage("metric"), field)
     out = tmp_path / "out"
     out.mkdir()
@@ -154,7 +154,7 @@ def test_a_route_that_was_not_wanted_is_told_apart(scene: SceneDir, tmp_path: Pa
 
 
 def test_the_same_scene_makes_the_same_files(scene: SceneDir, tmp_path: Path) -> None:
-    field = ChequeredField({"day": 1.0, "night": 0.25})
+    field = CheckeredField({"day": 1.0, "night": 0.25})
     make_cameras(scene.stage("metric"), field)
     contents = []
     for name in ("a", "b"):
@@ -166,7 +166,7 @@ def test_the_same_scene_makes_the_same_files(scene: SceneDir, tmp_path: Path) ->
 
 
 def test_frames_to_compare_show_both_kinds_in_order(tmp_path: Path) -> None:
-    cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField({"day": 1.0, "night": 0.3}))
+    cameras = make_cameras(tmp_path / "build" / "2_metric", CheckeredField({"day": 1.0, "night": 0.3}))
     chosen = frames_to_compare(cameras, "night", 6)
     assert chosen == sorted(chosen) and len(chosen) == len(set(chosen)) == 6
     assert {cameras.lightings[i] for i in chosen} == {"night"}
@@ -174,8 +174,8 @@ def test_frames_to_compare_show_both_kinds_in_order(tmp_path: Path) -> None:
     assert frames_to_compare(cameras, "dusk", 6) == []
 
 
-def test_a_held_out_frame_gets_the_light_of_its_neighbours(tmp_path: Path) -> None:
-    cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField({"day": 1.0, "night": 0.3}))
+def test_a_held_out_frame_gets_the_light_of_its_neighbors(tmp_path: Path) -> None:
+    cameras = make_cameras(tmp_path / "build" / "2_metric", CheckeredField({"day": 1.0, "night": 0.3}))
     assert appearance_of_frame(cameras, 13) == "night/000001"
     assert appearance_of_frame(cameras, 14) == "night/000001:night/000003:0.5"
     last = cameras.select(np.arange(3))  # its last frame is held out
@@ -184,7 +184,7 @@ def test_a_held_out_frame_gets_the_light_of_its_neighbours(tmp_path: Path) -> No
 
 
 def test_the_nearest_frame_is_at_the_same_place(tmp_path: Path) -> None:
-    cameras = make_cameras(tmp_path / "build" / "2_metric", ChequeredField({"day": 1.0, "night": 0.3}))
+    cameras = make_cameras(tmp_path / "build" / "2_metric", CheckeredField({"day": 1.0, "night": 0.3}))
     assert nearest_frame(cameras, 3, "night") == 12 + 3
     assert nearest_frame(cameras, 3, "dusk") is None
 
@@ -276,7 +276,7 @@ def test_a_bird_looks_along_the_route() -> None:
         assert pose[0, 2] > 0.5 and pose[2, 2] < 0 and pose[2, 3] > 1.0
 
 
-def test_what_is_masked_is_grey_and_the_rest_untouched() -> None:
+def test_what_is_masked_is_gray_and_the_rest_untouched() -> None:
     image = np.random.default_rng(0).integers(0, 255, (40, 60, 3)).astype(np.uint8)
     ignored = np.zeros((40, 60), bool)
     ignored[:, :20] = True
@@ -318,8 +318,10 @@ def test_work_ahead_stops_when_nobody_reads() -> None:
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_a_judged_row_shows_the_lighting_as_learnt_and_scores_what_is_not_masked(tmp_path: Path, masked: bool) -> None:
-    field = ChequeredField({"day": 1.0, "night": 0.25})
+def test_a_comparison_row_shows_the_lighting_as_learned_and_scores_what_is_not_masked(
+    tmp_path: Path, masked: bool
+) -> None:
+    field = CheckeredField({"day": 1.0, "night": 0.25})
     cameras = make_cameras(tmp_path / "build" / "2_metric", field, size=(320, 180))
     if masked:
         cameras = dataclasses.replace(cameras, masks=tmp_path / "masks")

@@ -341,7 +341,7 @@ def test_names_of_many_lightings_leave_room_for_the_rates(lights):
 
 
 def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
-    """Text and colour of every tile of a figure, by its row's and its column's name."""
+    """Text and color of every tile of a figure, by its row's and its column's name."""
     (axes,) = figure.axes
     rows, columns = ([t.get_text() for t in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels()))
     (drawn,) = axes.collections
@@ -390,11 +390,11 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
         ("good  1", "2"): "+18", ("good  1", "3"): "+20", ("fair  2", "1"): "−18",
         ("fair  2", "3"): "(+2)", ("poor  3", "1"): "−20", ("poor  3", "2"): "(−2)",
     }  # fmt: skip
-    colour = {key: face for key, (_, face) in drawn.items()}
-    assert to_hex(colour["good  1", "2"]) == SERIES[0] and to_hex(colour["fair  2", "1"]) == SERIES[1]
-    assert colour["good  1", "2"] == colour["good  1", "3"] != colour["fair  2", "1"] == colour["poor  3", "1"]
-    chance = colour["fair  2", "3"]
-    assert chance == colour["poor  3", "2"] and chance[3] < colour["good  1", "2"][3]
+    color = {key: face for key, (_, face) in drawn.items()}
+    assert to_hex(color["good  1", "2"]) == SERIES[0] and to_hex(color["fair  2", "1"]) == SERIES[1]
+    assert color["good  1", "2"] == color["good  1", "3"] != color["fair  2", "1"] == color["poor  3", "1"]
+    chance = color["fair  2", "3"]
+    assert chance == color["poor  3", "2"] and chance[3] < color["good  1", "2"][3]
 
 
 def test_what_never_drove_the_same_is_not_compared():

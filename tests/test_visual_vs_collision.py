@@ -1,4 +1,4 @@
-"""Seen equals touched: a field that shows the solid scene itself, and fields that do not."""
+"""Visual against collision geometry: a field that shows the collision geometry itself, and fields that do not."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def place(tmp_path_factory):
     mesh = SceneDir(root).stage("mesh")
     eyes = np.array([point_at(world.route, s) + np.array([0.0, 0.013, 0.6]) for s in STATIONS])
     poses = np.array([look_at(eye, eye + np.array([1.0, 0.007, -0.1])) for eye in eyes])
-    looks = render_views(SolidField(world.model()), world, poses, "day")
+    views = render_views(SolidField(world.model()), world, poses, "day")
     above = [look_at(np.array([3.0 + x, 0.0, 12.0]), np.array([3.01, 0.0, 0.0])) for x in (0.0, 1.0)]
     cameras = replace(
         Cameras.load(SceneDir(root).stage("metric")).select(np.array([1, 1])),
@@ -65,12 +65,12 @@ def place(tmp_path_factory):
         intrinsics=np.tile([300.0, 300.0, 320.0, 180.0], (2, 1)),
         held_out=np.zeros(2, bool),
     )
-    return world, looks, cameras, Ground.load(mesh), Parts.load(mesh / "parts.npz")
+    return world, views, cameras, Ground.load(mesh), Parts.load(mesh / "parts.npz")
 
 
 def test_what_shows_the_solid_scene_has_no_gap(place):
-    world, looks, cameras, ground, parts = place
-    found = compare_geometry(looks, world, cameras, ground, parts)
+    world, views, cameras, ground, parts = place
+    found = compare_geometry(views, world, cameras, ground, parts)
     assert found["pixels"] > 5000 and found["views"] == 3
     assert found["median_m"] < 1e-3 and found["p90_m"] < 5e-3
     assert found["ground_p95_m"] < 0.01 and found["standing_median_m"] < 1e-3
@@ -79,14 +79,14 @@ def test_what_shows_the_solid_scene_has_no_gap(place):
 
 
 def test_what_is_seen_above_the_corridor_is_a_leak(place):
-    world, looks, cameras, ground, parts = place
-    points = looks.points(looks.collision_depth, world.intrinsics)
-    s_near = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
+    world, views, cameras, ground, parts = place
+    points = views.points(views.collision_depth, world.intrinsics)
+    s_near = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & views.is_ground
     assert s_near.sum() > 30
     # The ground there is seen as if it were 0.35 m higher, along the same rays.
-    eye = looks.camera_to_world[:, None, None, 2, 3]
+    eye = views.camera_to_world[:, None, None, 2, 3]
     share = (eye - points[..., 2] - 0.35) / (eye - points[..., 2])
-    raised = replace(looks, visual_depth=np.where(s_near, looks.visual_depth * share, looks.visual_depth))
+    raised = replace(views, visual_depth=np.where(s_near, views.visual_depth * share, views.visual_depth))
     found = compare_geometry(raised, world, cameras, ground, parts)
     assert found["corridor_leak_m"] == pytest.approx(0.35, abs=0.1)
     assert found["corridor_ghost_m"] < 0.02
@@ -94,12 +94,12 @@ def test_what_is_seen_above_the_corridor_is_a_leak(place):
 
 
 def test_what_is_solid_but_seen_through_is_a_ghost_and_unfilmed_ones_are_told_apart(place):
-    world, looks, cameras, ground, parts = place
-    points = looks.points(looks.collision_depth, world.intrinsics)
-    hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
-    eye = looks.camera_to_world[:, None, None, 2, 3]
+    world, views, cameras, ground, parts = place
+    points = views.points(views.collision_depth, world.intrinsics)
+    hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & views.is_ground
+    eye = views.camera_to_world[:, None, None, 2, 3]
     share = (eye - points[..., 2] + 0.28) / (eye - points[..., 2])
-    sunk = replace(looks, visual_depth=np.where(hole, looks.visual_depth * share, looks.visual_depth))
+    sunk = replace(views, visual_depth=np.where(hole, views.visual_depth * share, views.visual_depth))
     found = compare_geometry(sunk, world, cameras, ground, parts)
     assert found["corridor_ghost_m"] == pytest.approx(0.28, abs=0.06)
     assert found["corridor_leak_m"] < 0.02 and found["unfilmed_ghost_m"] < 0.02
@@ -112,12 +112,12 @@ def test_what_is_solid_but_seen_through_is_a_ghost_and_unfilmed_ones_are_told_ap
 @pytest.fixture
 def sunk(place):
     """Looks through a hole of 0.28 m in the ground before the robot."""
-    world, looks, *_ = place
-    points = looks.points(looks.collision_depth, world.intrinsics)
-    hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & looks.is_ground
-    eye = looks.camera_to_world[:, None, None, 2, 3]
+    world, views, *_ = place
+    points = views.points(views.collision_depth, world.intrinsics)
+    hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & views.is_ground
+    eye = views.camera_to_world[:, None, None, 2, 3]
     share = (eye - points[..., 2] + 0.28) / (eye - points[..., 2])
-    return replace(looks, visual_depth=np.where(hole, looks.visual_depth * share, looks.visual_depth))
+    return replace(views, visual_depth=np.where(hole, views.visual_depth * share, views.visual_depth))
 
 
 @pytest.mark.parametrize(
@@ -154,31 +154,31 @@ def test_only_two_directions_of_one_film_determine_a_depth(place, sunk, what, tw
 
 
 def test_a_part_that_is_not_seen_is_a_ghost_and_one_that_is_not_solid_a_leak(place):
-    world, looks, cameras, ground, parts = place
-    part = ~looks.is_ground & (looks.collision_depth < 8.0)
+    world, views, cameras, ground, parts = place
+    part = ~views.is_ground & (views.collision_depth < 8.0)
     assert part.sum() > 50
     unseen = compare_geometry(
-        replace(looks, visual_depth=np.where(part, FAR, looks.visual_depth)), world, cameras, ground, parts
+        replace(views, visual_depth=np.where(part, FAR, views.visual_depth)), world, cameras, ground, parts
     )
     assert unseen["ghost_share"] > 0.5 and unseen["leak_share"] in (None, 0.0)
     none = Parts([], [])
     leaky = compare_geometry(
-        replace(looks, collision_depth=np.where(part, FAR, looks.collision_depth)), world, cameras, ground, none
+        replace(views, collision_depth=np.where(part, FAR, views.collision_depth)), world, cameras, ground, none
     )
     assert leaky["leak_share"] is None or leaky["leak_share"] > 0.3
-    far_off = replace(looks, visual_depth=np.where(part, looks.visual_depth - 0.6, looks.visual_depth))
+    far_off = replace(views, visual_depth=np.where(part, views.visual_depth - 0.6, views.visual_depth))
     assert compare_geometry(far_off, world, cameras, ground, parts)["leak_share"] > 0.5
 
 
-def test_a_drive_is_looked_at_every_two_metres():
+def test_a_drive_is_looked_at_every_two_meters():
     poses = np.tile(np.eye(4), (101, 1, 1))
     poses[:, 0, 3] = np.linspace(0.0, 10.0, 101)
     assert view_poses(poses)[:, 0, 3] == pytest.approx([0.0, 2.0, 4.0, 6.0, 8.0])
 
 
 def test_the_page_tells_it(place, tmp_path):
-    world, looks, cameras, ground, parts = place
-    found = compare_geometry(looks, world, cameras, ground, parts)
+    world, views, cameras, ground, parts = place
+    found = compare_geometry(views, world, cameras, ground, parts)
     report = {"scene": "tiny", "seen_touched": found, "review": {"follower": None}}
     section = geometry_section(report)
     assert not section.cautions and any(fact.name == "largest collision-only in the corridor" for fact in section.facts)
@@ -189,5 +189,5 @@ def test_the_page_tells_it(place, tmp_path):
     just_over = geometry_section({"seen_touched": found | {"median_m": 0.0521}}).cautions
     assert [it.what for it in just_over] == ["Visual and collision geometry differ: 0.052 m, more than 0.05 m."]
     assert geometry_section({}).not_applicable
-    assert gap_row(looks, 0).shape[1] > 4 * 300
-    assert isinstance(looks, GeometryViews)
+    assert gap_row(views, 0).shape[1] > 4 * 300
+    assert isinstance(views, GeometryViews)

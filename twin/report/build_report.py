@@ -74,7 +74,9 @@ def _reconstruction_charts(scene: SceneDir) -> list[Chart]:
     if not len(points):
         return []
     error = figures.histogram(points.error, "mean reprojection error [px]", "points", _MAX_REPROJECTION)
-    tracks = figures.histogram(points.track_length, "frames that observe it", "points", _MAX_TRACK_LENGTH, integer=True)
+    tracks = figures.histogram(
+        points.track_length, "frames that observe a point", "points", _MAX_TRACK_LENGTH, integer=True
+    )
     return [
         Chart("Reprojection error of points", figures.svg(error), "cameras"),
         Chart("Track length of points", figures.svg(tracks), "cameras"),

@@ -169,9 +169,8 @@ def place_map(
         # Films of one path overlap; later sources get smaller markers so that all remain visible.
         size = 16.0 / (1.0 + 0.8 * i)
         axes.scatter(trained[:, 0], trained[:, 1], s=size, c=color, marker=marker, linewidths=0, label=source, zorder=4)
-        axes.scatter(
-            unseen[:, 0], unseen[:, 1], s=size, facecolors="none", edgecolors=color, marker=marker, lw=0.8, zorder=4
-        )
+        hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": color, "lw": 0.8}
+        axes.scatter(unseen[:, 0], unseen[:, 1], s=size, marker=marker, zorder=4, **hollow)
     axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
     add_legend(figure)
     return figure

@@ -495,8 +495,10 @@ def _task(forecast: Forecast, task: str) -> dict[str, Any]:
         charts.append(Chart("Probability of each rank in the twin [%]", svg(rank_heatmap(mine))))
     cell_rates, differences = [], []
     if pairs and len(forecast.pairs) > MAX_TABLE_ROWS:
-        for title, figure in (("In the twin [%]", twin_heatmap), ("On the road [%]", road_heatmap)):
-            cell_rates.append(Chart(title, svg(figure(mine, pairs))))
+        for where, field, figure in (("In the twin", "twin", twin_heatmap), ("On the road", "real", road_heatmap)):
+            trials = sorted({getattr(pair, field).n for pair in pairs})
+            n = " to ".join(str(end) for end in dict.fromkeys((trials[0], trials[-1])))
+            cell_rates.append(Chart(f"{where} [%], n = {n} per cell", svg(figure(mine, pairs))))
         title = (
             "Road minus twin [percentage points]: red and below 0 where the twin was too optimistic, blue the "
             "opposite, pale and in parentheses within chance"

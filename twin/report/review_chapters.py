@@ -32,9 +32,7 @@ from twin.report.video_layout import (
     INK,
     MUTED,
     NEAREST_DEPTH,
-    PANEL_BACKGROUND,
     RED,
-    Box,
     Color,
     FrameLayout,
     MapView,
@@ -45,12 +43,11 @@ from twin.report.video_layout import (
     draw_depth_legend,
     draw_facts,
     draw_label,
-    draw_text,
+    draw_slider,
     fit,
     panel_row,
     paste,
     scale_bar,
-    shorten,
     side_by_side,
     titled_panel,
     to_uint8,
@@ -63,15 +60,6 @@ from twin.types import Array, Image
 
 _PICTURE_WIDTH = 1000  # [px] maximum, of pictures for the page
 _PICTURE_QUALITY = 82
-
-
-@dataclass(frozen=True)
-class PagePicture:
-    file: str
-    """Path within the stage folder."""
-    section: str
-    """Name of the report section."""
-    caption: str
 
 
 @dataclass
@@ -88,7 +76,8 @@ class Studio:
     render_width: int
     path: Array
     """Path on the map: the route, or the camera positions of the longest source [m], shape (n, 2)."""
-    pictures: list[PagePicture] = with_default(default_factory=list)
+    pictures: list[dict[str, str]] = with_default(default_factory=list)
+    """File within the stage folder, section and caption of each picture for the page."""
     renders: int = 0
     render_seconds: float = 0.0
 
@@ -137,7 +126,7 @@ class Studio:
         path = self.out / "pictures" / f"{name}.jpg"
         path.parent.mkdir(exist_ok=True)
         write_bytes(path, data.tobytes())
-        self.pictures.append(PagePicture(f"pictures/{name}.jpg", section, caption))
+        self.pictures.append({"file": f"pictures/{name}.jpg", "section": section, "caption": caption})
 
 
 def gray_out(image: Image, ignored: NDArray[np.bool_]) -> Image:
@@ -366,7 +355,7 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
                 paste(canvas, reals[prevailing], layout.right)
                 draw_label(canvas, f"real: {prevailing}", layout.right, size=layout.text, bold=True)
             slider, side = layout.strip(*LIGHTING_STRIP)
-            _draw_slider(canvas, slider, lightings, number + share, layout.text)
+            draw_slider(canvas, slider, lightings, number + share, layout.text)
             paste(canvas, map_with_pose(map_view, cameras.camera_to_world[i], None, layout.text), side)
             pure = share in (0.0, 1.0)
             studio.writer.write(canvas, round(_HOLD_SECONDS * studio.fps) if pure else shown)
@@ -383,26 +372,6 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
 
 def _lighting_mixture(a: str, b: str, share: float) -> str:
     return a if share <= 0.0 else b if share >= 1.0 else f"{a}:{b}:{share:.6g}"
-
-
-def _draw_slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, size: int) -> None:
-    """A slider with a stop per lighting and a knob at `at`, in stops."""
-    x, y, width, height = box
-    canvas[y : y + height, x : x + width] = PANEL_BACKGROUND
-    left, right, middle = x + round(0.08 * width), x + round(0.92 * width), y + height // 2
-    stops = np.linspace(left, right, len(lightings)).round().astype(int)
-    canvas[middle - 2 : middle + 2, left:right] = MUTED
-    room = (right - left) // max(1, len(lightings) - 1)
-    for k, (stop, name) in enumerate(zip(stops, lightings, strict=True)):
-        canvas[middle - 7 : middle + 7, stop - 2 : stop + 2] = INK
-        near = abs(at - k) < 0.5
-        align = "left" if k == 0 else "right" if k == len(lightings) - 1 else "middle"
-        edge = x + 12 if k == 0 else x + width - 12 if k == len(lightings) - 1 else int(stop)
-        text = shorten(name, room - 8, size, near)
-        draw_text(canvas, text, edge, middle + 16, size, GREEN if near else MUTED, near, align)
-    knob = round(left + (right - left) * at / max(1, len(lightings) - 1))
-    canvas[middle - 10 : middle + 10, knob - 5 : knob + 5] = AMBER
-    draw_text(canvas, "appearance", x + 12, y + 8, size, MUTED)
 
 
 # ---- drive

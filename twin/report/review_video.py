@@ -7,7 +7,6 @@ the Husky driven along the route by a scripted follower, if there is a route.
 import queue
 import threading
 from collections.abc import Iterator
-from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -124,7 +123,7 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
     if world and drive:
         metrics["seen_touched"] = _compare_geometry(studio, scene, world, drive)
     # The file contains no times, so that the same build writes the same bytes.
-    write_json(out / "review.json", metrics | {"pictures": [asdict(picture) for picture in studio.pictures]})
+    write_json(out / "review.json", metrics | {"pictures": studio.pictures})
     return metrics | {"render_seconds_per_frame": studio.render_seconds / max(1, studio.renders)}
 
 

@@ -370,7 +370,7 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tupl
             total += count
     at = point_at(line, edges[:-1] + _BIN / 2)[total > 0]
     above.scatter(*at.T, s=30.0 * total[total > 0], color="#c0392b", alpha=0.6, linewidths=0)
-    title = f"{total.sum():.0f} of {len(trials)} episodes failed; a dot’s area is the number of failures there"
+    title = f"{total.sum():.0f} of {len(trials)} episodes failed; the more fail at a place, the larger its dot"
     above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
     along.set(xlabel="distance along the task [m]", ylabel="failed episodes", xlim=(0.0, edges[-1]))
     along.yaxis.get_major_locator().set_params(integer=True)

@@ -264,6 +264,26 @@ def draw_depth_legend(canvas: Image, box: Box, size: int) -> None:
     draw_text(canvas, f"{FARTHEST_DEPTH:g} m", x + width - 8, top - round(size * 1.4), size, align="right")
 
 
+def draw_slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, size: int) -> None:
+    """A slider with a stop per lighting and a knob at `at`, in stops."""
+    x, y, width, height = box
+    canvas[y : y + height, x : x + width] = PANEL_BACKGROUND
+    left, right, middle = x + round(0.08 * width), x + round(0.92 * width), y + height // 2
+    stops = np.linspace(left, right, len(lightings)).round().astype(int)
+    canvas[middle - 2 : middle + 2, left:right] = MUTED
+    room = (right - left) // max(1, len(lightings) - 1)
+    for k, (stop, name) in enumerate(zip(stops, lightings, strict=True)):
+        canvas[middle - 7 : middle + 7, stop - 2 : stop + 2] = INK
+        near = abs(at - k) < 0.5
+        align = "left" if k == 0 else "right" if k == len(lightings) - 1 else "middle"
+        edge = x + 12 if k == 0 else x + width - 12 if k == len(lightings) - 1 else int(stop)
+        text = shorten(name, room - 8, size, near)
+        draw_text(canvas, text, edge, middle + 16, size, GREEN if near else MUTED, near, align)
+    knob = round(left + (right - left) * at / max(1, len(lightings) - 1))
+    canvas[middle - 10 : middle + 10, knob - 5 : knob + 5] = AMBER
+    draw_text(canvas, "appearance", x + 12, y + 8, size, MUTED)
+
+
 # ---- rows of panels
 
 _GAP = 6  # [px] between panels

@@ -209,8 +209,8 @@ def _collision_surface(ground: Ground, parts: Parts) -> Any:
     from twin.geometry.mesh_rays import Surface
 
     vertices, faces = ground.triangles(ground.cell, 2 * ground.height.size)
-    corners, triangles = trimesh.util.append_faces([vertices, *parts.vertices], [faces, *parts.faces])
-    return Surface(np.asarray(corners, np.float64), np.asarray(triangles))
+    together = trimesh.util.append_faces([vertices, *parts.vertices], [faces, *parts.faces])
+    return Surface(together[0].astype(np.float64), together[1])
 
 
 def _thin(points: Array) -> Array:
@@ -245,10 +245,11 @@ def gap_row(views: GeometryViews, k: int) -> Image:
     colors[~near] = PANEL_BACKGROUND
     labels = [(0.0, f"−{_MAX_GAP * 100:g} cm"), (0.5, "0"), (1.0, f"+{_MAX_GAP * 100:g} cm")]
     scale = scale_bar(_PANEL_WIDTH, colored("coolwarm", np.linspace(0, 1, _PANEL_WIDTH - 16)[None]), labels)
-    panels = (
-        (views.rgb[k], "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
-        (depth_colors(visual), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
-        (depth_colors(collision), "collision", "depth", caption_line(_PANEL_WIDTH, "ground and convex parts")),
-        (colors, "gap", f"up to {MAX_DEPTH:g} m", scale),
-    )
-    return panel_row([titled_panel(fit(image, size), title, note, below) for image, title, note, below in panels])
+    solid = caption_line(_PANEL_WIDTH, "ground and convex parts")
+    panels = [
+        titled_panel(fit(views.rgb[k], size), "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
+        titled_panel(fit(depth_colors(visual), size), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
+        titled_panel(fit(depth_colors(collision), size), "collision", "depth", solid),
+        titled_panel(fit(colors, size), "gap", f"up to {MAX_DEPTH:g} m", scale),
+    ]
+    return panel_row(panels)
