@@ -8,7 +8,6 @@ processes with one thread and a time limit, its results are cached by a hash of 
 far are split.
 """
 
-import argparse
 import hashlib
 import subprocess
 import sys
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from twin import runtime
-from twin.files import digest_json
+from twin.files import digest_json, load_arrays, save_arrays
 from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
 
@@ -290,9 +289,8 @@ def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: thr
 
 
 def _read_parts(path: Path) -> list[ConvexPart] | None:
-    with np.load(path, allow_pickle=False) as data:
-        counts = data["counts"]
-        points = np.split(data["points"], np.cumsum(counts)[:-1]) if len(counts) else []
+    data = load_arrays(path)
+    points = np.split(data["points"], np.cumsum(data["counts"])[:-1])
     parts = [part for part in (ConvexPart.hull(p) for p in points) if part is not None]
     return parts or None
 
@@ -303,16 +301,15 @@ def _decompose_files(paths: list[Path]) -> None:
 
     coacd.set_log_level("off")
     for source, target in zip(paths[::2], paths[1::2], strict=True):
-        with np.load(source, allow_pickle=False) as data:
-            vertices, faces = data["vertices"], data["faces"]
-            bound, seed = float(data["bound"]), int(data["seed"])
+        data = load_arrays(source)
+        vertices, faces = data["vertices"], data["faces"]
         if len(faces) > _MAX_COACD_FACES:
             vertices, faces = fast_simplification.simplify(
                 vertices.astype(np.float32), faces.astype(np.int32), target_count=_MAX_COACD_FACES, agg=3.0
             )[:2]
         result = coacd.run_coacd(
             coacd.Mesh(vertices, faces),
-            threshold=bound,
+            threshold=float(data["bound"]),
             real_metric=True,
             # Pieces are closed and results are checked, so a coarse search, 10 times as fast, suffices.
             preprocess_mode="off",
@@ -322,16 +319,12 @@ def _decompose_files(paths: list[Path]) -> None:
             mcts_max_depth=2,
             max_ch_vertex=_MAX_HULL_VERTICES,
             decimate=True,
-            seed=seed,
+            seed=int(data["seed"]),
         )
         points = [np.asarray(v) for v, _ in result]
-        partial = target.with_suffix(".partial.npz")
-        np.savez(partial, points=np.concatenate(points), counts=np.array([len(p) for p in points]))
-        partial.replace(target)
+        save_arrays(target, {"points": np.concatenate(points), "counts": np.array([len(p) for p in points])})
 
 
 if __name__ == "__main__":
     die_with_parent()
-    parser = argparse.ArgumentParser(description="Child of twin.assets.convex.")
-    parser.add_argument("paths", type=Path, nargs="+")
-    _decompose_files(parser.parse_args().paths)
+    _decompose_files([Path(argument) for argument in sys.argv[1:]])

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from twin.assets.ground import Ground
 from twin.config import SceneConfig
 from twin.errors import InputError
+from twin.files import load_arrays
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import write_image
 from twin.mjcf import husky
@@ -56,11 +57,11 @@ class Parts:
     @staticmethod
     def load(path: Path) -> "Parts":
         """Reads `parts.npz`."""
-        with np.load(path, allow_pickle=False) as data:
-            v, f = data["vertex_start"], data["face_start"]
-            if len(v) <= 1:
-                return Parts([], [])
-            return Parts(np.split(data["vertices"], v[1:-1]), np.split(data["faces"], f[1:-1]))
+        data = load_arrays(path)
+        v, f = data["vertex_start"], data["face_start"]
+        if len(v) <= 1:
+            return Parts([], [])
+        return Parts(np.split(data["vertices"], v[1:-1]), np.split(data["faces"], f[1:-1]))
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
@@ -116,8 +117,8 @@ def _load_route(path: Path) -> Array | None:
     """The route [m], shape (m, 3); None if the stage `mesh` wrote none."""
     if not path.exists():
         return None
-    with np.load(path, allow_pickle=False) as data:
-        return np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
+    data = load_arrays(path)
+    return np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
 
 
 def film_camera(cameras: Cameras) -> PixelCamera:
@@ -227,8 +228,8 @@ def _add_textured_material(spec: mujoco.MjSpec, name: str, emission: float) -> N
 
 
 def _add_visual(spec: mujoco.MjSpec, ground: Ground, path: Path, assets: Path) -> int:
-    with np.load(path, allow_pickle=False) as data:
-        vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
+    data = load_arrays(path)
+    vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
     faces = faces[~covered_by_ground(vertices, ground)[faces].all(1)]
     vertices, colors, faces = drop_unused_vertices(vertices, colors, faces)
     if len(faces) == 0:
