@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.reality import SEED
 from twin.reality.lighting import LIGHTINGS, Lighting, daylight, sky_cube_map
-from twin.reality.place_objects import SEED
 from twin.reality.place_spec import HorizonSpec, LightSpec, PlaceSpec, Rgb, stream
 from twin.reality.textures import fbm
 from twin.types import Array
@@ -75,7 +75,8 @@ def _scaled(color: Rgb, factor: float) -> Rgb:
 
 def place_sky(spec: PlaceSpec, lighting: Lighting) -> NDArray[np.uint8]:
     """The cube map of the sky of a place under a lighting."""
-    tinted = replace(lighting, skyline=tuple(a * b for a, b in zip(lighting.skyline, spec.horizon.tint, strict=True)))
+    red, green, blue = (a * b for a, b in zip(lighting.skyline, spec.horizon.tint, strict=True))
+    tinted = replace(lighting, skyline=(red, green, blue))
     seed = SEED + 1000 * spec.number
     return sky_cube_map(tinted, seed, skyline=skyline(spec.horizon, stream(spec.number, "horizon", 1)))
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.geometry.cameras import opencv_to_mujoco
-from twin.reality import true_world
+from twin.reality import SEED, true_world
 from twin.reality.lighting import Lighting, apply_haze
-from twin.reality.place_objects import SEED, KnownPlace, Road
+from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_spec import PassSpec, PlaceSpec
 from twin.runtime import track
 from twin.types import Array
@@ -98,7 +98,7 @@ def film_name(lighting: str, one: PassSpec) -> str:
     return lighting if one.name == OUT.name else f"{lighting}_{one.name}"
 
 
-def trajectory(plan: FilmingPlan, route: Road, film: str, one: PassSpec = OUT) -> tuple[Array, Array]:
+def trajectory(plan: FilmingPlan, route: DrivenLine, film: str, one: PassSpec = OUT) -> tuple[Array, Array]:
     """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of one film, by its name."""
     rng = np.random.default_rng([SEED, 11, sum(map(ord, film))])
     speed = plan.speed * rng.uniform(0.93, 1.07)

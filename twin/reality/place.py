@@ -6,13 +6,13 @@ objects stay outside ±1.6 m of the center line.
 
 import numpy as np
 
+from twin.reality import SEED, primitives
 from twin.reality import centerline as roads
-from twin.reality import primitives
 from twin.reality.campus_textures import BUILDINGS, campus_textures
 from twin.reality.centerline import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, VERGE_WIDTH, RoadLine
 from twin.reality.houses import add_block
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
-from twin.reality.place_objects import SEED, GroundLayout, KnownPlace, PlaceObject, Road, Solid, up
+from twin.reality.place_objects import DrivenLine, GroundLayout, KnownPlace, PlaceObject, Solid, up
 from twin.reality.plants import add_hedge, add_tree, add_tufts
 from twin.reality.primitives import MeshPart
 from twin.reality.street_furniture import (
@@ -165,7 +165,7 @@ def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
     return place
 
 
-def _road_strip(route: Road, laterals: list[float], heights: list[float] | None, step: float) -> MeshPart:
+def _road_strip(route: DrivenLine, laterals: list[float], heights: list[float] | None, step: float) -> MeshPart:
     """A strip along the road through laterals [m], left first, at heights above the undulation [m] or on the ground."""
     stations = np.arange(roads.START, roads.END + step / 2, step)
     across = np.asarray(laterals, float)

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twin.reality import primitives
+from twin.reality import SEED, primitives
 from twin.reality.primitives import MeshPart
 from twin.types import Array
 
 if TYPE_CHECKING:
     from twin.reality.lighting import Lighting
 
-SEED = 20  # of the place, its textures, sky and films
 ATLAS_CELL = 256  # [px] per side of a cell
 CELLS = (
     *("bark0", "bark1", "bark2", "leaf0", "leaf1", "leaf2", "leaf3", "hedge"),
@@ -31,7 +30,7 @@ CELLS = (
 """Names of the cells that every atlas begins with, row by row."""
 
 
-class Road(Protocol):
+class DrivenLine(Protocol):
     """A driven line and the ground around it."""
 
     @property
@@ -116,7 +115,7 @@ class PlaceObject:
 class KnownPlace:
     """A whole place: its road, its objects, and all that a picture of it needs."""
 
-    route: Road
+    route: DrivenLine
     layout: GroundLayout
     textures: Callable[[], dict[str, NDArray[np.uint8]]]
     """Returns all textures by name, uint8 RGB."""

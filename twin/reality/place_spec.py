@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 
 from twin.errors import InputError
-from twin.reality.place_objects import SEED
+from twin.reality import SEED
 
 Rgb = tuple[float, float, float]
 T = TypeVar("T")
@@ -510,7 +510,7 @@ def _line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineS
     base = rng.normal(0.0, 1.0, count) + rng.normal(0.0, 1.2)
     grades = steepest * np.clip(base / 1.5, -1.0, 1.0)
     bumps = float(rng.uniform(0.003, 0.012))
-    mouths = []
+    mouths: list[Mouth] = []
     stations = np.cumsum([0.0, *(piece.length for piece in pieces)])
     for piece, start in zip(pieces, stations, strict=False):
         width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
@@ -718,7 +718,7 @@ def _trees(rng: np.random.Generator, setting: str, grass: Rgb) -> TreesSpec:
         "forest": (14.0, 22.0),
         "field": (0.0, 2.5),
     }[setting]
-    kinds = ("broadleaf", "slender", "conifer", "bare", "birch", "shrub")
+    kinds: tuple[str, ...] = ("broadleaf", "slender", "conifer", "bare", "birch", "shrub")
     if setting == "forest":
         kinds = _pick(rng, {("conifer",): 1.0, ("conifer", "birch"): 1.0, ("broadleaf", "shrub", "birch"): 1.0})
     else:
@@ -767,10 +767,18 @@ def _furniture(rng: np.random.Generator, cars: np.random.Generator, setting: str
         *((0.55, 0.08, 0.08), (0.14, 0.28, 0.20), (0.72, 0.62, 0.20), (0.60, 0.54, 0.44), (0.36, 0.50, 0.60)),
         *((0.66, 0.34, 0.10), (0.32, 0.16, 0.30)),
     )
+    signs, bins, benches, bollards, cones, crates, cabinets, stones, parked = amounts
     return FurnitureSpec(
-        *amounts[:8],
+        signs=signs,
+        bins=bins,
+        benches=benches,
+        bollards=bollards,
+        cones=cones,
+        crates=crates,
+        cabinets=cabinets,
+        stones=stones,
         poles=bool(rng.random() < {"town": 0.05, "works": 0.3, "forest": 0.1}.get(setting, 0.3)),
-        cars=amounts[8],
+        cars=parked,
         car_colors=tuple(_shade(cars, color, 0.2) for color in _subset(cars, paints, 4, 6)),
         vans=float(cars.uniform(0.0, 0.6)),
     )

@@ -25,13 +25,13 @@ from twin.geometry.route import route_length, smooth_route
 from twin.mjcf import husky
 from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World, heading_at, point_at
+from twin.reality import SEED, true_world
 from twin.reality import place as places
-from twin.reality import true_world
 from twin.reality.centerline import RoadLine
 from twin.reality.drawn_place import build_number
 from twin.reality.filming import FilmingPlan, sensor_image, smooth_noise, trajectory
 from twin.reality.lighting import Lighting, apply_haze
-from twin.reality.place_objects import SEED, KnownPlace, PlaceObject, Road
+from twin.reality.place_objects import DrivenLine, KnownPlace, PlaceObject
 from twin.reality.place_spec import draw, tasks
 from twin.reality.rasterizer import SHADOW_RANGE, Rasterizer
 from twin.robot import WHEEL_RADIUS, HuskyParams
@@ -90,7 +90,7 @@ _COLLISION_REACH = 1.5  # [m] beyond the corridor; as in the twin, the robot tou
 _LENGTH_TOLERANCE = 0.98  # fraction of the longest path; the first film above it gives the route
 
 
-def true_route(plan: FilmingPlan | None = None, line: Road | None = None) -> Array:
+def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
     """The route: the filmed path on the true ground [m], shape (m, 3).
 
     As in a build, the first film within 2 % of the longest gives the path.

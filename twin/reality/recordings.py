@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from twin.env.options import Options
 from twin.errors import InputError
 from twin.geometry.images import write_image
-from twin.reality import true_world
+from twin.reality import SEED, true_world
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import WEATHER, Lighting
-from twin.reality.place_objects import SEED, Road
+from twin.reality.place_objects import DrivenLine
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day, shadow_range
 from twin.runtime import track
@@ -77,7 +77,7 @@ def _road_and_camera(light: Lighting, number: int) -> tuple[TrueRoad, RealCamera
     return road, RealCamera(raster, light, husky, intrinsics, size, np.random.default_rng([SEED, 43]))
 
 
-def _set_start_pose(road: TrueRoad, line: Road) -> None:
+def _set_start_pose(road: TrueRoad, line: DrivenLine) -> None:
     """Puts the robot at the first station of `_STATIONS`."""
     start = line.at(_STATIONS[0])
     road.physics.robot.set_pose(float(start[0]), float(start[1]), float(line.heading(_STATIONS[0])))
@@ -101,7 +101,7 @@ def _frames(count: int, number: int) -> Iterator[NDArray[np.uint8]]:
             physics.step(_CONTROL_STEP)
 
 
-def _steering(line: Road, pose: NDArray[np.float64]) -> float:
+def _steering(line: DrivenLine, pose: NDArray[np.float64]) -> float:
     """Yaw rate [rad/s] that steers a base at pose x, y, yaw to the weaving line."""
     station, lateral = (float(value[0]) for value in line.project(pose[None, :2]))
     phase = 2.0 * np.pi * station / _WEAVE_PERIOD
@@ -173,7 +173,7 @@ def write_log(path: Path, columns: dict[str, Array]) -> None:
         writer.writerows([f"{value:.6f}" for value in row] for row in np.stack(list(columns.values()), 1))
 
 
-def _sample_command(rng: np.random.Generator, line: Road, pose: Array, hold: float) -> Array:
+def _sample_command(rng: np.random.Generator, line: DrivenLine, pose: Array, hold: float) -> Array:
     """A random command that keeps the robot on the asphalt, or a turn on the spot if none is found."""
     for _ in range(_MAX_TRIES):
         command = rng.uniform([-_LOG_SPEED, -_YAW_RATE], [_LOG_SPEED, _YAW_RATE])
@@ -182,7 +182,7 @@ def _sample_command(rng: np.random.Generator, line: Road, pose: Array, hold: flo
     return np.array([0.0, rng.choice([-1.0, 1.0]) * _YAW_RATE])
 
 
-def _stays_inside(line: Road, pose: Array, command: Array, ahead: float) -> bool:
+def _stays_inside(line: DrivenLine, pose: Array, command: Array, ahead: float) -> bool:
     """True if a command held for `ahead` [s] keeps the robot inside the bounds."""
     times = np.linspace(0.0, ahead, 8)
     heading = pose[2] + command[1] * times

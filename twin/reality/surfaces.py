@@ -227,10 +227,10 @@ def turf(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int],
     count = int(shape[0] * shape[1] * 0.02)
     starts = np.stack([rng.uniform(0, shape[1], count), rng.uniform(0, shape[0], count)], -1)
     ends = starts + rng.normal(0, 4.0, (count, 2))
-    tones = rng.uniform(0.55, 1.65, count)
+    brightness = rng.uniform(0.55, 1.65, count)
     straw = np.array([0.62, 0.55, 0.30])
     dry = rng.random(count) < (0.3 if kind == "meadow" else 0.04)
-    colors = np.where(dry[:, None], straw, green) * tones[:, None]
+    colors = np.where(dry[:, None], straw, green) * brightness[:, None]
     for a, b, color in zip(starts.astype(int).tolist(), ends.astype(int).tolist(), colors.tolist(), strict=True):
         cv2.line(image, a, b, color, 1)
     spots = np.array([[0.6, 0.45, 0.18], [0.45, 0.27, 0.1], [0.5, 0.5, 0.47], [0.72, 0.66, 0.2]], np.float32)

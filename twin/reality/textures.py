@@ -289,7 +289,8 @@ def window(rng: np.random.Generator, lit: bool, style: str = "cross", frames: ND
         drop = int(rng.uniform(12, 60))
         image[4:drop] = (0.62 + 0.13 * (np.arange(4, drop) % 5 < 2))[:, None, None] * np.array([1.0, 0.97, 0.9])
     frame = rng.choice(frames)
-    for bar in (np.s_[:5], np.s_[-5:], np.s_[:, :5], np.s_[:, -5:], *WINDOW_BARS[style]):
+    edges = (np.s_[:5, :], np.s_[-5:, :], np.s_[:, :5], np.s_[:, -5:])
+    for bar in (*edges, *WINDOW_BARS[style]):
         image[bar] = frame
     return np.clip(image, 0.02, 1.0)
 

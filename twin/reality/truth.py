@@ -6,6 +6,7 @@
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +14,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
 from twin.files import read_json, write_json
+from twin.reality import SEED
 from twin.reality import place as places
 from twin.reality.centerline import RoadLine
 from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import CAMERA_HEIGHT
-from twin.reality.place_objects import SEED, KnownPlace
+from twin.reality.place_objects import KnownPlace
 from twin.reality.place_spec import FREE_HALF_WIDTH, draw
 from twin.types import Array
 
@@ -69,7 +71,11 @@ class Truth:
         arrays = {f"{key}_{name}": value for name, film in self.films.items() for key, value in vars(film).items()}
         np.savez_compressed(folder / "truth.npz", intrinsics=self.intrinsics, **arrays)
         road = asdict(self.route) if isinstance(self.route, RoadLine) else self.number
-        head = {"route" if self.number == 0 else "place": road, "start": self.start, "length": self.length}
+        head: dict[str, Any] = {
+            "route" if self.number == 0 else "place": road,
+            "start": self.start,
+            "length": self.length,
+        }
         head |= {"half_width": self.half_width}
         if self.number > 0:
             head |= {"lightings": self.lightings, "camera_height": self.camera_height}
