@@ -2,3 +2,5 @@
 
 The product imports nothing from this package; the truth beside a scene is read by `comparison.py` and tests only.
 """
+
+SEED = 20  # of everything random in this world: places, textures, skies, films, the hidden robot

@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.reality import textures
+from twin.reality import SEED, textures
 from twin.reality.atlas_painting import AtlasColors, paint_atlas, to_uint8
 from twin.reality.centerline import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, VERGE_WIDTH
-from twin.reality.place_objects import CELLS, SEED
+from twin.reality.place_objects import CELLS
 
 _ROAD_PIXEL = 0.0125  # [m] texel of the road
 _VERGE_PIXEL = 0.022

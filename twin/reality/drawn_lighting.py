@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.reality import SEED
 from twin.reality.lighting import LIGHTINGS, Lighting, daylight, sky_cube_map
-from twin.reality.place_objects import SEED
 from twin.reality.place_spec import HorizonSpec, LightSpec, PlaceSpec, Rgb, stream
 from twin.reality.textures import fbm
 from twin.types import Array

@@ -12,14 +12,14 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.reality import primitives, surfaces
+from twin.reality import SEED, primitives, surfaces
 from twin.reality import street_furniture as furniture
 from twin.reality.atlas_painting import AtlasColors, paint_atlas, to_uint8
 from twin.reality.boundaries import BAY, add_boundary, thickness
 from twin.reality.drawn_lighting import place_lightings, place_sky
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.houses import House, add_house
-from twin.reality.place_objects import CELLS, SEED, Atlas, GroundLayout, KnownPlace, PlaceObject
+from twin.reality.place_objects import CELLS, Atlas, GroundLayout, KnownPlace, PlaceObject
 from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, BoundarySpec, PlaceSpec, Rgb, draw, stream
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
 from twin.reality.textures import slabs
@@ -89,7 +89,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     _add_cars(place, spec, site, place.rng(20) if displaced else None)
     _add_furniture(place, spec, site, place.rng(21) if displaced else None)
     _add_trees(place, spec, site)
-    _add_tufts(place, spec, site)
+    _add_tufts(place, spec)
     return place
 
 
@@ -486,7 +486,7 @@ def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
             add_crowned_tree(place, k, at, height, crown, 1.0, skin)
 
 
-def _add_tufts(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
+def _add_tufts(place: KnownPlace, spec: PlaceSpec) -> None:
     rng = stream(spec.number, "trees", 2)
     road = place.route
     count = int(spec.trees.tufts * (spec.line.length + 20.0))

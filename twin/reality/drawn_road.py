@@ -139,7 +139,7 @@ class DrawnRoad:
     def grade(self, station: ArrayLike) -> Array:
         """Drawn slope along the line, without its unevenness."""
         knots = np.arange(len(self.line.grades)) * GRADE_STEP
-        return np.interp(np.asarray(station, np.float64), knots, self.line.grades)
+        return np.interp(np.asarray(station, float), knots, self.line.grades)
 
     def profile(self, station: ArrayLike) -> Array:
         """Height of the driven line [m]: the integral of the grades plus the unevenness."""

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.geometry.cameras import opencv_to_mujoco
-from twin.reality import true_world
+from twin.reality import SEED, true_world
 from twin.reality.lighting import Lighting, apply_haze
-from twin.reality.place_objects import SEED, DrivenLine, KnownPlace
+from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_spec import PassSpec, PlaceSpec
 from twin.runtime import track
 from twin.types import Array

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.reality.place_objects import SEED
+from twin.reality import SEED
 from twin.reality.textures import fbm
 
 Color = tuple[float, float, float]

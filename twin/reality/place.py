@@ -6,13 +6,13 @@ objects stay outside ±1.6 m of the center line.
 
 import numpy as np
 
+from twin.reality import SEED, primitives
 from twin.reality import centerline as roads
-from twin.reality import primitives
 from twin.reality.campus_textures import BUILDINGS, campus_textures
 from twin.reality.centerline import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, VERGE_WIDTH, RoadLine
 from twin.reality.houses import add_block
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
-from twin.reality.place_objects import SEED, DrivenLine, GroundLayout, KnownPlace, PlaceObject, Solid, up
+from twin.reality.place_objects import DrivenLine, GroundLayout, KnownPlace, PlaceObject, Solid, up
 from twin.reality.plants import add_hedge, add_tree, add_tufts
 from twin.reality.primitives import MeshPart
 from twin.reality.street_furniture import (

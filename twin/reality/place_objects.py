@@ -11,11 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twin.reality import primitives
+from twin.reality import SEED, primitives
 from twin.reality.primitives import MeshPart
 from twin.types import Array
 
-SEED = 20  # of the place, its textures, sky and films
+if TYPE_CHECKING:
+    pass
+
 ATLAS_CELL = 256  # [px] per side of a cell
 CELLS = (
     *("bark0", "bark1", "bark2", "leaf0", "leaf1", "leaf2", "leaf3", "hedge"),

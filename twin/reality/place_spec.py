@@ -13,12 +13,12 @@ import colorsys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from twin.errors import InputError
-from twin.reality.place_objects import SEED
+from twin.reality import SEED
 
 Rgb = tuple[float, float, float]
 T = TypeVar("T")
@@ -510,7 +510,7 @@ def _line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineS
     base = rng.normal(0.0, 1.0, count) + rng.normal(0.0, 1.2)
     grades = steepest * np.clip(base / 1.5, -1.0, 1.0)
     bumps = float(rng.uniform(0.003, 0.012))
-    mouths: list[Any] = []
+    mouths: list[Mouth] = []
     stations = np.cumsum([0.0, *(piece.length for piece in pieces)])
     for piece, start in zip(pieces, stations, strict=False):
         width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
@@ -767,7 +767,7 @@ def _furniture(rng: np.random.Generator, cars: np.random.Generator, setting: str
         *((0.55, 0.08, 0.08), (0.14, 0.28, 0.20), (0.72, 0.62, 0.20), (0.60, 0.54, 0.44), (0.36, 0.50, 0.60)),
         *((0.66, 0.34, 0.10), (0.32, 0.16, 0.30)),
     )
-    signs, bins, benches, bollards, cones, crates, cabinets, stones = amounts[:8]
+    signs, bins, benches, bollards, cones, crates, cabinets, stones, parked = amounts
     return FurnitureSpec(
         signs=signs,
         bins=bins,
@@ -778,7 +778,7 @@ def _furniture(rng: np.random.Generator, cars: np.random.Generator, setting: str
         cabinets=cabinets,
         stones=stones,
         poles=bool(rng.random() < {"town": 0.05, "works": 0.3, "forest": 0.1}.get(setting, 0.3)),
-        cars=amounts[8],
+        cars=parked,
         car_colors=tuple(_shade(cars, color, 0.2) for color in _subset(cars, paints, 4, 6)),
         vans=float(cars.uniform(0.0, 0.6)),
     )

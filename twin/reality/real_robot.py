@@ -24,13 +24,13 @@ from twin.geometry.passes import path_length, smooth_path
 from twin.mjcf import husky
 from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World, heading_at, point_at
+from twin.reality import SEED, true_world
 from twin.reality import place as places
-from twin.reality import true_world
 from twin.reality.centerline import RoadLine
 from twin.reality.drawn_place import build_number
 from twin.reality.filming import FilmingPlan, sensor_image, smooth_noise, trajectory
 from twin.reality.lighting import Lighting, apply_haze
-from twin.reality.place_objects import SEED, DrivenLine, KnownPlace, PlaceObject
+from twin.reality.place_objects import DrivenLine, KnownPlace, PlaceObject
 from twin.reality.place_spec import draw, tasks
 from twin.reality.rasterizer import SHADOW_RANGE, Rasterizer
 from twin.robot import WHEEL_RADIUS, HuskyParams

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from twin.env.options import Options
 from twin.errors import InputError
 from twin.geometry.images import write_image
-from twin.reality import true_world
+from twin.reality import SEED, true_world
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import WEATHER, Lighting
-from twin.reality.place_objects import SEED, DrivenLine
+from twin.reality.place_objects import DrivenLine
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day, shadow_range
 from twin.runtime import track

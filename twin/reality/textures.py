@@ -4,8 +4,6 @@ Nothing repeats along the road: a repeating texture would cause false matches in
 its own random generator, so a change of one leaves the others as they are.
 """
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -291,8 +289,8 @@ def window(rng: np.random.Generator, lit: bool, style: str = "cross", frames: ND
         drop = int(rng.uniform(12, 60))
         image[4:drop] = (0.62 + 0.13 * (np.arange(4, drop) % 5 < 2))[:, None, None] * np.array([1.0, 0.97, 0.9])
     frame = rng.choice(frames)
-    bars: tuple[Any, ...] = (np.s_[:5], np.s_[-5:], np.s_[:, :5], np.s_[:, -5:], *WINDOW_BARS[style])
-    for bar in bars:
+    edges = (np.s_[:5, :], np.s_[-5:, :], np.s_[:, :5], np.s_[:, -5:])
+    for bar in (*edges, *WINDOW_BARS[style]):
         image[bar] = frame
     return np.clip(image, 0.02, 1.0)
 

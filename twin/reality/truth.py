@@ -14,12 +14,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
 from twin.files import read_json, write_json
+from twin.reality import SEED
 from twin.reality import place as places
 from twin.reality.centerline import RoadLine
 from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import CAMERA_HEIGHT
-from twin.reality.place_objects import SEED, KnownPlace
+from twin.reality.place_objects import KnownPlace
 from twin.reality.place_spec import FREE_HALF_WIDTH, draw
 from twin.types import Array
 
