@@ -19,6 +19,8 @@ FEATURES = CHANNELS - 1
 LANES = {"cpu": 16, "cuda": 1}
 """Pixels per thread; see `march.py`."""
 
+_UNROLLING = OPTIONS | {"max_unroll": 8}  # unrolls loops over eight units, not those over lanes
+
 wp.set_module_options(OPTIONS)
 
 Vec8 = wp.types.vector(length=8, dtype=wp.float32)
@@ -72,6 +74,8 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
     Inputs = wp.types.matrix(shape=(FEATURES + HARMONICS, lanes), dtype=wp.float32)
+    Eight = wp.types.matrix(shape=(8, lanes), dtype=wp.float32)
+    Color = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
     Hidden = wp.types.matrix(shape=(hidden, lanes), dtype=wp.float32)
     Background = wp.types.matrix(shape=(background_hidden, lanes), dtype=wp.float32)
 
@@ -85,23 +89,12 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
             u = (float(pixel % image.width) + 0.5 - k[2]) / k[0]
             v = (float(pixel // image.width) + 0.5 - k[3]) / k[1]
             d = rotation * wp.normalize(wp.vec3f(u, v, 1.0))
+            x[FEATURES, j] = 1.0
             h = _compiled_harmonics(d[0], d[1], d[2])
-            x[15, j] = 1.0
-            x[16, j] = h[0]
-            x[17, j] = h[1]
-            x[18, j] = h[2]
-            x[19, j] = h[3]
-            x[20, j] = h[4]
-            x[21, j] = h[5]
-            x[22, j] = h[6]
-            x[23, j] = h[7]
-            x[24, j] = h[8]
-            x[25, j] = h[9]
-            x[26, j] = h[10]
-            x[27, j] = h[11]
-            x[28, j] = h[12]
-            x[29, j] = h[13]
-            x[30, j] = h[14]
+            for n in range(8):
+                x[FEATURES + 1 + n, j] = h[n]
+            for n in range(8, 15):
+                x[FEATURES + 1 + n, j] = h[n]
         return x
 
     @wp.struct
@@ -120,7 +113,7 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
         backdrop_0_bias: wp.array(dtype=wp.float32)
         backdrop_1: wp.array(dtype=wp.float32)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS)
+    @wp.kernel(enable_backward=False, module="unique", module_options=_UNROLLING)
     def color_rays(
         weights: Weights,
         bias: wp.array2d(dtype=Vec8),
@@ -165,80 +158,41 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
         # Eight units at a time: each input is read once for all, and eight sums keep the processor's units busy. Both
         # layers are written out, as one function for both, though equal to the bit, copies its inputs: 30 % slower.
         h = Hidden()
-        for q in range(hidden // 8):
+        for q in range(weights.head_1_bias.shape[0]):
+            s = Eight()
             w = bias[camera, q]
-            s0 = Floats(w[0])
-            s1 = Floats(w[1])
-            s2 = Floats(w[2])
-            s3 = Floats(w[3])
-            s4 = Floats(w[4])
-            s5 = Floats(w[5])
-            s6 = Floats(w[6])
-            s7 = Floats(w[7])
+            for k in range(8):
+                s[k] = Floats(w[k])
             for i in range(_INPUTS):
                 row = x[i]
                 w = weights.head_0[q * _INPUTS + i]
-                s0 += row * w[0]
-                s1 += row * w[1]
-                s2 += row * w[2]
-                s3 += row * w[3]
-                s4 += row * w[4]
-                s5 += row * w[5]
-                s6 += row * w[6]
-                s7 += row * w[7]
-            h[8 * q + 0] = wp.max(s0, Floats())
-            h[8 * q + 1] = wp.max(s1, Floats())
-            h[8 * q + 2] = wp.max(s2, Floats())
-            h[8 * q + 3] = wp.max(s3, Floats())
-            h[8 * q + 4] = wp.max(s4, Floats())
-            h[8 * q + 5] = wp.max(s5, Floats())
-            h[8 * q + 6] = wp.max(s6, Floats())
-            h[8 * q + 7] = wp.max(s7, Floats())
-        red = Floats(weights.head_2_bias[0])
-        green = Floats(weights.head_2_bias[1])
-        blue = Floats(weights.head_2_bias[2])
-        for q in range(hidden // 8):
+                for k in range(8):
+                    s[k] += row * w[k]
+            for k in range(8):
+                h[8 * q + k] = wp.max(s[k], Floats())
+        color = Color()
+        for c in range(3):
+            color[c] = Floats(weights.head_2_bias[c])
+        for q in range(weights.head_1_bias.shape[0]):
+            s = Eight()
             w = weights.head_1_bias[q]
-            s0 = Floats(w[0])
-            s1 = Floats(w[1])
-            s2 = Floats(w[2])
-            s3 = Floats(w[3])
-            s4 = Floats(w[4])
-            s5 = Floats(w[5])
-            s6 = Floats(w[6])
-            s7 = Floats(w[7])
+            for k in range(8):
+                s[k] = Floats(w[k])
             for i in range(hidden):
                 row = h[i]
                 w = weights.head_1[q * hidden + i]
-                s0 += row * w[0]
-                s1 += row * w[1]
-                s2 += row * w[2]
-                s3 += row * w[3]
-                s4 += row * w[4]
-                s5 += row * w[5]
-                s6 += row * w[6]
-                s7 += row * w[7]
-            s0 = wp.max(s0, Floats())
-            s1 = wp.max(s1, Floats())
-            s2 = wp.max(s2, Floats())
-            s3 = wp.max(s3, Floats())
-            s4 = wp.max(s4, Floats())
-            s5 = wp.max(s5, Floats())
-            s6 = wp.max(s6, Floats())
-            s7 = wp.max(s7, Floats())
-            w = weights.head_2[3 * q + 0]
-            red += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
-            red += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
-            w = weights.head_2[3 * q + 1]
-            green += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
-            green += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
-            w = weights.head_2[3 * q + 2]
-            blue += s0 * w[0] + s1 * w[1] + s2 * w[2] + s3 * w[3]
-            blue += s4 * w[4] + s5 * w[5] + s6 * w[6] + s7 * w[7]
+                for k in range(8):
+                    s[k] += row * w[k]
+            for k in range(8):
+                s[k] = wp.max(s[k], Floats())
+            for c in range(3):
+                w = weights.head_2[3 * q + c]
+                color[c] += s[0] * w[0] + s[1] * w[1] + s[2] * w[2] + s[3] * w[3]
+                color[c] += s[4] * w[4] + s[5] * w[5] + s[6] * w[6] + s[7] * w[7]
         for j in range(lanes):
             if start + j < last:
                 pixel = start + j
-                rgb[camera, pixel] = wp.vec3f(sigmoid(red[j]), sigmoid(green[j]), sigmoid(blue[j]))
+                rgb[camera, pixel] = wp.vec3f(sigmoid(color[0, j]), sigmoid(color[1, j]), sigmoid(color[2, j]))
                 opacity[camera, pixel] = share[j]
                 z = depth[camera, pixel]
                 depth[camera, pixel] = wp.where(z > 0.0, wp.min(z, FAR), FAR)
