@@ -15,9 +15,6 @@ from twin.reality import SEED, primitives
 from twin.reality.primitives import MeshPart
 from twin.types import Array
 
-if TYPE_CHECKING:
-    pass
-
 ATLAS_CELL = 256  # [px] per side of a cell
 CELLS = (
     *("bark0", "bark1", "bark2", "leaf0", "leaf1", "leaf2", "leaf3", "hedge"),
