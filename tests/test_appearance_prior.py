@@ -1,4 +1,4 @@
-"""Random lightings: what could have been filmed passes, what could not does not, and draws repeat."""
+"""Random lightings: the rule accepts plausible embeddings and rejects others; samples are repeatable."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ _LIFT = 20.0  # keeps the rectifiers of the made-up head open, so that it is lin
 
 
 def probes(k: int = 300) -> Probes:
-    """A place of random colours. Embedding: exposure, warmth, green, and how its left and right half differ."""
+    """A place of random colors. Embedding: exposure, warmth, green, and how its left and right half differ."""
     rng = np.random.default_rng(0)
     first = np.zeros((15 + 16 + 4, 4), np.float32)
     first[:4, :4] = np.eye(4)
@@ -43,7 +43,7 @@ def lightings(vectors: list[list[float]], frames: int = 12) -> Lightings:
 DAY_AND_DUSK = [[0.8, 0.0, 0.0, 0.0], [-0.8, 0.4, 0.0, 0.0]]
 
 
-def test_whatever_was_filmed_is_plausible():
+def test_filmed_lightings_are_plausible():
     mine = lightings(DAY_AND_DUSK)
     for vector in (*mine.vectors, *mine.frame_vectors):
         assert mine.prior.violations(vector) == []
@@ -76,12 +76,12 @@ def test_samples_obey_the_rule_and_vary():
         ([0.0, 0.2, 0.0, 3.0], "from any sum"),
     ],
 )
-def test_what_nobody_could_have_filmed_is_rejected(embedding, fault):
+def test_implausible_embeddings_are_rejected(embedding, fault):
     assert any(fault in found for found in lightings(DAY_AND_DUSK).prior.violations(np.array(embedding)))
 
 
-def test_light_adds():
-    """A longer exposure and both lights at once are sums of lights; the probes' colours in another order are none."""
+def test_sums_of_lights_have_no_color_error():
+    """A longer exposure and both lights at once are sums of lights; colors in another order of the probes are not."""
     mine = lightings(DAY_AND_DUSK)
     day, dusk = (mine.probes.picture(v) ** 2.2 for v in mine.vectors)
     assert mine.prior.color_error((0.3 * day + 0.9 * dusk) ** (1 / 2.2)).max() < 1e-3
@@ -106,7 +106,7 @@ def test_one_lighting_varies_as_its_frames_do():
     assert np.allclose(still.sample(np.random.default_rng(0)), mine.vectors[0])
 
 
-def test_it_gives_up_with_a_reason(monkeypatch):
+def test_sampling_fails_with_a_reason(monkeypatch):
     mine = lightings(DAY_AND_DUSK)
     monkeypatch.setattr(AppearancePrior, "violations", lambda self, embedding: ["brightness 9 (filmed: 0 to 1)"])
     with pytest.raises(
@@ -115,7 +115,7 @@ def test_it_gives_up_with_a_reason(monkeypatch):
         mine.sample(np.random.default_rng(0))
 
 
-def test_without_probes_it_says_where_they_are():
+def test_error_without_probes_names_the_baked_field():
     mine = lightings(DAY_AND_DUSK)
     bare = Lightings(mine.names, mine.vectors, mine.frames, mine.frame_vectors)
     with pytest.raises(InputError, match="baked field"):

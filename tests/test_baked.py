@@ -1,4 +1,4 @@
-"""The baked field: its march against formulas and against a slow march, and the way from a trained field to it."""
+"""Baked field: the march against formulas and against a slow reference, batches, sizes, files."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ def quiet():
 
 
 def places(layout: BrickLayout, near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Where the samples of bricks are [m], shape (s, 729, 3)."""
+    """Positions of the bricks' samples [m], shape (s, 729, 3)."""
     grid = np.stack(np.meshgrid(*[np.arange(bricks.CORNERS)] * 3, indexing="ij"), -1).reshape(-1, 3) / bricks.CELLS
     unit = [((near[:, None] + grid) / layout.near_shape * 2 - 1), ((far[:, None] + grid) / layout.far_shape * 4 - 2)]
     out = np.concatenate(unit)
@@ -37,13 +37,13 @@ def places(layout: BrickLayout, near: np.ndarray, far: np.ndarray) -> np.ndarray
     return out * layout.half + layout.centre
 
 
-def networks(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Networks that show the first three features as colour."""
+def networks(dim: int = 4) -> dict[str, np.ndarray]:
+    """Networks that map the first three features to color and ignore the `dim` numbers of the appearance."""
 
     def zeros(*shape: int) -> np.ndarray:
         return np.zeros(shape, np.float32)
 
-    p = {"head.0": zeros(15 + 16 + 4, 8), "head.1": np.eye(8, dtype=np.float32), "head.2": zeros(8, 3)}
+    p = {"head.0": zeros(15 + 16 + dim, 8), "head.1": np.eye(8, dtype=np.float32), "head.2": zeros(8, 3)}
     p["head.0"][:3, :3] = np.eye(3)
     p["head.2"][:3] = np.eye(3) * 4.0
     p |= {"head.0.bias": zeros(8), "head.1.bias": zeros(8), "head.2.bias": np.full(3, -2.0, np.float32)}
@@ -52,7 +52,7 @@ def networks(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 def baked(raw, layout: BrickLayout = LAYOUT) -> BakedField:
-    """All bricks stored; raw density by formula of places (..., 3) [m], features of waves."""
+    """A field with all bricks stored: raw density by a formula of positions (..., 3) [m], features of waves."""
     near = np.argwhere(np.ones(layout.near_shape, bool)).astype(np.int32)
     far = np.argwhere(np.ones(layout.far_shape, bool)).astype(np.int32)
     inside = ((far / layout.far_shape >= 0.25) & ((far + 1) / layout.far_shape <= 0.75)).all(1)
@@ -70,38 +70,38 @@ def baked(raw, layout: BrickLayout = LAYOUT) -> BakedField:
         "features": codes,
         "low": low.astype(np.float32),
         "step": step.astype(np.float32),
-        **networks(np.random.default_rng(0)),
+        **networks(),
     }
     names = Lightings(("day", "night"), np.eye(2, 4, dtype=np.float32), ("day/0",), np.ones((1, 4), np.float32))
     return BakedField(layout, names, arrays | skip_distances(layout, arrays))
 
 
-def looking(eye=(-3.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> np.ndarray:
+def camera_at(eye=(-3.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> np.ndarray:
     return look_at(np.array(eye), np.array(at))[None]
 
 
 def wall(x: float, raw: float):
-    """Raw density `raw` beyond x [m], nothing before."""
+    """Raw density `raw` beyond x [m], empty before."""
     return lambda p: np.where(p[..., 0] >= x, raw, LOW)
 
 
-def test_an_opaque_wall_is_where_it_is():
-    out = baked(wall(1.0, 11.0)).render(Viewpoints.of(looking(), K[None], SIZE), "day")
+def test_opaque_wall_renders_at_its_distance():
+    out = baked(wall(1.0, 11.0)).render(Viewpoints.of(camera_at(), K[None], SIZE), "day")
     cell = LAYOUT.near_side[0] / bricks.CELLS
     assert out.opacity.min() > 0.98
     assert np.abs(out.depth - 4.0).max() < 1.5 * cell
 
 
-def test_nothing_is_transparent_and_infinitely_far():
-    out = baked(lambda p: np.full(p.shape[:-1], LOW)).render(Viewpoints.of(looking(), K[None], SIZE), "day")
+def test_empty_space_is_transparent_and_far():
+    out = baked(lambda p: np.full(p.shape[:-1], LOW)).render(Viewpoints.of(camera_at(), K[None], SIZE), "day")
     assert out.opacity.max() < 0.05
     assert (out.depth == FAR).all()
 
 
-def test_a_slab_stops_as_much_as_its_thickness_says():
+def test_opacity_of_a_slab_follows_its_thickness():
     raw = 1.0
     out = baked(lambda p: np.where(np.abs(p[..., 0]) < 0.501, raw, LOW)).render(
-        Viewpoints.of(looking(), K[None], SIZE), "day"
+        Viewpoints.of(camera_at(), K[None], SIZE), "day"
     )
     middle = out.opacity[0, SIZE[1] // 2, SIZE[0] // 2]
     thickness = 1.0  # [m]; the rims of trilinear log density add little
@@ -109,9 +109,9 @@ def test_a_slab_stops_as_much_as_its_thickness_says():
 
 
 @pytest.mark.parametrize(("distance", "opacity"), [(2.0, 0.0), (6.0, 1.0)])
-def test_the_march_stops_at_what_else_stands_there(distance, opacity):
+def test_march_stops_at_given_depths(distance, opacity):
     stop = np.full((1, SIZE[1], SIZE[0]), distance)
-    out = baked(wall(1.0, 11.0)).render(Viewpoints.of(looking(), K[None], SIZE), "day", stop=stop)
+    out = baked(wall(1.0, 11.0)).render(Viewpoints.of(camera_at(), K[None], SIZE), "day", stop=stop)
     assert np.abs(out.opacity - opacity).max() < 0.05
 
 
@@ -141,16 +141,16 @@ def slow_march(field: BakedField, eye: np.ndarray, directions: np.ndarray, step:
     return total
 
 
-def test_the_march_equals_a_slow_one():
+def test_march_equals_the_reference():
     rng = np.random.default_rng(1)
-    centres, radii = rng.uniform([-1, -2, -1], [3, 2, 1], (9, 3)), rng.uniform(0.3, 0.7, 9)
+    centers, radii = rng.uniform([-1, -2, -1], [3, 2, 1], (9, 3)), rng.uniform(0.3, 0.7, 9)
 
     def blobs(p):
-        near = np.min([np.linalg.norm(p - c, axis=-1) - r for c, r in zip(centres, radii, strict=True)], axis=0)
+        near = np.min([np.linalg.norm(p - c, axis=-1) - r for c, r in zip(centers, radii, strict=True)], axis=0)
         return np.clip(4.0 - 12.0 * near, LOW, 5.0) - 100.0 * (np.abs(p) > np.array([3.9, 3.9, 1.9])).any(-1)
 
     field = baked(blobs)
-    pose = looking((-3.5, 0.5, 0.3))
+    pose = camera_at((-3.5, 0.5, 0.3))
     out, features = field.render_features(Viewpoints.of(pose, K[None], SIZE), "day")
     features = features[0].reshape(16, -1).T
     directions = unproject(pixel_grid(*SIZE), K).reshape(-1, 3)
@@ -162,7 +162,7 @@ def test_the_march_equals_a_slow_one():
     assert np.abs(out.opacity.ravel() - slow[:, 0]).max() < 0.3  # at a rim the two may differ
 
 
-def test_a_leap_never_passes_a_filled_block():
+def test_skip_distances_never_pass_an_occupied_block():
     rng = np.random.default_rng(2)
     sparse = dict(baked(wall(1.0, 11.0)).arrays)
     sparse["features"] = np.zeros_like(sparse["features"])
@@ -177,9 +177,9 @@ def test_a_leap_never_passes_a_filled_block():
     assert (far == 255).all()  # nothing there
 
 
-def test_one_camera_or_many_are_the_same(monkeypatch):
+def test_batched_cameras_equal_single_ones(monkeypatch):
     field = baked(wall(1.0, 2.0))
-    poses = np.concatenate([looking(), looking((-3.0, 1.0, 0.5)), looking((-2.0, -1.0, 0.0))])
+    poses = np.concatenate([camera_at(), camera_at((-3.0, 1.0, 0.5)), camera_at((-2.0, -1.0, 0.0))])
     intrinsics = np.tile(K, (3, 1))
     together = field.render(Viewpoints.of(poses, intrinsics, SIZE), "day:night:0.3")
     for i in range(3):
@@ -188,28 +188,27 @@ def test_one_camera_or_many_are_the_same(monkeypatch):
         assert np.allclose(alone.rgb[0], together.rgb[i], atol=1e-5)
 
 
-def test_a_picture_does_not_depend_on_the_lights_beside_it():
-    """To the last bit: or an episode would end otherwise beside others than alone."""
-    field = baked(wall(1.0, 2.0))
-    rng, hidden = np.random.default_rng(0), len(field._first_bias[0])
-    field._first_bias = (
-        field._first_bias[0],
-        rng.normal(0, 0.1, (32, hidden)).astype(np.float32),
-    )  # as wide as a real one's
+def test_image_does_not_depend_on_other_lightings_of_the_batch():
+    """Bit for bit, or an episode would depend on those that are driven beside it."""
+    bare, rng, dim = baked(wall(1.0, 2.0)), np.random.default_rng(0), 32  # as in real fields
+    head = networks(dim)
+    head["network.head.0"][-dim:] = rng.normal(0, 0.1, (dim, 8))
+    names = Lightings(("day",), np.zeros((1, dim), np.float32), (), np.zeros((0, dim), np.float32))
+    field = BakedField(LAYOUT, names, bare.arrays | head)
     lights = rng.normal(0, 1, (16, 32)).astype(np.float32)
     for n in (2, 3, 8, 16):
-        together = field.render(Viewpoints.of(np.tile(looking(), (n, 1, 1)), K, SIZE), lights[:n])
+        together = field.render(Viewpoints.of(np.tile(camera_at(), (n, 1, 1)), K, SIZE), lights[:n])
         for i in range(n):
-            alone = field.render(Viewpoints.of(looking(), K, SIZE), lights[i : i + 1])
+            alone = field.render(Viewpoints.of(camera_at(), K, SIZE), lights[i : i + 1])
             assert np.array_equal(alone.rgb[0], together.rgb[i])
 
 
-def test_every_camera_may_have_a_lighting_of_its_own():
+def test_each_camera_can_have_its_own_lighting():
     field = baked(wall(1.0, 2.0))
-    cameras = Viewpoints.of(np.concatenate([looking(), looking()]), K, SIZE)
+    cameras = Viewpoints.of(np.concatenate([camera_at(), camera_at()]), K, SIZE)
     together = field.render(cameras, ["day", field.embedding("night")])
     for i, name in enumerate(("day", "night")):
-        alone = field.render(Viewpoints.of(looking(), K, SIZE), name)
+        alone = field.render(Viewpoints.of(camera_at(), K, SIZE), name)
         assert np.array_equal(alone.rgb[0], together.rgb[i])
     assert np.array_equal(
         together.rgb, field.render(cameras, np.stack([field.embedding(n) for n in ("day", "night")])).rgb
@@ -219,23 +218,23 @@ def test_every_camera_may_have_a_lighting_of_its_own():
 
 
 @pytest.mark.parametrize("size", [(5, 3), (1, 41), (33, 17)])
-def test_a_picture_of_any_size_is_a_piece_of_a_larger_one(size):
+def test_image_of_any_size_equals_a_crop_of_a_larger_one(size):
     field, rim = baked(wall(1.0, 11.0)), 10
     middle = np.array([30.0, 30.0, size[0] / 2, size[1] / 2])
-    small = field.render(Viewpoints.of(looking(), middle, size), "day")
+    small = field.render(Viewpoints.of(camera_at(), middle, size), "day")
     wide = size[0] + 2 * rim, size[1] + 2 * rim
-    large = field.render(Viewpoints.of(looking(), middle + np.array([0, 0, rim, rim]), wide), "day")
+    large = field.render(Viewpoints.of(camera_at(), middle + np.array([0, 0, rim, rim]), wide), "day")
     inner = np.s_[0, rim:-rim, rim:-rim]
     assert small.depth.shape == (1, size[1], size[0])
     assert np.abs(small.depth[0] - large.depth[inner]).max() < 0.1
     assert np.abs(small.rgb[0] - large.rgb[inner]).max() < 0.05
 
 
-def test_it_comes_back_from_its_files_without_torch(tmp_path):
+def test_save_and_load_are_the_identity_without_torch(tmp_path):
     field = baked(wall(1.0, 3.0))
     field.save(tmp_path)
-    before = field.render(Viewpoints.of(looking(), K[None], SIZE), "night")
-    after = BakedField.load(tmp_path).render(Viewpoints.of(looking(), K[None], SIZE), "night")
+    before = field.render(Viewpoints.of(camera_at(), K[None], SIZE), "night")
+    after = BakedField.load(tmp_path).render(Viewpoints.of(camera_at(), K[None], SIZE), "night")
     assert np.array_equal(before.depth, after.depth)
     assert np.array_equal(before.rgb, after.rgb)
     code = (
@@ -245,7 +244,7 @@ def test_it_comes_back_from_its_files_without_torch(tmp_path):
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_random_lightings_come_back_from_its_files(tmp_path):
+def test_random_lightings_are_equal_after_loading(tmp_path):
     bare = baked(wall(1.0, 3.0))
     with pytest.raises(InputError, match="no probes"):
         bare.sample_lighting(np.random.default_rng(0))
@@ -257,14 +256,14 @@ def test_random_lightings_come_back_from_its_files(tmp_path):
     again = BakedField.load(tmp_path)
     drawn = field.sample_lighting(np.random.default_rng(0))
     assert np.array_equal(drawn, again.sample_lighting(np.random.default_rng(0)))
-    assert again.render(Viewpoints.of(looking(), K, SIZE), drawn).rgb.shape == (1, SIZE[1], SIZE[0], 3)
+    assert again.render(Viewpoints.of(camera_at(), K, SIZE), drawn).rgb.shape == (1, SIZE[1], SIZE[0], 3)
 
 
-def test_what_is_no_baked_field_is_an_input_error(tmp_path):
+def test_unreadable_baked_field_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match=r"no baked\.json"):
         BakedField.load(tmp_path)
     (tmp_path / "baked.json").write_text('{"format": 99}')
     with pytest.raises(InputError, match="format 99"):
         BakedField.load(tmp_path)
     with pytest.raises(InputError, match="unknown"):
-        baked(wall(1.0, 3.0)).render(Viewpoints.of(looking(), K[None], SIZE), "dawn")
+        baked(wall(1.0, 3.0)).render(Viewpoints.of(camera_at(), K[None], SIZE), "dawn")

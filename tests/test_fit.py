@@ -1,4 +1,4 @@
-"""Training: what a batch holds, that it learns, that it repeats itself, that held-out scores are honest."""
+"""Training: contents of a batch, convergence, repeatability, baking, evaluation."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ def quiet():
     set_quiet(False)
 
 
-def ground_picture(pose: np.ndarray, brightness: float) -> np.ndarray:
+def ground_image(pose: np.ndarray, brightness: float) -> np.ndarray:
     """A chequered floor at z = 0 under a blue sky."""
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     ray = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1) @ pose[:3, :3].T
@@ -55,7 +55,7 @@ def make_cameras(folder: Path, n: int = 8) -> Cameras:
     for source, brightness in (("day", 1.0), ("night", 0.4)):
         for k in range(n):
             pose = look_at(np.array([0.5 * k, 0.0, 1.5]), np.array([0.5 * k + 4.0, 0.3, 0.0]))
-            write_image(folder / "images" / source / f"{k:06d}.png", ground_picture(pose, brightness))
+            write_image(folder / "images" / source / f"{k:06d}.png", ground_image(pose, brightness))
             names.append(f"{source}/{k:06d}")
             poses.append(pose)
     lightings = tuple(name.split("/")[0] for name in names)
@@ -69,7 +69,7 @@ def make_cameras(folder: Path, n: int = 8) -> Cameras:
 
 
 def floor_points(cameras: Cameras, m: int = 200) -> SparsePoints:
-    """Points on the floor, each seen by every frame in whose picture it falls."""
+    """Points on the floor, each seen by every frame whose image contains it."""
     rng = np.random.default_rng(1)
     xyz = np.stack([rng.uniform(0.0, 9.0, m), rng.uniform(-3.0, 3.0, m), np.zeros(m)], -1)
     point, frame = [], []
@@ -93,12 +93,12 @@ def test_held_out_frames_are_not_among_the_training_pixels(cameras):
     assert len(pixels.colors) == (~cameras.held_out).sum() * WIDTH * HEIGHT
 
 
-def test_nothing_to_train_on_is_an_input_error(cameras):
+def test_no_training_frame_is_an_input_error(cameras):
     with pytest.raises(InputError, match="held out"):
         TrainingPixels(replace(cameras, held_out=np.ones(len(cameras), bool)), SparsePoints.empty(), WIDTH)
 
 
-def test_masked_pixels_are_never_drawn(cameras, tmp_path):
+def test_masked_pixels_are_never_sampled(cameras, tmp_path):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, :20] = 0
     for name in cameras.names:
@@ -114,18 +114,18 @@ def test_masked_pixels_are_never_drawn(cameras, tmp_path):
         TrainingPixels(masked, SparsePoints.empty(), WIDTH)
 
 
-def test_a_batch_holds_what_the_pictures_show(cameras):
+def test_batch_colors_equal_the_images(cameras):
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     batch = pixels.batch(np.random.default_rng(0), 4, 3, 16, 0)
     assert len(batch.frame) == 4 * (3 * 3 + 16)
-    for f, (u, v), colour in zip(batch.frame, batch.pixel, batch.color, strict=True):
+    for f, (u, v), color in zip(batch.frame, batch.pixel, batch.color, strict=True):
         image, _, _ = load_frame(pixels.cameras, int(f), WIDTH)
-        np.testing.assert_allclose(colour, image[int(v), int(u)] / 255.0, atol=1e-6)
+        np.testing.assert_allclose(color, image[int(v), int(u)] / 255.0, atol=1e-6)
     triples = batch.pixel.reshape(4, 25, 2)[:, :9].reshape(-1, 3, 2)
     np.testing.assert_allclose(triples[:, 0] + triples[:, 2], 2.0 * triples[:, 1], atol=1e-5)
 
 
-def test_sightings_lie_on_the_floor(cameras):
+def test_depth_supervision_lies_on_the_floor(cameras):
     pixels = TrainingPixels(cameras, floor_points(cameras), WIDTH, camera_height=1.5)
     for pool in (pixels.points, pixels.path):
         assert len(pool.frame) > 50
@@ -136,21 +136,21 @@ def test_sightings_lie_on_the_floor(cameras):
         np.testing.assert_allclose(height, 0.0, atol=1e-4)
 
 
-def test_a_plane_does_not_bend_and_an_edge_in_colour_may():
+def test_plane_loss_is_zero_on_planes_and_small_at_color_edges():
     pixel = np.random.default_rng(0).uniform(0.0, 1.0, (10, 2))
     step = np.random.default_rng(1).uniform(-0.1, 0.1, (10, 2))
     line = np.stack([pixel - step, pixel, pixel + step], 1)
     inverse = torch.from_numpy((0.3 * line[..., 0] + 0.7 * line[..., 1] + 0.2).ravel()).float()
-    grey = torch.full((30, 3), 0.5)
-    assert plane_loss(inverse, grey) < 1e-6
+    gray = torch.full((30, 3), 0.5)
+    assert plane_loss(inverse, gray) < 1e-6
     bent = inverse.clone()
     bent[1::3] += 0.05
-    striped = grey.clone()
+    striped = gray.clone()
     striped[1::3] = 1.0
-    assert plane_loss(bent, striped) < 0.01 * plane_loss(bent, grey)
+    assert plane_loss(bent, striped) < 0.01 * plane_loss(bent, gray)
 
 
-def test_free_space_follows_the_path_but_not_jumps(cameras):
+def test_free_segments_follow_the_path_without_jumps(cameras):
     segments = free_segments(cameras, 0.3)
     assert len(segments) == 16 + 14
     jumped = cameras.camera_to_world.copy()
@@ -160,7 +160,7 @@ def test_free_space_follows_the_path_but_not_jumps(cameras):
     assert len(free_segments(cameras, 0.0)) == 0
 
 
-def test_camera_height_counts_only_where_known_and_constant():
+def test_camera_height_is_used_only_if_known_and_constant():
     metric = {"camera_height_median_m": 1.2, "local_height_spread_m": 0.01, "road_reliable": True}
     assert constant_height(metric) == 1.2
     assert constant_height(metric | {"local_height_spread_m": 0.5}) == 0.0
@@ -176,7 +176,7 @@ def trained(cameras: Cameras, config: NerfConfig) -> RadianceField:
     return trainer.finish()
 
 
-def test_two_runs_are_equal_bit_by_bit_on_any_number_of_cores(cameras, monkeypatch):
+def test_training_is_bit_equal_on_any_number_of_cores(cameras, monkeypatch):
     first = trained(cameras, CONFIG)
     monkeypatch.setattr(buffers, "available_cores", lambda: 1)
     second = trained(cameras, CONFIG)
@@ -187,13 +187,13 @@ def test_two_runs_are_equal_bit_by_bit_on_any_number_of_cores(cameras, monkeypat
     assert first.table.abs().max() > 0.011  # it did move
 
 
-def test_another_seed_is_another_field(cameras):
+def test_another_seed_gives_another_field(cameras):
     a = Trainer(cameras, SparsePoints.empty(), CONFIG, 1, "cpu")
     b = Trainer(cameras, SparsePoints.empty(), CONFIG, 2, "cpu")
     assert not torch.equal(a.field.table, b.field.table)
 
 
-def test_it_learns_the_floor_and_both_lightings(cameras):
+def test_training_learns_the_floor_and_both_lightings(cameras):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
     field, metrics, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
     metrics |= evaluate(field, cameras, WIDTH)
@@ -210,17 +210,17 @@ def test_it_learns_the_floor_and_both_lightings(cameras):
     floor_depth = -1.5 / (ray @ cameras.camera_to_world[i, :3, :3].T)[..., 2]
     assert np.median(np.abs(result.depth[0, lower] / floor_depth - 1.0)) < 0.2
 
-    picture = ground_picture(cameras.camera_to_world[i], 0.7)
+    picture = ground_image(cameras.camera_to_world[i], 0.7)
     one = CameraArrays(cameras.camera_to_world[i : i + 1], K[None], field.device)
     pixels = np.stack([column.ravel() + 0.5 for column in np.mgrid[:HEIGHT, :WIDTH][::-1]], -1)
     features, harmonics, _, _ = field.trace(one, np.zeros(len(pixels), int), pixels)
-    colours = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
-    fitted, _ = fit_appearance(field.parameters, features, harmonics, colours, field.embedding("day"))
+    colors = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
+    fitted, _ = fit_appearance(field.parameters, features, harmonics, colors, field.embedding("day"))
     seen = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), fitted).rgb[0]
     assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
 
 
-def test_the_stage_writes_a_field_that_loads(cameras, tmp_path):
+def test_stage_writes_fields_that_load(cameras, tmp_path):
     scene = SceneDir(tmp_path / "scene")
     scene.stage("metric").mkdir(parents=True)
     cameras.save(scene.stage("metric"))
@@ -242,7 +242,7 @@ def bricks(facts) -> int:
     return facts["bricks_near"] + facts["bricks_far"]
 
 
-def test_a_baked_field_shows_what_the_field_shows(cameras, monkeypatch):
+def test_baked_field_renders_like_the_field(cameras, monkeypatch):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
     field, _, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
@@ -275,13 +275,13 @@ def test_a_baked_field_shows_what_the_field_shows(cameras, monkeypatch):
 
 
 @pytest.mark.parametrize(("value", "message"), [("tpu", "cpu or cuda"), ("cuda", "no CUDA device")])
-def test_a_device_that_is_not_there_is_an_input_error(monkeypatch, value, message):
+def test_unavailable_device_is_an_input_error(monkeypatch, value, message):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match=message):
         buffers.resolve_device(value)
 
 
-def test_a_field_that_no_camera_sees_is_not_baked(cameras):
+def test_field_without_visible_surface_is_not_baked(cameras):
     config = replace(CONFIG, steps=2, near_plane=100.0)  # [m] everything is nearer
     field, _, _ = train_field(cameras, floor_points(cameras), config, device="cpu")
     with pytest.raises(InputError, match=r"nothing to bake.*near_plane"):

@@ -1,4 +1,4 @@
-"""Every kernel compiles for a GPU ahead of time, on a machine that has none."""
+"""Every kernel compiles for a GPU ahead of time, on a machine without one."""
 
 import pkgutil
 from importlib import import_module
@@ -11,14 +11,14 @@ from twin.nerf.kernels import color_head, march
 
 _ARCH = 90  # sm_90: Hopper
 _SLOW = {"patch_match"}
-"""Unrolled windows make it 20 s of compiling to machine code; to PTX, which a driver takes on, it is half of that."""
+"""Kernels with unrolled windows, compiled to PTX, which takes half the time of machine code."""
 _MADE = {
-    "many worlds' steps": lambda: import_module("twin.env.vector_env_gpu"),
-    "many worlds' pictures": lambda: import_module("twin.env.observation"),
+    "steps of a GPU vector env": lambda: import_module("twin.env.vector_env_gpu"),
+    "images of a GPU vector env": lambda: import_module("twin.env.observation"),
     "march of one lane": lambda: march.march_kernel(march.LANES["cuda"]).module,
     "color head of one lane": lambda: color_head.color_head_kernel(color_head.LANES["cuda"], 64, 32)[0].module,
 }
-"""Those elsewhere; and kernels that are made for a number of lanes, which are in modules of their own."""
+"""Kernels outside this package, and those built for a number of lanes, each in its own module."""
 _NO_KERNEL = {"color_head"}
 
 

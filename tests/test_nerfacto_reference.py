@@ -1,4 +1,4 @@
-"""The Nerfacto baseline of the benchmarks: sampling, compositing, hash grid, and equality of its two forms."""
+"""The reference renderer of the benchmarks: its samples and its compositing are those of a radiance field."""
 
 import math
 import sys
@@ -14,7 +14,7 @@ import nerfacto_tuned
 sys.path.pop(0)
 
 RAYS = 32
-COLOUR = torch.tensor([0.2, 0.5, 0.9])
+COLOR = torch.tensor([0.2, 0.5, 0.9])
 POSE, INTRINSICS, SIZE = torch.eye(4), torch.tensor([10.0, 10.0, 4.0, 3.0]), (8, 6)
 
 
@@ -24,12 +24,12 @@ def rays() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def renderer(density) -> reference.Nerfacto:
-    """A renderer of a density function of points (r, s, 3) and a constant color."""
-    return reference.Nerfacto((density, density), lambda points, _: (density(points), COLOUR.expand(points.shape)))
+    """With a density by formula of points (r, s, 3), and the same color everywhere."""
+    return reference.Nerfacto((density, density), lambda points, _: (density(points), COLOR.expand(points.shape)))
 
 
 def vivid_networks():
-    """Networks with large weights, so that the image has contrast; initial features of ±1e-4 give a uniform fog."""
+    """With weights so large that the picture has contrast: features of the start, ±1e-4, make an even fog."""
     proposals, field = reference.networks()
     with torch.no_grad():
         for network in (*proposals, field):
@@ -39,16 +39,16 @@ def vivid_networks():
     return proposals, field
 
 
-# Tolerances grow with distance: beyond one unit the 256 samples are uniform in inverse distance.
+# The farther, the coarser: 256 samples are uniform in inverse distance beyond one unit.
 @pytest.mark.parametrize(("radius", "tolerance"), [(0.3, 0.01), (2.0, 0.02), (40.0, 0.08)])
-def test_an_opaque_shell_has_its_distance(radius, tolerance):
+def test_opaque_shell_renders_at_its_distance(radius, tolerance):
     rgb, distance, opacity = renderer(lambda points: 1e4 * (points.norm(dim=-1) > radius)).rays(*rays())
     assert torch.allclose(distance, torch.full((RAYS,), radius), rtol=tolerance)
     assert torch.allclose(opacity, torch.ones(RAYS), atol=1e-4)
-    assert torch.allclose(rgb, COLOUR.expand(RAYS, 3), atol=1e-3)
+    assert torch.allclose(rgb, COLOR.expand(RAYS, 3), atol=1e-3)
 
 
-def test_a_thin_fog_has_the_opacity_of_beer_and_lambert():
+def test_opacity_of_thin_fog_follows_beer_lambert():
     fog = 0.7
     density = lambda points: fog * ((points.norm(dim=-1) > 1.0) & (points.norm(dim=-1) < 2.0))  # noqa: E731
     rgb, _, opacity = renderer(density).rays(*rays())
@@ -61,7 +61,7 @@ def test_empty_space_is_transparent():
     assert not opacity.any()
 
 
-def test_a_frame_of_random_weights():
+def test_frame_of_random_weights():
     nerfacto = reference.Nerfacto(*reference.networks())
     rgb, depth, opacity = nerfacto.frame(POSE, INTRINSICS, SIZE)
     assert rgb.shape == (6, 8, 3) and depth.shape == opacity.shape == (6, 8)
@@ -69,17 +69,17 @@ def test_a_frame_of_random_weights():
     assert torch.allclose(nerfacto.frame(POSE, INTRINSICS, SIZE, chunk=7)[0], rgb, atol=1e-5)
 
 
-def test_the_tuned_form_renders_the_same_image():
+def test_tuned_renderer_renders_the_same_image():
     networks = vivid_networks()
     plain = reference.Nerfacto(*networks).frame(POSE, INTRINSICS, SIZE)
     tuned = nerfacto_tuned.tuned(*networks).frame(POSE, INTRINSICS, SIZE, chunk=20)
-    assert plain[0].std(dim=(0, 1)).min() > 0.01 and plain[1].std() > 0.1  # the image has contrast
+    assert plain[0].std(dim=(0, 1)).min() > 0.01 and plain[1].std() > 0.1  # there is something to see
     assert torch.allclose(plain[0], tuned[0], atol=5e-4) and torch.allclose(plain[2], tuned[2], atol=5e-4)
-    # Rounding can move a median to the next sample.
+    # A median jumps to the next sample where a rounding decides.
     assert (torch.isclose(plain[1], tuned[1], atol=5e-4)).float().mean() > 0.9
 
 
-def test_the_tuned_grid_has_the_same_features():
+def test_tuned_grid_has_the_same_features():
     proposals, field = vivid_networks()
     points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(2))
     for network in (*proposals, field):
@@ -87,14 +87,14 @@ def test_the_tuned_grid_has_the_same_features():
         assert torch.allclose(plain, tuned.T, rtol=1e-4, atol=1e-4)
 
 
-def test_depth_is_z_depth():
+def test_depth_is_along_the_axis():
     nerfacto = renderer(lambda points: 1e4 * (points[..., 2] > 1.5))
     _, depth, _ = nerfacto.frame(POSE, INTRINSICS, SIZE, chunk=16)
     assert torch.allclose(depth, torch.full((6, 8), 1.5), rtol=0.02)
 
 
-def test_the_hash_grid_is_trilinear():
-    """At a vertex it returns the stored features, at the middle of an edge the mean of its ends."""
+def test_hash_grid_is_trilinear():
+    """At a vertex the stored features; half way along an edge the mean of its two ends."""
     grid = reference.HashGrid(2, 17, 32)
     corner = torch.tensor([3.0, 5.0, 7.0])
     step = torch.tensor([0.0, 0.0, 1.0])

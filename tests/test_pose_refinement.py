@@ -1,4 +1,4 @@
-"""Camera refinement: gradients against finite differences, and cameras that were moved find back."""
+"""Pose refinement: gradients against finite differences, and correction of rotated cameras."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def cameras(tmp_path) -> Cameras:
     return make_cameras(tmp_path)
 
 
-def test_a_correction_turns_a_camera_about_its_centre_and_shifts_it():
+def test_correction_rotates_about_the_center_and_translates():
     pose = torch.eye(4, dtype=torch.float64)[None].repeat(2, 1, 1)
     pose[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
     turn = torch.tensor([[0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.0]], dtype=torch.float64)
@@ -32,8 +32,8 @@ def test_a_correction_turns_a_camera_about_its_centre_and_shifts_it():
     np.testing.assert_allclose(out[:, :3, 3], [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0]])
 
 
-def test_gradients_are_those_of_finite_differences(cameras):
-    """Of Σ wᵢ·featureᵢ along rays whose samples keep their distances, in the near box and outside."""
+def test_gradients_equal_finite_differences(cameras):
+    """For Σ wᵢ·featureᵢ along rays at fixed sample distances, in the near box and outside."""
     trainer = Trainer(cameras, floor_points(cameras), REFINING, 0, "cpu")
     ws, field, refinement = trainer.ws, trainer.field, trainer.refinement
     assert refinement is not None
@@ -48,18 +48,18 @@ def test_gradients_are_those_of_finite_differences(cameras):
     centre, half = torch.tensor(field.layout.centre), torch.tensor(field.layout.half)
 
     def value(origin: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        """Of every ray, shape (n,)."""
-        metres = (origin[:, None] + ws.distances[..., None] * direction[:, None]).reshape(-1, 3).contiguous()
-        points = wp.from_torch(metres, dtype=wp.vec3f)
-        wp.launch(space.contract_points, rows, [points, field.center, field.inverse_half, 0], [ws.w_positions])
+        """The sum per ray, shape (n,)."""
+        meters = (origin[:, None] + ws.distances[..., None] * direction[:, None]).reshape(-1, 3).contiguous()
+        points = wp.from_torch(meters, dtype=wp.vec3f)
+        wp.launch(space.contract_points, rows, [points, field.contraction], [ws.w_positions])
         field.query(ws, 0, rows)
         return (ws.features[:rows].double() * weights).sum(1).view(ws.rays, -1).sum(1)
 
     value(ws.origins, ws.directions)
     ws.features_grad[:rows].copy_(weights)
     refinement.backward(field, 0, ws.rays)
-    metres = ws.origins[:, None] + ws.distances[..., None] * ws.directions[:, None]
-    outside = (((metres - centre) / half).abs().amax(-1) > 1.0).sum()
+    meters = ws.origins[:, None] + ws.distances[..., None] * ws.directions[:, None]
+    outside = (((meters - centre) / half).abs().amax(-1) > 1.0).sum()
     assert 50 < outside < rows - 50
     for axis in range(3):
         for which, step in ((0, 1e-3), (1, 5e-5)):
@@ -74,7 +74,7 @@ def test_gradients_are_those_of_finite_differences(cameras):
             assert error.median() < 0.02
 
 
-def test_frames_that_were_turned_find_back_in_a_field_that_is_right(cameras, monkeypatch):
+def test_rotated_frames_are_corrected_in_a_trained_field(cameras, monkeypatch):
     config = replace(REFINING, steps=300, rays=512, samples=12, levels=4, log2_table=12, stereo=False, sightings=0.0)
     trainer = Trainer(cameras, floor_points(cameras), config, 0, "cpu", camera_height=1.5)
     refinement, given = trainer.refinement, trainer.pixels.cameras.camera_to_world
@@ -83,7 +83,7 @@ def test_frames_that_were_turned_find_back_in_a_field_that_is_right(cameras, mon
     turn = torch.as_tensor(turn - turn.mean(0))
 
     def error() -> float:
-        """Median angle between the cameras and the true ones, but for what is common to all [rad]."""
+        """Median angle between the cameras and the true ones without the mean rotation [rad]."""
         relative = refinement.arrays.rotation.numpy() @ given[:, :3, :3].transpose(0, 2, 1)
         angles = np.stack([relative[:, 2, 1], relative[:, 0, 2], relative[:, 1, 0]], 1)
         return float(np.median(np.linalg.norm(angles - angles.mean(0), axis=1)))
@@ -104,7 +104,7 @@ def test_frames_that_were_turned_find_back_in_a_field_that_is_right(cameras, mon
     assert np.mean(errors[-30:]) < 0.8 * np.mean(errors[:30])
 
 
-def test_cameras_stay_where_no_refinement_is_asked_for(cameras):
+def test_cameras_move_only_with_refinement(cameras):
     _, metrics, same = train_field(cameras, floor_points(cameras), CONFIG, camera_height=1.5, device="cpu")
     assert metrics["cameras_moved"] is None and same is cameras
     _, metrics, moved = train_field(cameras, floor_points(cameras), REFINING, camera_height=1.5, device="cpu")
@@ -112,7 +112,7 @@ def test_cameras_stay_where_no_refinement_is_asked_for(cameras):
     assert not np.array_equal(moved.camera_to_world, cameras.camera_to_world)
 
 
-def test_frames_not_trained_on_move_with_their_neighbours(cameras):
+def test_held_out_frames_move_with_their_neighbors(cameras):
     refinement = Trainer(cameras, floor_points(cameras), REFINING, 0, "cpu").refinement
     assert isinstance(refinement, PoseRefinement)
     with torch.no_grad():
@@ -125,7 +125,7 @@ def test_frames_not_trained_on_move_with_their_neighbours(cameras):
     assert said["most_m"] == pytest.approx(1.3) and said["most_deg"] == 0.0
 
 
-def test_two_refinements_are_equal_bit_by_bit(cameras):
+def test_refinement_is_bit_equal(cameras):
     def once() -> tuple[torch.Tensor, torch.Tensor]:
         trainer = Trainer(cameras, floor_points(cameras), REFINING, 5, "cpu")
         with single_threaded_torch():

@@ -1,4 +1,4 @@
-"""One photo adds its lighting: the fit, the file, what it is tied to, and what the verb refuses."""
+"""Lighting of a photo: the fit, the file, its field, and the errors of `twin.relight`."""
 
 import json
 from dataclasses import asdict, replace
@@ -26,7 +26,7 @@ from twin.scene import SceneDir, stage_result, write_stamp
 
 
 def small_field(seed: int = 0) -> RadianceField:
-    """Untrained: its backdrop's colours vary with direction and embedding, which is all that a fit needs."""
+    """An untrained field: its background varies with direction and embedding, which is all that a fit needs."""
     frames = tuple(f"day/{i:06d}" for i in range(4))
     appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, seed)
     layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
@@ -45,7 +45,7 @@ def scene(tmp_path_factory) -> SceneDir:
     return scene
 
 
-def test_a_fit_finds_the_light_of_a_photo():
+def test_fit_finds_the_lighting_of_a_photo():
     field, pose = small_field(), pose_at(0.0)
     hidden = field.embedding("night") + np.random.default_rng(1).normal(0.0, 0.8, 8).astype(np.float32)
     small = (64, 48)
@@ -85,14 +85,14 @@ def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
     assert clear.fog == Fog() and clear.psnr_other_half == clear.psnr_clear_other_half
 
 
-def test_a_half_is_judged_by_what_was_fitted_to_the_other():
+def test_halves_are_scored_by_the_fit_to_the_other_half():
     field, pose = small_field(), pose_at(0.0)
     day, night = _filmed(field, pose, (64, 48))
     torn = fit_photo(field, np.hstack([day[:, :32], night[:, 32:]]), pose, K / 5)
     assert torn.psnr_clear_other_half == pytest.approx(psnr(day, night), abs=3.0)  # each half fits one of them
 
 
-def test_air_by_closed_forms_and_between_two_lightings():
+def test_fog_by_closed_forms_and_in_mixtures():
     rgb, distance = np.full((1, 2, 3), 0.5, np.float32), np.array([[0.0, 1e6]], np.float32)
     np.testing.assert_array_equal(Fog().apply(rgb, distance), rgb)
     near, far = Fog(0.03, (1.0, 0.0, 0.5)).apply(rgb, distance)[0]
@@ -118,7 +118,7 @@ def _filmed(field, pose, size):
     return [field.render(Viewpoints.of(pose[None], K / 5, size), name).rgb[0] for name in field.lightings]
 
 
-def test_the_verb_adds_a_lighting_that_the_scene_then_has(scene, capsys):
+def test_relight_adds_a_lighting_to_the_scene(scene, capsys):
     assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "dusk"]) == 0
     said = capsys.readouterr().out
     assert "inliers of" in said and "dB fitted" in said
@@ -135,8 +135,8 @@ def test_the_verb_adds_a_lighting_that_the_scene_then_has(scene, capsys):
     assert psnr(fitted, photo, unlabelled) == pytest.approx(stored["figures"]["psnr_fitted"], abs=0.5)
 
 
-def test_the_picture_of_a_fit_names_its_panels(monkeypatch):
-    """In the corner of each panel; the rest is the images to the bit."""
+def test_comparison_labels_its_panels(monkeypatch):
+    """Labels lie in the corner of each panel; the other pixels are those of the images."""
     rng = np.random.default_rng(0)
     images = tuple(rng.uniform(0.0, 1.0, (150, 270, 3)).astype(np.float32) for _ in range(3))
     relit = PhotoFit("sun", np.zeros(4, np.float32), Fog(), images, 16.3, 25.34, 24.0, 24.0)
@@ -164,7 +164,7 @@ def _without_gaps(picture: np.ndarray) -> np.ndarray:
     return np.hstack([picture[:, k * (width + 4) : k * (width + 4) + width] for k in range(3)])
 
 
-def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
+def test_rebuilt_field_refuses_stale_lightings(scene):
     AddedLighting("old", [0.0] * 8, Fog(), stage_result(scene, "field"), "photo.png", {}).save(scene)
     assert "old" in added_lightings(scene, 8)[0]
     another = scene.stage("field") / "another"
@@ -184,7 +184,7 @@ def test_a_rebuilt_field_refuses_what_was_fitted_to_another(scene):
     assert "old" in twin.load_scene(scene.root).radiance_field().lightings
 
 
-def test_what_cannot_be_used_ends_with_one_line_and_status_2(scene, tmp_path, capsys):
+def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys):
     noise = np.kron(np.random.default_rng(0).integers(0, 255, (60, 80, 3)), np.ones((4, 4, 1))).astype(np.uint8)
     write_image(tmp_path / "noise.png", noise)
     photo = str(scene.root / "photo.png")
@@ -202,7 +202,7 @@ def test_what_cannot_be_used_ends_with_one_line_and_status_2(scene, tmp_path, ca
     assert not (scene.lightings / "x.json").exists()
 
 
-def test_a_damaged_file_is_named(scene):
+def test_error_names_a_damaged_file(scene):
     path = scene.lightings / "broken.json"
     scene.lightings.mkdir(exist_ok=True)
     whole = asdict(AddedLighting("broken", [0.0] * 8, Fog(), "first", "photo.png", {})) | {"format": 2}
@@ -224,7 +224,7 @@ def test_a_damaged_file_is_named(scene):
         path.unlink()
 
 
-def test_a_lighting_from_before_photos_told_the_air_is_stale(scene):
+def test_lighting_of_format_1_is_stale(scene):
     path = scene.lightings / "early.json"
     path.write_text('{"format": 1, "name": "early", "embedding": [0, 0, 0, 0, 0, 0, 0, 0], "field": "first"}')
     try:
@@ -238,7 +238,7 @@ def test_a_lighting_from_before_photos_told_the_air_is_stale(scene):
         path.unlink()
 
 
-def test_the_air_of_a_hazy_photo_is_kept_and_told(scene, monkeypatch, capsys):
+def test_fog_of_a_hazy_photo_is_stored_and_printed(scene, monkeypatch, capsys):
     air = Fog(0.03, (0.9, 0.8, 0.7))
 
     def hazy(field, photo, camera_to_world, intrinsics):
@@ -250,7 +250,7 @@ def test_the_air_of_a_hazy_photo_is_kept_and_told(scene, monkeypatch, capsys):
     assert added_lightings(scene, 8)[2]["hazy"] == air
 
 
-def test_plain_lightings_take_more_too():
+def test_lightings_can_be_added():
     mine = Lightings(("a",), np.zeros((1, 3), np.float32), (), np.zeros((0, 3), np.float32))
     more = mine.added({"b": np.ones(3, np.float32)}, ("c",))
     assert more.names == ("a", "b")
@@ -260,7 +260,7 @@ def test_plain_lightings_take_more_too():
 
 
 @pytest.mark.parametrize("share", ["30", "nan", "inf", "-0.1", "1.01"])
-def test_a_share_of_a_mixture_is_from_0_to_1(share):
+def test_share_of_a_mixture_is_from_0_to_1(share):
     mine = Lightings(("a", "b"), np.eye(2, dtype=np.float32), (), np.zeros((0, 2), np.float32))
     for end in ("0", "1"):
         assert np.array_equal(mine.embedding(f"a:b:{end}"), mine.embedding("ab"[int(end)]))
@@ -270,6 +270,6 @@ def test_a_share_of_a_mixture_is_from_0_to_1(share):
 
 
 @pytest.mark.parametrize("name", RESERVED_LIGHTINGS)
-def test_what_means_a_light_drawn_at_random_is_no_name(name):
+def test_reserved_names_are_refused(name):
     with pytest.raises(InputError, match=rf"--name '{name}': reserved"):
         check_name(name, ("day",))

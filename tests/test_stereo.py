@@ -1,4 +1,4 @@
-"""Stereo between the frames of a film: right where there is something to see, silent where there is not."""
+"""Stereo between the frames of a film: accurate on texture, without depth elsewhere."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ def quiet():
 
 
 def pattern(points: np.ndarray) -> np.ndarray:
-    """Grey in [0, 1] of places (..., 3): waves of 0.3 to 3 m in all directions."""
+    """Gray in [0, 1] of places (..., 3): waves of 0.3 to 3 m in all directions."""
     rng = np.random.default_rng(3)
     direction = rng.normal(size=(40, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -39,7 +39,7 @@ def poses(n: int, lateral: float = 0.0) -> np.ndarray:
 
 
 def film(folder: Path, n: int = 8, paint=None) -> Cameras:
-    """A drive past two boxes; `paint(i, places)` gives grey of frame i where it is not the pattern."""
+    """A drive past two boxes; `paint(i, places)` gives gray of frame i where it is not the pattern."""
     pose = poses(n)
     depth = PLACE.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), "day").depth
     names = tuple(f"day/{i:06d}" for i in range(n))
@@ -47,8 +47,8 @@ def film(folder: Path, n: int = 8, paint=None) -> Cameras:
     for i, name in enumerate(names):
         rays = unproject(pixel_grid(WIDTH, HEIGHT), K)
         places = (rays * depth[i][..., None]) @ pose[i, :3, :3].T + pose[i, :3, 3]
-        grey = (paint or (lambda i, p: pattern(p)))(i, places)
-        picture = np.repeat((np.clip(grey, 0, 1) * 255).astype(np.uint8)[..., None], 3, -1)
+        gray = (paint or (lambda i, p: pattern(p)))(i, places)
+        picture = np.repeat((np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, -1)
         write_image(folder / f"{name}.png", picture)
     return Cameras(
         *(names, pose, np.tile(K, (n, 1)), np.tile([WIDTH, HEIGHT], (n, 1)), ("day",) * n, ("day",) * n),
@@ -57,7 +57,7 @@ def film(folder: Path, n: int = 8, paint=None) -> Cameras:
 
 
 def points_of(cameras: Cameras, m: int = 150) -> SparsePoints:
-    """Some places on the ground that every frame may see."""
+    """Points on the ground, listed for every frame."""
     rng = np.random.default_rng(0)
     xyz = np.stack([rng.uniform(2.0, 14.0, m), rng.uniform(-3.0, 3.0, m), np.zeros(m)], 1)
     point, frame = (k.ravel() for k in np.meshgrid(np.arange(m), np.arange(len(cameras)), indexing="ij"))
@@ -65,7 +65,7 @@ def points_of(cameras: Cameras, m: int = 150) -> SparsePoints:
 
 
 def true_distance(cameras: Cameras, found) -> np.ndarray:
-    """Distance [m] along the rays of sightings."""
+    """True distance [m] along the rays of depth supervision."""
     out = np.empty(len(found.frame))
     for i in np.unique(found.frame):
         mine = found.frame == i
@@ -76,7 +76,7 @@ def true_distance(cameras: Cameras, found) -> np.ndarray:
     return out
 
 
-def test_it_finds_the_ground_and_what_stands_on_it(tmp_path):
+def test_stereo_finds_ground_and_boxes(tmp_path):
     cameras = film(tmp_path)
     pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
     found, facts = stereo_depths(pixels, 0, "cpu")
@@ -96,7 +96,7 @@ def test_it_finds_the_ground_and_what_stands_on_it(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["noise", "plain"])
-def test_it_finds_nothing_where_nothing_matches(tmp_path, kind):
+def test_stereo_finds_nothing_without_matching_texture(tmp_path, kind):
     def paint(i, places):
         return np.random.default_rng(i).random(places.shape[:2]) if kind == "noise" else np.full(places.shape[:2], 0.5)
 
@@ -105,7 +105,7 @@ def test_it_finds_nothing_where_nothing_matches(tmp_path, kind):
     assert facts["share"] < 0.01
 
 
-def test_same_seed_same_sightings_on_any_number_of_cores(tmp_path, monkeypatch):
+def test_stereo_is_equal_on_any_number_of_cores(tmp_path, monkeypatch):
     cameras = film(tmp_path, 5)
     pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
     first, _ = stereo_depths(pixels, 4, "cpu")
@@ -115,7 +115,7 @@ def test_same_seed_same_sightings_on_any_number_of_cores(tmp_path, monkeypatch):
     assert np.array_equal(first.pixel, second.pixel)
 
 
-def test_masked_pixels_are_not_sighted(tmp_path):
+def test_masked_pixels_get_no_depth(tmp_path):
     cameras = film(tmp_path / "pictures")
     mask = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     mask[:, : WIDTH // 2] = 0
@@ -128,27 +128,27 @@ def test_masked_pixels_are_not_sighted(tmp_path):
     assert found.pixel[:, 0].min() > WIDTH // 2
 
 
-def test_without_sparse_points_there_is_no_stereo(tmp_path):
+def test_no_stereo_without_sparse_points(tmp_path):
     cameras = film(tmp_path, 4)
     found, facts = stereo_depths(TrainingPixels(cameras, SparsePoints.empty(), WIDTH), 0, "cpu")
     assert len(found.frame) == 0
     assert facts["sightings"] == 0
 
 
-def test_sources_are_of_the_same_film_and_some_degrees_aside(tmp_path):
+def test_sources_are_of_the_same_film_and_degrees_apart(tmp_path):
     cameras = film(tmp_path, 8)
     mixed = replace(cameras, sources=("a", "b") * 4)
     chosen = choose_sources(mixed, mixed.intrinsics, np.full(8, 6.0))
     for i, sources in enumerate(chosen):
         assert len(sources) > 0
         assert all(mixed.sources[j] == mixed.sources[i] and j != i for j in sources)
-    # At 60 m, steps of 0.6 m show a place from less than a degree aside: the farthest frames are the best.
+    # At 60 m, steps of 0.6 m turn the view of a point by less than a degree: the farthest frames are the best.
     far = choose_sources(cameras, cameras.intrinsics, np.full(8, 60.0))
     assert far[0][0] == 7
 
 
-def test_the_homography_agrees_with_projection(tmp_path):
-    """A plane's window goes where projecting its places puts it."""
+def test_homography_agrees_with_projection(tmp_path):
+    """A pixel's image under the homography is the projection of its point."""
     from twin.nerf.stereo import _geometry
 
     cameras = film(tmp_path, 4)
