@@ -65,7 +65,7 @@ def tiny_field(boxes) -> BakedField:
         values[..., c + 1] = np.sin(at @ np.array([1.0 + 0.2 * c, 0.7 - 0.1 * c, 0.5]))
     low, step = np.r_[LOW, np.full(15, -1.0)], np.r_[STEP, np.full(15, 2.0 / 255)]
     rng = np.random.default_rng(0)
-    weights = networks(rng)
+    weights = networks()
     weights["network.head.0"][31, :3], weights["network.head.0"][32, :3] = 0.6, 0.1  # day and night
     weights["network.head.0"][33, 0], weights["network.head.0"][34, 2] = 0.1, 0.1
     probes = rng.uniform(-1, 1, (300, 15)), rng.uniform(-1, 1, (300, 16))
