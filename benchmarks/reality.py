@@ -94,7 +94,7 @@ def contact_sheet(path: Path) -> None:
         label = (str(number), (5, 15), cv2.FONT_HERSHEY_DUPLEX, 0.45)
         frames.append(cv2.putText(np.ascontiguousarray(image), *label, (255, 255, 255), 1, cv2.LINE_AA))
     rows = [np.hstack(frames[k : k + 6]) for k in range(0, len(frames), 6)]
-    write_image(path, np.vstack(rows))
+    cv2.imwrite(str(path), np.vstack(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 78])
 
 
 def main() -> int:

@@ -33,6 +33,7 @@ class AtlasColors:
     woods: Mapping[str, _Rgb] = field(
         default_factory=lambda: {"planks": (0.50, 0.37, 0.24), "crate": (0.50, 0.37, 0.24)}
     )
+    masonry: Mapping[str, _Rgb] = field(default_factory=dict)
     doors: tuple[_Rgb, _Rgb] = ((0.50, 0.37, 0.24), (0.50, 0.37, 0.24))
     greens: tuple[_Rgb, ...] = ((0.26, 0.37, 0.12), (0.33, 0.42, 0.13), (0.40, 0.40, 0.14), (0.22, 0.33, 0.14))
     hedge: _Rgb = (0.10, 0.16, 0.06)
@@ -77,6 +78,10 @@ def _cell(rng: np.random.Generator, name: str, colors: AtlasColors) -> Array32 |
         return textures.leaf(rng, square, colors.hedge)
     if name in colors.metals:
         return textures.metal(rng, square, colors.metals[name])
+    if name in colors.masonry:
+        return textures.bricks(rng, square, 0.02, colors.masonry[name])
+    if name == "birch":
+        return textures.bark(rng, square, (0.72, 0.71, 0.67))
     if name in colors.woods:
         return textures.wood(rng, square, colors.woods[name])
     if name == "cone":

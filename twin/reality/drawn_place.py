@@ -529,13 +529,14 @@ def _atlas_image(spec: PlaceSpec) -> NDArray[np.uint8]:
     woods = {"planks": near((0.50, 0.37, 0.24)), "crate": near((0.52, 0.40, 0.27)), "pole": near((0.33, 0.26, 0.2))}
     woods["shutter"] = near((0.3, 0.34, 0.3), 0.8)
 
+    masonry = {"chimney": near((0.45, 0.3, 0.25), 0.3)}
+
     def surface(boundary: BoundarySpec, name: str) -> None:
-        (woods if boundary.kind in ("picket", "boards", "rails") else metals)[name] = boundary.color
+        material = {"wall": masonry, "mesh": metals, "bollards": metals}.get(boundary.kind, woods)
+        material[name] = boundary.color
 
     surface(left, "boundary_left")
     surface(right, "boundary_right")
-    metals["chimney"] = near((0.45, 0.3, 0.25), 0.3)
-    metals["birch"] = (0.78, 0.77, 0.73)
     plates = [((0.93, 0.92, 0.88), f"{chr(65 + int(rng.integers(26)))}X {int(rng.integers(100, 999))}") for _ in "12"]
     signs = [
         (_SIGN_GROUNDS[int(rng.integers(len(_SIGN_GROUNDS)))], _WORDS[int(rng.integers(len(_WORDS)))]) for _ in range(6)
@@ -546,6 +547,7 @@ def _atlas_image(spec: PlaceSpec) -> NDArray[np.uint8]:
     colors = AtlasColors(
         metals=metals,
         woods=woods,
+        masonry=masonry,
         doors=(near((0.6, 0.42, 0.3), 0.5), near((0.4, 0.5, 0.5), 0.6)),
         greens=trees.greens,
         hedge=(0.45 * dark[0], 0.45 * dark[1], 0.45 * dark[2]),
