@@ -23,6 +23,7 @@ from twin.files import check_shapes, load_tensors, read_json, require_text, wrap
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
 from twin.nerf.fog import Fog
+from twin.nerf.kernels import ground_texture as ground_kernels
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
@@ -127,6 +128,74 @@ def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str,
     return out
 
 
+# ---- ground texture
+
+
+@dataclass(frozen=True)
+class GroundTexture:
+    """Features on the ground; terms as in `kernels/ground_texture.py`."""
+
+    heights: Array32
+    """Height map [m], shape (along x, along y)."""
+    origin: NDArray[np.float64]
+    """Lowest corner of the height map and of the tiles [m], shape (2,)."""
+    height_cell: float
+    """Spacing of the height map [m]."""
+    tiles: NDArray[np.int32]
+    """Positions of the stored tiles in their grid, shape (t, 2)."""
+    texel: float
+    """Side of the finest texels [m]."""
+    texels: NDArray[np.uint8]
+    """Bytes of the texels around 128, each the sum of its level and the coarser ones, shape (t · TEXELS, CHANNELS)."""
+    step: Array32
+    """Value of a byte's unit, shape (CHANNELS,)."""
+
+    @staticmethod
+    def untextured(heights: Array32, origin: NDArray[np.float64], height_cell: float) -> "GroundTexture":
+        """A height map without texture."""
+        empty = np.zeros((0, CHANNELS), np.uint8)
+        return GroundTexture(heights, origin, height_cell, np.zeros((0, 2), np.int32), 1.0, empty, np.zeros(CHANNELS, "f4"))
+
+    @property
+    def tile_index(self) -> NDArray[np.int32]:
+        """Slots of the tiles of a grid that covers them, −1 where none is stored."""
+        index = np.full(self.tiles.max(0, initial=0) + 1, -1, np.int32)
+        index[tuple(self.tiles.T)] = np.arange(len(self.tiles))
+        return index
+
+    def arrays(self) -> dict[str, NDArray]:
+        """The arrays of a `BakedField` that hold the texture."""
+        return {
+            "ground.heights": self.heights,
+            "ground.origin": self.origin,
+            "ground.sides": np.array([self.height_cell, self.texel]),
+            "ground.tiles": self.tiles,
+            "ground.texels": self.texels,
+            "ground.step": self.step,
+        }
+
+    @staticmethod
+    def of_arrays(arrays: dict[str, NDArray]) -> "GroundTexture":
+        """The texture in the arrays of a `BakedField`; fields of earlier versions have none."""
+        if "ground.heights" not in arrays:
+            return GroundTexture.untextured(np.zeros((0, 0), np.float32), np.zeros(2), 1.0)
+        height_cell, texel = map(float, arrays["ground.sides"])
+        return GroundTexture(
+            *(arrays["ground.heights"], arrays["ground.origin"], height_cell, arrays["ground.tiles"], texel),
+            *(arrays["ground.texels"], arrays["ground.step"]),
+        )
+
+
+def ground_grid(texture: GroundTexture, device: str) -> Any:
+    """A texture's height map and tile index on a device, see `ground_kernels.GroundGrid`."""
+    grid: Any = ground_kernels.GroundGrid()
+    grid.origin = wp.vec2f(*texture.origin.tolist())
+    grid.height_cell, grid.texel = texture.height_cell, texture.texel
+    grid.heights = wp.array(texture.heights, dtype=wp.float32, device=device)
+    grid.tiles = wp.array(texture.tile_index, dtype=wp.int32, device=device)
+    return grid
+
+
 # ---- field
 
 _FORMAT = 2
@@ -186,6 +255,7 @@ class BakedField:
         self._bricks = b
         self._lock = threading.Lock()
         self._targets: dict[tuple[int, int, int, bool], _RenderTarget] = {}
+        self._set_ground(GroundTexture.of_arrays(arrays))
 
         self._march = kernels.march_kernel(kernels.LANES[device])
         self._color_head, weights = color_head_kernel(
@@ -204,7 +274,7 @@ class BakedField:
             setattr(w, name.replace(".", "_"), on_device(p[name].ravel(), wp.float32))
         self._weights = w
         self._first_bias = p["head.0.bias"], p["head.0"][rows:]
-        needed = kernels.cone_march, self._march, self._color_head
+        needed = kernels.cone_march, self._march, ground_kernels.add_ground, self._color_head
         # Loaded here, so that no two threads do it at once.
         with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
             for kernel in needed:
@@ -290,16 +360,31 @@ class BakedField:
             target = self._render(cameras, lighting)
             consume(target.rgb, target.opacity)
 
-    def render_features(self, cameras: PosedCameras, lighting: str | NDArray) -> tuple[Rendering, Array32]:
+    def render_features(
+        self, cameras: PosedCameras, lighting: str | NDArray, size: tuple[int, int] | None = None
+    ) -> tuple[Rendering, Array32]:
         """Renders as `render` does and also returns the composited features before the color head.
 
         Returns:
             The rendering, and a copy of opacity (channel 0) and features, shape (n, CHANNELS, height, width).
         """
         with self._lock:
-            target = self._render(cameras, lighting)
+            target = self._render(cameras, lighting, size)
             n, height, width = target.shape
             return target.result(), target.features.numpy().reshape(n, -1, height, width).copy()
+
+    def set_ground_texture(self, texture: GroundTexture) -> None:
+        """Replaces the ground texture."""
+        with self._lock:
+            self.arrays |= texture.arrays()
+            self._set_ground(texture)
+
+    def _set_ground(self, texture: GroundTexture) -> None:
+        grid = ground_grid(texture, self.device)
+        texels = wp.array(texture.texels, dtype=Bytes, device=self.device)
+        self._ground = grid, texels, Channels(*texture.step.tolist())
+        self._textured = bool(len(texture.tiles))
+        self._targets.clear()
 
     def single_threaded(self) -> "BakedField":
         """A field on the same arrays with its own render targets and lock, which renders on the calling thread.
@@ -421,6 +506,16 @@ class _RenderTarget:
                     recorded(
                         *(field._march, (n, packets), [field._bricks, image, first * across, start]),
                         [self.features, self.depth],
+                    ),
+                    *(
+                        [
+                            recorded(
+                                *(ground_kernels.add_ground, (n, bottom - top), [*field._ground, image, top, self.depth]),
+                                [self.features],
+                            )
+                        ]
+                        if field._textured
+                        else []
                     ),
                     recorded(
                         *(field._color_head, (n, runs), [field._weights, self.bias, image, top, bottom, self.features]),
