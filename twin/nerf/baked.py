@@ -23,7 +23,7 @@ from twin.files import check_shapes, load_tensors, read_json, require_text, wrap
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
 from twin.nerf.fog import Fog
-from twin.nerf.kernels import ground_texture as ground_kernels
+from twin.nerf.kernels import detail as detail_kernels
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
@@ -128,12 +128,12 @@ def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str,
     return out
 
 
-# ---- ground texture
+# ---- detail
 
 
 @dataclass(frozen=True)
-class GroundTexture:
-    """Features on the ground; terms as in `kernels/ground_texture.py`."""
+class Detail:
+    """Features at surfaces, finer than bricks; terms as in `kernels/detail.py`."""
 
     heights: Array32
     """Height map [m], shape (along x, along y)."""
@@ -146,15 +146,19 @@ class GroundTexture:
     texel: float
     """Side of the finest texels [m]."""
     texels: NDArray[np.uint8]
-    """Bytes of the texels around 128, each the sum of its level and the coarser ones, shape (t · TEXELS, CHANNELS)."""
-    step: Array32
-    """Value of a byte's unit, shape (CHANNELS,)."""
+    """Bytes of the texels, shape (t · TEXELS, CHANNELS), see `DetailBytes`."""
+    texel_step: Array32
+    cell: float
+    """Side of the hash grid's cells [m]."""
+    vertices: NDArray[np.uint8]
+    """Bytes of the hash grid's table, shape (rows, CHANNELS)."""
+    vertex_step: Array32
 
     @staticmethod
-    def untextured(heights: Array32, origin: NDArray[np.float64], height_cell: float) -> "GroundTexture":
-        """A height map without texture."""
-        empty = np.zeros((0, CHANNELS), np.uint8)
-        return GroundTexture(heights, origin, height_cell, np.zeros((0, 2), np.int32), 1.0, empty, np.zeros(CHANNELS, "f4"))
+    def without_features(heights: Array32, origin: NDArray[np.float64], height_cell: float) -> "Detail":
+        """A height map alone."""
+        none, step = np.zeros((0, CHANNELS), np.uint8), np.zeros(CHANNELS, np.float32)
+        return Detail(heights, origin, height_cell, np.zeros((0, 2), np.int32), 1.0, none, step, 1.0, none, step)
 
     @property
     def tile_index(self) -> NDArray[np.int32]:
@@ -164,35 +168,35 @@ class GroundTexture:
         return index
 
     def arrays(self) -> dict[str, NDArray]:
-        """The arrays of a `BakedField` that hold the texture."""
-        return {
-            "ground.heights": self.heights,
-            "ground.origin": self.origin,
-            "ground.sides": np.array([self.height_cell, self.texel]),
-            "ground.tiles": self.tiles,
-            "ground.texels": self.texels,
-            "ground.step": self.step,
-        }
+        """The arrays of a `BakedField` that hold the detail."""
+        sides = np.array([self.height_cell, self.texel, self.cell])
+        return {f"detail.{name}": getattr(self, name) for name in _DETAIL_ARRAYS} | {"detail.sides": sides}
 
     @staticmethod
-    def of_arrays(arrays: dict[str, NDArray]) -> "GroundTexture":
-        """The texture in the arrays of a `BakedField`; fields of earlier versions have none."""
-        if "ground.heights" not in arrays:
-            return GroundTexture.untextured(np.zeros((0, 0), np.float32), np.zeros(2), 1.0)
-        height_cell, texel = map(float, arrays["ground.sides"])
-        return GroundTexture(
-            *(arrays["ground.heights"], arrays["ground.origin"], height_cell, arrays["ground.tiles"], texel),
-            *(arrays["ground.texels"], arrays["ground.step"]),
-        )
+    def of_arrays(arrays: dict[str, NDArray]) -> "Detail":
+        """The detail in the arrays of a `BakedField`; fields of earlier versions have none."""
+        if "detail.sides" not in arrays:
+            return Detail.without_features(np.zeros((0, 0), np.float32), np.zeros(2), 1.0)
+        height_cell, texel, cell = map(float, arrays["detail.sides"])
+        named = {name: arrays[f"detail.{name}"] for name in _DETAIL_ARRAYS}
+        return Detail(height_cell=height_cell, texel=texel, cell=cell, **named)
 
 
-def ground_grid(texture: GroundTexture, device: str) -> Any:
-    """A texture's height map and tile index on a device, see `ground_kernels.GroundGrid`."""
-    grid: Any = ground_kernels.GroundGrid()
-    grid.origin = wp.vec2f(*texture.origin.tolist())
-    grid.height_cell, grid.texel = texture.height_cell, texture.texel
-    grid.heights = wp.array(texture.heights, dtype=wp.float32, device=device)
-    grid.tiles = wp.array(texture.tile_index, dtype=wp.int32, device=device)
+_DETAIL_ARRAYS = ("heights", "origin", "tiles", "texels", "texel_step", "vertices", "vertex_step")
+
+
+def detail_grid(detail: Detail, device: str) -> Any:
+    """Height map, tile index and sizes on a device, see `detail_kernels.DetailGrid`."""
+    grid: Any = detail_kernels.DetailGrid()
+    grid.origin = wp.vec2f(*detail.origin.tolist())
+    grid.texel, grid.cell, grid.per_height_cell = detail.texel, detail.cell, 1.0 / detail.height_cell
+    grid.coarsest = max(detail.texel * 2 ** (detail_kernels.LEVELS - 1), detail.cell)
+    grid.mask = wp.uint32(max(1, len(detail.vertices)) - 1)
+    index = detail.tile_index
+    grid.heights_x, grid.heights_y = detail.heights.shape
+    grid.tiles_x, grid.tiles_y = index.shape
+    grid.heights = wp.array(detail.heights.ravel(), dtype=wp.float32, device=device)
+    grid.tiles = wp.array(index.ravel(), dtype=wp.int32, device=device)
     return grid
 
 
@@ -255,7 +259,7 @@ class BakedField:
         self._bricks = b
         self._lock = threading.Lock()
         self._targets: dict[tuple[int, int, int, bool], _RenderTarget] = {}
-        self._set_ground(GroundTexture.of_arrays(arrays))
+        self._set_detail(Detail.of_arrays(arrays))
 
         self._march = kernels.march_kernel(kernels.LANES[device])
         self._color_head, weights = color_head_kernel(
@@ -274,7 +278,7 @@ class BakedField:
             setattr(w, name.replace(".", "_"), on_device(p[name].ravel(), wp.float32))
         self._weights = w
         self._first_bias = p["head.0.bias"], p["head.0"][rows:]
-        needed = kernels.cone_march, self._march, ground_kernels.add_ground, self._color_head
+        needed = kernels.cone_march, self._march, detail_kernels.add_detail, self._color_head
         # Loaded here, so that no two threads do it at once.
         with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
             for kernel in needed:
@@ -373,17 +377,21 @@ class BakedField:
             n, height, width = target.shape
             return target.result(), target.features.numpy().reshape(n, -1, height, width).copy()
 
-    def set_ground_texture(self, texture: GroundTexture) -> None:
-        """Replaces the ground texture."""
+    def set_detail(self, detail: Detail) -> None:
+        """Replaces the detail."""
         with self._lock:
-            self.arrays |= texture.arrays()
-            self._set_ground(texture)
+            self.arrays |= detail.arrays()
+            self._set_detail(detail)
 
-    def _set_ground(self, texture: GroundTexture) -> None:
-        grid = ground_grid(texture, self.device)
-        texels = wp.array(texture.texels, dtype=Bytes, device=self.device)
-        self._ground = grid, texels, Channels(*texture.step.tolist())
-        self._textured = bool(len(texture.tiles))
+    def _set_detail(self, detail: Detail) -> None:
+        stored: Any = detail_kernels.DetailBytes()
+        stored.texels = wp.array(detail.texels, dtype=Bytes, device=self.device)
+        stored.vertices = wp.array(detail.vertices, dtype=Bytes, device=self.device)
+        stored.texel_step, stored.vertex_step = (
+            Channels(*step.tolist()) for step in (detail.texel_step, detail.vertex_step)
+        )
+        self._detail = detail_grid(detail, self.device), stored
+        self._has_detail = bool(len(detail.tiles) or len(detail.vertices))
         self._targets.clear()
 
     def single_threaded(self) -> "BakedField":
@@ -510,11 +518,12 @@ class _RenderTarget:
                     *(
                         [
                             recorded(
-                                *(ground_kernels.add_ground, (n, bottom - top), [*field._ground, image, top, self.depth]),
+                                *(detail_kernels.add_detail, (n, -(-(bottom - top) // detail_kernels.RUN))),
+                                [*field._detail, image, top, bottom, self.depth],
                                 [self.features],
                             )
                         ]
-                        if field._textured
+                        if field._has_detail
                         else []
                     ),
                     recorded(

@@ -1,8 +1,8 @@
-"""Ground texture of a baked field: fits it to the training frames; terms as in `kernels/ground_texture.py`.
+"""Detail of a baked field: fits it to the training frames; terms as in `kernels/detail.py`.
 
-Bricks blur the ground, which a driving camera sees at grazing angles: a ray runs through many of their cells before it
-is blocked. But the ground's height is known much better than a brick's cell, so where a ray meets the ground is known
-to a few centimeters, and features can be looked up there. The texture holds what the bricks' features lack.
+Bricks blur surfaces that are seen at grazing angles, the ground most of all: a ray runs through many of their cells
+before it is blocked. But where it is blocked is known better than that, and on the ground to a few centimeters, as its
+height is smooth. So features are looked up there that hold what those of the bricks lack.
 """
 
 from dataclasses import dataclass, replace
@@ -17,24 +17,26 @@ from scipy.ndimage import gaussian_filter
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
-from twin.nerf.baked import BakedField, GroundTexture, ground_grid
+from twin.nerf.baked import BakedField, Detail, detail_grid
 from twin.nerf.buffers import parallel, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import ground_texture as kernels
+from twin.nerf.kernels import detail as kernels
 from twin.runtime import bar
 from twin.warp_runtime import wp
 
 _TEXEL = 0.025  # [m] least side of the finest texels
 _MAX_TILES = 6000  # texels grow until there are at most this many tiles, 33 MB
+_CELL = 0.04  # [m] side of the hash grid's cells
+_LOG2_ROWS = 20  # of the hash grid's table, 16 MB
 _HEIGHT_CELL = 0.25  # [m]
 _HEIGHT_VIEW = 160  # [px] width of the views that find the ground
 _REACH = 12.0  # [m] greatest distance of a view from the ground it finds
 _MIN_UPRIGHT = 0.94  # z of the normal of ground (20° from level)
 _MIN_SEEN = 8  # pixels in a cell whose height is known
-_MIN_OPACITY = 0.98  # of a ray that shows the ground and nothing behind it
+_MIN_OPACITY = 0.98  # of a ray that shows a surface and nothing behind it
 _MIN_HITS = 24  # training pixels in a stored tile
-_MAX_HITS = 6_000_000  # training pixels that are kept, at most: 0.3 GB
+_MAX_HITS = 8_000_000  # training pixels that are kept, about: 0.5 GB
 _SHARDS = 4
 _RAYS = 16384  # per step
 _RATE, _FINAL_RATE = 0.04, 0.05  # learning rate, and its final share
@@ -42,11 +44,11 @@ _CLIPPED_SHARE = 2e-4  # share of values clipped by the range of a byte
 
 
 @dataclass(frozen=True)
-class GroundPixels:
-    """n training pixels on the ground."""
+class SurfacePixels:
+    """n training pixels on surfaces."""
 
     hits: NDArray[np.float32]
-    """x, y [m] from the corner of the height map, and footprint [m], shape (n, 3)."""
+    """See `kernels.Hit`, shape (n, 4)."""
     features: NDArray[np.float16]
     """Features of the baked field, shape (n, CHANNELS − 1)."""
     directions: NDArray[np.float16]
@@ -57,42 +59,42 @@ class GroundPixels:
     """Training frames, shape (n,)."""
 
 
-def fit_ground_texture(
-    baked: BakedField, appearance: Appearance, pixels: TrainingPixels, seed: int, passes: int
+def fit_detail(
+    baked: BakedField, appearance: Appearance, pixels: TrainingPixels, seed: int, passes: float
 ) -> dict[str, Any]:
-    """Gives a baked field a ground texture, fitted to the training frames; returns a summary.
+    """Gives a baked field detail, fitted to the training frames; returns a summary.
 
     Args:
-        baked: Gets the texture, unless no level surface is seen.
+        baked: Gets the detail.
         appearance: Embeddings of the training frames.
         pixels: Training frames of the field.
         seed: Seed of the order of pixels.
-        passes: How often every training pixel on the ground is used.
+        passes: How often every training pixel near enough is used.
     """
-    ground = _height_map(baked, pixels)
-    if ground is None:
-        return {"tiles": 0}
-    heights, origin = ground
-    seen = _ground_pixels(baked, pixels, heights, origin, seed)
-    tiles, texel = _choose_tiles(seen.hits, heights.shape)
-    if not len(tiles):
-        return {"tiles": 0}
-    texture = replace(GroundTexture.untextured(heights, origin, _HEIGHT_CELL), tiles=tiles, texel=texel)
-    fitter = _TextureFitter(baked, appearance, texture, seen)
+    ground = Detail.without_features(*_height_map(baked, pixels), _HEIGHT_CELL)
+    seen = _surface_pixels(baked, pixels, ground, seed)
+    if not len(seen.hits):
+        return {"pixels": 0}
+    tiles, texel = _choose_tiles(seen.hits, ground.heights.shape)
+    vertices = np.zeros((2**_LOG2_ROWS, 0), np.uint8)
+    fitter = _DetailFitter(
+        baked, appearance, replace(ground, tiles=tiles, texel=texel, cell=_CELL, vertices=vertices), seen
+    )
     before, after = fitter.run(max(1, round(passes * len(seen.hits) / _RAYS)))
-    baked.set_ground_texture(fitter.quantized())
+    detail = fitter.quantized()
+    baked.set_detail(detail)
     return {
+        "pixels": len(seen.hits),
         "tiles": len(tiles),
         "texel_m": texel,
-        "pixels": len(seen.hits),
         "psnr_before": round(before, 3),
         "psnr_after": round(after, 3),
-        "bytes": len(tiles) * kernels.TEXELS * volume.CHANNELS,
+        "bytes": sum(array.nbytes for array in detail.arrays().values()),
     }
 
 
-def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
-    """Heights of level surfaces (along x, along y) [m], and the lowest corner of their grid; None if none is seen."""
+def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Heights of level surfaces (along x, along y) [m], and the lowest corner of their grid."""
     found = [np.zeros((0, 3))]
     for i in range(len(pixels.cameras)):
         width = min(_HEIGHT_VIEW, int(pixels.width[i]))
@@ -108,8 +110,8 @@ def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.f
         level = (normal[..., 2] > _MIN_UPRIGHT) & (depth[1:, 1:] < _REACH) & (points[..., 2] < pose[2, 3])
         found.append(points[level])
     xyz = np.concatenate(found)
-    if len(xyz) < _MIN_SEEN:
-        return None
+    if not len(xyz):
+        return np.full((2, 2), kernels.NO_GROUND, np.float32), pixels.cameras.positions[:, :2].min(0)
     origin = xyz[:, :2].min(0) - _HEIGHT_CELL
     # Node i of the map is the median of the points within half a cell.
     node = np.floor((xyz[:, :2] - origin) / _HEIGHT_CELL + 0.5).astype(np.int64)
@@ -129,15 +131,13 @@ def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.f
     return np.where(weight > 0.3, smooth, kernels.NO_GROUND).astype(np.float32), origin
 
 
-def _ground_pixels(
-    baked: BakedField, pixels: TrainingPixels, heights: NDArray[np.float32], origin: NDArray, seed: int
-) -> GroundPixels:
-    """Unmasked training pixels on the ground, in random order."""
-    grid = ground_grid(GroundTexture.untextured(heights, origin, _HEIGHT_CELL), baked.device)
+def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, seed: int) -> SurfacePixels:
+    """Unmasked training pixels that detail can change, in random order."""
+    grid = detail_grid(ground, baked.device)
     rng = np.random.default_rng([seed, 7])
-    share = min(1.0, _MAX_HITS / max(1, int(0.5 * pixels.start[-1])))
+    share = min(1.0, _MAX_HITS / max(1, int(0.7 * pixels.start[-1])))
     parts = []
-    with bar("ground pixels", len(pixels.cameras), "frame") as progress:
+    with bar("surfaces", len(pixels.cameras), "frame") as progress:
         for i in range(len(pixels.cameras)):
             width, height = int(pixels.width[i]), int(pixels.height[i])
             pose, k = pixels.cameras.camera_to_world[i].astype(np.float32), pixels.intrinsics[i].astype(np.float32)
@@ -145,9 +145,9 @@ def _ground_pixels(
                 pixels.cameras.select(np.array([i])), baked.lightings[0], (width, height)
             )
             depth = wp.array(shown.depth.ravel(), dtype=wp.float32, device=baked.device)
-            hits = wp.empty(len(depth), dtype=wp.vec3f, device=baked.device)
+            hits = wp.empty(len(depth), dtype=kernels.Hit, device=baked.device)
             wp.launch(
-                kernels.find_ground,
+                kernels.find_surface,
                 len(depth),
                 [grid, wp.mat33f(*pose[:3, :3].ravel()), wp.vec3f(*pose[:3, 3]), wp.vec4f(*k), width, depth],
                 [hits],
@@ -155,7 +155,8 @@ def _ground_pixels(
             )
             hit = hits.numpy()
             rows = slice(pixels.start[i], pixels.start[i + 1])
-            usable = (hit[:, 2] > 0.0) & (hit[:, 2] < _TEXEL * 2**kernels.LEVELS) & pixels.unmasked[rows]
+            usable = np.where(hit[:, 3] > 0.0, hit[:, 3] < _TEXEL * 2**kernels.LEVELS, hit[:, 3] > -2.0 * _CELL)
+            usable &= (hit[:, 3] != 0.0) & pixels.unmasked[rows]
             usable &= shown.opacity.ravel() > _MIN_OPACITY
             if share < 1.0:
                 usable &= rng.random(len(hit)) < share
@@ -165,24 +166,23 @@ def _ground_pixels(
             ray = local @ pose[:3, :3].T
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
             base = features[0].reshape(volume.CHANNELS, -1)[1:, at].T.astype(np.float16)
-            parts.append((hit[at], base, ray.astype(np.float16), pixels.colors[rows][at], np.full(len(at), i, np.int32)))
+            parts.append(
+                (hit[at], base, ray.astype(np.float16), pixels.colors[rows][at], np.full(len(at), i, np.int32))
+            )
             progress.update()
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     order = rng.permutation(len(columns[0]))
-    return GroundPixels(*(column[order] for column in columns))
-
-
-def _parameters(baked: BakedField) -> dict[str, torch.Tensor]:
-    return {name: torch.from_numpy(value) for name, value in baked.network.items()}
+    return SurfacePixels(*(column[order] for column in columns))
 
 
 def _choose_tiles(hits: NDArray[np.float32], map_shape: tuple[int, ...]) -> tuple[NDArray[np.int32], float]:
     """Tiles (t, 2) with enough hits, and the side of their finest texels [m]."""
-    texel = _TEXEL
+    texel, on_ground = _TEXEL, hits[hits[:, 3] > 0.0]
     while True:
         side = texel * kernels.TILE
         shape = np.ceil(np.array(map_shape) * _HEIGHT_CELL / side).astype(int) + 1
-        at = (hits[:, :2] / side).astype(np.int64)
+        at = np.floor(on_ground[:, :2] / side).astype(np.int64)
+        at = at[((at >= 0) & (at < shape)).all(1)]
         count = np.bincount(at[:, 0] * shape[1] + at[:, 1], minlength=int(shape.prod()))
         tiles = np.argwhere(count.reshape(shape) >= _MIN_HITS).astype(np.int32)
         if len(tiles) <= _MAX_TILES:
@@ -190,40 +190,40 @@ def _choose_tiles(hits: NDArray[np.float32], map_shape: tuple[int, ...]) -> tupl
         texel *= max(1.05, (len(tiles) / _MAX_TILES) ** 0.5)
 
 
-class _TextureFitter:
-    """Fits texels by gradient descent through the color head, which stays as it is."""
+class _DetailFitter:
+    """Fits detail by gradient descent through the color head, which stays as it is."""
 
-    def __init__(
-        self,
-        baked: BakedField,
-        appearance: Appearance,
-        texture: GroundTexture,
-        pixels: GroundPixels,
-    ):
-        self.texture, self.pixels = texture, pixels
-        self.device, self.parameters = baked.device, _parameters(baked)
-        self.embeddings = appearance.of_frames(torch.arange(len(appearance.frames))).detach().cpu()
-        self.grid = ground_grid(texture, self.device)
-        rows = len(texture.tiles) * kernels.TEXELS
-        self.values, self.gradient = torch.zeros(rows, volume.CHANNELS), torch.zeros(rows, volume.CHANNELS)
-        self.second = torch.zeros(rows)
-        self.out, self.out_grad = torch.zeros(_RAYS, volume.CHANNELS), torch.zeros(_RAYS, volume.CHANNELS)
-        self.batch_hits = torch.zeros(_RAYS, 3)
-        self.w_values, self.w_gradient, self.w_out, self.w_out_grad = (
-            warp_view(t, volume.Channels) for t in (self.values, self.gradient, self.out, self.out_grad)
-        )
-        self.w_second, self.w_hits = warp_view(self.second, wp.float32), warp_view(self.batch_hits, wp.vec3f)
+    def __init__(self, baked: BakedField, appearance: Appearance, detail: Detail, pixels: SurfacePixels):
+        self.detail, self.pixels, self.device = detail, pixels, baked.device
+        self.parameters = {name: torch.from_numpy(value).to(self.device) for name, value in baked.network.items()}
+        with torch.no_grad():
+            self.embeddings = appearance.of_frames(torch.arange(len(appearance.frames), device=self.device))
+        self.grid = detail_grid(detail, self.device)
+
+        def new(*shape: int, dtype: Any = volume.Channels) -> tuple[torch.Tensor, Any]:
+            tensor = torch.zeros(shape, device=self.device)
+            return tensor, warp_view(tensor, dtype)
+
+        self.hits, self.w_hits = new(_RAYS, 4, dtype=kernels.Hit)
+        self.added, self.w_added = new(_RAYS, volume.CHANNELS)
+        self.added_grad, self.w_added_grad = new(_RAYS, volume.CHANNELS)
+        tables = []
+        for rows in (len(detail.tiles) * kernels.TEXELS, len(detail.vertices)):
+            values, gradient = new(rows, volume.CHANNELS), new(rows, volume.CHANNELS)
+            tables.append((values[1], gradient[1], new(rows, dtype=wp.float32)[1]))
+        self.texels, self.vertices = tables
+        wp.load_module("twin.nerf.kernels.detail", device=self.device)
 
     def run(self, steps: int) -> tuple[float, float]:
-        """Fits the texels; returns the PSNR [dB] of the first and of the last tenth of the batches."""
-        wp.load_module("twin.nerf.kernels.ground_texture", device=self.device)
+        """Fits the detail; returns the PSNR [dB] of the first and of the last tenth of the batches."""
+        n = len(self.pixels.hits)
+        count = min(_RAYS, n)
         errors = []
-        with bar("ground texture", steps, "step") as progress, single_threaded_torch():
+        with bar("detail", steps, "step") as progress, single_threaded_torch():
             for step in range(steps):
-                start = (step * _RAYS) % max(1, len(self.pixels.hits) - _RAYS + 1)
-                count = min(_RAYS, len(self.pixels.hits))
+                start = step * count % (n - count + 1)
                 rows = slice(start, start + count)
-                self.batch_hits[:count] = torch.from_numpy(self.pixels.hits[rows])
+                self.hits[:count] = torch.from_numpy(self.pixels.hits[rows])
                 rate = _RATE * _FINAL_RATE ** (step / steps)
                 squared = parallel(partial(self._backward, rows=rows), range(_SHARDS), self.device)
                 parallel(partial(self._update, count=count, rate=rate, step=step), range(_SHARDS), self.device)
@@ -233,55 +233,66 @@ class _TextureFitter:
         return float(-10 * np.log10(np.mean(errors[:some]))), float(-10 * np.log10(np.mean(errors[-some:])))
 
     def _backward(self, shard: int, rows: slice) -> float:
-        """Gradient of the loss with respect to the texture's features of a shard, and the sum of squared errors."""
+        """Gradient of the loss with respect to the added features of a shard, and its sum of squared errors."""
         count = rows.stop - rows.start
         low, high = shard * count // _SHARDS, (shard + 1) * count // _SHARDS
         mine = slice(rows.start + low, rows.start + high)
+
+        def batch(array: NDArray) -> torch.Tensor:
+            return torch.from_numpy(array[mine]).to(self.device)
+
         wp.launch(
-            kernels.interpolate_texture,
+            kernels.interpolate_detail,
             high - low,
-            [self.w_hits, self.grid, self.w_values, low],
-            [self.w_out],
+            [self.w_hits, self.grid, self.texels[0], self.vertices[0], low],
+            [self.w_added],
             device=self.device,
         )
-        base = torch.from_numpy(self.pixels.features[mine]).float()
-        harmonics = network.spherical_harmonics(torch.from_numpy(self.pixels.directions[mine]).float())
-        added = self.out[low:high, 1:].detach().requires_grad_(True)
-        embedding = self.embeddings[torch.from_numpy(self.pixels.frame[mine]).long()]
-        rgb = network.head(self.parameters, base + added, harmonics, embedding)
-        error = rgb - torch.from_numpy(self.pixels.color[mine]).float() / 255.0
+        added = self.added[low:high, 1:].detach().requires_grad_(True)
+        harmonics = network.spherical_harmonics(batch(self.pixels.directions).float())
+        embedding = self.embeddings[batch(self.pixels.frame).long()]
+        rgb = network.head(self.parameters, batch(self.pixels.features).float() + added, harmonics, embedding)
+        error = rgb - batch(self.pixels.color).float() / 255.0
         loss = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.1, reduction="sum") / count
-        (self.out_grad[low:high, 1:],) = torch.autograd.grad(loss, [added])
+        (self.added_grad[low:high, 1:],) = torch.autograd.grad(loss, [added])
         return float((error.detach() ** 2).sum())
 
     def _update(self, part: int, count: int, rate: float, step: int) -> None:
         wp.launch(
-            kernels.interpolate_texture_backward,
+            kernels.interpolate_detail_backward,
             count,
-            [self.w_hits, self.grid, self.w_out_grad, part, _SHARDS],
-            [self.w_gradient],
+            [self.w_hits, self.grid, self.w_added_grad, part, _SHARDS],
+            [self.texels[1], self.vertices[1]],
             device=self.device,
         )
         wp.launch(
-            kernels.adam_step_texture,
+            kernels.adam_step_detail,
             count,
             [self.w_hits, self.grid, part, _SHARDS, rate, 1.0 / (1.0 - 0.99 ** (step + 1))],
-            [self.w_values, self.w_gradient, self.w_second],
+            [*self.texels, *self.vertices],
             device=self.device,
         )
 
-    def quantized(self) -> GroundTexture:
-        """The texture with its texels as the renderer reads them: sums over the coarser levels, as bytes."""
-        total = wp.zeros(len(self.values), dtype=volume.Channels, device=self.device)
+    def quantized(self) -> Detail:
+        """The detail as the renderer reads it: texels summed over the coarser levels, all as bytes."""
+        total = wp.zeros(self.texels[0].shape, dtype=volume.Channels, device=self.device)
         wp.launch(
             kernels.sum_levels,
-            len(self.values),
-            [wp.array(self.texture.tiles, dtype=wp.vec2i, device=self.device), self.grid, self.w_values],
+            total.shape[0],
+            [wp.array(self.detail.tiles, dtype=wp.vec2i, device=self.device), self.grid, self.texels[0]],
             [total],
             device=self.device,
         )
-        values = total.numpy()
-        some = np.abs(values[:: max(1, len(values) // 200_000)])
-        step = (np.quantile(some, 1.0 - _CLIPPED_SHARE, axis=0) / 127.0).astype(np.float32)
-        codes = np.rint(values / np.maximum(step, 1e-9)).clip(-127, 127) + 128
-        return replace(self.texture, texels=codes.astype(np.uint8), step=step)
+        texels, texel_step = _as_bytes(total.numpy())
+        vertices, vertex_step = _as_bytes(self.vertices[0].numpy())
+        return replace(self.detail, texels=texels, texel_step=texel_step, vertices=vertices, vertex_step=vertex_step)
+
+
+def _as_bytes(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Values (rows, CHANNELS) as bytes around 128, and the value of a unit per channel."""
+    used = values[np.abs(values).sum(1) > 0.0]
+    if not len(used):
+        return np.full(values.shape, 128, np.uint8), np.zeros(values.shape[1], np.float32)
+    step = np.quantile(np.abs(used[:: max(1, len(used) // 200_000)]), 1.0 - _CLIPPED_SHARE, axis=0) / 127.0
+    codes = np.rint(values / np.maximum(step, 1e-9)).clip(-127, 127) + 128
+    return codes.astype(np.uint8), step.astype(np.float32)

@@ -1,0 +1,452 @@
+"""Detail: features finer than bricks, added to those of a ray at the point where it meets a surface.
+
+On the ground they are a texture, elsewhere a hash grid. A height map on a regular grid says where the ground is. A
+*texel* holds features at a node of a grid in (x, y); there are `LEVELS` such grids, each with texels twice as wide as
+the one before (a mipmap, Williams 1983). *Tile*: a square of `TILE`² texels of the finest level with the coarser texels
+on it; texels of all levels of a tile lie together, the finest first. *Slot*: row of a stored tile; the *index* gives it
+per tile, −1 where none is stored. The hash grid (Müller et al. 2022) has one level; its *vertices* share the rows of a
+table. *Footprint*: width of a pixel on the surface [m], by which a ray chooses its levels.
+"""
+
+# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# mypy: ignore-errors
+# ruff: noqa: RUF046
+from twin.nerf.kernels.bricks import Bytes
+from twin.nerf.kernels.composite import CHANNELS, Channels
+from twin.nerf.kernels.march import OPTIONS, ImageBuffers, as_floats, sample_of, slot_of
+from twin.warp_runtime import wp
+
+wp.set_module_options(OPTIONS)
+
+LEVELS = 4
+_LOG2_TILE = 4
+TILE = 1 << _LOG2_TILE
+"""Texels of the finest level along a tile's side."""
+TEXELS = sum((TILE >> level) ** 2 for level in range(LEVELS))
+"""Texels of a tile, of all levels."""
+NO_GROUND = 1.0e6
+"""Height of nodes where the ground is unknown [m]."""
+
+_UNKNOWN = 1.0e3  # height above which an interpolated one contains a node without ground [m]
+_MIN_DESCENT = 0.01  # descent per meter along the ray of rays that can meet the ground
+_TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m] between the ground and a surface that counts as ground
+_MAX_FOOTPRINT = 1.5  # of a level [texels]
+_MAX_STRETCH = 4.0  # of a pixel on the ground, beyond which its length does not count
+_PRIME_Y = wp.uint32(2654435761)
+_PRIME_Z = wp.uint32(805459861)
+RUN = 16
+"""Neighboring pixels per thread when rendering."""
+_ZERO = 128.0  # byte of the value 0
+_MIN_GRADIENT = 1.0e-22  # squared norm from which a ray takes part in a step
+
+
+@wp.struct
+class DetailGrid:
+    """Height map and tile index, which start at the same corner, and the hash grid."""
+
+    origin: wp.vec2f
+    """Lowest corner [m]."""
+    heights: wp.array(dtype=wp.float32)
+    """[m], (along x, along y) and flat; `NO_GROUND` where it is unknown."""
+    heights_x: wp.int32
+    """Nodes along x."""
+    heights_y: wp.int32
+    per_height_cell: wp.float32
+    """Nodes per meter."""
+    tiles: wp.array(dtype=wp.int32)
+    """Slots, (along x, along y) and flat."""
+    tiles_x: wp.int32
+    tiles_y: wp.int32
+    texel: wp.float32
+    """Side of the finest texels [m]."""
+    cell: wp.float32
+    """Side of the hash grid's cells [m]."""
+    mask: wp.uint32
+    """Rows of the hash grid's table, a power of 2, minus 1."""
+    coarsest: wp.float32
+    """Side of the coarsest texels or cells [m]."""
+
+
+# A hit, where a ray meets a surface: x, y, z [m] from the corner of the height map, and the footprint [m], which is
+# negative if the surface is not the ground, and 0 if there is none.
+Hit = wp.vec4f
+
+
+# Warp arrays may be strided; these are contiguous, and the compiler does better when it knows.
+@wp.func_native("return array.data[i];")
+def height_of(array: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32: ...
+
+
+@wp.func
+def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
+    """Height of the ground [m] at a distance (x, y) [m] from the grid's corner; at least `NO_GROUND` / 2 if unknown."""
+    px = x * grid.per_height_cell
+    py = y * grid.per_height_cell
+    ix = int(px)
+    iy = int(py)
+    if wp.min(px, py) < 0.0 or ix > grid.heights_x - 2 or iy > grid.heights_y - 2:
+        return NO_GROUND
+    ax = px - float(ix)
+    ay = py - float(iy)
+    at = ix * grid.heights_y + iy
+    low = height_of(grid.heights, at) * (1.0 - ay) + height_of(grid.heights, at + 1) * ay
+    at += grid.heights_y
+    high = height_of(grid.heights, at) * (1.0 - ay) + height_of(grid.heights, at + 1) * ay
+    height = low * (1.0 - ax) + high * ax
+    return wp.where(height > _UNKNOWN, NO_GROUND, height)
+
+
+@wp.func
+def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32, per_pixel: wp.float32) -> Hit:
+    """Meets a surface with a ray on which it is at a z-depth [m].
+
+    `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. The height
+    map is much flatter than the ray, so two steps of a fixed-point iteration find the ground.
+    """
+    x0 = o[0] - grid.origin[0]
+    y0 = o[1] - grid.origin[1]
+    x = x0 + ray[0] * depth
+    y = y0 + ray[1] * depth
+    z = o[2] + ray[2] * depth
+    length = wp.length(ray)
+    per_descent = 1.0 / wp.max(-ray[2], _MIN_DESCENT * length)
+    height = height_at(grid, x, y)
+    if wp.abs(z - height) < _TOLERANCE + _TOLERANCE_PER_METER * depth and ray[2] < -_MIN_DESCENT * length:
+        t = wp.clamp((o[2] - height) * per_descent, 0.5 * depth, 1.5 * depth)
+        height = height_at(grid, x0 + ray[0] * t, y0 + ray[1] * t)
+        t = wp.clamp((o[2] - height) * per_descent, 0.5 * depth, 1.5 * depth)
+        stretch = wp.max(1.0, length * per_descent * (1.0 / _MAX_STRETCH))
+        if height < NO_GROUND:
+            return Hit(x0 + ray[0] * t, y0 + ray[1] * t, height, t * per_pixel * stretch)
+    return Hit(x, y, z, -depth * per_pixel)
+
+
+@wp.func
+def level_weight(footprint: wp.float32, texel: wp.float32) -> wp.float32:
+    """1 if a level of such texels is fine enough to show and coarse enough not to alias, else 0."""
+    return wp.where(footprint < _MAX_FOOTPRINT * texel, 1.0, 0.0)
+
+
+@wp.func
+def texel_row(grid: DetailGrid, level: wp.int32, ix: wp.int32, iy: wp.int32) -> wp.int32:
+    """Row of a texel in the stored tiles, −1 where its tile is not stored."""
+    shift = _LOG2_TILE - level
+    side = 1 << shift
+    tx = ix >> shift
+    ty = iy >> shift
+    if wp.min(tx, ty) < 0 or tx >= grid.tiles_x or ty >= grid.tiles_y:
+        return -1
+    slot = slot_of(grid.tiles, tx * grid.tiles_y + ty)
+    first = (4 * (TILE * TILE - side * side)) // 3  # texels of the finer levels
+    return wp.where(slot < 0, -1, slot * TEXELS + first + ((ix & (side - 1)) << shift) + (iy & (side - 1)))
+
+
+@wp.func
+def vertex_row(grid: DetailGrid, x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
+    """Row of a vertex of the hash grid. Vertices of a block of 2³ lie together."""
+    block = wp.uint32(x >> 1) ^ (wp.uint32(y >> 1) * _PRIME_Y) ^ (wp.uint32(z >> 1) * _PRIME_Z)
+    return wp.int32(((block << wp.uint32(3)) | wp.uint32((x & 1) * 4 + (y & 1) * 2 + (z & 1))) & grid.mask)
+
+
+@wp.func
+def weight_elsewhere(grid: DetailGrid, hit: Hit) -> wp.float32:
+    """Weight of the hash grid at a hit that is not on the ground."""
+    return level_weight(-hit[3], grid.cell)
+
+
+@wp.func
+def corner_share(b: wp.vec3f, n: wp.int32) -> wp.float32:
+    """Weight of a cell's corner n = x + 2·y + 4·z at the position b in the cell."""
+    x = wp.where((n & 1) > 0, b[0], 1.0 - b[0])
+    y = wp.where((n & 2) > 0, b[1], 1.0 - b[1])
+    return x * y * wp.where((n & 4) > 0, b[2], 1.0 - b[2])
+
+
+# ---- training
+
+
+@wp.kernel(enable_backward=False)
+def find_surface(
+    grid: DetailGrid,
+    rotation: wp.mat33f,
+    position: wp.vec3f,
+    intrinsics: wp.vec4f,
+    width: wp.int32,
+    depth: wp.array(dtype=wp.float32),
+    hits: wp.array(dtype=Hit),
+):
+    """Hits of the pixels of an image."""
+    i = wp.tid()
+    u = (float(i % width) + 0.5 - intrinsics[2]) / intrinsics[0]
+    v = (float(i / width) + 0.5 - intrinsics[3]) / intrinsics[1]
+    if depth[i] > 0.0:
+        hits[i] = surface_hit(grid, position, rotation * wp.vec3f(u, v, 1.0), depth[i], 1.0 / intrinsics[0])
+    else:
+        hits[i] = Hit()
+
+
+@wp.func
+def interpolated(
+    grid: DetailGrid, values: wp.array(dtype=Channels), level: wp.int32, x: wp.float32, y: wp.float32
+) -> Channels:
+    """Interpolated texels of a level at (x, y) [m] from the grid's corner."""
+    side = grid.texel * float(1 << level)
+    px = x / side
+    py = y / side
+    ix = int(px)
+    iy = int(py)
+    ax = px - float(ix)
+    ay = py - float(iy)
+    total = Channels()
+    for n in range(4):
+        row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+        if row >= 0:
+            share = wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
+            total += values[row] * share
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def interpolate_detail(
+    hits: wp.array(dtype=Hit),
+    grid: DetailGrid,
+    texels: wp.array(dtype=Channels),
+    vertices: wp.array(dtype=Channels),
+    start: wp.int32,
+    outputs: wp.array(dtype=Channels),
+):
+    """Features at hits [start, start + dim): the sum over levels of texels, or vertices of the hash grid."""
+    i = start + wp.tid()
+    hit = hits[i]
+    total = Channels()
+    if hit[3] > 0.0:
+        for level in range(LEVELS):
+            weight = level_weight(hit[3], grid.texel * float(1 << level))
+            if weight > 0.0:
+                total += interpolated(grid, texels, level, hit[0], hit[1]) * weight
+    else:
+        weight = weight_elsewhere(grid, hit)
+        p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
+        low = wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))
+        b = p - low
+        for n in range(8):
+            row = vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2))
+            total += vertices[row] * (weight * corner_share(b, n))
+    outputs[i] = total
+
+
+@wp.kernel(enable_backward=False)
+def interpolate_detail_backward(
+    hits: wp.array(dtype=Hit),
+    grid: DetailGrid,
+    outputs_grad: wp.array(dtype=Channels),
+    part: wp.int32,
+    parts: wp.int32,
+    texels_grad: wp.array(dtype=Channels),
+    vertices_grad: wp.array(dtype=Channels),
+):
+    """Adds the gradient of `interpolate_detail`; launched once per `part` of tiles and rows, which fixes the order of
+    sums."""
+    i = wp.tid()
+    g = outputs_grad[i]
+    if wp.dot(g, g) < _MIN_GRADIENT:
+        return
+    hit = hits[i]
+    if hit[3] > 0.0:
+        for level in range(LEVELS):
+            side = grid.texel * float(1 << level)
+            weight = level_weight(hit[3], side)
+            if weight > 0.0:
+                px = hit[0] / side
+                py = hit[1] / side
+                ix = int(px)
+                iy = int(py)
+                ax = px - float(ix)
+                ay = py - float(iy)
+                for n in range(4):
+                    row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+                    if row >= 0 and (row / TEXELS) % parts == part:
+                        share = weight * wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
+                        wp.atomic_add(texels_grad, row, g * share)
+    else:
+        weight = weight_elsewhere(grid, hit)
+        p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
+        low = wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))
+        b = p - low
+        for n in range(8):
+            row = vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2))
+            if (row / 8) % parts == part:
+                wp.atomic_add(vertices_grad, row, g * (weight * corner_share(b, n)))
+
+
+@wp.func
+def adam_row(
+    row: wp.int32,
+    rate: wp.float32,
+    second_correction: wp.float32,
+    values: wp.array(dtype=Channels),
+    gradient: wp.array(dtype=Channels),
+    second: wp.array(dtype=wp.float32),
+):
+    g = gradient[row]
+    squared = wp.dot(g, g)
+    if squared > 0.0:
+        v = second[row] * 0.99 + squared / float(CHANNELS - 1) * 0.01
+        second[row] = v
+        values[row] = values[row] - g * (rate / (wp.sqrt(v * second_correction) + 1.0e-15))
+        gradient[row] = Channels()
+
+
+@wp.kernel(enable_backward=False)
+def adam_step_detail(
+    hits: wp.array(dtype=Hit),
+    grid: DetailGrid,
+    part: wp.int32,
+    parts: wp.int32,
+    rate: wp.float32,
+    second_correction: wp.float32,
+    texels: wp.array(dtype=Channels),
+    texels_grad: wp.array(dtype=Channels),
+    texels_second: wp.array(dtype=wp.float32),
+    vertices: wp.array(dtype=Channels),
+    vertices_grad: wp.array(dtype=Channels),
+    vertices_second: wp.array(dtype=wp.float32),
+):
+    """Adam step (Kingma and Ba 2015) on the rows with a gradient, which it clears; β = (0, 0.99).
+
+    To save memory there is no momentum, and the features of a row share one second moment.
+    """
+    i = wp.tid()
+    hit = hits[i]
+    if hit[3] > 0.0:
+        for level in range(LEVELS):
+            side = grid.texel * float(1 << level)
+            if level_weight(hit[3], side) > 0.0:
+                ix = int(hit[0] / side)
+                iy = int(hit[1] / side)
+                for n in range(4):
+                    row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+                    if row >= 0 and (row / TEXELS) % parts == part:
+                        adam_row(row, rate, second_correction, texels, texels_grad, texels_second)
+    else:
+        p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
+        x = int(wp.floor(p[0]))
+        y = int(wp.floor(p[1]))
+        z = int(wp.floor(p[2]))
+        for n in range(8):
+            row = vertex_row(grid, x + (n & 1), y + ((n >> 1) & 1), z + (n >> 2))
+            if (row / 8) % parts == part:
+                adam_row(row, rate, second_correction, vertices, vertices_grad, vertices_second)
+
+
+@wp.kernel(enable_backward=False)
+def sum_levels(
+    tiles: wp.array(dtype=wp.vec2i), grid: DetailGrid, values: wp.array(dtype=Channels), total: wp.array(dtype=Channels)
+):
+    """Every texel plus the coarser levels at its node; exact, as the nodes of a level are nodes of the finer ones."""
+    row = wp.tid()
+    tile = tiles[row / TEXELS]
+    rest = row % TEXELS
+    level = int(0)
+    while rest >= (TILE >> level) * (TILE >> level):
+        rest -= (TILE >> level) * (TILE >> level)
+        level += 1
+    side = TILE >> level
+    texel = grid.texel * float(1 << level)
+    x = float(tile[0] * side + rest / side) * texel
+    y = float(tile[1] * side + rest % side) * texel
+    out = values[row]
+    for coarser in range(level + 1, LEVELS):
+        # A node of this level is a node of the coarser one or halfway between two, whatever the rounding.
+        out += interpolated(grid, values, coarser, x + 1.0e-5 * texel, y + 1.0e-5 * texel)
+    total[row] = out
+
+
+# ---- rendering
+
+
+@wp.struct
+class DetailBytes:
+    """Features as bytes around 128, and the value of a unit per channel."""
+
+    texels: wp.array(dtype=Bytes)
+    """A texel is the sum of its level and the coarser ones at its node, so a ray reads one level."""
+    texel_step: Channels
+    vertices: wp.array(dtype=Bytes)
+    vertex_step: Channels
+
+
+@wp.func
+def texture_bytes(grid: DetailGrid, texels: wp.array(dtype=Bytes), level: wp.int32, x: wp.float32, y: wp.float32):
+    side = grid.texel * float(1 << level)
+    px = x / side
+    py = y / side
+    ix = int(px)
+    iy = int(py)
+    ax = px - float(ix)
+    ay = py - float(iy)
+    total = Channels()
+    for n in range(4):
+        row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+        if row >= 0:
+            share = wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
+            total += (as_floats(sample_of(texels, row)) - Channels(_ZERO)) * share
+    return total
+
+
+@wp.func
+def vertex_bytes(grid: DetailGrid, vertices: wp.array(dtype=Bytes), hit: Hit) -> Channels:
+    """Interpolated vertices of the hash grid at a hit, as bytes around 0."""
+    p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
+    low = wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))
+    b = p - low
+    total = Channels()
+    for n in range(8):
+        row = vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2))
+        total += as_floats(sample_of(vertices, row)) * corner_share(b, n)
+    return total - Channels(_ZERO)
+
+
+@wp.func_native("for (int c = 1; c < 16; ++c) array.data[at + c * stride] += value[c];")
+def add_channels(array: wp.array3d(dtype=wp.float32), at: wp.int32, stride: wp.int32, value: Channels): ...
+
+
+@wp.kernel(enable_backward=False)
+def add_detail(
+    grid: DetailGrid,
+    detail: DetailBytes,
+    image: ImageBuffers,
+    first: wp.int32,
+    last: wp.int32,
+    depth: wp.array2d(dtype=wp.float32),
+    features: wp.array3d(dtype=wp.float32),
+):
+    """Adds detail to the features of runs of `RUN` pixels, from `first` up to `last`, of every camera."""
+    camera, run = wp.tid()
+    k = image.intrinsics[camera]
+    rotation = image.rotation[camera]
+    position = image.position[camera]
+    per_pixel = 1.0 / k[0]
+    pixels = image.width * image.height
+    for j in range(RUN):
+        pixel = first + run * RUN + j
+        if pixel < last:
+            z = depth[camera, pixel]
+            if z > 0.0 and z * per_pixel < _MAX_FOOTPRINT * grid.coarsest:
+                u = (float(pixel % image.width) + 0.5 - k[2]) * per_pixel
+                v = (float(pixel // image.width) + 0.5 - k[3]) / k[1]
+                hit = surface_hit(grid, position, rotation * wp.vec3f(u, v, 1.0), z, per_pixel)
+                value = Channels()
+                found = int(0)
+                if hit[3] > 0.0:
+                    level = int(0)
+                    while level < LEVELS and level_weight(hit[3], grid.texel * float(1 << level)) <= 0.0:
+                        level += 1
+                    if level < LEVELS:
+                        found = 1
+                        value = wp.cw_mul(texture_bytes(grid, detail.texels, level, hit[0], hit[1]), detail.texel_step)
+                elif weight_elsewhere(grid, hit) > 0.0:
+                    found = 1
+                    value = wp.cw_mul(vertex_bytes(grid, detail.vertices, hit), detail.vertex_step)
+                if found == 1:
+                    add_channels(features, camera * CHANNELS * pixels + pixel, pixels, value)
