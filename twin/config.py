@@ -191,8 +191,11 @@ class MetricConfig:
 
 @dataclass(frozen=True)
 class NerfConfig:
-    """The radiance field and its training."""
+    """The radiance field and its training; the defaults are those of quality "standard"."""
 
+    quality: str = "standard"
+    """"draft", "standard" or "high": sets those of `steps`, `bake_steps`, `detail_passes` and `max_width` that are not
+    given, see `QUALITIES`."""
     steps: Annotated[int, Range(1)] = 2000
     rays: Annotated[int, Range(1, 2**20)] = 4096
     """Rays per step."""
@@ -204,6 +207,8 @@ class NerfConfig:
     """Supervise depth from stereo between frames in addition to the sparse points."""
     bake_steps: Annotated[int, Range(1)] = 300
     """Fine-tuning steps of the baked field, which renders images."""
+    detail_passes: Annotated[float, Range(0, 100)] = 2.0
+    """How often each training pixel on a near surface is used to fit the detail that bricks lack; 0 = no detail."""
     max_bricks: Annotated[int, Range(100)] = 9000
     """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field, which determines the
     cell size; 9,000 take about 105 MB. It is raised by a factor of 1.39 (146 MB) if cells would exceed 15 cm. Fewer
@@ -222,6 +227,14 @@ class NerfConfig:
     """Half side of the uncontracted near box [m]; 0 = from the cameras."""
     near_plane: Annotated[float, Range(0, 100)] = 0.3
     """Distance from a camera up to which space is empty [m]."""
+
+
+QUALITIES: dict[str, dict[str, int | float]] = {
+    "draft": {"steps": 1200, "bake_steps": 200, "detail_passes": 1.0},
+    "standard": {},
+    "high": {"steps": 10000, "bake_steps": 1000, "detail_passes": 4.0, "max_width": 640},
+}
+"""Settings of `NerfConfig` by quality, where they differ from the defaults."""
 
 
 @dataclass(frozen=True)

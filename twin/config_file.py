@@ -20,6 +20,7 @@ from twin.config import (
     MAPPERS,
     MARKER_FAMILIES,
     OBSTACLE_KINDS,
+    QUALITIES,
     RANDOMIZED,
     RESERVED_LIGHTINGS,
     UPS,
@@ -55,6 +56,10 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
         _apply_override(table, override)
     if isinstance(table.get("robot", {}), dict):
         table["robot"] = merge_robot(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), str(path))
+    nerf = table.get("nerf", {})
+    if isinstance(nerf, dict) and "quality" in nerf:
+        _check_choice(nerf["quality"], tuple(QUALITIES), f"{path}: nerf.quality")
+        table["nerf"] = QUALITIES[nerf["quality"]] | nerf
     config = parse_table(SceneConfig, table, str(path))
     folder = path.resolve().parent.name
     try:

@@ -2,7 +2,8 @@
 
 The embedding of a held-out frame is fitted on one half of the image, left or right, starting from its lighting's, and
 scored on the other half; the score is the mean of both ways. *Unfitted* scores use the lighting's embedding itself;
-*wrong* scores use those of the other lightings, unfitted.
+*wrong* scores use those of the other lightings, unfitted. *Small* scores are those of images as policies see them, each
+half under the embedding that was fitted on the other. A baked field, which is what users see, is scored if there is one.
 """
 
 from functools import cache
@@ -13,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from twin.geometry.cameras import Cameras, nearest_frame
-from twin.geometry.images import psnr, ssim
+from twin.geometry.images import psnr, resize, ssim
+from twin.nerf import network
 from twin.nerf.appearance import fit_appearance
 from twin.nerf.baked import BakedField
 from twin.nerf.buffers import CameraArrays, single_threaded_torch
@@ -25,52 +27,78 @@ from twin.types import Array
 
 _FIT_RAYS = 4000  # of half an image, evenly spaced
 _MAX_FRAMES = 6  # held-out frames scored per lighting, evenly spaced
+_SMALL_WIDTH = 160  # [px] of the images that policies see
+_MIN_SSIM_ROWS = 11  # rows of the window of SSIM
 
 
 def score_frame(
     field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
 ) -> dict[str, float]:
-    """Scores one held-out frame: `ssim`, and in dB the PSNRs `psnr`, `unfitted`, `wrong` (nan with one lighting) and
-    `baked` (of the baked field, unfitted; nan without one)."""
+    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) and, with a baked field, `trained`
+    (of the field itself, unfitted) and `psnr_small` [dB], `ssim`, `ssim_small`, and both small ones of the lower half."""
     bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
     image = bytes_.astype(np.float32) / 255.0
     height, width = mask.shape
-    v, u = np.mgrid[:height, :width] + 0.5
-    arrays = CameraArrays(cameras.camera_to_world[i : i + 1], intrinsics[None], field.device)
-    pixel = np.stack([u.ravel(), v.ravel()], -1)
-    features, harmonics, _, _ = field.trace(arrays, np.zeros(len(pixel), int), pixel)
-    colors = torch.as_tensor(image.reshape(-1, 3), device=field.device)
+    camera = cameras.select(np.array([i]))
     start = field.embedding(cameras.lightings[i])
+    v, u = np.mgrid[:height, :width] + 0.5
+    arrays = CameraArrays(camera.camera_to_world, intrinsics[None], field.device)
+    features, harmonics, _, _ = field.trace(arrays, np.zeros(u.size, int), np.stack([u.ravel(), v.ravel()], -1))
+    out = {}
+    if baked is not None:
+        out["trained"] = psnr(field.color(features, harmonics, start).reshape(image.shape), image, mask)
+        composited = baked.render_features(camera, start, (width, height))[1][0].reshape(-1, height * width).T
+        features = network.ray_features(field.parameters, torch.as_tensor(composited, device=field.device), harmonics)
+    colors = torch.as_tensor(image.reshape(-1, 3), device=field.device)
 
     def picture(embedding: NDArray[np.float32]) -> NDArray[np.float32]:
         return field.color(features, harmonics, embedding).reshape(height, width, 3)
 
     left = np.zeros((height, width), bool)
     left[:, : width // 2] = True
-    psnrs, ssims = [], []
+    psnrs, ssims, fitted = [], [], []
     for half in (left, ~left):
         fit_on, score_on = np.flatnonzero(half & mask), ~half & mask
         if not len(fit_on) or not score_on.any():
             continue
         some = torch.as_tensor(fit_on[:: max(1, len(fit_on) // _FIT_RAYS)], device=field.device)
-        shown = picture(fit_appearance(field.parameters, features[some], harmonics[some], colors[some], start)[0])
+        fitted.append(fit_appearance(field.parameters, features[some], harmonics[some], colors[some], start)[0])
+        shown = picture(fitted[-1])
         psnrs.append(psnr(shown, image, score_on))
         # Masked pixels are made equal, which affects SSIM only in windows that contain them.
         shown[~mask] = image[~mask]
         side = slice(width // 2, None) if half is left else slice(None, width // 2)
         ssims.append(ssim(shown[:, side], image[:, side]))
+    if baked is not None and len(fitted) == 2:
+        out |= _small_scores(baked, camera, image, mask, fitted)
     others = [name for name in field.lightings if name != cameras.lightings[i]]
     wrong = [psnr(picture(field.embedding(name)), image, mask) for name in others]
-    again = float("nan")
-    if baked is not None:
-        again = psnr(baked.render(cameras.select(np.array([i])), start, (width, height)).rgb[0], image, mask)
-    return {
-        "baked": again,
+    return out | {
         "psnr": float(np.mean(psnrs)) if psnrs else float("nan"),
         "ssim": float(np.mean(ssims)) if ssims else float("nan"),
         "unfitted": psnr(picture(start), image, mask),
         "wrong": float(np.mean(wrong)) if wrong else float("nan"),
     }
+
+
+def _small_scores(
+    baked: BakedField, camera: Cameras, image: NDArray, mask: NDArray[np.bool_], fitted: list[NDArray[np.float32]]
+) -> dict[str, float]:
+    """Small scores of a frame under the embeddings that were fitted on its left and its right half."""
+    height, width = mask.shape
+    small = max(1, round(height * _SMALL_WIDTH / width))
+    wanted, usable = resize(image, _SMALL_WIDTH, small), resize(mask.astype(np.float32), _SMALL_WIDTH, small) > 0.999
+    left, right = (baked.render(camera, embedding, (_SMALL_WIDTH, small)).rgb[0] for embedding in fitted)
+    shown = np.concatenate([right[:, : _SMALL_WIDTH // 2], left[:, _SMALL_WIDTH // 2 :]], 1)
+    shown[~usable] = wanted[~usable]
+    lower = slice(small // 2, None)
+    out = {
+        "psnr_small": psnr(shown, wanted, usable),
+        "psnr_small_lower": psnr(shown[lower], wanted[lower], usable[lower]),
+    }
+    if small - small // 2 >= _MIN_SSIM_ROWS:
+        out |= {"ssim_small": ssim(shown, wanted), "ssim_small_lower": ssim(shown[lower], wanted[lower])}
+    return out
 
 
 def evaluate(
@@ -80,12 +108,14 @@ def evaluate(
     max_frames: int = _MAX_FRAMES,
     baked: BakedField | None = None,
 ) -> dict[str, Any]:
-    """Mean held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted`, `psnr_baked` (unfitted; only with a
-    baked field) and `psnr_wrong_lighting` (None without another lighting). Lightings without held-out frames have n = 0
-    and no other entry."""
+    """Mean held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted` and `psnr_wrong_lighting` (None without
+    another lighting); with a baked field also `psnr_trained` (of the field itself, unfitted), and `psnr_small`,
+    `psnr_small_lower`, `ssim_small` and `ssim_small_lower` of images 160 px wide. Lightings without held-out frames have
+    n = 0 and no other entry."""
     columns = {"psnr": "psnr", "ssim": "ssim", "psnr_unfitted": "unfitted"}
     if baked is not None:
-        columns["psnr_baked"] = "baked"
+        small = ("psnr_small", "psnr_small_lower", "ssim_small", "ssim_small_lower")
+        columns |= {"psnr_trained": "trained", **{name: name for name in small}}
     result: dict[str, Any] = {key: {} for key in (*columns, "n", "psnr_wrong_lighting")}
     frames = []
     for name in field.lightings:
@@ -100,7 +130,7 @@ def evaluate(
     for name, rows in scores.items():
         result["n"][name] = len(rows)
         for key, column in columns.items():
-            values = [row[column] for row in rows if np.isfinite(row[column])]
+            values = [row[column] for row in rows if np.isfinite(row.get(column, np.nan))]
             if values:
                 result[key][name] = round(float(np.mean(values)), 4)
         wrong = [row["wrong"] for row in rows if np.isfinite(row["wrong"])]

@@ -1,4 +1,4 @@
-"""Stage `field`: trains a radiance field on metric cameras, bakes it for rendering, and evaluates both.
+"""Stage `field`: trains a radiance field on metric cameras, bakes it for rendering with detail, and evaluates both.
 
 The number of training steps is fixed (`nerf.steps`), and nothing depends on a clock, so on a CPU the same input gives
 the same field bit for bit. Every batch of rays comes with *free points*: random points around the camera path, where
@@ -36,6 +36,7 @@ from twin.nerf.buffers import (
     warp_view,
 )
 from twin.nerf.dataset import TrainingPixels
+from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import cross_lighting, evaluate
 from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.kernels import composite as volume
@@ -434,6 +435,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     field, metrics, cameras = train_field(cameras, points, config.nerf, config.seed, height, device)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
+    if config.nerf.detail_passes > 0.0:
+        metrics["detail"] = fit_detail(baked, field.appearance, pixels, config.seed, config.nerf.detail_passes)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
     metrics["cross_lighting"] = cross_lighting(baked, cameras)
     field.about = {

@@ -235,10 +235,14 @@ def field_section(report: dict[str, Any]) -> Section:
     if (found := pick(field, "stereo.sightings")) is not None:
         form = "used for depth supervision; {:.0%} of the attempted stereo estimates succeeded"
         facts.append(Fact("stereo depths", number(found, "{:,}"), number(pick(field, "stereo.share"), form)))
+    small, lower = (numbers(field.get(key)) for key in ("psnr_small", "psnr_small_lower"))
+    for name, value in small.items():
+        text = number(value, "{:.1f} dB PSNR") + (f", {lower[name]:.1f} dB in the lower half" if name in lower else "")
+        facts.append(Fact(f"{name}, at 160×90", text, "as policies see it"))
     unfitted = numbers(field.get("psnr_unfitted"))
-    for name, value in numbers(field.get("psnr_baked")).items():
-        lost = number(value - unfitted.get(name, value), "{:+.1f} dB")
-        facts.append(Fact(f"{name}, baked", lost, "effect of baking, on the same frames"))
+    for name, value in numbers(field.get("psnr_trained")).items():
+        change = number(unfitted.get(name, value) - value, "{:+.1f} dB")
+        facts.append(Fact(f"{name}, baked", change, "effect of baking and detail, on the same frames, unfitted"))
     swapped, more = cross_lighting_facts(report)
     done = (
         "A NeRF models the appearance of every point from every direction, in each lighting. It is evaluated on "
