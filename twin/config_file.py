@@ -57,7 +57,7 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
     if isinstance(table.get("robot", {}), dict):
         table["robot"] = merge_robot(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), str(path))
     nerf = table.get("nerf", {})
-    if isinstance(nerf, dict) and "quality" in nerf:
+    if isinstance(nerf, dict) and isinstance(nerf.get("quality"), str):
         _check_choice(nerf["quality"], tuple(QUALITIES), f"{path}: nerf.quality")
         table["nerf"] = QUALITIES[nerf["quality"]] | nerf
     config = parse_table(SceneConfig, table, str(path))

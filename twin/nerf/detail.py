@@ -144,7 +144,7 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
             shown, features = baked.render_features(
                 pixels.cameras.select(np.array([i])), baked.lightings[0], (width, height)
             )
-            depth = wp.array(shown.depth.ravel(), dtype=wp.float32, device=baked.device)
+            depth: wp.array = wp.array(shown.depth.ravel(), dtype=wp.float32, device=baked.device)
             hits = wp.empty(len(depth), dtype=kernels.Hit, device=baked.device)
             wp.launch(
                 kernels.find_surface,

@@ -3,7 +3,7 @@
 The embedding of a held-out frame is fitted on one half of the image, left or right, starting from its lighting's, and
 scored on the other half; the score is the mean of both ways. *Unfitted* scores use the lighting's embedding itself;
 *wrong* scores use those of the other lightings, unfitted. *Small* scores are those of images as policies see them, each
-half under the embedding that was fitted on the other. A baked field, which is what users see, is scored if there is one.
+half under the embedding that was fitted on the other. If there is a baked field, which is what users see, it is scored.
 """
 
 from functools import cache
@@ -28,14 +28,15 @@ from twin.types import Array
 _FIT_RAYS = 4000  # of half an image, evenly spaced
 _MAX_FRAMES = 6  # held-out frames scored per lighting, evenly spaced
 _SMALL_WIDTH = 160  # [px] of the images that policies see
-_MIN_SSIM_ROWS = 11  # rows of the window of SSIM
+_SSIM_WINDOW = 11  # [px]
 
 
 def score_frame(
     field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
 ) -> dict[str, float]:
-    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) and, with a baked field, `trained`
-    (of the field itself, unfitted) and `psnr_small` [dB], `ssim`, `ssim_small`, and both small ones of the lower half."""
+    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) [dB] and `ssim`; with a baked
+    field also `trained` (PSNR of the field itself, unfitted), `psnr_small`, `ssim_small`, and these of the lower half.
+    """
     bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
     image = bytes_.astype(np.float32) / 255.0
     height, width = mask.shape
@@ -86,18 +87,16 @@ def _small_scores(
 ) -> dict[str, float]:
     """Small scores of a frame under the embeddings that were fitted on its left and its right half."""
     height, width = mask.shape
-    small = max(1, round(height * _SMALL_WIDTH / width))
-    wanted, usable = resize(image, _SMALL_WIDTH, small), resize(mask.astype(np.float32), _SMALL_WIDTH, small) > 0.999
-    left, right = (baked.render(camera, embedding, (_SMALL_WIDTH, small)).rgb[0] for embedding in fitted)
-    shown = np.concatenate([right[:, : _SMALL_WIDTH // 2], left[:, _SMALL_WIDTH // 2 :]], 1)
+    size = min(_SMALL_WIDTH, width), max(1, round(height * min(_SMALL_WIDTH, width) / width))
+    wanted, usable = resize(image, *size), resize(mask.astype(np.float32), *size) > 0.999
+    left, right = (baked.render(camera, embedding, size).rgb[0] for embedding in fitted)
+    shown = np.concatenate([right[:, : size[0] // 2], left[:, size[0] // 2 :]], 1)
     shown[~usable] = wanted[~usable]
-    lower = slice(small // 2, None)
-    out = {
-        "psnr_small": psnr(shown, wanted, usable),
-        "psnr_small_lower": psnr(shown[lower], wanted[lower], usable[lower]),
-    }
-    if small - small // 2 >= _MIN_SSIM_ROWS:
-        out |= {"ssim_small": ssim(shown, wanted), "ssim_small_lower": ssim(shown[lower], wanted[lower])}
+    out = {}
+    for name, rows in (("small", slice(0, None)), ("small_lower", slice(size[1] // 2, None))):
+        out[f"psnr_{name}"] = psnr(shown[rows], wanted[rows], usable[rows])
+        if min(shown[rows].shape[:2]) >= _SSIM_WINDOW:
+            out[f"ssim_{name}"] = ssim(shown[rows], wanted[rows])
     return out
 
 
@@ -108,10 +107,10 @@ def evaluate(
     max_frames: int = _MAX_FRAMES,
     baked: BakedField | None = None,
 ) -> dict[str, Any]:
-    """Mean held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted` and `psnr_wrong_lighting` (None without
-    another lighting); with a baked field also `psnr_trained` (of the field itself, unfitted), and `psnr_small`,
-    `psnr_small_lower`, `ssim_small` and `ssim_small_lower` of images 160 px wide. Lightings without held-out frames have
-    n = 0 and no other entry."""
+    """Mean held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted` and `psnr_wrong_lighting` (None
+    without another lighting); with a baked field also `psnr_trained` (of the field itself, unfitted), and `psnr_small`,
+    `psnr_small_lower`, `ssim_small` and `ssim_small_lower` of images at most 160 px wide. Lightings without held-out
+    frames have n = 0 and no other entry."""
     columns = {"psnr": "psnr", "ssim": "ssim", "psnr_unfitted": "unfitted"}
     if baked is not None:
         small = ("psnr_small", "psnr_small_lower", "ssim_small", "ssim_small_lower")

@@ -1,0 +1,212 @@
+"""Detail: where rays meet the ground, interpolation and its gradient, the mipmap, the fit, and files."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_fit import CONFIG, HEIGHT, WIDTH, K, floor_points, make_cameras
+
+from twin.geometry.cameras import SparsePoints, Viewpoints
+from twin.geometry.poses import look_at
+from twin.nerf.bake import bake
+from twin.nerf.baked import BakedField, Detail, detail_grid
+from twin.nerf.dataset import TrainingPixels
+from twin.nerf.detail import fit_detail
+from twin.nerf.kernels import detail as kernels
+from twin.nerf.kernels.composite import CHANNELS, Channels
+from twin.nerf.trainer import train_field
+from twin.runtime import set_quiet
+from twin.warp_runtime import wp
+
+ORIGIN = np.array([-3.0, -2.0])
+CELL = 0.25
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    set_quiet(True)
+    yield
+    set_quiet(False)
+
+
+def slope(x, y):
+    return 0.1 + 0.04 * x - 0.03 * y
+
+
+def sloping_ground(tiles: np.ndarray | None = None, texel: float = 0.05) -> Detail:
+    """Ground on a plane, unknown for x > 5 m."""
+    x, y = np.meshgrid(np.arange(41) * CELL, np.arange(33) * CELL, indexing="ij")
+    heights = np.where(x + ORIGIN[0] > 5.0, kernels.NO_GROUND, slope(x + ORIGIN[0], y + ORIGIN[1]))
+    ground = Detail.without_features(heights.astype(np.float32), ORIGIN, CELL)
+    if tiles is None:
+        return ground
+    return replace(ground, tiles=tiles.astype(np.int32), texel=texel, cell=0.1, vertices=np.zeros((256, 0), np.uint8))
+
+
+def hits_of(detail: Detail, pose: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    hits = wp.empty(depth.size, dtype=kernels.Hit, device="cpu")
+    wp.launch(
+        kernels.find_surface,
+        depth.size,
+        [
+            *(detail_grid(detail, "cpu"), wp.mat33f(*pose[:3, :3].ravel()), wp.vec3f(*pose[:3, 3]), wp.vec4f(*K)),
+            *(WIDTH, wp.array(depth.ravel().astype(np.float32), dtype=wp.float32, device="cpu")),
+        ],
+        [hits],
+        device="cpu",
+    )
+    return hits.numpy()
+
+
+def rays_of(pose: np.ndarray) -> np.ndarray:
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.2
+    return (np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1) @ pose[:3, :3].T).reshape(-1, 3)
+
+
+def test_rays_meet_the_ground_where_the_height_map_says_not_where_the_depth_says():
+    pose = look_at(np.array([0.0, 0.0, 1.5]), np.array([3.0, 0.5, 0.2]))
+    o, ray = pose[:3, 3], rays_of(pose)
+    # o + t·ray lies on the plane z = slope(x, y).
+    exact = (slope(o[0], o[1]) - o[2]) / (ray[:, 2] - 0.04 * ray[:, 0] + 0.03 * ray[:, 1])
+    point = o + exact[:, None] * ray
+    inside = (exact > 0) & (np.abs(point[:, :2]) < [2.9, 1.9]).all(1)
+    assert inside.sum() > 100
+    noisy = exact * np.where(np.arange(len(exact)) % 2, 1.02, 0.98)
+    hits = hits_of(sloping_ground(), pose, noisy)
+    near = inside & (np.abs((o + noisy[:, None] * ray)[:, 2] - slope(*(o + noisy[:, None] * ray)[:, :2].T)) < 0.08)
+    assert near.sum() > 100 and (hits[near, 3] > 0).all()
+    assert np.abs(hits[near, :2] + ORIGIN - point[near, :2]).max() < 0.02
+    assert np.abs(noisy[near] - exact[near]).max() > 0.05
+    # A surface well above the ground is found where it is.
+    above = hits_of(sloping_ground(), pose, 0.6 * exact)
+    assert (above[inside, 3] < 0).all()
+    assert np.allclose(above[inside, :3], (o + 0.6 * exact[:, None] * ray)[inside] - [*ORIGIN, 0.0], atol=1e-4)
+    assert not hits_of(sloping_ground(), pose, -np.ones_like(exact))[:, 3].any()
+
+
+def random_hits(rng: np.random.Generator, n: int) -> np.ndarray:
+    xyz = rng.uniform([0.1, 0.1, 0.0], [6.0, 6.0, 2.0], (n, 3))
+    footprint = rng.uniform(0.01, 0.14, n) * np.where(rng.random(n) < 0.6, 1.0, -1.0)
+    return np.concatenate([xyz, footprint[:, None]], 1).astype(np.float32)
+
+
+def as_channels(values: np.ndarray) -> wp.array:
+    return wp.array(values.astype(np.float32), dtype=Channels, device="cpu")
+
+
+def interpolate(detail: Detail, hits: np.ndarray, texels: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    out = wp.zeros(len(hits), dtype=Channels, device="cpu")
+    given = [wp.array(hits, dtype=kernels.Hit, device="cpu"), detail_grid(detail, "cpu")]
+    wp.launch(
+        kernels.interpolate_detail,
+        len(hits),
+        [*given, as_channels(texels), as_channels(vertices), 0],
+        [out],
+        device="cpu",
+    )
+    return out.numpy()
+
+
+@pytest.fixture(scope="module")
+def tables():
+    rng = np.random.default_rng(3)
+    tiles = np.argwhere(rng.random((8, 8)) < 0.8)
+    detail = sloping_ground(tiles)
+    texels = rng.normal(size=(len(tiles) * kernels.TEXELS, CHANNELS))
+    vertices = rng.normal(size=(len(detail.vertices), CHANNELS))
+    return detail, texels, vertices
+
+
+def test_the_gradient_is_the_transpose_of_the_interpolation(tables):
+    detail, texels, vertices = tables
+    rng = np.random.default_rng(4)
+    hits = random_hits(rng, 300)
+    out = interpolate(detail, hits, texels, vertices)
+    assert (np.abs(out).sum(1) > 0).mean() > 0.5
+    cotangent = rng.normal(size=out.shape).astype(np.float32)
+    by_texel, by_vertex = as_channels(np.zeros_like(texels)), as_channels(np.zeros_like(vertices))
+    given = [wp.array(hits, dtype=kernels.Hit, device="cpu"), detail_grid(detail, "cpu"), as_channels(cotangent)]
+    for part in range(4):
+        wp.launch(
+            kernels.interpolate_detail_backward, len(hits), [*given, part, 4], [by_texel, by_vertex], device="cpu"
+        )
+    backward = (by_texel.numpy() * texels).sum() + (by_vertex.numpy() * vertices).sum()
+    assert backward == pytest.approx((out * cotangent).sum(), rel=1e-4)
+
+
+def test_the_renderer_adds_what_the_fit_interpolates(tables):
+    detail, texels, vertices = tables
+    total = wp.zeros(len(texels), dtype=Channels, device="cpu")
+    wp.launch(
+        kernels.sum_levels,
+        len(texels),
+        [
+            *(wp.array(detail.tiles, dtype=wp.vec2i, device="cpu"), detail_grid(detail, "cpu")),
+            as_channels(np.round(10.0 * texels)),
+        ],
+        [total],
+        device="cpu",
+    )
+    one, none = np.ones(CHANNELS, np.float32), np.zeros_like(vertices)
+    hits = random_hits(np.random.default_rng(5), 300)
+    hits = hits[hits[:, 3] > 0]
+    # All corners of a hit's cells must be stored: beside missing tiles coarse levels fade within their own cells.
+    full = interpolate(detail, hits, np.ones_like(texels), none)
+    coarse_sum = np.array([sum(h[3] < 1.5 * 0.05 * 2**k for k in range(kernels.LEVELS)) for h in hits])
+    whole = np.isclose(full[:, 1], coarse_sum, atol=1e-4)
+    assert whole.sum() > 20
+    wanted = interpolate(detail, hits, np.round(10.0 * texels), none)
+    stored = replace(detail, texels=total.numpy(), texel_step=one)
+    finest = np.array([next((k for k in range(kernels.LEVELS) if h[3] < 1.5 * 0.05 * 2**k), -1) for h in hits])
+    for k in range(kernels.LEVELS):
+        mine = whole & (finest == k)
+        # One level of the sums, found by giving the hit a footprint that only this level of the sums may show.
+        shown = _level_of(stored, hits[mine], k)
+        assert np.allclose(shown[:, 1:], wanted[mine][:, 1:], atol=1e-2)
+
+
+def _level_of(detail: Detail, hits: np.ndarray, level: int) -> np.ndarray:
+    """Interpolated texels of one level, slowly and obviously."""
+    out = np.zeros((len(hits), CHANNELS))
+    side = detail.texel * 2**level
+    first = sum((kernels.TILE >> k) ** 2 for k in range(level))
+    width = kernels.TILE >> level
+    for h, hit in enumerate(hits):
+        p = hit[:2] / np.float32(side)
+        low = np.floor(p).astype(int)
+        a = p - low
+        for n in np.ndindex(2, 2):
+            node = low + n
+            tile, inside = node // width, node % width
+            slot = detail.tile_index[tuple(tile)]
+            row = slot * kernels.TEXELS + first + inside[0] * width + inside[1]
+            out[h] += detail.texels[row] * np.prod(np.where(n, a, 1.0 - a))
+    return out
+
+
+def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
+    cameras = make_cameras(tmp_path)
+    config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
+    field, _, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    plain, _ = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
+    view = Viewpoints.of(cameras.camera_to_world[2:3], K, (WIDTH, HEIGHT))
+    before = plain.render(view, "day")
+    fields = []
+    for _ in range(2):
+        fields.append(BakedField(plain.layout, plain.lightings_by_name, dict(plain.arrays)))
+        facts = fit_detail(fields[-1], field.appearance, pixels, seed=0, passes=30.0)
+        assert facts["pixels"] > 100 and facts["psnr_after"] > facts["psnr_before"] + 0.2
+    after, again = (f.render(view, "day") for f in fields)
+    assert np.array_equal(after.rgb, again.rgb)
+    assert np.array_equal(after.depth, before.depth) and np.array_equal(after.opacity, before.opacity)
+    assert np.abs(after.rgb - before.rgb).max() > 0.02
+    # Where rays end before the ground nothing is added.
+    stop = np.full(before.depth.shape, 0.6)
+    assert np.array_equal(fields[0].render(view, "day", stop=stop).rgb, plain.render(view, "day", stop=stop).rgb)
+    fields[0].save(tmp_path)
+    assert np.array_equal(BakedField.load(tmp_path).render(view, "day").rgb, after.rgb)
+    plain.save(tmp_path)  # as earlier versions wrote them, without detail
+    assert np.array_equal(BakedField.load(tmp_path).render(view, "day").rgb, before.rgb)
+    assert torch.is_grad_enabled()
