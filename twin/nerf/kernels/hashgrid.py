@@ -101,13 +101,19 @@ def encode_backward(
     levels: Levels,
     first_level: wp.int32,
     features_grad: wp.array2d(dtype=Feature),
+    least: wp.float32,
     table_grad: wp.array2d(dtype=Feature),
 ):
-    """Adds the gradient of `encode` to `table_grad`; launched over (levels, n) from `first_level` on."""
+    """Adds the gradient of `encode` to `table_grad`; launched over (levels, n) from `first_level` on.
+
+    Gradients of norm `least` or less are left out: more than half of a batch, which together hardly count.
+    """
     k, i = wp.tid()
     level = first_level + k
-    cell = cell_at(positions[i], levels.cells[level])
     g = features_grad[i, level]
+    if wp.dot(g, g) <= least * least:
+        return
+    cell = cell_at(positions[i], levels.cells[level])
     for n in range(8):
         wp.atomic_add(table_grad, level, vertex_index(cell, n, levels, level), g * vertex_weight(cell, n))
 
