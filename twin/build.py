@@ -45,9 +45,9 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.trainer", 3, ("nerf", "mjcf.route"), ("cameras", "metric")),
-    Stage("mesh", "twin.assets.mesh", 2, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
-    Stage("mjcf", "twin.mjcf.scene_xml", 3, ("mjcf", "robot"), ("metric", "mesh")),
+    Stage("field", "twin.nerf.trainer", 4, ("nerf", "mjcf.route"), ("cameras", "metric")),
+    Stage("mesh", "twin.assets.mesh", 3, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
+    Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",
         "twin.report.review_video",
@@ -304,7 +304,8 @@ def summary(report: dict[str, Any]) -> str:
 
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    report = build(options.scene, options.until, tuple(options.force), tuple(options.set), options.device)
+    settings = [*options.set, *([f"nerf.quality={options.quality}"] if options.quality else [])]
+    report = build(options.scene, options.until, tuple(options.force), tuple(settings), options.device)
     if not options.quiet:
         print(summary(report))
         if options.until is None:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from twin import runtime
-from twin.config import HELD_OUT, Condition
+from twin.config import HELD_OUT, QUALITIES, Condition
 from twin.errors import InputError, print_error, shortened
 from twin.scene import STAGES
 
@@ -174,6 +174,9 @@ twin new SCENE VIDEO... writes such a folder.
     parser.add_argument("scene", type=Path, help="folder with scene.toml and input/")
     parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"stop after: {', '.join(STAGES)}")
     parser.add_argument("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="run it again")
+    parser.add_argument(
+        "--quality", choices=tuple(QUALITIES), help="of the pictures; default: scene.toml's, or standard"
+    )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")

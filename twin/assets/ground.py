@@ -233,6 +233,8 @@ _MAX_CELLS = 1_500_000
 _SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed as noise
 _EXTRAPOLATION_LENGTH = 8.0  # [m] over which slopes continue without data
 _REWEIGHTINGS = 6
+_COLOR_WIDTHS = (0.1, 0.4, 1.6, 6.4)  # [m] σ of means of colors
+_COLOR_WEIGHT = 0.1  # share of cells with a color from which a mean counts in full
 _MIN_DATA = 50  # with fewer data the ground is flat
 
 
@@ -399,16 +401,21 @@ def build_ground(
 
 
 def _mean_colors(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Mean color per cell; a cell without pixels has the color of the nearest one with pixels."""
+    """Mean color per cell; a cell without pixels has a mean of cells around it, over a wider circle the farther they
+    are."""
     node, inside = grid.index(points[:, :2])
     count = np.bincount(node[inside], minlength=grid.rows * grid.columns)
-    mean = np.stack(
-        [np.bincount(node[inside], rgb[inside, k], len(count)) / np.maximum(count, 1) for k in range(3)], -1
-    )
     if not count.any():
         return np.full((grid.rows, grid.columns, 3), 128, np.uint8)
-    nearest = distance_transform_edt(
-        (count == 0).reshape(grid.rows, grid.columns), return_distances=False, return_indices=True
-    )
-    filled = mean.reshape(grid.rows, grid.columns, 3)[tuple(nearest)]
-    return (gaussian_filter(filled, (1.0, 1.0, 0.0)) + 0.5).astype(np.uint8)
+    sums = np.stack([np.bincount(node[inside], rgb[inside, k], len(count)) for k in range(3)], -1)
+    sums = (sums / np.maximum(count, 1)[:, None]).reshape(grid.rows, grid.columns, 3)
+    seen = (count > 0).reshape(grid.rows, grid.columns).astype(np.float64)
+    colors = np.empty_like(sums)
+    colors[:] = sums[seen > 0].mean(0)
+    for width in reversed(_COLOR_WIDTHS):
+        sigma = width / grid.cell
+        weight = gaussian_filter(seen, sigma, mode="constant")
+        near = gaussian_filter(sums, (sigma, sigma, 0.0), mode="constant") / np.maximum(weight, 1e-12)[..., None]
+        share = np.clip(weight / _COLOR_WEIGHT, 0.0, 1.0)[..., None]
+        colors += share * (near - colors)
+    return np.clip(colors + 0.5, 0, 255).astype(np.uint8)

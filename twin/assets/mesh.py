@@ -2,7 +2,8 @@
 
 Renders views of the field, fits the ground, fuses a distance field above it, extracts surface and solids, decomposes
 the solids into convex parts, and clears the corridor. Writes `visual.npz` (colored triangles), `ground.npz` (height
-field), `parts.npz` (convex parts of the obstacles) and, for a drive, `route.npz` (the filmed path on the ground).
+field), `ground.png` (its picture), `parts.npz` (convex parts of the obstacles) and, for a drive, `route.npz` (the
+filmed path on the ground).
 """
 
 import time
@@ -17,12 +18,15 @@ from scipy.spatial import cKDTree
 from twin import runtime
 from twin.assets import convex, solids, tsdf
 from twin.assets.ground import Ground, build_ground
+from twin.assets.ground_picture import ground_picture
 from twin.assets.tsdf import FREE_SPACE_REACH, color_points
 from twin.assets.views import ColorField, Views, render_views
 from twin.config import SceneConfig
 from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.images import write_image
 from twin.geometry.passes import path_length
 from twin.geometry.route import distance_to_route, filmed_route, route_metrics
+from twin.nerf.baked import BakedField
 from twin.scene import SceneDir
 from twin.types import Array
 
@@ -40,7 +44,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     field = RadianceField.load(scene.stage("field"), device)
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
-    return build_assets(field, cameras, points, config, out, scene.build / ".cache" / "convex")
+    metrics = build_assets(field, cameras, points, config, out, scene.build / ".cache" / "convex")
+    baked = BakedField.load(scene.stage("field"), field.device)
+    write_image(out / "ground.png", ground_picture(baked, cameras, Ground.load(out), baked.lightings[0]))
+    return metrics
 
 
 def build_assets(

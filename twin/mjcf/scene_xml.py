@@ -21,7 +21,7 @@ from twin.config import SceneConfig
 from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras
-from twin.geometry.images import write_image
+from twin.geometry.images import read_image, write_image
 from twin.mjcf import husky
 from twin.mjcf.world import (
     GROUND_GROUP,
@@ -85,7 +85,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     # Saves computing the poses of thousands of static geoms; bodies with motors, as the robot, never sleep.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_sky_and_lights(spec)
-    add_ground(spec, ground, assets, config.mjcf.hfield_cell)
+    add_ground(spec, ground, assets, config.mjcf.hfield_cell, read_image(mesh / "ground.png"))
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
 
@@ -193,18 +193,27 @@ def _add_sky_and_lights(spec: mujoco.MjSpec) -> None:
     spec.visual.map.znear, spec.visual.map.zfar = 0.005, 50.0
 
 
-def add_ground(spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float) -> None:
-    """Adds the geom `ground`, a height field of `cell` [m] in the ground's colors; writes its files to `assets`."""
+def add_ground(
+    spec: mujoco.MjSpec, ground: Ground, assets: Path, cell: float, picture: NDArray[np.uint8] | None = None
+) -> None:
+    """Adds the geom `ground`, a height field of `cell` [m]; writes its files to `assets`.
+
+    Its texture is the `picture` of `ground_picture`, or the ground's mean colors.
+    """
     coarse = ground.coarsened(cell)
     # MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge.
     size = np.array(coarse.height.shape, np.int32)
     (assets / "ground.bin").write_bytes(size.tobytes() + coarse.height.astype(np.float32).tobytes())
-    # The texture spans the field edge to edge: a texel per fine cell, the mean of its corners; the first row is at +y.
+    # The texture spans the field edge to edge; without a picture a texel is a fine cell, the mean of its corners. The
+    # first row is at +y.
     finer = round(coarse.cell / ground.cell)
     rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
     rgb = ground.rgb[:rows, :columns].astype(np.uint16)
-    cells = (rgb[1:, 1:] + rgb[1:, :-1] + rgb[:-1, 1:] + rgb[:-1, :-1] + 2) // 4
-    write_image(assets / "ground.png", cells[::-1].astype(np.uint8))
+    texels = ((rgb[1:, 1:] + rgb[1:, :-1] + rgb[:-1, 1:] + rgb[:-1, :-1] + 2) // 4).astype(np.uint8)
+    if picture is not None:
+        k = picture.shape[0] // (ground.height.shape[0] - 1)  # texels along a cell
+        texels = picture[: k * (rows - 1), : k * (columns - 1)]
+    write_image(assets / "ground.png", texels[::-1])
     low, high = float(coarse.height.min()), float(coarse.height.max())
     half = np.array([columns - 1, rows - 1]) * ground.cell / 2
     # MuJoCo maps the lowest value of the file to 0 and the highest to size[2]; a level field is 0 for any size.
