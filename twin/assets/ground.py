@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter, gaussian_filter1d, map_coordinates
+from scipy.ndimage import binary_closing, gaussian_filter, gaussian_filter1d, map_coordinates
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 

@@ -85,7 +85,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     # Saves computing the poses of thousands of static geoms; bodies with motors, as the robot, never sleep.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_sky_and_lights(spec)
-    add_ground(spec, ground, assets, config.mjcf.hfield_cell, read_image(mesh / "ground.png"))
+    picture = mesh / "ground.png"  # written by the stage; `build_assets` alone makes none
+    add_ground(spec, ground, assets, config.mjcf.hfield_cell, read_image(picture) if picture.exists() else None)
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
 

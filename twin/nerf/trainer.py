@@ -95,7 +95,6 @@ _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
 _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # rates at which opacity grid cells follow higher and lower samples
 _LOG_OFFSET = 0.05  # of the distortion's logarithmic distance [share of the near box's longest half side]
-_LEAST_GRADIENT = 3e-5  # norm of a sample's gradient that counts, times the rays: the others sum to 0.1 %
 _WARM_UP = 20  # steps of rising learning rate
 _EXPLORATION_SHARE = 0.15  # share of the steps over which sampling narrows down; cameras move only after it
 
@@ -305,7 +304,7 @@ class Trainer:
         wp.launch(
             hashgrid.encode_backward,
             (1, ws.features.shape[0]),
-            [ws.w_positions, f.w_levels, task, ws.w_features_grad, _LEAST_GRADIENT / self.rays, self.moments[0]],
+            [ws.w_positions, f.w_levels, task, ws.w_features_grad, self.moments[0]],
             device=self.device,
         )
         wp.launch(

@@ -101,17 +101,13 @@ def encode_backward(
     levels: Levels,
     first_level: wp.int32,
     features_grad: wp.array2d(dtype=Feature),
-    least: wp.float32,
     table_grad: wp.array2d(dtype=Feature),
 ):
-    """Adds the gradient of `encode` to `table_grad`; launched over (levels, n) from `first_level` on.
-
-    Gradients of norm `least` or less are left out: more than half of a batch, which together hardly count.
-    """
+    """Adds the gradient of `encode` to `table_grad`; launched over (levels, n) from `first_level` on."""
     k, i = wp.tid()
     level = first_level + k
     g = features_grad[i, level]
-    if wp.dot(g, g) <= least * least:
+    if wp.dot(g, g) == 0.0:  # behind an opaque sample; small gradients count, as Adam divides by their size
         return
     cell = cell_at(positions[i], levels.cells[level])
     for n in range(8):
