@@ -94,14 +94,7 @@ def test_encoding_and_its_gradient_equal_the_reference(field):
         wp.launch(
             hashgrid.encode_backward,
             (1, 100),
-            [
-                ws.w_positions,
-                field.w_levels,
-                level,
-                ws.w_features_grad,
-                0.0,
-                wp.from_torch(got, dtype=hashgrid.Feature),
-            ],
+            [ws.w_positions, field.w_levels, level, ws.w_features_grad, wp.from_torch(got, dtype=hashgrid.Feature)],
             device="cpu",
         )
     torch.testing.assert_close(got.double(), table.grad, atol=1e-5, rtol=1e-4)
