@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from test_fit import CONFIG, HEIGHT, WIDTH, K, floor_points, make_cameras
 
+from twin.errors import InputError
 from twin.geometry.cameras import SparsePoints, Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf.bake import bake
@@ -60,7 +60,7 @@ def hits_of(detail: Detail, pose: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 def rays_of(pose: np.ndarray) -> np.ndarray:
-    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.2
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     return (np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1) @ pose[:3, :3].T).reshape(-1, 3)
 
 
@@ -207,6 +207,19 @@ def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
     assert np.array_equal(fields[0].render(view, "day", stop=stop).rgb, plain.render(view, "day", stop=stop).rgb)
     fields[0].save(tmp_path)
     assert np.array_equal(BakedField.load(tmp_path).render(view, "day").rgb, after.rgb)
+    # A file that a kernel would read beyond its ends is refused.
+    texels, tiles = fields[0].arrays["detail.texels"], fields[0].arrays["detail.tiles"]
+    for name, value in (
+        ("texels", texels[:-1]),
+        ("tiles", tiles - 10**6),
+        ("tiles", tiles + 10**6),
+        ("vertices", fields[0].arrays["detail.vertices"][:12]),
+        ("sides", np.zeros(3)),
+        ("heights", np.zeros((2, 2, 2), np.float32)),
+    ):
+        fields[1].arrays = fields[0].arrays | {f"detail.{name}": value}
+        fields[1].save(tmp_path)
+        with pytest.raises(InputError, match="build the scene again"):
+            BakedField.load(tmp_path)
     plain.save(tmp_path)  # as earlier versions wrote them, without detail
     assert np.array_equal(BakedField.load(tmp_path).render(view, "day").rgb, before.rgb)
-    assert torch.is_grad_enabled()

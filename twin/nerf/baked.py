@@ -174,14 +174,36 @@ class Detail:
 
     @staticmethod
     def of_arrays(arrays: dict[str, NDArray]) -> "Detail":
-        """The detail in the arrays of a `BakedField`; fields of earlier versions have none."""
+        """The detail in the arrays of a `BakedField`; fields of earlier versions have none.
+
+        Raises ValueError for arrays that a kernel could not read.
+        """
         if "detail.sides" not in arrays:
             return Detail.without_features(np.zeros((0, 0), np.float32), np.zeros(2), 1.0)
-        height_cell, texel, cell = map(float, arrays["detail.sides"])
+        sides = arrays["detail.sides"]
         named = {name: arrays[f"detail.{name}"] for name in _DETAIL_ARRAYS}
+        tiles, rows = len(named["tiles"]), len(named["vertices"])
+        check_shapes(
+            {
+                "detail.sides": (sides, (3,), "f"),
+                "detail.heights": (named["heights"], named["heights"].shape[:2], "f"),
+                "detail.origin": (named["origin"], (2,), "f"),
+                "detail.tiles": (named["tiles"], (tiles, 2), "i"),
+                "detail.texels": (named["texels"], (tiles * detail_kernels.TEXELS, CHANNELS), "u"),
+                "detail.texel_step": (named["texel_step"], (CHANNELS,), "f"),
+                "detail.vertices": (named["vertices"], (rows, CHANNELS), "u"),
+                "detail.vertex_step": (named["vertex_step"], (CHANNELS,), "f"),
+            }
+        )
+        if rows < 8 or rows & (rows - 1):
+            raise ValueError(f"detail.vertices has {rows} rows; expected a power of 2 from 8 on")
+        if not (sides > 0.0).all() or named["tiles"].min(initial=0) < 0 or named["tiles"].max(initial=0) >= _MAX_INDEX:
+            raise ValueError("detail.sides or detail.tiles out of range")
+        height_cell, texel, cell = map(float, sides)
         return Detail(height_cell=height_cell, texel=texel, cell=cell, **named)
 
 
+_MAX_INDEX = 10_000  # tiles along an axis
 _DETAIL_ARRAYS = ("heights", "origin", "tiles", "texels", "texel_step", "vertices", "vertex_step")
 
 

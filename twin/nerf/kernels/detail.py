@@ -178,7 +178,7 @@ def find_surface(
     """Hits of the pixels of an image."""
     i = wp.tid()
     u = (float(i % width) + 0.5 - intrinsics[2]) / intrinsics[0]
-    v = (float(i / width) + 0.5 - intrinsics[3]) / intrinsics[1]
+    v = (float(i // width) + 0.5 - intrinsics[3]) / intrinsics[1]
     if depth[i] > 0.0:
         hits[i] = surface_hit(grid, position, rotation * wp.vec3f(u, v, 1.0), depth[i], 1.0 / intrinsics[0])
     else:
@@ -265,7 +265,7 @@ def interpolate_detail_backward(
                 ay = py - float(iy)
                 for n in range(4):
                     row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
-                    if row >= 0 and (row / TEXELS) % parts == part:
+                    if row >= 0 and (row // TEXELS) % parts == part:
                         share = weight * wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
                         wp.atomic_add(texels_grad, row, g * share)
     else:
@@ -275,7 +275,7 @@ def interpolate_detail_backward(
         b = p - low
         for n in range(8):
             row = vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2))
-            if (row / 8) % parts == part:
+            if (row // 8) % parts == part:
                 wp.atomic_add(vertices_grad, row, g * (weight * corner_share(b, n)))
 
 
@@ -326,7 +326,7 @@ def adam_step_detail(
                 iy = int(hit[1] / side)
                 for n in range(4):
                     row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
-                    if row >= 0 and (row / TEXELS) % parts == part:
+                    if row >= 0 and (row // TEXELS) % parts == part:
                         adam_row(row, rate, second_correction, texels, texels_grad, texels_second)
     else:
         p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
@@ -335,7 +335,7 @@ def adam_step_detail(
         z = int(wp.floor(p[2]))
         for n in range(8):
             row = vertex_row(grid, x + (n & 1), y + ((n >> 1) & 1), z + (n >> 2))
-            if (row / 8) % parts == part:
+            if (row // 8) % parts == part:
                 adam_row(row, rate, second_correction, vertices, vertices_grad, vertices_second)
 
 
@@ -345,7 +345,7 @@ def sum_levels(
 ):
     """Every texel plus the coarser levels at its node; exact, as the nodes of a level are nodes of the finer ones."""
     row = wp.tid()
-    tile = tiles[row / TEXELS]
+    tile = tiles[row // TEXELS]
     rest = row % TEXELS
     level = int(0)
     while rest >= (TILE >> level) * (TILE >> level):
@@ -353,7 +353,7 @@ def sum_levels(
         level += 1
     side = TILE >> level
     texel = grid.texel * float(1 << level)
-    x = float(tile[0] * side + rest / side) * texel
+    x = float(tile[0] * side + rest // side) * texel
     y = float(tile[1] * side + rest % side) * texel
     out = values[row]
     for coarser in range(level + 1, LEVELS):
