@@ -27,7 +27,7 @@ from twin.warp_runtime import wp
 
 _TEXEL = 0.025  # [m] least side of the finest texels
 _MAX_TILES = 6000  # texels grow until there are at most this many tiles, 33 MB
-_CELL = 0.04  # [m] side of the hash grid's cells
+_CELL = 0.06  # [m] side of the hash grid's cells
 _LOG2_ROWS = 20  # of the hash grid's table, 16 MB
 _HEIGHT_CELL = 0.25  # [m]
 _HEIGHT_VIEW = 160  # [px] width of the views that find the ground
