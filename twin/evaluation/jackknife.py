@@ -2,8 +2,8 @@
 
 The *estimand* of an interval is the mean of the statistic over repetitions of the experiment with as many new
 trainings, new days and new trials, at the same place; with several places, over repetitions with new places, too. For a
-mean rate or a bias this is the rate of the population; for a correlation, MMRV or regret it is what such an experiment gives on
-average, the noise of its few days and trials included. It is no statement about these policies on these days.
+mean rate or a bias this is the rate of the population; for a correlation, MMRV or regret it is what such an experiment
+gives on average, the noise of its few days and trials included. It is no statement about these policies on these days.
 
 Units are what varies independently: a *training* (checkpoints of a run are one unit), a *day* (a lighting of the real
 trials, left out of the twin and the road together), a *place* (with all its policies and days). With one place the

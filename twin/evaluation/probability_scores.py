@@ -6,9 +6,9 @@ A predictor gives a probability p of success for each cell (policy, day) of the 
     log score: mean over trials of −log of the probability that was given to the outcome
 
 Both are 0 at best and *proper*: no other p than one's true belief has a better expectation (Gneiting and Raftery, J.
-Am. Stat. Assoc. 102, 2007). The scores of the twin mean little alone; they are compared with baselines that do not look at
-the twin, or not at the day. A baseline that is fitted to real trials, and the twin's recalibration, use those of other
-trainings than the one that is predicted.
+Am. Stat. Assoc. 102, 2007). The scores of the twin mean little alone; they are compared with baselines that do not look
+at the twin, or not at the day. A baseline that is fitted to real trials, and the twin's recalibration, use those of
+other trainings than the one that is predicted.
 """
 
 from collections.abc import Callable, Sequence

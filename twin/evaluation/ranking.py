@@ -2,8 +2,8 @@
 
 Samples of the policies' true rates come from the posterior of `twin.evaluation.rate_model`, which shrinks a rate
 towards the other policies and counts the trials of a day as far as they say more than one. A rank's probability is the
-fraction of samples in which a policy has it. All this holds for the world in which the trials were driven: a ranking in the twin
-is no evidence of one on the road.
+fraction of samples in which a policy has it. All this holds for the world in which the trials were driven: a ranking in
+the twin is no evidence of one on the road.
 """
 
 from dataclasses import dataclass

@@ -17,8 +17,8 @@ Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them, so their cells are not
 independent: the product of their likelihoods is a *composite* likelihood. It is raised to the power (k − 1)/k for k
-days (Ribatet, Cooley and Davison, Statistica Sinica 22, 2012, on scaling such likelihoods); without, intervals from two days
-held 0.72 to 0.92 of the time, and one day says nothing about others.
+days (Ribatet, Cooley and Davison, Statistica Sinica 22, 2012, on scaling such likelihoods); without, intervals from two
+days held 0.72 to 0.92 of the time, and one day says nothing about others.
 
 The estimand is the rate over the *population* of days of the kind that were driven (`interval`), or of policies and
 days (`mean_interval`), not over these days; `cell_means` is about these. Coverage: `benchmarks/intervals.py`.
