@@ -337,7 +337,7 @@ def _candidates(
     if len(with_real) > 1:
         each = ranking.rank_probabilities(_sampled_rates([driven[i] for i in with_real], True, rng))
         real_ranks = dict(zip(with_real, each, strict=True))
-    twin_rates = _rates_over_days(cells) if by_day else [_mean_rate(mine) for mine in cells]
+    twin_rates = _rates_over_days(cells, road=False) if by_day else [_mean_rate(mine) for mine in cells]
     real_rates = dict(zip(with_real, _rates_over_days([driven[i] for i in with_real]), strict=True))
     corrected = _corrected(cells, driven, lightings, {cell.key: cell for cell in twin})
     out = []
@@ -400,11 +400,11 @@ def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.
     return RateModel.fit(*_counts(rows, by_day), shared_days=False).sample(rng, ranking.SAMPLES)
 
 
-def _rates_over_days(rows: Sequence[Sequence[Cell]]) -> list[Estimate]:
-    """Mean rate of each policy's cells, with an interval over days."""
+def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[Estimate]:
+    """Mean rate of each policy's cells, with an interval over days, on the road or in the twin."""
     if not rows:
         return []
-    low, high = RateModel.fit(*_counts(rows, True)).interval()
+    low, high = RateModel.fit(*_counts(rows, True), road=road).interval()
     out = []
     for i, row in enumerate(rows):
         value, trials = float(np.mean([c.rate for c in row])), sum(c.trials for c in row)

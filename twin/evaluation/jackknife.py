@@ -15,8 +15,9 @@ design is crossed, so the variance is that of two-way clustering (Cameron, Gelba
 V_both leaves out one training on one day, and is contained in both others. Subtracting all of it, as for a linear
 statistic of many units, made intervals too narrow where ranks jump, subtracting nothing made them too wide
 (`benchmarks/intervals.py`). The interval is the estimate ± Student's t times √V on a scale on which the statistic is
-less skewed, with Satterthwaite's degrees of freedom. It is not widened to contain anything. It is refused for fewer
-units than it holds for, and if leaving units out changes nothing, since then there is no variance to go by.
+less skewed, with Satterthwaite's degrees of freedom, at least half of those of the trainings (few days made intervals
+too wide). It is not widened to contain anything. It is refused for fewer units than it holds for, and if leaving units
+out changes nothing, since then there is no variance to go by.
 
 A bootstrap was worse: resampled policies come twice, which raises correlations, and cells resampled at shrunken rates
 agree less than observed ones; its intervals held 0.5 to 0.8 of the time.
@@ -135,8 +136,11 @@ class Statistic:
     low: float
     high: float
     """Limits of the interval."""
+    linear: bool = False
+    """True: a mean of differences, for which V_both is subtracted entirely."""
     trainings: int = MIN_TRAININGS
     days: int = MIN_DAYS
+    """Numbers of units below which there is no interval."""
 
 
 def _identity(value: Array) -> Array:
@@ -164,7 +168,7 @@ STATISTICS = {
     "pearson": Statistic(pearson_batched, _fisher, np.tanh, -1.0, 1.0),
     "spearman": Statistic(spearman_batched, _arcsine, _sine, -1.0, 1.0),
     "mmrv": Statistic(mmrv_batched, _identity, _identity, 0.0, 1.0),
-    "bias": Statistic(mean_bias, _identity, _identity, -1.0, 1.0, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS),
+    "bias": Statistic(mean_bias, _identity, _identity, -1.0, 1.0, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS),
 }
 """Statistics that have intervals. Regret and agreement of the winner have none from one place: they are maxima."""
 
@@ -192,7 +196,7 @@ def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: floa
     """
     trainings, days = data.trainings, data.days
     lacking = [
-        f"{count} {what}, {needed} are needed"
+        f"{count} {what if count != 1 else what[:-1]}, {needed} are needed"
         for what, count, needed in (("trainings", trainings, statistic.trainings), ("days", days, statistic.days))
         if count < needed
     ]
@@ -203,10 +207,10 @@ def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: floa
     both = [t | d for t in of_training for d in of_day]
     with np.errstate(invalid="ignore", divide="ignore"):
         parts = [_variance(statistic, [data.rates(kept) for kept in units]) for units in (of_training, of_day, both)]
-        variance = parts[0] + parts[1] - _SHARE_OF_BOTH * parts[2]
+        variance = parts[0] + parts[1] - (1.0 if statistic.linear else _SHARE_OF_BOTH) * parts[2]
         variance = np.where(variance > 0, variance, np.maximum(parts[0], parts[1]))
         freedom = variance**2 / (parts[0] ** 2 / (trainings - 1) + parts[1] ** 2 / (days - 1))
-    freedom = np.clip(freedom, 1.0, trainings + days - 2)
+    freedom = np.clip(freedom, (trainings - 1) / 2, trainings + days - 2)
     return _ends(statistic, statistic.of(**data.rates()), variance, freedom, confidence)
 
 

@@ -23,7 +23,9 @@ from twin.types import Array, Indices
 CALIBRATION_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 """Ends of the bins of predicted probability in a calibration curve."""
 
-SCORE_DIFFERENCE = Statistic(mean_bias, lambda x: x, lambda x: x, -np.inf, np.inf, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS)
+SCORE_DIFFERENCE = Statistic(
+    mean_bias, lambda x: x, lambda x: x, -np.inf, np.inf, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS
+)
 """Mean over policies of the difference of two scores; `jackknife_interval` takes it with `score_pair`."""
 
 _LEAST = 0.005  # probability that any predictor leaves to either outcome
@@ -80,7 +82,7 @@ def mean_score(data: PairedCells, score: Array) -> float:
 
 def twin_probabilities(successes: Array, trials: Array) -> Array:
     """The twin's probability for each of its cells, shrunk towards the policy's rate in the twin, shapes (n, k)."""
-    return RateModel.fit(successes, trials, shared_days=False).cell_means()
+    return RateModel.fit(successes, trials, shared_days=False, road=False).cell_means()
 
 
 def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callable[[Array, Array], Array]) -> Array:
