@@ -47,7 +47,7 @@ from twin.evaluation.jackknife import (
     place_interval,
 )
 from twin.evaluation.rate_model import MIN_RATE_DAYS, MIN_SETUP_TRAININGS, RateModel
-from twin.evaluation.statistics import UndefinedStatistic, leave_one_group_out
+from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out
 
 sys.path.append(str(Path(__file__).parent))
 from record import add_record_options, save
@@ -334,6 +334,8 @@ def _predicted(worlds: Worlds) -> Hits:
     for i in range(len(out)):
         data = worlds.place(0, i)
         f, y = data.rates()["twin"], data.rates()["real"]
+        if len(f) - np.bincount(data.training).max() < MIN_PREDICTORS:
+            break
         try:
             _, low, high = leave_one_group_out(twin=f, real=y, groups=data.training.tolist())
         except UndefinedStatistic:

@@ -48,6 +48,7 @@ from twin.evaluation.rate_model import MIN_RATE_DAYS, RateModel, padded_counts
 from twin.evaluation.statistics import (
     CONFIDENCE,
     MIN_POLICIES,
+    MIN_PREDICTORS,
     MIN_TRIALS,
     LinearCorrection,
     UndefinedStatistic,
@@ -377,7 +378,11 @@ def _corrected(
             line = LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
             score = scores[i][0] if i in scores else _mean_rate(mine).value
             value, low, high = map(float, line.predict(np.array(score)))
-            out.append(Estimate(value, low, high, line.n))
+            if line.n < MIN_PREDICTORS:
+                few = f"too few for an interval: {line.n} policies of other trainings, {MIN_PREDICTORS} are needed"
+                out.append(Estimate(value, n=line.n, no_interval=few))
+            else:
+                out.append(Estimate(value, low, high, line.n))
     return out
 
 
@@ -509,13 +514,16 @@ def _corrected_coverage(data: PairedCells) -> Estimate:
     rates = data.rates()
     for members in data.strata:
         f, y = rates["twin"][members], rates["real"][members]
+        groups = data.training[members]
+        if len(members) - np.bincount(groups).max() < MIN_PREDICTORS:
+            continue
         try:
-            _, low, high = leave_one_group_out(twin=f, real=y, groups=data.training[members].tolist())
+            _, low, high = leave_one_group_out(twin=f, real=y, groups=groups.tolist())
         except UndefinedStatistic:
             continue
         hits += list((low <= y) & (y <= high))
     if not hits:
-        return Estimate(missing=f"{MIN_POLICIES} policies of a task, of other trainings, are needed for each")
+        return Estimate(missing=f"{MIN_PREDICTORS} policies of a task, of other trainings, are needed for each")
     return _share(int(sum(hits)), len(hits), _DEPENDENT)
 
 

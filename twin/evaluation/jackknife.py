@@ -42,6 +42,8 @@ from twin.types import Array, Indices
 
 MIN_TRAININGS, MIN_DAYS, MIN_PLACES = 8, 4, 5
 """Number of units below which a correlation or MMRV has no interval."""
+MIN_PEARSON_TRAININGS = 12
+"""The same for Pearson's correlation, which a single policy can carry."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
 """The same for a mean difference."""
 
@@ -165,7 +167,7 @@ def mean_bias(*, twin: Array, real: Array) -> Array:
 
 
 STATISTICS = {
-    "pearson": Statistic(pearson_batched, _fisher, np.tanh, -1.0, 1.0),
+    "pearson": Statistic(pearson_batched, _fisher, np.tanh, -1.0, 1.0, trainings=MIN_PEARSON_TRAININGS),
     "spearman": Statistic(spearman_batched, _arcsine, _sine, -1.0, 1.0),
     "mmrv": Statistic(mmrv_batched, _identity, _identity, 0.0, 1.0),
     "bias": Statistic(mean_bias, _identity, _identity, -1.0, 1.0, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS),

@@ -25,7 +25,7 @@ from twin.evaluation.forecasting import (
     Forecast,
     TrialAllocation,
 )
-from twin.evaluation.jackknife import training_of
+from twin.evaluation.jackknife import MIN_DAYS, MIN_TRAININGS, training_of
 from twin.evaluation.ranking import MAX_TRIALS
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.evaluation.trials import csv_text
@@ -168,10 +168,11 @@ def believable(group: Agreement) -> Verdict:
                 f"What may be believed: the order of two policies {gap} in the twin, which the road had in {right:g} "
                 f"of {n} pairs{rest} ({where})."
             )
-            return Verdict(text, "good" if start <= _SMALL_GAP else "mixed")
+            enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
+            return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
     n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
-    text = f"No order of two policies in the twin may be believed yet: the road had it in {right:g} of {n} pairs ({where})."
-    return Verdict(text, "bad")
+    text = f"No order of two policies in the twin may be believed yet: the road had it in {right:g} of {n} pairs"
+    return Verdict(f"{text} ({where}).", "bad")
 
 
 def _count(n: int, what: str) -> str:
@@ -538,7 +539,8 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
     calibration = []
     if measured and measured[-1].calibration:
         group = measured[-1]
-        title = f"Success on the road over the twin’s probability, cell by cell (n = {group.cells} cells, {group.task})"
+        n = f"n = {group.cells} cells, {group.task}; numbers are trials"
+        title = f"Success on the road over the twin’s probability, cell by cell ({n})"
         calibration = [Chart(title, svg(calibration_chart(group)))]
     predictions = []
     if tested := [c for c in known if c.driven]:
