@@ -18,6 +18,7 @@ none, as in 706 of the 720 cells of Table 1, to which the kind `recorded` is fit
 - policy: its rate on the road over all days of this kind, averaged over the policies; *policy, middling* those between
   0.1 and 0.9.
 - setup: the rate on the road over all trainings (places) and days of the kind, of finished policies.
+- setup, these trainings: the rate over all days of the finished policies that drove (`rate_over_days`), at one place.
 - setups' difference: the difference of two such rates, by pairs of trainings at one place.
 - twin: a policy's rate in the twin over all days of this kind.
 - predicted: the observed real rate of a policy, predicted from the twin's rates and the other trainings.
@@ -47,7 +48,7 @@ from twin.evaluation.jackknife import (
     place_interval,
 )
 from twin.evaluation.rate_model import MIN_RATE_DAYS, MIN_SETUP_TRAININGS, RateModel
-from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out
+from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out, rate_over_days
 
 sys.path.append(str(Path(__file__).parent))
 from record import add_record_options, save
@@ -308,16 +309,20 @@ def _setups(worlds: Worlds) -> Hits:
     shape, done = worlds.shape, worlds.finished
     setups = worlds.setup[0, 0, done]
     aims = [setup_rate(worlds.kind, shape, setup) for setup in range(3)]
-    rate, difference = np.full((2, len(worlds.real), 3), np.nan)
+    rate, difference, own = np.full((3, len(worlds.real), 3), np.nan)
+    true = worlds.policy_rates()[:, :, done]
     rows = [worlds.real[:, :, done][:, :, setups == setup] for setup in range(3)]  # (worlds, places, trainings, days)
     count = rows[0].shape[1] * rows[0].shape[2]
     if not shape.setups or count < MIN_SETUP_TRAININGS:
-        return {"setup": rate.mean(1), "setups' difference": difference.mean(1)}
+        return {"setup": rate.mean(1), "setup, these trainings": own.mean(1), "setups' difference": difference.mean(1)}
     for i in range(_counted(worlds)):
         mine = [row[i].reshape(count, shape.days) for row in rows]
         for setup, won in enumerate(mine):
             low, high = RateModel.fit(won, np.full(won.shape, shape.trials)).mean_interval()
             rate[i, setup] = low <= aims[setup] <= high
+            if shape.places == 1:
+                _, low, high = rate_over_days(won.mean(0) / shape.trials)
+                own[i, setup] = low <= true[i, 0, setups == setup].mean() <= high
         for k, (one, other) in enumerate(((0, 1), (0, 2), (1, 2))):
             each = ((mine[one] - mine[other]) / shape.trials).mean(-1)
             each = each.reshape(shape.places, -1).mean(-1) if shape.places > 1 else each
@@ -326,7 +331,11 @@ def _setups(worlds: Worlds) -> Hits:
             except UndefinedStatistic:
                 continue
             difference[i, k] = low <= aims[one] - aims[other] <= high
-    return {"setup": rate.mean(1), "setups' difference": _mean_or_nan(difference)}
+    return {
+        "setup": rate.mean(1),
+        "setup, these trainings": own.mean(1),
+        "setups' difference": _mean_or_nan(difference),
+    }
 
 
 def _predicted(worlds: Worlds) -> Hits:
