@@ -17,7 +17,8 @@ none, as in 706 of the 720 cells of Table 1, to which the kind `recorded` is fit
   trainings, days and trials, at the same place or, where the shape has several, at other places.
 - policy: its rate on the road over all days of this kind, averaged over the policies; *policy, middling* those between
   0.1 and 0.9.
-- setup: the rate on the road over all trainings (places) and days of the kind, of finished policies.
+- setup: the rate on the road over all trainings and days of the kind, of finished policies; with several places, which
+  are the units then, over places, too.
 - setup, these trainings: the rate over all days of the finished policies that drove (`rate_over_days`), at one place.
 - setups' difference: the difference of two such rates, by pairs of trainings at one place.
 - twin: a policy's rate in the twin over all days of this kind.
@@ -317,8 +318,10 @@ def _setups(worlds: Worlds) -> Hits:
         return {"setup": rate.mean(1), "setup, these trainings": own.mean(1), "setups' difference": difference.mean(1)}
     for i in range(_counted(worlds)):
         mine = [row[i].reshape(count, shape.days) for row in rows]
+        units = [row[i].sum(1) if shape.places > 1 else row[i, 0] for row in rows]
+        trials = shape.trials * (rows[0].shape[2] if shape.places > 1 else 1)
         for setup, won in enumerate(mine):
-            low, high = RateModel.fit(won, np.full(won.shape, shape.trials)).mean_interval()
+            low, high = RateModel.fit(units[setup], np.full(units[setup].shape, trials)).mean_interval()
             rate[i, setup] = low <= aims[setup] <= high
             if shape.places == 1:
                 _, low, high = rate_over_days(won.mean(0) / shape.trials)

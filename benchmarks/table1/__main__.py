@@ -154,7 +154,7 @@ def main() -> int:
     folders = [path for path in (given.scene / "runs").glob("*_*_[0-9]*") if path.is_dir()]
     seeds = sorted({int(path.name.rsplit("_", 1)[1]) for path in folders})
     results = collect(given.scene, runs(seeds, list(TASKS), list(SETUPS)))
-    status = save(given.results, results)
+    status = save(given.results, results, replace=None)
     if status:
         return status
     print(tables(results))
