@@ -1,170 +1,382 @@
-"""Coverage of the forecast's 90 % intervals in simulated experiments with a known truth.
+"""Coverage of every 90 % interval of a forecast, in simulated worlds whose truth is known.
 
-    python benchmarks/intervals.py [--experiments 300]
-    python benchmarks/intervals.py --record benchmarks/table1/results.json
+    python benchmarks/intervals.py [--worlds 1000] [--shapes user] [--json FILE]
 
-In an experiment, policies of varied quality drive under two lightings; the twin's rates are biased upwards and noisy.
-Prints a table: one setting per row, one statistic per column. With `--record`, experiments are resampled from a
-recorded one instead, which has many days of few trials with mostly equal outcomes. See `RESAMPLING`.
+A *world* is one whole experiment: places, trainings, checkpoints, days, and trials in the twin and on the road. Policy
+p succeeds on day d at the rate
+
+    road: logit = s (q_p + day_d + cell_pd)            twin: the same with a sharpness, bias and noise of its own
+
+where q_p is a setup's mean plus the effects of place, training and checkpoint. Day and cell effects are correlated
+between twin and road: a low sun troubles both. With a large sharpness s a policy succeeds in all trials of a day or in
+none, as in 706 of the 720 cells of Table 1, to which the kind `recorded` is fitted.
+
+*Estimands*, which an interval must contain 9 times in 10:
+
+- Pearson, Spearman, MMRV, bias, regret: the mean of the statistic over further worlds of the same shape: other
+  trainings, days and trials, at the same place or, where the shape has several, at other places.
+- policy: its rate on the road over all days of this kind, averaged over the policies; *policy, middling* those between
+  0.1 and 0.9.
+- setup: the rate on the road over all trainings and days of the kind, of finished policies; with several places, which
+  are the units then, over places, too.
+- setup, these trainings: the rate over all days of the finished policies that drove (`rate_over_days`), at one place.
+- setups' difference: the difference of two such rates, by pairs of trainings at one place.
+- twin: a policy's rate in the twin over all days of this kind.
+- predicted: the observed real rate of a policy, predicted from the twin's rates and the other trainings.
+
+Prints coverage, or – where no interval is printed in that shape. Worlds whose units do not determine an interval are
+not counted, as none is printed there, either; *refused* is their largest share. Rates are estimated in a quarter of the
+worlds where these have more than ten policies. The seed is fixed. Takes ten minutes of one core.
 """
 
 import argparse
+import sys
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.special import expit
+from scipy.stats import norm
 
-from twin.config import Condition
-from twin.evaluation.bootstrap import PairedCells, Rates, bootstrap_interval, observed_rates, resample
-from twin.evaluation.statistics import (
-    LinearCorrection,
-    leave_one_group_out,
-    mmrv_batched,
-    pearson_batched,
-    prediction_powered_mean,
-    spearman_batched,
-    winner_batched,
+from twin.evaluation.jackknife import (
+    STATISTICS,
+    PairedCells,
+    Statistic,
+    jackknife_interval,
+    mean_difference_interval,
+    place_interval,
 )
-from twin.files import read_json
+from twin.evaluation.rate_model import MIN_RATE_DAYS, MIN_SETUP_TRAININGS, RateModel
+from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out, rate_over_days
 
-_MEAN_OVER = 3000  # experiments that estimate the true value of a statistic
-_DRAWS = 400
+sys.path.append(str(Path(__file__).parent))
+from record import add_record_options, save
 
-# policies, trials per cell in the twin and on the road, std of quality [logit], std of the twin's noise [logit]
-SETTINGS = {
-    "12 policies, 50 real trials": (12, 100, 50, 1.5, 0.5),
-    "12, 50, a very good twin": (12, 200, 50, 2.0, 0.2),
-    "24, 20": (24, 100, 20, 1.5, 0.5),
-    "12, 20, a poor twin": (12, 100, 20, 1.5, 3.0),
-    "6, 10": (6, 100, 10, 1.5, 0.7),
-    "5, 5": (5, 50, 5, 1.5, 0.5),
+WORLDS = 1000
+_MEAN_OVER = 6000  # worlds that estimate the mean of a statistic
+_BATCH = 250
+_RATE_WORLDS = 250  # of which rates are estimated, in shapes of more policies than a user has
+_USERS_POLICIES = 10
+_QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Size of an experiment."""
+
+    places: int
+    setups: int
+    """Setups per place; 0: each training has a setup drawn at random."""
+    trainings: int
+    """Trainings per place."""
+    checkpoints: int
+    """Policies per training."""
+    days: int
+    twin_trials: int
+    """Per policy and day."""
+    trials: int = 5
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How policies, days and the twin vary [logit divided by the sharpness]."""
+
+    setups: tuple[float, float, float]
+    training: float
+    place: float
+    checkpoint: float
+    """How much worse the first checkpoint is; its noise is a third of it."""
+    day: float
+    cell: float
+    shared: float
+    """Correlation of day and cell effects between twin and road."""
+    sharpness: float
+    twin_sharpness: float
+    bias: float
+    noise: float
+    """Standard deviation over policies of the twin's own error."""
+
+
+SHAPES = {
+    "Table 1: 12 trainings × 3, 20 days": Shape(1, 6, 12, 3, 20, 5),
+    "Table 1 by days 6 to 15: 12 × 3, 10 days": Shape(1, 6, 12, 3, 10, 5),
+    "6 places of 12 × 3, 20 days": Shape(6, 6, 12, 3, 20, 5),
+    "6 places of 6 × 1, 10 days": Shape(6, 6, 6, 1, 10, 5),
+    "user: 8 policies, 4 days": Shape(1, 0, 8, 1, 4, 20),
+    "user: 6 policies, 3 days": Shape(1, 0, 6, 1, 3, 20),
+    "user: 5 policies, 2 days": Shape(1, 0, 5, 1, 2, 20),
+}
+KINDS = {
+    "recorded": Kind((-2.2, -1.5, 2.4), 0.5, 0.3, 1.8, 0.5, 0.9, 0.5, 20.0, 2.5, 0.0, 0.4),
+    "graded": Kind((-1.5, 0.0, 1.5), 1.0, 0.5, 1.0, 0.5, 1.0, 0.5, 1.0, 1.0, 0.5, 0.5),
+    "poor twin": Kind((-3.0, 0.0, 3.0), 2.0, 1.0, 2.0, 1.0, 2.0, 0.3, 1.0, 1.0, 0.5, 4.0),
+    "good policies": Kind((3.0, 4.0, 5.0), 2.0, 1.0, 2.0, 2.0, 4.0, 0.8, 1.0, 1.0, 0.0, 0.5),
 }
 
 
-def simulated_experiment(
-    rng: np.random.Generator, n: int, twin_trials: int, real_trials: int, spread: float, noise: float
-) -> PairedCells:
-    """One simulated experiment."""
-    quality = rng.normal(0.0, spread, (n, 1)) + rng.normal(0.0, 0.3, (n, 2))
-    twin = expit(quality + 0.5 + rng.normal(0.0, noise, (n, 1)))
-    trials = np.full((n, 2), twin_trials), np.full((n, 2), real_trials)
-    won = rng.binomial(trials[0], twin), rng.binomial(trials[1], expit(quality))
-    of = np.broadcast_to(np.arange(2), (n, 2))
-    return PairedCells(trials[0], won[0], of, trials[1], won[1], np.ones((n, 2)), (np.arange(n),))
+@dataclass(frozen=True)
+class Worlds:
+    """Simulated worlds, shapes (worlds, places, policies, days)."""
+
+    kind: Kind
+    shape: Shape
+    twin: np.ndarray
+    """Successes in the twin."""
+    real: np.ndarray
+    quality: np.ndarray
+    """q_p, shape (worlds, places, policies)."""
+    twin_quality: np.ndarray
+    """The same with the twin's error."""
+    setup: np.ndarray
+    """Index of each policy's setup in `Kind.setups`, shape (worlds, places, policies)."""
+
+    def place(self, i: int, world: int | slice = slice(None)) -> PairedCells:
+        """One place of one or all worlds."""
+        shape, n = self.shape, self.twin.shape[2]
+        return PairedCells(
+            twin=self.twin[world, i] / shape.twin_trials,
+            real=self.real[world, i] / shape.trials,
+            weight=np.ones((n, shape.days)),
+            training=np.arange(n) // shape.checkpoints,
+            day=np.broadcast_to(np.arange(shape.days), (n, shape.days)),
+            strata=(np.arange(n),),
+        )
+
+    @property
+    def places(self) -> list[PairedCells]:
+        return [self.place(i) for i in range(self.shape.places)]
+
+    @property
+    def finished(self) -> np.ndarray:
+        """True for the last policy of each training, shape (policies,)."""
+        return np.arange(self.twin.shape[2]) % self.shape.checkpoints == self.shape.checkpoints - 1
+
+    def policy_rates(self) -> np.ndarray:
+        """True rates on the road over all days, shape (worlds, places, policies)."""
+        return _rate(self.kind.sharpness, self.quality, np.hypot(self.kind.day, self.kind.cell))
+
+    def twin_rates(self) -> np.ndarray:
+        """The same in the twin."""
+        return _rate(self.kind.twin_sharpness, self.twin_quality, np.hypot(self.kind.day, self.kind.cell))
 
 
-RESAMPLING = {
-    "policies resampled, the same days": False,
-    "policies and days resampled": True,
-}
-"""Row → True if days are resampled, too. Trials are resampled at each policy's recorded rates."""
+def simulate(rng: np.random.Generator, kind: Kind, shape: Shape, worlds: int) -> Worlds:
+    """Simulates worlds. With one place its effect is part of the kind, and the same in all of them."""
+    per_place = (worlds, shape.places, shape.trainings)
+    if shape.setups:
+        setup = np.broadcast_to(np.arange(shape.trainings) * shape.setups // shape.trainings % 3, per_place)
+    else:
+        setup = rng.integers(3, size=per_place)
+    several = shape.places > 1
+    place, place_bias = rng.normal(0.0, kind.place * several, (2, worlds, shape.places, 1, 1))
+    training = np.array(kind.setups)[setup] + rng.normal(0.0, kind.training, per_place)
+    early = np.linspace(-1.0, 0.0, shape.checkpoints) if shape.checkpoints > 1 else np.zeros(1)
+    effect = kind.checkpoint * early * (1.0 + rng.normal(0.0, 1 / 3, (*per_place, shape.checkpoints)))
+    quality = (training[..., None] + place + effect).reshape(worlds, shape.places, -1)
+    n = quality.shape[-1]
+    error = kind.bias + place_bias / 2 + rng.normal(0.0, kind.noise, (worlds, shape.places, n, 1))
+
+    def effects(std: float, size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        road, own = rng.normal(0.0, std, (2, *size))
+        return road, kind.shared * road + np.sqrt(1.0 - kind.shared**2) * own
+
+    day, twin_day = effects(kind.day, (worlds, shape.places, 1, shape.days))
+    cell, twin_cell = effects(kind.cell, (worlds, shape.places, n, shape.days))
+    real = expit(kind.sharpness * (quality[..., None] + day + cell))
+    twin = expit(kind.twin_sharpness * (quality[..., None] + error + twin_day + twin_cell))
+    won = rng.binomial(shape.twin_trials, twin), rng.binomial(shape.trials, real)
+    setups = np.repeat(setup, shape.checkpoints, -1)
+    return Worlds(kind, shape, *won, quality, quality + error[..., 0], setups)
 
 
-def read_experiment(path: Path) -> PairedCells:
-    """The experiment that `benchmarks/table1` recorded, with the twin's lightings from photos; policies by task."""
-    read: list[tuple[str, list[list[int]]]] = []
-    for run in read_json(path)["runs"]:
-        for policy in run["policies"]:
-            twin, real = policy["validate_by_photo"]["by_lighting"], policy["real"]["by_lighting"]
-            sides = [[twin[str(Condition(day, True))], real[day]] for day in real]
-            read.append((run["task"], [[c["trials"] for c in s] + [c["successes"] for c in s] for s in sides]))
-    counts = np.array([cells for _, cells in read])
-    task = np.array([name for name, _ in read])
-    of = np.broadcast_to(np.arange(counts.shape[1]), counts.shape[:2])
-    strata = tuple(np.flatnonzero(task == name) for name in dict.fromkeys(task))
-    weight = np.ones(counts.shape[:2])
-    return PairedCells(counts[..., 0], counts[..., 2], of, counts[..., 1], counts[..., 3], weight, strata)
+def _rate(sharpness: float, quality: np.ndarray, std: float) -> np.ndarray:
+    """Mean rate where the quality has a normal deviation."""
+    out = np.zeros_like(quality)
+    for z in _QUANTILES:
+        out += expit(sharpness * (quality + std * z))
+    return out / len(_QUANTILES)
 
 
-def resampled_experiment(rng: np.random.Generator, record: PairedCells, resample_days: bool) -> PairedCells:
-    """One experiment with policies resampled within each task, and days if `resample_days`, both with replacement."""
-    policies = np.concatenate([rng.choice(members, len(members)) for members in record.strata])
-    strata = tuple(np.split(np.arange(len(policies)), np.cumsum([len(m) for m in record.strata])[:-1]))
-    days = np.arange(record.weight.shape[1])
-    chosen = np.ix_(policies, rng.choice(days, len(days)) if resample_days else days)
-    twin_trials, real_trials = record.twin_trials[chosen], record.real_trials[chosen]
-    twin = rng.binomial(twin_trials, record.twin_successes[chosen] / twin_trials)
-    real = rng.binomial(real_trials, record.real_successes[chosen] / real_trials)
-    return PairedCells(twin_trials, twin, record.twin_index, real_trials, real, record.weight, strata)
+def setup_rate(kind: Kind, shape: Shape, setup: int) -> float:
+    """True rate on the road of a setup's finished policies over all trainings, days and, if several, places."""
+    std = np.sqrt(kind.training**2 + kind.day**2 + kind.cell**2 + (kind.place**2 if shape.places > 1 else 0.0))
+    return float(_rate(kind.sharpness, np.array([kind.setups[setup]]), float(std))[0])
 
 
-def statistics(rates: Rates) -> dict[str, np.ndarray]:
-    """The statistics that have a bootstrap interval."""
-    agreement, regret = winner_batched(twin=rates.twin, real=rates.real)
+# ---- coverage
+
+Hits = dict[str, np.ndarray]
+"""Interval → 1 where it holds its estimand, 0 where not, nan where it is refused."""
+
+
+def coverage(kind: Kind, shape: Shape, worlds: int, seed: int = 0) -> dict[str, float]:
+    """Coverage of each interval; nan where it is never printed. *refused*: the largest share of worlds without one."""
+    rng = np.random.default_rng(seed)
+    truth = expected(kind, shape, rng)
+    parts = [
+        holds(simulate(rng, kind, shape, min(_BATCH, worlds - start)), truth) for start in range(0, worlds, _BATCH)
+    ]
+    hits = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    out = {name: float(np.nanmean(hit)) if np.isfinite(hit).any() else float("nan") for name, hit in hits.items()}
+    agreement = [name for name in hits if name.partition(",")[0] in STATISTICS]
+    refused = [float(np.isnan(hits[name]).mean()) for name in agreement if out[name] == out[name]]
+    return out | {"refused": max(refused, default=float("nan"))}
+
+
+def expected(kind: Kind, shape: Shape, rng: np.random.Generator) -> dict[str, float]:
+    """Mean of each statistic over many worlds."""
+    means: dict[str, list[np.ndarray]] = {}
+    batch = max(_MEAN_OVER // (20 if shape.places > 1 else 6), 1)
+    for _ in range(_MEAN_OVER // batch):
+        places = simulate(rng, kind, shape, batch).places
+        for name, statistic in STATISTICS.items():
+            with np.errstate(invalid="ignore", divide="ignore"):
+                for data in places:
+                    means.setdefault(name, []).append(statistic.of(**data.rates()))
+                if shape.places > 1:
+                    each = [data.rates() for data in places]
+                    both = {key: np.concatenate([one[key] for one in each], -1) for key in ("twin", "real")}
+                    means.setdefault(f"{name}, pooled", []).append(statistic.of(**both))
+    return {name: float(np.nanmean(np.concatenate(values))) for name, values in means.items()}
+
+
+def holds(worlds: Worlds, truth: dict[str, float]) -> Hits:
+    several = worlds.shape.places > 1
+    agreement = _over_places(worlds, truth) if several else _at_one_place(worlds, truth)
+    return agreement | _rates(worlds) | _setups(worlds) | ({} if several else _predicted(worlds))
+
+
+def _hit(ends: Callable[[], tuple[Any, ...]], aim: float | np.ndarray, count: int) -> np.ndarray:
+    try:
+        low, high = ends()[-2:]
+    except UndefinedStatistic:
+        return np.full(count, np.nan)
+    hit = (low - 1e-9 <= aim) & (aim <= high + 1e-9)
+    return np.where(np.isfinite(low), hit, np.nan)
+
+
+def _at_one_place(worlds: Worlds, truth: dict[str, float]) -> Hits:
+    data, count = worlds.places[0], len(worlds.twin)
     return {
-        "Pearson": pearson_batched(twin=rates.twin, real=rates.real),
-        "Spearman": spearman_batched(twin=rates.twin, real=rates.real),
-        "MMRV": mmrv_batched(twin=rates.twin, real=rates.real),
-        "winner": agreement,
-        "regret": regret,
-        "cells agree": rates.compatible,
-        "bias": rates.difference,
+        name: _hit(lambda s=statistic: jackknife_interval(s, data), truth[name], count)
+        for name, statistic in STATISTICS.items()
     }
 
 
-def coverage(settings: tuple[int, int, int, float, float], experiments: int, seed: int = 0) -> dict[str, float]:
-    """Fraction of the experiments in which each interval contains the true value."""
-    rng = np.random.default_rng(seed)
-    truth = true_values(lambda: simulated_experiment(rng, *settings))
-    hits: dict[str, list[float]] = {name: [] for name in (*truth, "predicted", "left out", "mean on the road")}
-    n = settings[0]
-    for _ in range(experiments):
-        data = simulated_experiment(rng, *settings)
-        for name, hit in intervals_hold(data, rng, truth).items():
-            hits[name].append(hit)
-        further = observed_rates(simulated_experiment(rng, 2 * n, *settings[1:]))
-        driven, others = slice(0, n), slice(n, 2 * n)
-        f, y = further.twin, further.real
-        _, low, high = LinearCorrection.fit(twin=f[driven], real=y[driven]).predict(f[others])
-        hits["predicted"].append(float(np.mean((low <= y[others]) & (y[others] <= high))))
-        if n > 5:
-            _, low, high = leave_one_group_out(twin=f[driven], real=y[driven], groups=range(n))
-            hits["left out"].append(float(np.mean((low <= y[driven]) & (y[driven] <= high))))
-        mean = prediction_powered_mean(twin=f[driven], real=y[driven], twin_only=f[others])
-        hits["mean on the road"].append(mean.low <= 0.5 <= mean.high)  # one half, by symmetry
-    return {name: float(np.mean(each)) if each else float("nan") for name, each in hits.items()}
+def _over_places(worlds: Worlds, truth: dict[str, float]) -> Hits:
+    out: Hits = {}
+    for name, statistic in STATISTICS.items():
+        for pooled in (False, True):
+            key = f"{name}, pooled" if pooled else name
+            ends = _places_of(statistic, worlds, pooled)
+            out[key] = _hit(ends, truth[key], len(worlds.twin))
+    return out
 
 
-def true_values(experiment: Callable[[], PairedCells]) -> dict[str, float]:
-    """True value of each statistic: its mean over many experiments."""
-    many = [statistics(observed_rates(experiment())) for _ in range(_MEAN_OVER)]
-    return {name: float(np.nanmean([one[name] for one in many])) for name in many[0]}
+def _places_of(statistic: Statistic, worlds: Worlds, pooled: bool) -> Callable[[], tuple[Any, ...]]:
+    return lambda: place_interval(statistic, worlds.places, pooled)
 
 
-def intervals_hold(data: PairedCells, rng: np.random.Generator, truth: dict[str, float]) -> dict[str, bool]:
-    """Statistic → True if its bootstrap interval contains the true value; without undefined intervals."""
-    own, repeated = statistics(observed_rates(data)), statistics(resample(data, rng, _DRAWS))
-    ends = {name: bootstrap_interval(float(own[name]), repeated[name]) for name in truth}
-    return {name: end[0] - 1e-9 <= truth[name] <= end[1] + 1e-9 for name, end in ends.items() if end}
+def _rates(worlds: Worlds) -> Hits:
+    """Rates of single policies, at the first place."""
+    shape, true = worlds.shape, worlds.policy_rates()[:, 0]
+    policy, twin = np.full((2, *true.shape), np.nan)
+    if shape.days >= MIN_RATE_DAYS:
+        for hit, won, aim, trials in (
+            (policy, worlds.real[:, 0], true, shape.trials),
+            (twin, worlds.twin[:, 0], worlds.twin_rates()[:, 0], shape.twin_trials),
+        ):
+            for i, mine in enumerate(won[: _counted(worlds)]):
+                low, high = RateModel.fit(mine, np.full(mine.shape, trials), road=hit is policy).interval()
+                hit[i] = (low <= aim[i]) & (aim[i] <= high)
+    middling = np.where((true >= 0.1) & (true <= 0.9), policy, np.nan)
+    return {"policy": policy.mean(1), "policy, middling": _mean_or_nan(middling), "twin": twin.mean(1)}
 
 
-def recorded_coverage(record: PairedCells, resample_days: bool, experiments: int, seed: int = 0) -> dict[str, float]:
-    """`coverage` in experiments resampled from a record."""
-    rng = np.random.default_rng(seed)
-    truth = true_values(lambda: resampled_experiment(rng, record, resample_days))
-    hits = [intervals_hold(resampled_experiment(rng, record, resample_days), rng, truth) for _ in range(experiments)]
-    return {name: float(np.mean([one[name] for one in hits if name in one])) for name in truth}
+def _counted(worlds: Worlds) -> int:
+    """Number of worlds in which rates are estimated; the others have nan."""
+    return len(worlds.real) if worlds.twin.shape[2] <= _USERS_POLICIES else _RATE_WORLDS * len(worlds.real) // WORLDS
 
 
-def main() -> None:
+def _mean_or_nan(values: np.ndarray) -> np.ndarray:
+    count = np.isfinite(values).sum(-1)
+    return np.where(count > 0, np.nansum(values, -1) / np.maximum(count, 1), np.nan)
+
+
+def _setups(worlds: Worlds) -> Hits:
+    """Rates of setups, and differences of two setups."""
+    shape, done = worlds.shape, worlds.finished
+    setups = worlds.setup[0, 0, done]
+    aims = [setup_rate(worlds.kind, shape, setup) for setup in range(3)]
+    rate, difference, own = np.full((3, len(worlds.real), 3), np.nan)
+    true = worlds.policy_rates()[:, :, done]
+    rows = [worlds.real[:, :, done][:, :, setups == setup] for setup in range(3)]  # (worlds, places, trainings, days)
+    count = rows[0].shape[1] * rows[0].shape[2]
+    if not shape.setups or count < MIN_SETUP_TRAININGS:
+        return {"setup": rate.mean(1), "setup, these trainings": own.mean(1), "setups' difference": difference.mean(1)}
+    for i in range(_counted(worlds)):
+        mine = [row[i].reshape(count, shape.days) for row in rows]
+        units = [row[i].sum(1) if shape.places > 1 else row[i, 0] for row in rows]
+        trials = shape.trials * (rows[0].shape[2] if shape.places > 1 else 1)
+        for setup, won in enumerate(mine):
+            low, high = RateModel.fit(units[setup], np.full(units[setup].shape, trials)).mean_interval()
+            rate[i, setup] = low <= aims[setup] <= high
+            if shape.places == 1:
+                _, low, high = rate_over_days(won.mean(0) / shape.trials)
+                own[i, setup] = low <= true[i, 0, setups == setup].mean() <= high
+        for k, (one, other) in enumerate(((0, 1), (0, 2), (1, 2))):
+            each = ((mine[one] - mine[other]) / shape.trials).mean(-1)
+            each = each.reshape(shape.places, -1).mean(-1) if shape.places > 1 else each
+            try:
+                _, low, high = mean_difference_interval(each)
+            except UndefinedStatistic:
+                continue
+            difference[i, k] = low <= aims[one] - aims[other] <= high
+    return {
+        "setup": rate.mean(1),
+        "setup, these trainings": own.mean(1),
+        "setups' difference": _mean_or_nan(difference),
+    }
+
+
+def _predicted(worlds: Worlds) -> Hits:
+    out = np.full(len(worlds.real), np.nan)
+    for i in range(len(out)):
+        data = worlds.place(0, i)
+        f, y = data.rates()["twin"], data.rates()["real"]
+        if len(f) - np.bincount(data.training).max() < MIN_PREDICTORS:
+            break
+        try:
+            _, low, high = leave_one_group_out(twin=f, real=y, groups=data.training.tolist())
+        except UndefinedStatistic:
+            continue
+        out[i] = np.mean((low - 1e-9 <= y) & (y <= high + 1e-9))
+    return {"predicted": out}
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--experiments", type=int, default=300)
-    parser.add_argument("--record", type=Path, metavar="FILE", help="results.json of benchmarks/table1")
+    parser.add_argument("--worlds", type=int, default=WORLDS)
+    parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes; none: all")
+    add_record_options(parser)
     given = parser.parse_args()
-    rows: dict[str, Callable[[], dict[str, float]]] = {
-        name: partial(coverage, settings, given.experiments) for name, settings in SETTINGS.items()
-    }
-    if given.record:
-        record = read_experiment(given.record)
-        rows = {name: partial(recorded_coverage, record, days, given.experiments) for name, days in RESAMPLING.items()}
-    for i, (name, measure) in enumerate(rows.items()):
-        row = measure()
-        if i == 0:
-            print(f"| setting | {' | '.join(row)} |\n|---|{'---|' * len(row)}")
-        print(f"| {name} | {' | '.join(f'{x:.2f}' if x == x else '–' for x in row.values())} |", flush=True)
+    shapes = {k: v for k, v in SHAPES.items() if not given.shapes or k.startswith(tuple(given.shapes))}
+    record: dict[str, Any] = {"worlds": given.worlds, "shapes": {}}
+    heads: list[str] = []
+    for name, shape in shapes.items():
+        record["shapes"][name] = {}
+        for kind in KINDS:
+            row = coverage(KINDS[kind], shape, given.worlds)
+            record["shapes"][name][kind] = row
+            if list(row) != heads:
+                heads = list(row)
+                print(f"\n| shape | kind | {' | '.join(heads)} |\n|---|---|{'---|' * len(heads)}")
+            cells = " | ".join(f"{x:.2f}" if x == x else "–" for x in row.values())
+            print(f"| {name} | {kind} | {cells} |", flush=True)
+    return save(given.json, record, given.replace_record)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -79,13 +79,13 @@ def write_so_far(path: Path, record: dict[str, Any]) -> None:
     write_json(_partial(path), _finite(record))
 
 
-def write_record(path: Path, record: dict[str, Any], replace: bool = False) -> None:
+def write_record(path: Path, record: dict[str, Any], replace: bool | None = False) -> None:
     """Writes a record.
 
     Args:
         path: The file.
         record: A JSON object; may contain NaN and infinity.
-        replace: True overwrites a record even if the new one lacks entries.
+        replace: True overwrites a record even if the new one lacks entries; None: the script has no such option.
 
     Raises:
         InputError: the file has entries that the new record lacks, or is no record. It is kept, and the new record is
@@ -97,7 +97,7 @@ def write_record(path: Path, record: dict[str, Any], replace: bool = False) -> N
             write_so_far(path, record)
             raise InputError(
                 f"{path} {wrong}; it is kept and the new figures are in {_partial(path)}: "
-                "give another file, or --replace-record"
+                f"give another file{'' if replace is None else ', or --replace-record'}"
             )
     write_json(path, _finite(record))
     _partial(path).unlink(missing_ok=True)
@@ -116,7 +116,7 @@ def _reason_to_keep(path: Path, record: dict[str, Any]) -> str:
     return f"has entries that the new record lacks ({', '.join(gone[:_LISTED])}{more})"
 
 
-def save(path: Path | None, record: dict[str, Any], replace: bool = False) -> int:
+def save(path: Path | None, record: dict[str, Any], replace: bool | None = False) -> int:
     """`write_record` for the end of a script; writes nothing if `path` is None.
 
     Returns:

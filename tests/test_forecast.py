@@ -13,15 +13,17 @@ from scipy.special import expit
 
 from twin.env.options import CAUSES
 from twin.errors import InputError
-from twin.evaluation.forecasting import ALL_TASKS, Estimate, Forecast, make_forecast
-from twin.evaluation.statistics import MIN_POLICIES, mmrv, pearson, spearman, wilson
+from twin.evaluation.forecasting import ALL_TASKS, OTHERS, SHUFFLED, TWIN, Estimate, Forecast, make_forecast
+from twin.evaluation.jackknife import STATISTICS as WITH_INTERVAL
+from twin.evaluation.jackknife import jackknife_interval, pair_cells
+from twin.evaluation.statistics import MIN_POLICIES, mean_rate, mmrv, pearson, rate_difference, spearman
 from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
 from twin.report import forecast_report
 from twin.report.figures import lighting_labels
 from twin.report.forecast_report import (
     CSV_COLUMNS,
-    NOMINAL_INTERVALS,
+    INTERVALS_NOTE,
     STATISTICS,
     candidates_csv,
     forecast_page,
@@ -34,6 +36,19 @@ from twin.report.forecast_report import (
 from twin.report.html import MAX_TABLE_ROWS
 
 LIGHTS = ("held-out", "sun")
+
+
+def days(n: int = 9, k: int = 5, seed: int = 0, trials: int = 5) -> tuple[list[Cell], list[Cell]]:
+    """Cells of the twin and of the road on k days; the twin has a lighting from a photo of each."""
+    rng = np.random.default_rng(seed)
+    twin, real = [], []
+    for i in range(n):
+        for day in range(k):
+            quality = 6.0 * (i + 0.5) / n - 3.0 + rng.normal(0.0, 1.5)
+            twin.append(Cell(f"p{i}", "straight", f"photo{day}", 20, int(rng.binomial(20, expit(quality)))))
+            won = int(rng.binomial(trials, expit(2 * quality)))
+            real.append(Cell(f"p{i}", "straight", f"day{day}", trials, won, f"photo{day}"))
+    return twin, real
 
 
 def cells(
@@ -120,10 +135,24 @@ def test_the_numbers_are_those_of_the_tables() -> None:
     assert [pair.bias.value for pair in made.pairs] == pytest.approx(biases)
     for name, _, _ in STATISTICS[:-1]:
         estimate = getattr(group, name)
-        assert estimate.low <= estimate.value <= estimate.high and estimate.n > 0
+        if name == "corrected_coverage":
+            assert "7 policies of a task, of other trainings" in estimate.missing
+            continue
+        assert estimate.value is not None and estimate.n > 0
+        assert estimate.low is estimate.high is None  # seven trainings on two days
+    assert group.spearman.no_interval == "too few for an interval: 7 trainings, 8 are needed; 2 days, 4 are needed"
+    assert (group.trainings, group.days) == (7, 2)
+    assert group.twin_error.value == pytest.approx(np.mean(np.abs(np.subtract(by_twin, by_real))))
     first = made.pairs[0]
     assert (first.lighting, first.twin_lighting) == ("dusk", "held-out")
-    assert (first.real.low, first.real.high) == pytest.approx(wilson(real[0].successes, real[0].trials))
+    assert first.real.value == real[0].rate and first.real.low is None
+    _, low, high = rate_difference(
+        twin_successes=found[real[0].twin_key].successes,
+        twin_trials=50,
+        real_successes=real[0].successes,
+        real_trials=20,
+    )
+    assert first.within_chance == (low <= 0.0 <= high)
 
 
 def test_policies_not_driven_are_predicted_from_the_others() -> None:
@@ -138,7 +167,7 @@ def test_policies_not_driven_are_predicted_from_the_others() -> None:
     driven = [c for c in made.candidates if c.driven]
     assert all(c.corrected.n == 6 for c in driven)
     (group,) = made.groups
-    assert group.mean_real.n == 9 and group.corrected_coverage.n == 7
+    assert group.mean_real.n == 9 and group.corrected_coverage.missing  # six others are too few for intervals
 
 
 def test_all_tasks_together() -> None:
@@ -147,7 +176,7 @@ def test_all_tasks_together() -> None:
     assert [g.task for g in made.groups] == ["straight", "right_turn", ALL_TASKS]
     assert [g.policies for g in made.groups] == [7, 7, 14]
     one, two, both = (g.winner_regret.value or 0.0 for g in made.groups)
-    assert both == pytest.approx((one + two) / 2)
+    assert both == pytest.approx((one + two) / 2) and made.groups[2].trainings == 7
     assert made.groups[2].bias.value == pytest.approx(np.mean([p.bias.value for p in made.pairs]))
 
 
@@ -250,7 +279,8 @@ def test_rates_that_are_all_the_same_have_no_correlation_but_a_bias() -> None:
     (group,) = made.groups
     assert group.spearman.value is None and "all rates on the road are 1" in group.spearman.missing
     assert group.bias.value is not None and group.winner_regret.value == 0.0
-    assert verdicts(made)[0].mood == "bad" and "cannot be compared" in verdicts(made)[0].text
+    assert verdicts(made)[0].mood == "bad" and "does not tell these policies apart" in verdicts(made)[0].text
+    assert verdicts(made)[1].mood == "bad" and "cannot be compared" in verdicts(made)[1].text
     assert "nan" not in forecast_page(made) + summary_text(made) + candidates_csv(made)
 
 
@@ -329,7 +359,7 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
 
 
 def test_ranks_that_are_hardly_possible_have_no_tile() -> None:
-    made = make_forecast("road", *cells(n=8))
+    made = make_forecast("road", cells(n=8)[0], [])  # episodes count singly where no days are compared
     ranks = np.array([c.twin_ranks for c in made.candidates])
     assert (ranks < 0.005).sum() > 0
     told, names = tile_texts(forecast_report.rank_heatmap(made.candidates)), [c.policy for c in made.candidates]
@@ -448,19 +478,92 @@ def test_names_from_files_are_text() -> None:
     assert "script" not in page.tags and evil in page.text
 
 
-def test_the_intervals_coverage_stands_beside_them() -> None:
+def test_what_intervals_are_about_stands_beside_them() -> None:
     twin, real = cells()
     made = make_forecast("road", twin, real)
-    assert all(
-        word in NOMINAL_INTERVALS for word in ("nominal", "60% (Spearman)", "70% (Pearson)", "50% (MMRV)", "days")
-    )
     page = forecast_page(made)
     road = page[page.index('<section id="road"') : page.index('<section id="stages"')]
-    assert NOMINAL_INTERVALS in Text(road).text and NOMINAL_INTERVALS in " ".join(summary_text(made).split())
-    told = page + summary_text(made)
-    assert "drive more policies" not in told and "in a repetition" not in told
+    assert INTERVALS_NOTE in Text(road).text and INTERVALS_NOTE in " ".join(summary_text(made).split())
+    assert "drive more policies" not in page + summary_text(made)
     for alone in (make_forecast("road", twin, []), make_forecast("road", *cells(driven=4))):  # no intervals there
-        assert NOMINAL_INTERVALS not in " ".join((forecast_page(alone) + summary_text(alone)).split())
+        assert INTERVALS_NOTE not in " ".join((forecast_page(alone) + summary_text(alone)).split())
+
+
+# ---- intervals, and what may be believed
+
+
+def test_intervals_leave_trainings_and_days_out() -> None:
+    twin, real = days()
+    (group,) = make_forecast("road", twin, real).groups
+    data = pair_cells(real, {c.key: c for c in twin})
+    for name in ("spearman", "mmrv", "bias"):
+        low, high = jackknife_interval(WITH_INTERVAL[name], data)
+        estimate = getattr(group, name)
+        assert (estimate.low, estimate.high) == pytest.approx((float(low), float(high)))
+        assert estimate.no_interval == ""
+    assert "9 trainings, 12 are needed" in group.pearson.no_interval and group.pearson.value is not None
+    page = Text(forecast_page(make_forecast("road", twin, real))).text
+    assert "no interval: too few for an interval: 9 trainings, 12 are needed" in page
+
+
+def test_checkpoints_of_few_trainings_have_no_interval() -> None:
+    """As many policies, but of three trainings."""
+    twin, real = days()
+    names = {f"p{i}": f"run{i // 3}/{i}" for i in range(9)}
+    twin, real = ([replace(c, policy=names[c.policy]) for c in some] for some in (twin, real))
+    made = make_forecast("road", twin, real)
+    assert made.groups[0].spearman.value is not None
+    assert "3 trainings, 8 are needed" in made.groups[0].spearman.no_interval
+    assert any("5 days and 3 trainings" in caution.what for caution in limitations(made))
+
+
+def test_rates_have_intervals_over_days_and_none_from_one_day() -> None:
+    twin, real = days()
+    made = make_forecast("road", twin, real)
+    for c in made.candidates:
+        own = [cell for cell in real if cell.policy == c.policy]
+        _, low, high = mean_rate([cell.successes for cell in own], [cell.trials for cell in own])
+        assert c.real.value == pytest.approx(np.mean([cell.rate for cell in own]))
+        assert c.real.high - c.real.low > 0.8 * (high - low)
+    wide = [c for c in made.candidates if 0.2 < (c.real.value or 0.0) < 0.8]
+    assert wide and all(c.real.high - c.real.low > 0.4 for c in wide)  # five days, whatever the number of trials
+    one = make_forecast("road", [c for c in twin if c.lighting == "photo0"], [c for c in real if c.lighting == "day0"])
+    for c in one.candidates:
+        assert c.real.value is not None and c.real.low is None and "1 day, 2 are needed" in c.real.no_interval
+
+
+def test_the_twin_is_scored_against_guesses_without_it() -> None:
+    twin, real = days()
+    (group,) = make_forecast("road", twin, real).groups
+    scores = {it.predictor: it for it in group.scores}
+    own, others, shuffled = scores[TWIN], scores[OTHERS], scores[SHUFFLED]
+    assert own.gain.value is None and others.gain.value == pytest.approx(others.log.value - own.log.value)
+    assert others.gain.low > 0.0 and shuffled.gain.value > 0.0  # days differ, and the twin knows how
+    assert sum(it.cells for it in group.calibration) == group.cells == 45
+    assert [it.day for it in group.errors] == [f"day{k}" for k in range(5)]
+    rates = {c.key: c.rate for c in real}
+    wrong = sum(it.misses + it.false_alarms for it in group.errors)
+    assert 0 < wrong < 12 and sum((rate >= 0.5) for rate in rates.values()) > 10
+    # A twin that knows nothing of a day gains nothing by its days.
+    flat = [replace(c, successes=round(np.mean([o.successes for o in twin if o.policy == c.policy]))) for c in twin]
+    (group,) = make_forecast("road", flat, real).groups
+    assert {it.predictor: it.gain.value for it in group.scores}[SHUFFLED] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_first_sentence_says_what_may_be_believed() -> None:
+    twin, real = days(n=12)
+    made = make_forecast("road", twin, real)
+    (group,) = made.groups
+    first = verdicts(made)[0]
+    assert first.text.startswith("What may be believed: the order of two policies that differ")
+    assert "5 days and 12 trainings" in first.text
+    rates = pair_cells(real, {c.key: c for c in twin}).rates()
+    different = sum(abs(a - b) > 1e-9 for i, a in enumerate(rates["real"]) for b in rates["real"][:i])
+    assert sum(it.pairs for it in group.ordered) == different
+    # A twin that has the order backwards is not to be believed, however large its differences.
+    worse = [replace(c, successes=c.trials - c.successes) for c in twin]
+    first = verdicts(make_forecast("road", worse, real))[0]
+    assert first.mood == "bad" and first.text.startswith("No order of two policies in the twin may be believed yet")
 
 
 def test_numbers_are_shown_with_their_interval() -> None:

@@ -10,7 +10,6 @@ from twin.evaluation.ranking import (
     MAX_TRIALS,
     SETTLED_PROBABILITY,
     RankingConfidence,
-    TrialCounts,
     expected_confidence,
     rank_interval,
     rank_probabilities,
@@ -18,13 +17,14 @@ from twin.evaluation.ranking import (
 )
 
 
-def of(*counts: tuple[int, int]) -> TrialCounts:
-    """One cell per policy: successes and trials."""
-    return TrialCounts.from_rows([[one] for one in counts])
+def of(*counts: tuple[int, int], samples: int = 4000, seed: int = 0) -> np.ndarray:
+    """Samples of true rates from Jeffreys' posterior of independent trials: successes and trials per policy."""
+    won, driven = np.array(counts).T
+    return np.random.default_rng(seed).beta(won + 0.5, driven - won + 0.5, (samples, len(counts)))
 
 
 def test_two_policies_against_integration() -> None:
-    chance = rank_probabilities(of((7, 10), (5, 10)), np.random.default_rng(0), 100_000)
+    chance = rank_probabilities(of((7, 10), (5, 10), samples=100_000))
     rate = (np.arange(200_000) + 0.5) / 200_000
     better = np.mean(stats.beta.pdf(rate, 7.5, 3.5) * stats.beta.cdf(rate, 5.5, 5.5))
     assert chance[0, 0] == pytest.approx(better, abs=0.005)
@@ -32,16 +32,10 @@ def test_two_policies_against_integration() -> None:
 
 
 def test_rows_and_columns_sum_to_one() -> None:
-    chance = rank_probabilities(of((1, 10), (9, 10), (5, 10), (5, 10)), np.random.default_rng(1))
+    chance = rank_probabilities(of((1, 10), (9, 10), (5, 10), (5, 10)))
     assert np.allclose(chance.sum(0), 1.0) and np.allclose(chance.sum(1), 1.0)
     assert chance[1, 0] > 0.9 and chance[0, 3] > 0.9
     assert chance[2, 1] == pytest.approx(0.5, abs=0.05)
-
-
-def test_a_score_is_the_mean_over_cells_whatever_their_trials() -> None:
-    tallies = TrialCounts.from_rows([[(100, 100), (0, 10)], [(60, 100)]])
-    assert np.allclose(tallies.scores(tallies.successes / np.maximum(tallies.trials, 1)), [0.5, 0.6])
-    assert rank_probabilities(tallies, np.random.default_rng(2))[1, 0] > 0.9
 
 
 def test_rank_interval_excludes_unlikely_ranks() -> None:
@@ -59,7 +53,9 @@ def test_rank_intervals_cover() -> None:
     held = []
     for _ in range(300):
         true = rng.uniform(size=6)
-        chance = rank_probabilities(of(*zip(rng.binomial(30, true), [30] * 6, strict=True)), rng, 500)
+        chance = rank_probabilities(
+            of(*zip(rng.binomial(30, true), [30] * 6, strict=True), samples=500, seed=len(held))
+        )
         rank = np.argsort(np.argsort(-true)) + 1
         for i in range(6):
             _, low, high = rank_interval(chance[i])
@@ -68,8 +64,8 @@ def test_rank_intervals_cover() -> None:
 
 
 def test_confidence_grows_with_trials() -> None:
-    tallies = of((8, 10), (6, 10), (3, 10))
-    sure = [expected_confidence(tallies, more, 0) for more in (0, 20, 100, 500)]
+    rates = of((8, 10), (6, 10), (3, 10))
+    sure = [expected_confidence(rates, more, 0) for more in (0, 20, 100, 500)]
     assert [s.winner for s in sure] == sorted(s.winner for s in sure)
     assert [s.order for s in sure] == sorted(s.order for s in sure)
     assert sure[-1].winner > 0.95 > sure[0].winner
@@ -77,28 +73,25 @@ def test_confidence_grows_with_trials() -> None:
 
 def test_confidence_without_further_trials_is_the_posterior() -> None:
     """With no further trials the leader is fixed: it is within the margin of the best as often as in the posterior."""
-    tallies = of((8, 10), (6, 10), (3, 10))
-    draws = tallies.scores(tallies.sample_posterior(np.random.default_rng(9), 100_000))
-    assert expected_confidence(tallies, 0, 0, samples=50_000).winner == pytest.approx(
-        np.mean(draws[:, 0] >= draws.max(1) - MARGIN), abs=0.01
-    )
+    rates = of((8, 10), (6, 10), (3, 10))
+    assert expected_confidence(rates, 0, 0).winner == pytest.approx(np.mean(rates[:, 0] >= rates.max(1) - MARGIN))
 
 
 def test_without_trials_so_far_nothing_is_known() -> None:
-    tallies = of((80, 100), (50, 100), (20, 100), (10, 100))
-    nothing = expected_confidence(tallies, 0, 0, so_far=False)
+    rates = of((80, 100), (50, 100), (20, 100), (10, 100))
+    nothing = expected_confidence(rates, 0, 0, so_far=False)
     assert nothing.winner == pytest.approx(0.25, abs=0.01) and nothing.order == 0.5
-    assert expected_confidence(tallies, 0, 0).winner > 0.99
+    assert expected_confidence(rates, 0, 0).winner > 0.99
 
 
 def test_trials_needed_is_the_least_sufficient_number() -> None:
-    tallies = of((16, 20), (13, 20), (5, 20))
-    more = trials_needed(tallies, "winner", 0)
+    rates = of((16, 20), (13, 20), (5, 20))
+    more = trials_needed(rates, "winner", 0)
     assert more is not None and more % 5 == 0 and more > 0
     assert (
-        expected_confidence(tallies, more, 0).winner
+        expected_confidence(rates, more, 0).winner
         >= SETTLED_PROBABILITY
-        > expected_confidence(tallies, more - 5, 0).winner
+        > expected_confidence(rates, more - 5, 0).winner
     )
     assert trials_needed(of((100, 100), (1, 100)), "winner", 0) == 0
     assert trials_needed(of((100, 100), (1, 100)), "order", 0) == 0
@@ -108,7 +101,7 @@ def test_trials_needed_is_the_least_sufficient_number() -> None:
 def test_no_more_trials_than_the_maximum_are_needed(needed: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A ranking that settles at a known number of trials: that number, or None above the maximum."""
 
-    def confidence(counts: TrialCounts, more: int, seed: int, so_far: bool = True) -> RankingConfidence:
+    def confidence(rates: np.ndarray, more: int, seed: int, so_far: bool = True) -> RankingConfidence:
         assert more < 2 * MAX_TRIALS, "tried in vain"
         return RankingConfidence(float(more >= needed), 0.0)
 

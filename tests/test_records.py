@@ -94,10 +94,13 @@ def test_table_1_without_runs_keeps_its_record(tmp_path, results):
     done = run(TABLE1, scene, "--steps", "--results", record)
     assert done.returncode == 2 and done.stdout == ""
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1 and "runs[straight simulator 0]" in errors[0] and "--replace-record" in errors[0]
+    assert len(errors) == 1 and "runs[straight simulator 0]" in errors[0] and errors[0].endswith("give another file")
     assert json.loads(record.read_text()) == results
-    assert run(TABLE1, scene, "--steps", "--results", record, "--replace-record").returncode == 0
-    assert json.loads(record.read_text())["runs"] == []
+    assert run(TABLE1, scene, "--steps", "--results", record, "--replace-record").returncode == 2  # no such option
+    assert json.loads(record.read_text()) == results
+    other = tmp_path / "other.json"
+    assert run(TABLE1, scene, "--steps", "--results", other).returncode == 0
+    assert json.loads(other.read_text())["runs"] == []
 
 
 def test_a_partial_run_does_not_overwrite_a_record(tmp_path):
@@ -130,7 +133,7 @@ def test_days_that_no_choice_had_seen_come_first_and_match_the_docs(scripts, res
         assert getattr(full, name) == pytest.approx(forecast[name]["value"])
     assert full.cells == pytest.approx(forecast["coverage"]["value"])
     assert full.regret == pytest.approx(forecast["winner_regret"]["value"])
-    assert full.corrected == (31, 36) and forecast["corrected_coverage"]["value"] == pytest.approx(31 / 36)
+    assert full.corrected == (32, 36)
     drawn = list(scores.GROUPS.values())[1]
     assert scores.finals(policies, "varied", "straight", drawn) == "1.00 [0.85, 1.00], 150/150"
     assert scores.finals(policies, "varied", "right_turn", drawn) == "0.99 [0.84, 1.00], 149/150"
@@ -138,9 +141,10 @@ def test_days_that_no_choice_had_seen_come_first_and_match_the_docs(scripts, res
     assert text.index(first) < text.index("half of them seen during development")
     docs = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8").split("## Table 1")[1]
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert docs.index("days 6 to 15: twin, by a photo of each day** | **0.78** | **0.98** | **0.084**") < docs.index(
-        "0.92"
-    )
+    headline = "| **days 6 to 15: twin, by a photo of each day** | **0.78** (0.51 to 0.95) | **0.98** (0.93 to 0.99) |"
+    assert docs.index(headline) < docs.index("0.92 (0.81 to 0.98)")
+    ends = {name: tuple(round(end, 2) for end in twin.intervals[name]) for name in ("spearman", "pearson", "mmrv")}
+    assert ends == {"spearman": (0.51, 0.95), "pearson": (0.93, 0.99), "mmrv": (0.03, 0.14)}
     page = (ROOT / "docs" / "forecast.md").read_text(encoding="utf-8")
     assert "Spearman of 0.78" in page and "benchmarks/table1/scores.py" in page
     assert "| 0.78 / 0.98 / 0.084 |" in readme and "| 0.77 / 0.97 / 0.143 |" in readme
@@ -209,28 +213,45 @@ def test_intervals_over_days_cover_correlated_trials_and_those_over_trials_do_no
     assert np.mean(by_day) > 0.86 and np.mean(by_trial) < 0.7
 
 
-# ---- coverage of the forecast's intervals in resampled experiments
+# ---- predictions of single days
 
 
-def test_an_experiment_is_resampled_from_the_record(scripts, results):
-    import intervals
+def test_on_unseen_days_the_twin_s_log_score_is_better_than_every_baseline(scripts, results):
+    import scores
 
-    record = intervals.read_experiment(TABLE1 / "results.json")
-    assert record.weight.shape == (36, 20) and [len(s) for s in record.strata] == [18, 18]
-    totals = [[p["real"]["successes"], p["real"]["trials"]] for r in results["runs"] for p in r["policies"]]
-    assert np.array_equal(np.stack([record.real_successes.sum(1), record.real_trials.sum(1)], 1), totals)
-    rng = np.random.default_rng(0)
-    one = intervals.resampled_experiment(rng, record, resample_days=False)
-    assert [s.tolist() for s in one.strata] == [list(range(18)), list(range(18, 36))]
-    assert (one.real_trials[:, 5:] == 5).all() and set(one.real_trials[:, :5].flat) == {5, 10}
-    assert (one.real_successes <= one.real_trials).all() and (one.twin_successes <= one.twin_trials).all()
-    assert (record.real_successes.sum(1) == 0).sum() == 15  # a resampled policy without a success has none either
-    assert (one.real_successes.sum(1) == 0).sum() > 5
-    other = intervals.resampled_experiment(rng, record, resample_days=True)
-    of_finals = other.real_trials[other.real_trials.max(1) == 10]
-    assert (of_finals == of_finals[0]).all() and (of_finals[0, 5:] == 10).any()  # all policies share the resampled days
-    truth = intervals.true_values(lambda: record)
-    assert truth["Spearman"] == pytest.approx(results["forecast_by_photo"]["all tasks"]["spearman"]["value"])
+    policies = scores.policy_records(results)
+    each = scores.day_scores(policies, next(iter(scores.GROUPS.values())))
+    twin = each.pop(scores.TWIN)
+    assert (round(twin.brier, 3), round(twin.log, 3)) == (0.035, 0.127)
+    corrected = each.pop("the twin, recalibrated on other trainings")
+    assert abs(corrected.gain) < 0.01  # it needs no recalibration
+    for name, one in each.items():
+        assert one.gain == pytest.approx(one.log - twin.log) and one.interval[0] > 0.0, name
+    assert round(each["the rule"].gain, 3) == 0.065
+
+
+def test_baselines_do_not_look_at_the_twin_nor_at_their_own_training(scripts, results):
+    import scores
+
+    policies = scores.policy_records(results)
+    days = next(iter(scores.GROUPS.values()))
+    _, before = scores.probabilities(policies, days)
+    mine = [i for i, p in enumerate(policies) if p.name.startswith("straight_varied_0")]
+    for i in mine:  # all trials of one training turn out the other way, and the twin says nothing
+        p = policies[i]
+        policies[i] = scores.PolicyRecord(
+            p.name,
+            p.setup,
+            p.task,
+            p.trained,
+            dict.fromkeys(p.twin, (0, 5)),
+            0.0,
+            {d: (n - k, n) for d, (k, n) in p.real.items()},
+        )
+    _, after = scores.probabilities(policies, days)
+    for name in before:
+        if not name.startswith("the twin"):
+            assert np.array_equal(before[name][mine], after[name][mine]), name
 
 
 # ---- comparison of the aligned model with kinematics

@@ -1,6 +1,6 @@
 """Replication of the paper's table 1 on a road with known truth.
 
-    python benchmarks/table1 SCENE [--seeds 0] [--jobs 2] [--steps train validate photos real forecast]
+    python benchmarks/table1 SCENE [--seeds 0 1] [--jobs 2] [--steps train validate photos real forecast]
 
 Steps, each a command of `twin` that resumes where it was interrupted:
 
@@ -11,9 +11,10 @@ Steps, each a command of `twin` that resumes where it was interrupted:
 - real: drives every policy in the known-truth world under weather that was not filmed.
 - forecast: forecasts real success, once from held-out lightings, once from the photos.
 
-The same call with more seeds adds runs. `results.json` beside this file records every run; `--replace-record` is needed
-to overwrite it with fewer. `plan.py` defines setups, sizes and checkpoints. The first tables printed are those of
-`scores.py`, which needs `results.json` alone.
+The published plan is the default; the same call with more seeds adds runs. `results.json` beside this file records
+every run. It is never overwritten by a record with fewer runs, policies, days or trials: the command then ends with
+status 2, the new record is in `results.json.partial`, and `--results` names another file for it. `plan.py` defines
+setups, sizes and checkpoints. The first tables printed are those of `scores.py`, which needs `results.json` alone.
 """
 
 import argparse
@@ -36,7 +37,7 @@ from twin.config import Condition
 from twin.reality.lighting import WEATHER
 
 sys.path.append(str(Path(__file__).parents[1]))
-from record import add_replace_option, save
+from record import save
 
 STAGES = ("train", "validate", "photos", "real", "forecast")
 
@@ -126,13 +127,12 @@ def _policies(scene: Path, run: Run) -> list[Path]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--setups", nargs="+", choices=SETUPS, default=list(SETUPS))
     parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="no names: the tables only")
     parser.add_argument("--jobs", type=int, default=2, help="runs at once, one core each")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: the one beside this file)")
-    add_replace_option(parser)
     given = parser.parse_args()
     asked = runs(given.seeds, given.tasks, given.setups)
     if given.steps:
@@ -154,12 +154,12 @@ def main() -> int:
     folders = [path for path in (given.scene / "runs").glob("*_*_[0-9]*") if path.is_dir()]
     seeds = sorted({int(path.name.rsplit("_", 1)[1]) for path in folders})
     results = collect(given.scene, runs(seeds, list(TASKS), list(SETUPS)))
-    status = save(given.results, results, given.replace_record)
+    status = save(given.results, results, replace=None)
     if status:
         return status
     print(tables(results))
     print(f"\nThe paper's table, over all {len(WEATHER)} weathers\n\n{table(results)}")
-    print("\nForecasts over all weathers; coverage of their 90 % intervals: benchmarks/intervals.py --record")
+    print("\nForecasts over all weathers; coverage of their 90 % intervals: benchmarks/intervals.py")
     for kind in ("forecast", "forecast_by_photo"):
         for task, group in results[kind].items():
             print(kind, task, json.dumps(group))

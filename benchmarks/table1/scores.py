@@ -2,9 +2,11 @@
 
     python benchmarks/table1/scores.py [--results FILE]
 
-Prints success on the road by groups of days, and how well the twin's rates rank the policies there. Rates on the road
-have intervals over days. Scores have none, because the forecast's are too narrow for experiments of this shape
-(`benchmarks/intervals.py --record`). A *rule* that does not use the twin is the baseline; see `rule`.
+Prints success on the road by groups of days; how well the twin's rates rank the policies there; how well it predicts
+single days, by proper scores against baselines that do not look at the twin; and its false alarms and missed failures.
+Rates on the road have intervals over days. Ranking and scores have the forecast's intervals, about further trainings
+and days on this street (`twin/evaluation/jackknife.py`; coverage in this shape: `benchmarks/intervals.py`). A *rule*
+that does not use the twin is a baseline of the ranking; see `rule`.
 
 A *choice* is a decision made while trials or images of a day were known: the training methods, developed in the five
 stated weathers, and the fraction of the weather randomisation kept beside a photo, measured on images of these and of
@@ -21,6 +23,20 @@ import numpy as np
 from plan import SETUPS, SHARES, STEPS, TASKS
 
 from twin.config import Condition
+from twin.evaluation.jackknife import STATISTICS, PairedCells, Statistic, jackknife_interval, mean_bias, training_of
+from twin.evaluation.probability_scores import (
+    SCORE_DIFFERENCE,
+    brier,
+    calibration,
+    errors_by_day,
+    log_score,
+    mean_score,
+    other_trainings,
+    recalibrated,
+    score_pair,
+    shuffled_days,
+    twin_probabilities,
+)
 from twin.evaluation.statistics import (
     MIN_POLICIES,
     UndefinedStatistic,
@@ -129,6 +145,8 @@ class Scores:
     spearman: float | None
     pearson: float | None
     mmrv: float | None
+    intervals: dict[str, tuple[float, float] | None]
+    """Statistic → its 90 % interval; None where there is none."""
     regret: float | None
     """Mean over tasks."""
     bias: float
@@ -136,7 +154,7 @@ class Scores:
     cells: float | None
     """Fraction of the cells whose predicted and real counts are compatible; None if the predictor has no counts."""
     corrected: tuple[int, int]
-    """Number of policies within the interval predicted from the task's other policies, and number of intervals."""
+    """Number of policies within the interval predicted from the task's other trainings, and number of intervals."""
 
 
 def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> Scores | None:
@@ -155,18 +173,133 @@ def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]
         spearman=_defined(spearman, twin, real),
         pearson=_defined(pearson, twin, real),
         mmrv=_defined(mmrv, twin, real),
+        intervals={name: _interval(STATISTICS[name], _predicted_cells(predictor, mine, days)) for name in STATISTICS},
         regret=float(np.mean(regrets)) if regrets else None,
         bias=float(np.mean(real - twin)),
         cells=_cells_held(predictor, mine, days),
-        corrected=_corrected(twin, real, tasks),
+        corrected=_corrected(twin, real, tasks, [training_of(policy.name) for policy in mine]),
     )
 
 
-def _corrected(twin: np.ndarray, real: np.ndarray, tasks: Sequence[np.ndarray]) -> tuple[int, int]:
+def paired_cells(policies: Sequence[PolicyRecord], days: Sequence[str], twin: np.ndarray) -> PairedCells:
+    """Real rates of policies on days with predictions (n, k), as units of the jackknife."""
+    tasks, runs = [policy.task for policy in policies], [training_of(policy.name) for policy in policies]
+    return PairedCells(
+        twin=twin,
+        real=np.array([[policy.real[day][0] / policy.real[day][1] for day in days] for policy in policies]),
+        weight=np.ones((len(policies), len(days))),
+        training=np.unique(runs, return_inverse=True)[1],
+        day=np.broadcast_to(np.arange(len(days)), (len(policies), len(days))),
+        strata=tuple(np.flatnonzero(np.array(tasks) == task) for task in dict.fromkeys(tasks)),
+    )
+
+
+def _predicted_cells(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> PairedCells:
+    each = [[PREDICTORS[predictor](policy, [day]) for day in days] for policy in policies]
+    return paired_cells(policies, days, np.array(each))
+
+
+def _interval(statistic: Statistic, data: PairedCells) -> tuple[float, float] | None:
+    try:
+        low, high = jackknife_interval(statistic, data)
+    except UndefinedStatistic:
+        return None
+    return (float(low), float(high)) if np.isfinite(low) else None
+
+
+# ---- predictions of single days
+
+TWIN = "the twin, by a photo of each day"
+
+
+@dataclass(frozen=True)
+class DayScores:
+    """Scores of a predictor of single days; see `twin.evaluation.probability_scores`."""
+
+    brier: float
+    log: float
+    gain: float
+    """Log score of the predictor minus the twin's: above 0 the twin is better."""
+    interval: tuple[float, float] | None
+    """Of the gain."""
+
+
+def probabilities(policies: Sequence[PolicyRecord], days: Sequence[str]) -> tuple[PairedCells, dict[str, np.ndarray]]:
+    """The cells, and the probability of success by predictor, shapes (n, k); baselines use other trainings alone."""
+    counts_ = np.array([[policy.twin[day] for day in days] for policy in policies])
+    twin = twin_probabilities(counts_[..., 0], counts_[..., 1])
+    data = paired_cells(policies, days, twin)
+    steps = [min(SHARES, key=lambda share: abs(share - p.trained)) if p.trained < 0.9 else 1.0 for p in policies]
+    groups = {
+        "mean of other trainings": [0] * len(policies),
+        "setup": [p.setup for p in policies],
+        "training step": steps,
+        "the rule": [rule(p) for p in policies],
+        "setup and step": [(p.setup, step) for p, step in zip(policies, steps, strict=True)],
+        "the other seed (same task, setup, step)": [
+            (p.task, p.setup, step) for p, step in zip(policies, steps, strict=True)
+        ],
+    }
+    out = {TWIN: twin, "the twin, recalibrated on other trainings": recalibrated(twin, data)}
+    for name, keys in groups.items():
+        ids = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+        each = other_trainings(data, np.array([ids[key] for key in keys]))
+        out[name] = np.broadcast_to(each[:, None], twin.shape)
+    return data, out
+
+
+def day_scores(policies: Sequence[PolicyRecord], days: Sequence[str]) -> dict[str, DayScores]:
+    """Scores of every predictor of single days."""
+    data, each = probabilities(policies, days)
+    logs = {name: log_score(p, data.real) for name, p in each.items()}
+    briers = {name: brier(p, data.real) for name, p in each.items()}
+    shuffled = "the twin, its days shuffled"
+    logs[shuffled] = shuffled_days(each[TWIN], data.weight, data.real, log_score)
+    briers[shuffled] = shuffled_days(each[TWIN], data.weight, data.real, brier)
+    out = {}
+    for name in logs:
+        pair = score_pair(data, logs[TWIN], logs[name])
+        ends = _interval(SCORE_DIFFERENCE, pair) if name != TWIN else None
+        gain = float(mean_bias(**pair.rates()))
+        out[name] = DayScores(mean_score(data, briers[name]), mean_score(data, logs[name]), gain, ends)
+    return out
+
+
+def day_tables(policies: Sequence[PolicyRecord], days: Sequence[str]) -> str:
+    """Scores of single days, calibration of the twin, and its errors by day, in Markdown."""
+    lines = ["| predictor of single days | Brier | log score | the twin's is better by | ", "|---|---|---|---|"]
+    for name, one in day_scores(policies, days).items():
+        gain = "–" if name == TWIN else _bracketed(one.gain, one.interval, "+.3f")
+        lines.append(f"| {name} | {one.brier:.3f} | {one.log:.3f} | {gain} |")
+    data, each = probabilities(policies, days)
+    trials = np.array([[policy.real[day][1] for day in days] for policy in policies])
+    lines += ["", "| the twin's probability | mean | success on the road | cells | trials |", "|---|---|---|---|---|"]
+    for part in calibration(each[TWIN].ravel(), data.real.ravel(), trials.ravel()):
+        ends = f"{part.low:g} to {part.high:g}"
+        lines.append(f"| {ends} | {part.predicted:.2f} | {part.observed:.2f} | {part.cells} | {part.trials} |")
+    lines += ["", "| day | cells | missed failures | false alarms |", "|---|---|---|---|"]
+    for error in errors_by_day(each[TWIN].ravel(), data.real.ravel(), list(days) * len(policies)):
+        lines.append(f"| {error.day} | {error.cells} | {error.misses} | {error.false_alarms} |")
+    return "\n".join(lines)
+
+
+def _bracketed(value: float | None, ends: tuple[float, float] | None, form: str) -> str:
+    if value is None:
+        return "–"
+    text = format(value, form)
+    if ends is not None:
+        text += f" ({format(ends[0], form)} to {format(ends[1], form)})"
+    return text.replace("-", "−")
+
+
+def _corrected(
+    twin: np.ndarray, real: np.ndarray, tasks: Sequence[np.ndarray], trainings: Sequence[str]
+) -> tuple[int, int]:
     held: list[bool] = []
     for of in tasks:
         try:
-            _, low, high = leave_one_group_out(twin=twin[of], real=real[of], groups=range(int(of.sum())))
+            groups = [trainings[i] for i in np.flatnonzero(of)]
+            _, low, high = leave_one_group_out(twin=twin[of], real=real[of], groups=groups)
         except UndefinedStatistic:
             continue
         held += ((low <= real[of]) & (real[of] <= high)).tolist()
@@ -239,7 +372,7 @@ def tables(results: dict[str, Any]) -> str:
         "cells that agree",
         "corrected hold",
     )
-    lines += ["", "Ranking of all policies, finished and checkpoints, by predictor; without intervals", ""]
+    lines += ["", "Ranking of all policies, finished and checkpoints, by predictor, with 90 % intervals", ""]
     lines += [f"| days | task | predictor | {' | '.join(heads)} |", f"|---|---|---|{'---|' * len(heads)}"]
     for group, days in GROUPS.items():
         for task in ("both tasks", *TASKS.values()):
@@ -248,17 +381,25 @@ def tables(results: dict[str, Any]) -> str:
                 found = scores(name, mine, days)
                 if found:
                     lines.append(f"| {group} | {task} | {name} | {' | '.join(_row(found))} |")
+    for group, days in list(GROUPS.items())[:2]:
+        mine = [p for p in policies if set(days) <= p.real.keys() and set(days) <= p.twin.keys()]
+        if len(mine) >= MIN_POLICIES:
+            lines += ["", f"Single days, {group}", "", day_tables(mine, days)]
     return "\n".join(lines)
 
 
 def _row(found: Scores) -> list[str]:
-    def text(value: float | None, form: str) -> str:
-        return "–" if value is None else format(value, form).replace("-", "−")
-
-    values = (found.spearman, found.pearson, found.mmrv, found.regret, found.bias)
-    forms = (".2f", ".3f", ".3f", ".3f", "+.3f")
-    corrected = f"{found.corrected[0]} of {found.corrected[1]}" if found.corrected[1] else "–"
-    return [str(found.policies), *map(text, values, forms), text(found.cells, ".1%"), corrected]
+    held = found.intervals
+    shown = [
+        _bracketed(found.spearman, held["spearman"], ".2f"),
+        _bracketed(found.pearson, held["pearson"], ".3f"),
+        _bracketed(found.mmrv, held["mmrv"], ".3f"),
+        _bracketed(found.regret, None, ".3f"),
+        _bracketed(found.bias, held["bias"], "+.3f"),
+        "–" if found.cells is None else f"{found.cells:.1%}",
+        f"{found.corrected[0]} of {found.corrected[1]}" if found.corrected[1] else "–",
+    ]
+    return [str(found.policies), *shown]
 
 
 def main() -> None:

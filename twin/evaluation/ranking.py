@@ -1,8 +1,9 @@
 """Bayesian ranking of policies: probabilities of ranks, and how many further trials would settle the ranking.
 
-The true rate of a cell is sampled from Jeffreys' posterior, Beta(successes + ½, trials − successes + ½); a policy's
-score is the mean over its cells. A rank's probability is the fraction of samples in which a policy has it. All this
-holds for the world in which the trials were driven: a ranking in the twin is no evidence of one on the road.
+Samples of the policies' true rates come from the posterior of `twin.evaluation.rate_model`, which shrinks a rate
+towards the other policies and counts the trials of a day as far as they say more than one. A rank's probability is the
+fraction of samples in which a policy has it. All this holds for the world in which the trials were driven: a ranking in
+the twin is no evidence of one on the road.
 """
 
 from dataclasses import dataclass
@@ -10,51 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.evaluation.statistics import CONFIDENCE
-from twin.types import Array, Indices
+from twin.types import Array
 
 SETTLED_PROBABILITY = 0.95  # from which on a ranking counts as settled
 MARGIN = 0.05  # policies whose true scores differ by less count as equally good
 MAX_TRIALS = 1000  # most further trials per policy that are considered
 
-_SAMPLES = 4000  # of the posterior
+SAMPLES = 4000  # of the posterior
 _STEP = 5  # trials
 
 
-@dataclass(frozen=True)
-class TrialCounts:
-    """Trials of n policies on one task in up to k cells each, shape (n, k); short rows are padded."""
-
-    successes: Indices
-    trials: Indices
-    weight: Array
-    """1 for a cell, 0 for padding."""
-
-    @staticmethod
-    def from_rows(rows: list[list[tuple[int, int]]]) -> "TrialCounts":
-        """Counts from (successes, trials) of each policy's cells."""
-        shape = len(rows), max(map(len, rows))
-        successes, trials, weight = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
-        for i, row in enumerate(rows):
-            for j, (won, driven) in enumerate(row):
-                successes[i, j], trials[i, j], weight[i, j] = won, driven, 1.0
-        return TrialCounts(successes, trials, weight)
-
-    def scores(self, rates: Array) -> Array:
-        """Scores (..., n) from rates of cells (..., n, k)."""
-        return (rates * self.weight).sum(-1) / self.weight.sum(-1)
-
-    def sample_posterior(self, rng: np.random.Generator, samples: int) -> Array:
-        """Samples of the true rates, shape (samples, n, k)."""
-        shape = (samples, *self.successes.shape)
-        return rng.beta(self.successes + 0.5, self.trials - self.successes + 0.5, shape)
-
-
-def rank_probabilities(counts: TrialCounts, rng: np.random.Generator, samples: int = _SAMPLES) -> Array:
-    """Probability that policy i has rank k + 1, shape (n, n); rows and columns sum to 1."""
-    scores = counts.scores(counts.sample_posterior(rng, samples))
-    ranks = np.argsort(np.argsort(-scores, axis=-1), axis=-1)
-    n = scores.shape[-1]
-    return np.stack([(ranks == k).mean(0) for k in range(n)], -1)
+def rank_probabilities(rates: Array) -> Array:
+    """Probability that policy i has rank k + 1, shape (n, n), from samples of rates (samples, n); rows sum to 1."""
+    ranks = np.argsort(np.argsort(-rates, axis=-1), axis=-1)
+    return np.stack([(ranks == k).mean(0) for k in range(rates.shape[-1])], -1)
 
 
 def rank_interval(probabilities: Array, confidence: float = CONFIDENCE) -> tuple[float, int, int]:
@@ -79,47 +49,44 @@ class RankingConfidence:
     """Expected fraction of pairs in the right order, among those with true scores more than `MARGIN` apart."""
 
 
-def expected_confidence(
-    counts: TrialCounts, more: int, seed: int, so_far: bool = True, samples: int = _SAMPLES
-) -> RankingConfidence:
-    """Expected confidence in the ranking after `more` trials per policy, spread evenly over its cells.
+def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True) -> RankingConfidence:
+    """Expected confidence in the ranking after `more` trials per policy, each on a day of its own.
 
-    True rates are sampled from the posterior, and trials at these rates; policies are ranked by the posterior mean.
+    Policies are ranked by the posterior mean after trials at the sampled rates; the posterior so far is taken for a
+    Beta distribution of the samples' mean and variance.
 
     Args:
-        counts: Trials so far.
+        rates: Samples of the true rates, shape (samples, n).
         more: Further trials per policy.
         seed: With the same seed, different `more` are compared on the same samples.
         so_far: False: the trials so far determine the true rates, but do not count for the ranking.
-        samples: Number of samples of the true rates.
     """
-    rng = np.random.default_rng(seed)
-    true = counts.sample_posterior(rng, samples)
-    per_cell = np.broadcast_to(more / counts.weight.sum(-1, keepdims=True), counts.weight.shape)
-    extra = np.ceil(per_cell * counts.weight).astype(np.int64)
-    won = rng.binomial(extra, true)
-    base_won, base = (counts.successes, counts.trials) if so_far else (0, 0)
-    known = counts.scores((base_won + won + 0.5) / (base + extra + 1.0))
-    score = counts.scores(true)
+    won = np.random.default_rng(seed).binomial(more, rates)
+    if so_far:
+        mean = rates.mean(0)
+        strength = np.maximum(mean * (1.0 - mean) / np.maximum(rates.var(0), 1e-9) - 1.0, 1e-6)
+        known = (strength * mean + won) / (strength + more)
+    else:
+        known = won.astype(float)
     # Policies tied in the posterior mean are equally likely to be chosen.
     leading = np.isclose(known, known.max(-1, keepdims=True), rtol=0.0, atol=1e-12)
-    good = score >= score.max(-1, keepdims=True) - MARGIN
+    good = rates >= rates.max(-1, keepdims=True) - MARGIN
     winner = ((leading & good).sum(-1) / leading.sum(-1)).mean()
-    gap, known_gap = score[:, :, None] - score[:, None, :], known[:, :, None] - known[:, None, :]
+    gap, known_gap = rates[:, :, None] - rates[:, None, :], known[:, :, None] - known[:, None, :]
     apart = gap > MARGIN
     right = np.where(np.isclose(known_gap, 0.0, rtol=0.0, atol=1e-12), 0.5, known_gap > 0)
     order = (right * apart).sum() / apart.sum() if apart.any() else 1.0
     return RankingConfidence(float(winner), float(order))
 
 
-def trials_needed(counts: TrialCounts, what: str, seed: int, so_far: bool = True) -> int | None:
+def trials_needed(rates: Array, what: str, seed: int, so_far: bool = True) -> int | None:
     """Further trials per policy, a multiple of 5, until an expected confidence reaches `SETTLED_PROBABILITY`.
 
     `what` names a field of `RankingConfidence`. Returns None if `MAX_TRIALS` do not suffice.
     """
 
     def enough(more: int) -> bool:
-        return bool(getattr(expected_confidence(counts, more, seed, so_far), what) >= SETTLED_PROBABILITY)
+        return bool(getattr(expected_confidence(rates, more, seed, so_far), what) >= SETTLED_PROBABILITY)
 
     low, high = 0, _STEP
     if enough(0):

@@ -24,6 +24,8 @@ CONFIDENCE = 0.9
 """Confidence level of every interval."""
 MIN_POLICIES = 5
 """Number of policies below which no correlation is given."""
+MIN_PREDICTORS = 7
+"""Number of policies below which a prediction has no interval."""
 MIN_TRIALS = 5
 """Number of trials per cell below which no correlation is given."""
 

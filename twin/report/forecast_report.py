@@ -14,7 +14,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.errors import join_names
-from twin.evaluation.forecasting import ALL_TASKS, Agreement, Candidate, CellPair, Estimate, Forecast, TrialAllocation
+from twin.evaluation.forecasting import (
+    ALL_TASKS,
+    OTHERS,
+    SHUFFLED,
+    Agreement,
+    Candidate,
+    CellPair,
+    Estimate,
+    Forecast,
+    TrialAllocation,
+)
+from twin.evaluation.jackknife import MIN_DAYS, MIN_TRAININGS, training_of
 from twin.evaluation.ranking import MAX_TRIALS
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.evaluation.trials import csv_text
@@ -43,6 +54,7 @@ from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Verdict, command, r
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Rank correlations above which twin and road rank policies alike, or roughly alike."""
 SMALL_REGRET = 0.05
+_SMALL_GAP = 0.1  # difference in the twin from which on an order that may be believed counts as good
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -57,20 +69,25 @@ STATISTICS = (
         "share of the cells where twin and road differ by no more than chance; high for any guess if most cells are "
         "all successes or all failures",
     ),
-    ("corrected_coverage", "predictions hold", "share of policies within the interval predicted from the others"),
+    (
+        "corrected_coverage",
+        "predictions hold",
+        "share of policies within the interval predicted from the other trainings; 90% are expected",
+    ),
+    ("twin_error", "twin is off by", "mean over the policies of the absolute difference of the rates"),
     ("mean_real", "mean on the road", "of policies such as these, driven or not (prediction-powered estimate)"),
 )
 """Field of `Agreement`, its short name, and its meaning."""
-PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage", "mean_real")
+PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage", "twin_error", "mean_real")
 """Statistics shown in percent."""
 
-NOMINAL_INTERVALS = (
-    "These 90% intervals are nominal: in simulated experiments of 36 policies, 20 days and 5 trials per day, most days "
-    "all successes or all failures, they contained the true value in only about 60% (Spearman), 70% (Pearson) and 50% "
-    "(MMRV) of the cases. They assume that policies of one training, and trials of one day, are independent. More days "
-    "and more trainings reduce the uncertainty; more checkpoints and more trials on the same days reduce it less."
+INTERVALS_NOTE = (
+    "Intervals (90%) are about repetitions with other trainings and other days, of which these are a sample: days and "
+    "trainings are left out in turn, not trials. More days and more trainings make them narrower; more checkpoints of "
+    "one training, or more trials on the same day, hardly do. Where there are too few for an interval that holds, none "
+    "is given."
 )
-"""Note wherever intervals of the agreement of twin and road are shown; measured by `benchmarks/intervals.py`."""
+"""Note wherever intervals of the agreement of twin and road are shown; coverage: `benchmarks/intervals.py`."""
 
 CSV_COLUMNS = (
     *("task", "policy", "twin", "twin_low", "twin_high", "twin_trials", "rank", "rank_low", "rank_high"),
@@ -78,6 +95,8 @@ CSV_COLUMNS = (
     *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
 )
 
+_RELIABLE = 0.95  # share of pairs in the road's order from which on the twin's order may be believed
+_ENOUGH_PAIRS = 10
 _POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
 _TRIALS_NEEDED = (
     f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
@@ -87,16 +106,18 @@ _TRIALS_NEEDED = (
 # ---- numbers
 
 
-def format_estimate(estimate: Estimate, percent: bool = False, missing: str = "–") -> str:
+def format_estimate(estimate: Estimate, percent: bool = False, missing: str = "–", digits: int = 2) -> str:
     """Formats an estimate as "0.93 (0.81 to 0.97)", or returns `missing`."""
     if estimate.value is None:
         return missing
-    value, *ends = (_format_value(x, percent) for x in (estimate.value, estimate.low, estimate.high) if x is not None)
+    value, *ends = (
+        _format_value(x, percent, digits) for x in (estimate.value, estimate.low, estimate.high) if x is not None
+    )
     return f"{value} ({' to '.join(ends)})" if len(ends) == 2 else value
 
 
-def _format_value(value: float, percent: bool) -> str:
-    text = f"{100 * value:.0f}%" if percent else f"{value:.2f}"
+def _format_value(value: float, percent: bool, digits: int) -> str:
+    text = f"{100 * value:.0f}%" if percent else f"{value:.{digits}f}"
     return text.replace("-", "−" if text.strip("-0.%") else "")
 
 
@@ -123,7 +144,39 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
     if group.missing:
         first = f"Too few real trials to measure how well the twin predicts the road: {group.missing[0]}."
         return [Verdict(first, "bad"), *leaders]
-    return [_agreement(group), *_regret(group), _bias(group), *_predictions(group)]
+    return [believable(group), _agreement(group), *_regret(group), _bias(group), *_skill(group)]
+
+
+def believable(group: Agreement) -> Verdict:
+    """One sentence: which differences in the twin the road has confirmed, and which not."""
+    pairs = [(it.low, it.pairs, it.right) for it in group.ordered]
+    many, days = _count(group.trainings, "training"), _count(group.days, "day")
+    where = f"measured on {days} and {many}"
+    if not pairs:
+        return Verdict(
+            f"The road does not tell these policies apart, so no order of the twin was confirmed ({where}).", "bad"
+        )
+    for start, _, _ in pairs:
+        beyond = [(n, right) for low, n, right in pairs if low >= start]
+        n, right = sum(n for n, _ in beyond), sum(right for _, right in beyond)
+        if n >= _ENOUGH_PAIRS and right >= _RELIABLE * n:
+            closer = [(m, r) for low, m, r in pairs if low < start]
+            m, r = sum(m for m, _ in closer), sum(r for _, r in closer)
+            gap = f"that differ by {100 * start:.0f} percentage points or more" if start else "that differ at all"
+            rest = f", while closer ones were right in {r:g} of {m}" if m else ""
+            text = (
+                f"What may be believed: the order of two policies {gap} in the twin, which the road had in {right:g} "
+                f"of {n} pairs{rest} ({where})."
+            )
+            enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
+            return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
+    n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
+    text = f"No order of two policies in the twin may be believed yet: the road had it in {right:g} of {n} pairs"
+    return Verdict(f"{text} ({where}).", "bad")
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def _agreement(group: Agreement) -> Verdict:
@@ -137,39 +190,59 @@ def _agreement(group: Agreement) -> Verdict:
     if group.task == ALL_TASKS:
         what, where = "pairs of policy and task", "on all tasks together"
     text = f"The twin {how} these {group.policies} {what} as the road does: Spearman {format_estimate(rank)} {where}."
-    # A wide interval lowers the mood, whatever its center.
+    if rank.no_interval:
+        text = f"{text.removesuffix('.')}; {rank.no_interval}."
+    # Without a narrow interval a high value is no good news.
     return Verdict(text, "mixed" if mood == "good" and (rank.low or 0.0) < FAIR_CORRELATION else mood)
 
 
 def _regret(group: Agreement) -> list[Verdict]:
     regret = group.winner_regret
-    if regret.value is None or regret.high is None:
+    if regret.value is None:
         return []
     lost = "nothing" if regret.value < 5e-4 else percentage_points(regret.value)
-    text = (
-        f"Choosing the twin’s best policy would have cost {lost} of real success; its nominal 90% interval ends at "
-        f"{percentage_points(regret.high)}."
-    )
+    text = f"In these trials, choosing the twin’s best policy would have cost {lost} of real success."
     return [Verdict(text, "good" if regret.value <= SMALL_REGRET else "bad")]
 
 
 def _bias(group: Agreement) -> Verdict:
-    bias, covered = group.bias, group.coverage
-    if bias.value is None or bias.low is None or bias.high is None:
+    bias, off = group.bias, group.twin_error
+    if bias.value is None or off.value is None:
         return Verdict("The bias of the twin’s rates is not known.", "bad")
-    text, mood = f"On average its rates deviate by no more than chance ({format_estimate(bias, True)})", "good"
-    if not bias.low <= 0.0 <= bias.high:
-        much = "high" if bias.value < 0 else "low"
-        text, mood = f"On average its rates are {percentage_points(bias.value)} too {much}", "mixed"
-    return Verdict(f"{text}; {covered.value or 0.0:.0%} of the cells agree with the road within chance.", mood)
+    single = f"a single policy’s rate is off by {percentage_points(off.value)} on average"
+    much = "high" if bias.value < 0 else "low"
+    if bias.low is None or bias.high is None:
+        mean = f"The twin’s rates are {percentage_points(bias.value)} too {much} on average"
+        return Verdict(f"{mean} ({bias.no_interval}); {single}.", "mixed")
+    if bias.low <= 0.0 <= bias.high:
+        return Verdict(f"No bias of the twin is certain ({format_estimate(bias, True)}); {single}.", "good")
+    return Verdict(f"The twin’s rates are {percentage_points(bias.value)} too {much} on average; {single}.", "mixed")
 
 
-def _predictions(group: Agreement) -> list[Verdict]:
-    hold = group.corrected_coverage
-    if hold.value is None:
+def _skill(group: Agreement) -> list[Verdict]:
+    """Whether the twin predicts single days and policies better than a guess without it."""
+    gains = {it.predictor: it.gain for it in group.scores}
+    gain = gains.get(OTHERS)
+    if gain is None or gain.value is None:
         return []
-    text = f"Predictions corrected by the other policies held for {hold.value:.0%} of {hold.n}; 90% are expected."
-    return [Verdict(text, "good" if (hold.low or 0.0) <= 0.9 <= (hold.high or 1.0) else "mixed")]
+    if gain.low is None or gain.high is None:
+        better = "better" if gain.value > 0 else "worse"
+        text = (
+            f"In these trials the twin predicts days {better} than the mean of the other policies; {gain.no_interval}."
+        )
+        return [Verdict(text, "mixed")]
+    if gain.low > 0:
+        text = "The twin predicts a policy’s days better than the mean of the other policies does"
+        shuffled = gains.get(SHUFFLED)
+        if shuffled is not None and shuffled.low is not None:
+            more = "and tells days apart" if shuffled.low > 0 else "but whether it tells days apart is open"
+            text = f"{text}, {more}"
+        return [Verdict(f"{text} (log scores).", "good")]
+    worse = gain.high < 0
+    text = "worse than" if worse else "not certainly better than"
+    return [
+        Verdict(f"The twin predicts a policy’s days {text} the mean of the other policies does (log scores).", "bad")
+    ]
 
 
 def _leader(forecast: Forecast, task: str) -> Verdict:
@@ -193,14 +266,19 @@ def limitations(forecast: Forecast) -> list[Caution]:
         what = "Whether the road ranks these policies as the twin does, and how far its rates are off, is not known."
         out.append(Caution(what, _TRIALS_NEEDED))
     on_road = {p.policy for p in forecast.pairs}
-    runs = {name.partition("/")[0] for name in on_road}
-    if len(runs) < len(on_road):
+    days = {p.lighting for p in forecast.pairs}
+    runs = {training_of(name) for name in on_road}
+    if on_road:
         what = (
-            f"The {len(on_road)} policies that were driven on the road come from {len(runs)} trainings; the intervals "
-            "treat them as independent and are therefore too narrow."
+            f"What is known of the road rests on {_count(len(days), 'day')} and {_count(len(runs), 'training')}, "
+            f"not on {_count(forecast.real_trials, 'trial')}."
         )
-        cure = "train again with another --seed: the variation between trainings is known from these few only."
+        cure = "drive on further days, and train again with another --seed."
         out.append(Caution(what, cure))
+    for group in forecast.groups:
+        if group.spearman.no_interval:
+            what = f"{group.task}: correlations have no interval ({group.spearman.no_interval})."
+            out.append(Caution(what, "the same: further days, further trainings."))
     lightings = join_names(sorted({name for c in forecast.candidates for name in c.lightings}))
     cure = (
         "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
@@ -292,13 +370,24 @@ def summary_text(forecast: Forecast) -> str:
         for name, title, _ in STATISTICS:
             values = [format_estimate(getattr(group, name), name in PERCENT_STATISTICS) for group in groups]
             lines.append(f"  {title:<18}{''.join(f'{value:<26}' for value in values)}".rstrip())
-        lines += ["", *textwrap.wrap(NOMINAL_INTERVALS, 110), ""]
+        lines += ["", *_score_lines(groups[-1]), "", *textwrap.wrap(INTERVALS_NOTE, 110), ""]
     lines += [f"{group.task}: no correlation: {'; '.join(group.missing)}" for group in forecast.groups if group.missing]
     lines += [allocation_text(allocation) for allocation in forecast.plans]
     lines += [verdict.text for verdict in verdicts(forecast)]
     if not forecast.groups:
         lines.append(limitations(forecast)[0].what)
     return "\n".join(lines)
+
+
+def _score_lines(group: Agreement) -> list[str]:
+    """Scores of the predictors of a group's cells."""
+    width = max(len(it.predictor) for it in group.scores)
+    row = f"  {{:<{width}}}  {{:<7}}  {{:<7}}  {{}}".format
+    lines = [row(f"{group.task}: scores, 0 is best", "Brier", "log", "the twin's log score is better by")]
+    for it in group.scores:
+        numbers = (format_estimate(e, digits=3) for e in (it.brier, it.log, it.gain))
+        lines.append(row(it.predictor, *numbers).rstrip())
+    return lines
 
 
 def candidates_csv(forecast: Forecast) -> str:
@@ -373,6 +462,24 @@ def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
         axes.annotate(shorten_name(name), (x, y), offset, textcoords="offset points", **look)
 
 
+@styled
+def calibration_chart(group: Agreement) -> Figure:
+    """Success rate on the road of cells by the twin's predicted probability; areas show the number of trials."""
+    figure, axes = new_figure(_SQUARE_SIZE)
+    axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
+    limits, ticks = RATE_AXIS.values()
+    axes.set(xlabel="probability by the twin", ylabel="success on the road", ylim=limits, yticks=ticks, **RATE_AXIS)
+    x, y, trials = (
+        np.array([getattr(it, name) for it in group.calibration]) for name in ("predicted", "observed", "trials")
+    )
+    axes.plot(x, y, color=SERIES[0], lw=1.0, zorder=2)
+    axes.scatter(x, y, s=20 + 180 * trials / trials.max(), color=SERIES[0], alpha=0.8, linewidths=0, zorder=3)
+    for at, height, n in zip(x, y, trials, strict=True):
+        side = -1 if at > 0.5 else 1
+        axes.annotate(f"{n}", (at, height), (side * 10, -12), textcoords="offset points", fontsize=7.5, color=MUTED)
+    return figure
+
+
 def rank_heatmap(candidates: Sequence[Candidate]) -> Figure:
     """Probability of every rank in the twin, one row per candidate."""
     n = len(candidates)
@@ -429,6 +536,12 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
     if forecast.groups:
         title = f"Success on the road over success in the twin (n = {driven}); on the dashed line they are equal"
         agreement = [Chart(title, svg(rates_against_road(forecast)))]
+    calibration = []
+    if measured and measured[-1].calibration:
+        group = measured[-1]
+        n = f"n = {group.cells} cells, {group.task}; numbers are trials"
+        title = f"Success on the road over the twin’s probability, cell by cell ({n})"
+        calibration = [Chart(title, svg(calibration_chart(group)))]
     predictions = []
     if tested := [c for c in known if c.driven]:
         title = f"Success on the road over the rate predicted from the other policies (n = {len(tested)})"
@@ -473,7 +586,9 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
         MIN_TRIALS=MIN_TRIALS,
         STATISTICS=STATISTICS,
         PERCENT_STATISTICS=PERCENT_STATISTICS,
-        NOMINAL_INTERVALS=NOMINAL_INTERVALS,
+        INTERVALS_NOTE=INTERVALS_NOTE,
+        calibration=calibration,
+        last=measured[-1] if measured else None,
         allocation_text=allocation_text,
         format_estimate=format_estimate,
         format_probability=format_probability,

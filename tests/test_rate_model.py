@@ -1,0 +1,117 @@
+"""Hierarchical rates: exactness in tiny cases, limits, shrinkage, coverage."""
+
+import numpy as np
+import pytest
+from intervals import KINDS, Shape, simulate
+from scipy import integrate, stats
+
+from twin.evaluation.rate_model import RateModel, padded_counts
+from twin.evaluation.statistics import wilson
+
+
+def test_single_trials_against_integration() -> None:
+    """One policy of single trials: ρ plays no part, and the posterior of the rate can be integrated directly."""
+    won, driven = 7, 10
+    model = RateModel.fit([[1] * won + [0] * (driven - won)], [[1] * driven], shared_days=False)
+    means, correlations = np.sin(np.pi / 2 * (np.arange(15) + 0.5) / 15) ** 2, (np.arange(10) + 0.5) / 10
+
+    def prior(rate: float) -> float:
+        sizes = 1 / correlations - 1
+        return float(np.mean([stats.beta.pdf(rate, m * s, (1 - m) * s) for m in means for s in sizes]))
+
+    def moment(power: int) -> float:
+        return integrate.quad(lambda p: p ** (won + power) * (1 - p) ** (driven - won) * prior(p), 1e-6, 1 - 1e-6)[0]
+
+    assert model.mean()[0] == pytest.approx(moment(1) / moment(0), abs=0.005)
+
+
+def test_policies_and_days_in_any_order_give_the_same() -> None:
+    rng = np.random.default_rng(0)
+    won = rng.integers(0, 6, (5, 4))
+    rows, days = rng.permutation(5), rng.permutation(4)
+    one, other = (RateModel.fit(a, np.full((5, 4), 5)) for a in (won, won[rows][:, days]))
+    assert np.allclose(np.array(one.interval())[:, rows], other.interval())
+    assert np.allclose(one.mean_interval(), other.mean_interval())
+
+
+def test_successes_and_failures_are_symmetric() -> None:
+    won = np.array([[5, 5, 0, 5], [0, 1, 0, 0], [5, 4, 5, 5]])
+    one, other = RateModel.fit(won, np.full(won.shape, 5)), RateModel.fit(5 - won, np.full(won.shape, 5))
+    assert np.allclose(one.mean(), 1.0 - other.mean())
+    (low, high), (other_low, other_high) = one.interval(), other.interval()
+    assert np.allclose(low, 1.0 - other_high, atol=1e-3) and np.allclose(high, 1.0 - other_low, atol=1e-3)
+
+
+def test_identical_cells_leave_the_ends_in_the_interval_and_do_not_make_it_a_point() -> None:
+    model = RateModel.fit(np.array([[5] * 10, [0] * 10, [5] * 10]), np.full((3, 10), 5))
+    low, high = model.interval()
+    assert high[0] == high[2] == 1.0 and low[1] == 0.0
+    assert 0.02 < high[1] < 0.3 and low[0] == pytest.approx(low[2])
+    assert model.mean()[1] < 0.04  # not the 8 % of half a trial added to every cell of five
+
+
+def test_days_count_and_trials_of_one_day_hardly_do() -> None:
+    """All or nothing on half of the days: more trials a day do not narrow the interval, more days do."""
+
+    def width(days: int, trials: int) -> float:
+        won = np.tile([0, trials], (4, days // 2))
+        low, high = RateModel.fit(won, np.full(won.shape, trials)).interval()
+        return float((high - low)[0])
+
+    assert width(4, 50) > 0.9 * width(4, 5)
+    assert width(16, 5) < 0.7 * width(4, 5)
+    low, high = wilson(10, 20)
+    assert width(4, 5) > 1.2 * (high - low)  # as if the 20 trials were independent
+
+
+def test_a_policy_is_drawn_towards_the_others_and_not_towards_one_half() -> None:
+    trials = np.full((6, 2), 5)
+    good = RateModel.fit([[5, 5]] * 5 + [[5, 0]], trials).mean()
+    bad = RateModel.fit([[0, 0]] * 5 + [[5, 0]], trials).mean()
+    assert good[-1] > 0.5 > bad[-1]
+    assert bad[0] < 0.15
+
+
+def test_a_covariate_draws_a_policy_towards_it() -> None:
+    won, trials = np.array([[5, 5], [5, 5], [0, 0], [0, 0], [5, 0], [5, 0]]), np.full((6, 2), 5)
+    x = np.array([3.0, 3.0, -3.0, -3.0, 3.0, -3.0])
+    mean = RateModel.fit(won, trials, x).mean()
+    assert mean[4] > mean[5] + 0.1
+    assert np.allclose(*RateModel.fit(won, trials).mean()[4:])
+
+
+def test_samples_follow_the_posterior() -> None:
+    won = np.array([[5, 5, 0, 5], [0, 1, 0, 0], [5, 4, 5, 5]])
+    model = RateModel.fit(won, np.full(won.shape, 5))
+    samples = model.sample(np.random.default_rng(0), 20_000)
+    assert np.allclose(samples.mean(0), model.mean(), atol=0.01)
+    low, high = model.interval()
+    assert np.allclose(((low <= samples) & (samples <= high)).mean(0), 0.9, atol=0.02)
+
+
+def test_cells_are_drawn_towards_their_policy() -> None:
+    means = RateModel.fit([[5, 0, 5, 5], [0, 0, 0, 5]], np.full((2, 4), 5), shared_days=False).cell_means()
+    assert means[0, 1] < 0.5 < means[0, 0] and means[0, 1] > means[1, 0]
+    assert means[1, 3] < means[0, 0]
+
+
+def test_padding_and_wrong_counts() -> None:
+    won, trials = padded_counts([[(3, 5), (5, 5)], [(2, 4)]])
+    assert won.tolist() == [[3, 5], [2, 0]] and trials.tolist() == [[5, 5], [4, 0]]
+    padded = RateModel.fit(np.pad(won, ((0, 0), (0, 3))), np.pad(trials, ((0, 0), (0, 3))))
+    assert np.allclose(padded.interval(), RateModel.fit(won, trials).interval())
+    for successes, driven in (([[6]], [[5]]), ([[-1]], [[5]]), ([[1, 2]], [[5]])):
+        with pytest.raises(ValueError, match="expected 0 ≤ successes ≤ trials"):
+            RateModel.fit(successes, driven)
+
+
+@pytest.mark.parametrize("kind", ["recorded", "graded"])
+def test_intervals_cover_the_rates_over_days(kind: str) -> None:
+    """Small and fast: 100 worlds of 8 policies; `benchmarks/intervals.py` has the precise figures."""
+    shape = Shape(places=1, setups=0, trainings=8, checkpoints=1, days=4, twin_trials=5)
+    worlds = simulate(np.random.default_rng(0), KINDS[kind], shape, 100)
+    held = []
+    for won, true in zip(worlds.real[:, 0], worlds.policy_rates()[:, 0], strict=True):
+        low, high = RateModel.fit(won, np.full(won.shape, 5)).interval()
+        held.append((low <= true) & (true <= high))
+    assert 0.82 <= np.mean(held) <= 0.98, np.mean(held)

@@ -1,0 +1,172 @@
+"""Scores of predicted success probabilities: Brier and log scores, calibration, false alarms and misses.
+
+A predictor gives a probability p of success for each cell (policy, day) of the road, in which y of m trials succeed:
+
+    Brier score: mean over trials of (p − outcome)²
+    log score: mean over trials of −log of the probability that was given to the outcome
+
+Both are 0 at best and *proper*: no other p than one's true belief has a better expectation (Gneiting and Raftery, J.
+Am. Stat. Assoc. 102, 2007). The scores of the twin mean little alone; they are compared with baselines that do not look
+at the twin, or not at the day. A baseline that is fitted to real trials, and the twin's recalibration, use those of
+other trainings than the one that is predicted.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.evaluation.jackknife import MIN_BIAS_DAYS, MIN_BIAS_TRAININGS, PairedCells, Statistic, mean_bias
+from twin.evaluation.rate_model import RateModel
+from twin.types import Array, Indices
+
+CALIBRATION_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
+"""Ends of the bins of predicted probability in a calibration curve."""
+
+SCORE_DIFFERENCE = Statistic(
+    mean_bias, lambda x: x, lambda x: x, -np.inf, np.inf, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS
+)
+"""Mean over policies of the difference of two scores; `jackknife_interval` takes it with `score_pair`."""
+
+_LEAST = 0.005  # probability that any predictor leaves to either outcome
+_RIDGE = 0.1  # of a recalibration: weight of a prior that leaves probabilities as they are
+_NEWTON_STEPS = 30
+
+
+@dataclass(frozen=True)
+class CalibrationBin:
+    """Trials of the cells whose predicted probability lies in a bin."""
+
+    low: float
+    high: float
+    predicted: float
+    """Mean predicted probability."""
+    observed: float
+    """Success rate on the road."""
+    cells: int
+    trials: int
+
+
+@dataclass(frozen=True)
+class DayErrors:
+    """Cells of one day on which the twin and the road disagree about success in most trials."""
+
+    day: str
+    cells: int
+    misses: int
+    """Missed failures: the twin predicts success (p ≥ ½), and fewer than half of the trials succeed."""
+    false_alarms: int
+    """The twin predicts failure, and half of the trials or more succeed."""
+
+
+def brier(probability: Array, rate: Array) -> Array:
+    """Brier score of each cell with success rate `rate`, shapes (...)."""
+    return np.asarray(rate * (1.0 - probability) ** 2 + (1.0 - rate) * probability**2)
+
+
+def log_score(probability: Array, rate: Array) -> Array:
+    """Log score of each cell [nats], shapes (...); probabilities are kept 0.005 away from 0 and 1."""
+    p = np.clip(probability, _LEAST, 1.0 - _LEAST)
+    return np.asarray(-rate * np.log(p) - (1.0 - rate) * np.log1p(-p))
+
+
+def score_pair(data: PairedCells, score: Array, baseline: Array) -> PairedCells:
+    """The cells with scores (n, k) instead of rates, so that their `mean_bias` is baseline minus score."""
+    return PairedCells(score, baseline, data.weight, data.training, data.day, data.strata)
+
+
+def mean_score(data: PairedCells, score: Array) -> float:
+    """Mean over policies of the mean score of their cells."""
+    return float(((data.weight * score).sum(-1) / data.weight.sum(-1)).mean())
+
+
+def twin_probabilities(successes: Array, trials: Array) -> Array:
+    """The twin's probability for each of its cells, shrunk towards the policy's rate in the twin, shapes (n, k)."""
+    return RateModel.fit(successes, trials, shared_days=False, road=False).cell_means()
+
+
+def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callable[[Array, Array], Array]) -> Array:
+    """Expected score of each cell if the policy's days were permuted at random in the twin, shape (n, k).
+
+    Args:
+        probability: Of each cell, shape (n, k).
+        weight: 1 for a cell, 0 for padding.
+        rate: Success rates on the road, shape (n, k).
+        score: `brier` or `log_score`.
+    """
+    out = np.zeros_like(probability)
+    for i, row in enumerate(weight > 0):
+        out[i, row] = score(probability[i, row][:, None], rate[i, row][None]).mean(0)
+    return out
+
+
+def other_trainings(data: PairedCells, groups: Indices) -> Array:
+    """Baseline: success rate on the road of the same group in other trainings, for each policy, shape (n,).
+
+    Shrunk towards the rate of all other trainings by one trial's weight. `groups` names the group of each policy, such
+    as its setup; all equal gives the mean of the other policies.
+    """
+    real = data.rates()["real"]
+    out = np.full(data.policies, 0.5)
+    for i in range(data.policies):
+        others = data.training != data.training[i]
+        mine = others & (groups == groups[i])
+        everyone = (real[others].sum() + 0.5) / (others.sum() + 1.0)
+        out[i] = (real[mine].sum() + everyone) / (mine.sum() + 1.0)
+    return out
+
+
+def recalibrated(probability: Array, data: PairedCells) -> Array:
+    """Probabilities (n, k) on a logistic line fitted to the real trials of other trainings (Platt 1999)."""
+    x = np.log(np.clip(probability, _LEAST, 1 - _LEAST)) - np.log1p(-np.clip(probability, _LEAST, 1 - _LEAST))
+    out = np.empty_like(probability)
+    for training in np.unique(data.training):
+        mine = data.training == training
+        used = (data.weight > 0) & ~mine[:, None]
+        if not used.any():
+            out[mine] = probability[mine]
+            continue
+        intercept, slope = _logistic_line(x[used], data.real[used])
+        out[mine] = 1.0 / (1.0 + np.exp(-(intercept + slope * x[mine])))
+    return out
+
+
+def _logistic_line(x: Array, rate: Array) -> tuple[float, float]:
+    """Intercept and slope by Newton's method, with a weak prior at 0 and 1."""
+    design = np.stack([np.ones_like(x), x], -1)
+    start = np.array([0.0, 1.0])
+    line = start.copy()
+    for _ in range(_NEWTON_STEPS):
+        p = 1.0 / (1.0 + np.exp(-np.clip(design @ line, -30, 30)))
+        gradient = design.T @ (rate - p) - _RIDGE * (line - start)
+        hessian = (design * (p * (1 - p))[:, None]).T @ design + _RIDGE * np.eye(2)
+        line = line + np.clip(np.linalg.solve(hessian, gradient), -2.0, 2.0)
+    return float(line[0]), float(line[1])
+
+
+def calibration(probability: Array, rate: Array, trials: Indices) -> tuple[CalibrationBin, ...]:
+    """Calibration curve of cells, shapes (c,); bins without cells are left out."""
+    edges = np.array(CALIBRATION_EDGES)
+    index = np.clip(np.searchsorted(edges, probability, "right") - 1, 0, len(edges) - 2)
+    out = []
+    for b in range(len(edges) - 1):
+        of = index == b
+        if n := int(trials[of].sum()):
+            predicted, observed = ((trials[of] * value[of]).sum() / n for value in (probability, rate))
+            out.append(
+                CalibrationBin(
+                    float(edges[b]), float(edges[b + 1]), float(predicted), float(observed), int(of.sum()), n
+                )
+            )
+    return tuple(out)
+
+
+def errors_by_day(probability: Array, rate: Array, days: Sequence[str]) -> tuple[DayErrors, ...]:
+    """Misses and false alarms of cells, shapes (c,), by day in order of first occurrence."""
+    out = []
+    for day in dict.fromkeys(days):
+        of = np.array([other == day for other in days])
+        predicted, happened = probability[of] >= 0.5, rate[of] >= 0.5
+        misses, alarms = int((predicted & ~happened).sum()), int((~predicted & happened).sum())
+        out.append(DayErrors(day, int(of.sum()), misses, alarms))
+    return tuple(out)

@@ -1,0 +1,195 @@
+"""Success rates of policies and of their population, by a hierarchical beta-binomial model.
+
+Of a policy's trials on one day most end alike, so the trials are not independent; the day is. With m trials on day j,
+policy i succeeds yᵢⱼ times:
+
+    rᵢⱼ | pᵢ ~ Beta with mean pᵢ and intra-class correlation ρ        the rate on day j
+    yᵢⱼ | rᵢⱼ ~ Binomial(m, rᵢⱼ)
+    pᵢ ~ Beta with mean μᵢ and intra-class correlation τ              the policy's rate over days
+    logit μᵢ = logit μ + β xᵢ                                        xᵢ: a covariate such as the twin's rate, or none
+
+A Beta distribution of mean p and intra-class correlation ρ is Beta(p/ρ − p, (1 − p)/ρ − (1 − p)); ρ = 1 makes all
+trials of a day agree, ρ = 0 makes them independent. τ has a uniform prior and μ Jeffreys'. ρ has Beta(5, 1), since on
+most days of a road all trials end alike (706 of 720 cells in docs/benchmarks.md) and few days cannot tell that from
+policies that differ: with a uniform prior, which the twin's rates have (`road=False`), intervals from four such days
+held 0.79 of the time. All are integrated over a grid, so that intervals need no sampling and no seed. A policy's rate
+is thus shrunk towards the other policies, as far as these are alike, and not towards one half; policies share ρ, so
+that two days say something where eight policies drove on them. Beta-binomial: Skellam, J. R. Stat. Soc. B 10 (1948);
+hierarchical: Gelman et al., Bayesian Data Analysis, section 5.3.
+
+Policies of one experiment drive on the same days, and a bad day is bad for all of them, so their cells are not
+independent: the product of their likelihoods is a *composite* likelihood. It is raised to the power (2k − 1) / (2k + 1)
+for k days (Ribatet, Cooley and Davison, Statistica Sinica 22, 2012, on scaling such likelihoods); without, intervals
+from two days held 0.72 to 0.92 of the time.
+
+The estimand is the rate over the *population* of days of the kind that were driven (`interval`), or of policies and
+days (`mean_interval`), not over these days; `cell_means` is about these. Coverage: `benchmarks/intervals.py`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import betainc, betaln, expit, logit
+
+from twin.evaluation.statistics import CONFIDENCE
+from twin.types import Array, Indices
+
+MIN_RATE_DAYS = 2
+"""Number of days below which a policy's rate over days has no interval."""
+MIN_SETUP_TRAININGS = 4
+"""Number of trainings below which a setup's rate has no interval."""
+
+_EDGES = np.concatenate([[0.0], expit(np.linspace(-7.5, 7.5, 47)), [1.0]])
+"""Edges of the grid of rates."""
+_RATES = np.concatenate([[_EDGES[1] / 3], expit((logit(_EDGES[1:-2]) + logit(_EDGES[2:-1])) / 2), [1 - _EDGES[1] / 3]])
+_CORRELATIONS = (np.arange(10) + 0.5) / 10  # of ρ and τ, the latter equally likely
+_ROAD_PRIOR = 4.0  # exponent of the prior of ρ, Beta(5, 1)
+_MEANS = np.sin(np.pi / 2 * (np.arange(15) + 0.5) / 15) ** 2  # of μ: quantiles of Jeffreys' Beta(½, ½)
+_SLOPES = (0.0, 0.5, 1.0)  # of β, equally likely
+
+
+@dataclass(frozen=True)
+class RateModel:
+    """Posterior of the rates of n policies; see the module."""
+
+    successes: Array
+    """Of each cell, shape (n, k)."""
+    trials: Array
+    """Shape (n, k); 0 in padding."""
+    likelihood: Array
+    """Of each policy's cells given rate (g) and ρ (r), up to a factor per policy, shape (n, g, r)."""
+    prior: Array
+    """Mass of the grid's rates under each pair of μ, τ (and β), shape (n or 1, h, g)."""
+    evidence: Array
+    """Likelihood of each policy's cells under each pair of hyperparameters, shape (n, h, r)."""
+    weight: Array
+    """Posterior of the hyperparameters, shape (h, r)."""
+    means: Array
+    """μ of each h, shape (h,)."""
+
+    @staticmethod
+    def fit(
+        successes: ArrayLike,
+        trials: ArrayLike,
+        covariate: ArrayLike | None = None,
+        shared_days: bool = True,
+        road: bool = True,
+    ) -> "RateModel":
+        """Fits the counts of n policies in up to k cells, shapes (n, k); cells without trials are padding.
+
+        Args:
+            successes: Successes of each cell.
+            trials: Trials of each cell.
+            covariate: xᵢ [logit], shape (n,), centered here; None: no covariate.
+            shared_days: True: policies drove on the same few days; see the module.
+            road: True: the prior of ρ is the road's; False: it is uniform.
+
+        Raises:
+            ValueError: more successes than trials, negative counts, or shapes that differ.
+        """
+        won, driven = np.atleast_2d(np.asarray(successes, float)), np.atleast_2d(np.asarray(trials, float))
+        if won.shape != driven.shape or not len(won) or (won < 0).any() or (won > driven).any():
+            raise ValueError(f"successes {won.shape} of trials {driven.shape}: expected 0 ≤ successes ≤ trials, (n, k)")
+        days = (driven > 0).sum(-1).max()
+        likelihood = _likelihood(won, driven) ** ((2 * days - 1) / (2 * days + 1) if shared_days else 1.0)
+        slopes = np.zeros(1) if covariate is None else np.array(_SLOPES)
+        given = np.zeros(1) if covariate is None else np.asarray(covariate, float)
+        x = given - given.mean()
+        mean, correlation, slope = (a.ravel() for a in np.meshgrid(_MEANS, _CORRELATIONS, slopes, indexing="ij"))
+        centers = expit(logit(mean) + slope * x[:, None])
+        prior = _masses(np.clip(centers, 1e-4, 1 - 1e-4), correlation)
+        evidence = np.maximum(np.matmul(prior, likelihood), 1e-300)
+        log = np.log(evidence).sum(0)
+        weight = np.exp(log - log.max()) * _CORRELATIONS ** (_ROAD_PRIOR if road else 0.0)
+        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), mean)
+
+    def posterior(self) -> Array:
+        """Mass of the grid's rates for each policy, shape (n, g)."""
+        return np.asarray(self._joint().sum(-1))
+
+    def _joint(self) -> Array:
+        """Mass of the grid's rates and ρ for each policy, shape (n, g, r)."""
+        scaled = self.weight / self.evidence
+        prior = np.broadcast_to(self.prior, (len(scaled), *self.prior.shape[1:]))
+        mass = np.matmul(np.swapaxes(prior, 1, 2), scaled) * self.likelihood
+        return np.asarray(mass / mass.sum((-1, -2), keepdims=True))
+
+    def mean(self) -> Array:
+        """Posterior mean of each policy's rate over days, shape (n,)."""
+        return np.asarray(self.posterior() @ _RATES)
+
+    def interval(self, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
+        """Ends of the shortest credible interval of each policy's rate over days, shapes (n,)."""
+        ends = np.array([_shortest(mass, _EDGES, confidence) for mass in self.posterior()])
+        return ends[:, 0], ends[:, 1]
+
+    def mean_interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+        """Ends of the shortest credible interval of μ, the rate over the population of policies and days."""
+        mass = np.array([self.weight[self.means == mean].sum() for mean in _MEANS])
+        return _shortest(mass, np.sin(np.pi / 2 * np.arange(len(_MEANS) + 1) / len(_MEANS)) ** 2, confidence)
+
+    def sample(self, rng: np.random.Generator, samples: int) -> Array:
+        """Samples of the policies' rates over days, shape (samples, n)."""
+        chosen = rng.choice(self.weight.size, samples, p=self.weight.ravel())
+        h, r = np.unravel_index(chosen, self.weight.shape)
+        out = np.empty((samples, len(self.likelihood)))
+        for i, likelihood in enumerate(self.likelihood):
+            mass = self.prior[min(i, len(self.prior) - 1)][h] * likelihood.T[r]
+            cumulative = np.cumsum(mass, -1)
+            picked = (cumulative < rng.random((samples, 1)) * cumulative[:, -1:]).sum(-1)
+            low, high = _EDGES[picked], _EDGES[picked + 1]
+            out[:, i] = low + (high - low) * rng.random(samples)
+        return out
+
+    def cell_means(self) -> Array:
+        """Posterior mean of the rate of each cell, shape (n, k): its own trials, shrunk towards the policy's rate."""
+        joint = self._joint()
+        size = 1.0 / _CORRELATIONS - 1.0
+        won, driven = self.successes[:, :, None, None], self.trials[:, :, None, None]
+        means = (_RATES[:, None] * size + won) / (size + driven)
+        return np.asarray((joint[:, None] * means).sum((-1, -2)))
+
+
+def _beta(mean: Array, correlation: Array) -> tuple[Array, Array]:
+    """Parameters of a Beta distribution from mean and intra-class correlation."""
+    size = 1.0 / correlation - 1.0
+    return mean * size, (1.0 - mean) * size
+
+
+def _masses(mean: Array, correlation: Array) -> Array:
+    """Mass of Beta distributions (..., h) on the grid, shape (..., h, g)."""
+    a, b = _beta(mean, correlation)
+    return np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
+
+
+def _likelihood(won: Array, driven: Array) -> Array:
+    """Product over cells of the beta-binomial likelihood, shape (n, g, r), at most 1 for each policy."""
+    a, b = _beta(_RATES[:, None], _CORRELATIONS[None])
+    pairs, index = np.unique(np.stack([won.ravel(), driven.ravel()], -1), axis=0, return_inverse=True)
+    y, m = pairs[:, 0, None, None], pairs[:, 1, None, None]
+    table = betaln(a + y, b + m - y) - betaln(a, b)
+    counts = np.zeros((len(won), len(pairs)))
+    np.add.at(counts, (np.repeat(np.arange(len(won)), won.shape[1]), index.ravel()), 1.0)
+    log = np.tensordot(counts, table, 1)
+    return np.asarray(np.exp(log - log.max((1, 2), keepdims=True)))
+
+
+def _shortest(mass: Array, edges: Array, confidence: float) -> tuple[float, float]:
+    """Shortest interval of a distribution given by the mass between edges, uniform within."""
+    below = np.concatenate([[0.0], np.cumsum(mass)])
+    below /= below[-1]
+    start = np.linspace(0.0, 1.0 - confidence, 201)
+    low, high = np.interp(start, below, edges), np.interp(start + confidence, below, edges)
+    best = int(np.argmin(high - low))
+    return float(low[best]), float(high[best])
+
+
+def padded_counts(rows: list[list[tuple[int, int]]]) -> tuple[Indices, Indices]:
+    """Successes and trials, shapes (n, k), from (successes, trials) of each policy's cells; 0 in padding."""
+    shape = len(rows), max(map(len, rows))
+    won, driven = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    for i, row in enumerate(rows):
+        for j, (successes, trials) in enumerate(row):
+            won[i, j], driven[i, j] = successes, trials
+    return won, driven
