@@ -127,7 +127,7 @@ class Camera:
             raise PictureError(f"{len(self.distortion)} coefficients of {self.model!r}; expected {counts}")
 
     @staticmethod
-    def from_info(info: Any, rectified: bool = False) -> Camera:
+    def from_info(info: Any, rectified: bool = False) -> "Camera":
         """The camera of a sensor_msgs/CameraInfo (ROS 2's fields, or ROS 1's).
 
         `rectified`: the topic carries pictures after image_proc's rectification, whose camera is the matrix P.
@@ -145,15 +145,21 @@ class Camera:
         model, distortion = ("", ()) if rectified else (str(info.distortion_model), tuple(map(float, d)))
         return Camera((width // across, height // down), intrinsics, model, distortion)
 
-    def resized(self, size: tuple[int, int]) -> Camera:
+    def resized(self, size: tuple[int, int]) -> "Camera":
         """The same camera at another size: scaled by the width, the height cropped or extended about its middle."""
         scale = size[0] / self.size[0]
         fx, fy, cx, cy = (float(x) * scale for x in self.intrinsics)
         cut = (self.size[1] * scale - size[1]) / 2
         return Camera(size, (fx, fy, cx, cy - cut), self.model, self.distortion)
 
-    def without_distortion(self) -> Camera:
+    def without_distortion(self) -> "Camera":
         return Camera(self.size, self.intrinsics)
+
+    def reach(self) -> float:
+        """Largest distance of a ray (x, y, 1) from the axis up to which the distortion polynomial is one to one."""
+        r = np.linspace(0.0, 10.0, 2001)
+        turns = np.flatnonzero(np.diff(self.project(r, np.zeros_like(r))[0]) <= 0.0)
+        return float(r[turns[0]]) if len(turns) else np.inf
 
     def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels of rays (x, y, 1), OpenCV axes; arrays of one shape."""
@@ -209,6 +215,7 @@ class Rectifier:
         x, y = np.meshgrid((u - cx) / fx, (v - cy) / fy)
         column, row = camera.project(x, y)
         outside = (column < 0) | (column > camera.size[0]) | (row < 0) | (row > camera.size[1])
+        outside |= np.hypot(x, y) > camera.reach()
         if outside.mean() > _MAX_OUTSIDE:
             raise PictureError(
                 f"the camera does not see {outside.mean():.0%} of the policy's picture; expected at most "

@@ -169,9 +169,10 @@ class Pilot:
             v, yaw_rate = self.policy.command(np.ascontiguousarray(self.stack).reshape(self.policy.stack_shape))
         except Exception as error:  # whatever the network's runtime raises, the robot stops
             return self._stop(str(error).splitlines()[0] if str(error) else type(error).__name__)
-        self.duration = (self._steady() - begin) * 1e-9
+        took = self._steady() - begin
+        self.duration = took * 1e-9
         self.counts["used"] += 1
-        if self.duration > self.limits.inference:
+        if took > self._nanoseconds(self.limits.inference):
             return self._stop(f"inference took {self.duration:.3f} s; expected at most {self.limits.inference:g}")
         self._command = Command(v, yaw_rate, "", stamp)
         return self.command()
@@ -181,9 +182,9 @@ class Pilot:
     def command(self) -> Command:
         """The command that holds now; a stop if the newest picture is too old. Call it regularly."""
         if self._may_drive() and self._command.drives:
-            age = (self._clock() - self._command.stamp) * 1e-9
-            if age > self.limits.timeout:
-                self._stop(f"newest picture is {age:.2f} s old; expected at most {self.limits.timeout:g}")
+            age = self._clock() - self._command.stamp
+            if age > self._nanoseconds(self.limits.timeout):
+                self._stop(f"newest picture is {age * 1e-9:.2f} s old; expected at most {self.limits.timeout:g}")
         return self._command
 
     @property
@@ -211,22 +212,27 @@ class Pilot:
         if self._newest is not None and stamp <= self._newest:
             self.counts["doubled" if stamp == self._newest else "reordered"] += 1
             return False
-        age = (self._clock() - stamp) * 1e-9
-        if age > self.limits.timeout:
+        age = self._clock() - stamp
+        seconds = abs(age) * 1e-9
+        if age > self._nanoseconds(self.limits.timeout):
             self.counts["late"] += 1
             if not self._command.drives:  # else the driving command, which is older still, expires
-                self._command = Command(cause=f"pictures are {age:.2f} s old; expected at most {self.limits.timeout:g}")
+                self._command = Command(
+                    cause=f"pictures are {seconds:.2f} s old; expected at most {self.limits.timeout:g}"
+                )
             return False
-        if age < -self.limits.ahead:
+        if -age > self._nanoseconds(self.limits.ahead):
             self.counts["refused"] += 1
-            self._stop(f"a picture's stamp is {-age:.2f} s ahead of the clock; synchronize the camera's clock")
+            self._stop(f"a picture's stamp is {seconds:.2f} s ahead of the clock; synchronize the camera's clock")
             return False
         self._newest = stamp
         return True
 
     def _push(self, newest: np.ndarray, stamp: int, step: int) -> None:
         if len(self.stack):
-            self.counts["lost"] += max(0, round((stamp - self._used) / step) - 1)
+            lost = round((stamp - self._used) / step) - 1
+            if lost > 0:
+                self.counts["lost"] += lost
             self.stack = np.concatenate([self.stack[1:], newest[None]])
         else:
             self.stack = np.repeat(newest[None], self.policy.stack, 0)
