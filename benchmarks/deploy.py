@@ -2,9 +2,9 @@
 
     python benchmarks/deploy.py [--policy RUN] [--json FILE]
 
-Pictures of 1280×720 px arrive as JPEG or BGRA from a camera with distortion; each is decoded, rectified, scaled, stacked
-and shown to the policy: nothing is left out. The time is from the picture's arrival to its command, on one core. Without
---policy, a policy of the size of `twin train`'s presets with random weights.
+Pictures of 1280×720 px arrive as JPEG or BGRA from a camera with distortion; each is decoded, rectified, scaled,
+stacked and shown to the policy. Latency is the time from a picture's arrival to its command, on one core. Without
+--policy, policies of the sizes of `twin train`'s presets with random weights.
 """
 
 import argparse

@@ -39,7 +39,6 @@ ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV)
 _COEFFICIENTS = {"": (0,), "none": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 _MAX_SIDE = 16_384  # [px] of a picture
 _MAX_OVERSAMPLING = 16
-_MAX_OUTSIDE = 0.05  # fraction of a policy's picture that the camera may not see
 _EXACT = 1e-6  # [px] up to which two intrinsics are equal
 
 
@@ -195,11 +194,12 @@ class Rectifier:
     nothing aliases. A picture that is already the pinhole camera's passes unchanged, bit for bit.
     """
 
-    def __init__(self, camera: Camera, pinhole: Camera) -> None:
+    def __init__(self, camera: Camera, pinhole: Camera, max_outside: float = 0.05) -> None:
         """
         Args:
             camera: Takes the pictures.
             pinhole: The policy's camera and size; its distortion is ignored.
+            max_outside: Fraction of the pinhole camera's picture that the camera may not see.
 
         Raises:
             PictureError: the camera does not see what the policy's does.
@@ -216,10 +216,10 @@ class Rectifier:
         column, row = camera.project(x, y)
         outside = (column < 0) | (column > camera.size[0]) | (row < 0) | (row > camera.size[1])
         outside |= np.hypot(x, y) > camera.reach()
-        if outside.mean() > _MAX_OUTSIDE:
+        if outside.mean() > max_outside:
             raise PictureError(
                 f"the camera does not see {outside.mean():.0%} of the policy's picture; expected at most "
-                f"{_MAX_OUTSIDE:.0%}: enter its intrinsics in [robot], build, train and validate with them"
+                f"{max_outside:.0%}: enter its intrinsics in [robot], build, train and validate with them"
             )
         # OpenCV counts pixels from the center of the first one.
         maps = [(one - 0.5).astype(np.float32) for one in (column, row)]
