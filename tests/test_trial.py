@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from picture_bag import CAMERA_INFO, START, TYPES, Recorded, camera_info, command, header, image, odometry, write
+from picture_bag import CAMERA_INFO, MESSAGES, START, TYPES, Recorded, camera_info, command, image, odometry, write
 from scipy.spatial.transform import Rotation
 from test_policy import some_weights
 from tiny_twin import tiny_twin
@@ -211,7 +211,9 @@ def test_satellite_fixes_are_metres_and_headings_those_of_motion(tmp_path):
         messages.append(image(np.zeros((36, 64, 3), np.uint8), stamp))
         status = TYPES["sensor_msgs/msg/NavSatStatus"](0 if k != 30 else -1, 1)
         north, east = np.degrees(way / earth), np.degrees(way / earth / np.cos(np.radians(49.0)))
-        fix = TYPES["sensor_msgs/msg/NavSatFix"](header(stamp), status, 49.0 + north, 8.0 + east, 100.0, np.zeros(9), 2)
+        fix = TYPES["sensor_msgs/msg/NavSatFix"](
+            MESSAGES.header(stamp), status, 49.0 + north, 8.0 + east, 100.0, np.zeros(9), 2
+        )
         messages.append(Recorded("/gps/fix", "sensor_msgs/msg/NavSatFix", fix, stamp))
     found = read_trial(write(tmp_path / "bag", messages))
     assert found.topics["poses"] == "/gps/fix" and len(found.poses) == 59  # one had no fix
