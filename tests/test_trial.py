@@ -231,3 +231,30 @@ def test_headers_of_another_clock_are_replaced_by_times_of_recording(place, tmp_
     found = read_trial(write(tmp_path / "bag", shifted))
     np.testing.assert_array_equal(found.shutter, found.arrival)
     assert abs(found.shutter[0] - found.pose_times[0]) < STEP
+
+
+# ---- the played robot
+
+
+def test_the_played_robots_bag_has_what_its_pilot_saw(tmp_path):
+    """It drives by the pilot on JPEG pictures; the recorded commands are the policy's for the recorded pictures."""
+    from twin.reality.robot_bag import write_robot_bag
+    from twin_policy import Limits, OnnxPolicy, Pilot
+
+    weights = some_weights(SMALL)
+    weights["mean.bias"][:] = np.arctanh(0.95)  # leaves the road soon
+    save_policy(tmp_path / "left", SMALL, Control(), weights, {})
+    row = write_robot_bag(tmp_path / "bag", tmp_path / "left", "straight", "haze", seed=3)
+    assert row.cause in ("out_of_bounds", "collision") and row.policy == "left"
+    found = read_trial(tmp_path / "bag")
+    assert found.camera.size == (640, 360) and len(found.shutter) == len(found.commands) == row.steps + 15
+    now = 0
+    pilot = Pilot(OnnxPolicy(tmp_path / "left"), Limits(), None, lambda: now, lambda: now)
+    pilot.set_camera(found.camera)
+    given = []
+    for (stamp, picture), now in zip(found.pictures(found.shutter), found.arrival.tolist(), strict=True):  # noqa: B007
+        command = pilot.picture(picture, stamp)
+        given.append((command.v, command.yaw_rate))
+    np.testing.assert_array_equal(given, found.commands)
+    with pytest.raises(InputError, match="exists; give another --out"):
+        write_robot_bag(tmp_path / "bag", None, "straight", "haze")

@@ -28,7 +28,8 @@ from twin.runtime import bar
 from twin.types import Array
 from twin_policy import Camera, CompressedPicture, Limits, OnnxPolicy, Pilot
 
-_START = 1_700_000_000_000_000_000  # [ns] time of the first message
+_START = 1_700_000_000  # [s] time of the first trial
+_APART = 1000  # [s] between the starts of two trials
 _WIDTH = 640  # [px] of the camera's stream
 _QUALITY = 92  # of JPEG
 _POSITION_NOISE, _YAW_NOISE = 0.01, 0.003  # [m], [rad]
@@ -82,7 +83,8 @@ def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, s
     model = true_world.world_spec(WEATHER[lighting], road.place).compile()
     raster = Rasterizer(model, np.array((fx, fy, cx, cy)), size, shadow_range(road.place))
     camera = RealCamera(raster, WEATHER[lighting], robot, np.array((fx, fy, cx, cy)), size, drive.rng(CAMERA))
-    rng, messages, now = np.random.default_rng([SEED, 44, seed]), BagMessages(), _START
+    rng, messages = np.random.default_rng([SEED, 44, seed]), BagMessages()
+    begin = now = (_START + _APART * (list(WEATHER).index(lighting) + len(WEATHER) * seed)) * 10**9
 
     def clock() -> int:
         return now
@@ -101,7 +103,7 @@ def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, s
             writer.write(topics[kind], now, messages.store.serialize_cdr(message, _TOPICS[kind][1]))
 
         while left:
-            now = _START + round(physics.time() * 1e9)
+            now = begin + round(physics.time() * 1e9)
             shutter = now - round(robot.params.camera_latency * 1e9)
             image = camera.capture(physics.camera_to_world, physics.time())
             jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
