@@ -29,7 +29,7 @@ from twin.capture.localize import register_film
 from twin.config import Condition
 from twin.env.suite import EnvFactory
 from twin.errors import InputError
-from twin.evaluation.trial_judge import JudgedTrial, Views, judge, replay, view
+from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
 from twin.evaluation.trials import Trial, read_counts, read_trials, tally, write_real_trials
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
@@ -271,7 +271,7 @@ def _figures(
     trial: JudgedTrial,
     replayed: Array,
     fit: FrameFit,
-    views: Views,
+    views: TrialViews,
     apart: Array,
 ) -> dict[str, Any]:
     """All numbers of a trial, for JSON."""

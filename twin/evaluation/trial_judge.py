@@ -91,7 +91,7 @@ def replay(factory: EnvFactory, start: Array, times: Array, command_times: Array
 
 
 @dataclass(frozen=True)
-class Views:
+class TrialViews:
     """The robot's pictures beside the twin's, from the same poses."""
 
     lighting: str
@@ -105,7 +105,9 @@ class Views:
     """See `twin.env.trust`, shape (n,)."""
 
 
-def view(factory: EnvFactory, poses: Array, pictures: list[Image], camera: PixelCamera, lighting: str | None) -> Views:
+def view(
+    factory: EnvFactory, poses: Array, pictures: list[Image], camera: PixelCamera, lighting: str | None
+) -> TrialViews:
     """Renders the field where pictures were taken.
 
     Args:
@@ -134,7 +136,7 @@ def view(factory: EnvFactory, poses: Array, pictures: list[Image], camera: Pixel
         lighting = max(scores, key=lambda name: float(scores[name]))
     renderings = [render(i, lighting) for i in range(len(seen))]
     twin = [np.clip(one.rgb[0], 0.0, 1.0) for one in renderings]
-    return Views(
+    return TrialViews(
         lighting,
         [(one * 255.0 + 0.5).astype(np.uint8) for one in twin],
         np.array([psnr(a, b) for a, b in zip(twin, real, strict=True)]),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from twin.assets.ground import Ground
-from twin.evaluation.trial_judge import JudgedTrial, Views
+from twin.evaluation.trial_judge import JudgedTrial, TrialViews
 from twin.mjcf.world import World, point_at
 from twin.report.episode_video import CAUSE_TEXT, draw_curves
 from twin.report.video_layout import (
@@ -37,7 +37,7 @@ def write_trial_video(
     replayed: Array,
     pictures: Sequence[Image],
     times: Array,
-    views: Views,
+    views: TrialViews,
     world: World,
     half_width: float,
     segment: tuple[float, float],
