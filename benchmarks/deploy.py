@@ -22,10 +22,9 @@ from record import add_record_options, save
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
 
-from twin_policy import Camera, CompressedPicture, Limits, OnnxPolicy, Pilot, RawPicture
-
 from twin.learn.policy import save_policy
 from twin.learn.train_config import PRESETS, TrainConfig
+from twin_policy import Camera, CompressedPicture, Limits, OnnxPolicy, Pilot, RawPicture
 
 TARGETS = {
     "pictures_per_s": ("≥", 50.0),
