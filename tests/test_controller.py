@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from twin.env.controller import CONTROL_PERIOD, Controller, limit_command, wheel_speeds, wheel_speeds_to_twist
-from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
+from twin.errors import InputError
+from twin.robot import CONTROLLERS, TRACK, WHEEL_RADIUS, HuskyParams
 
 _PARAMS = HuskyParams()
 
@@ -60,6 +61,32 @@ def test_a_command_lapses_after_a_quarter_second():
         controller.update(time)
         carried_out.append(controller.limited_command[0])
     assert carried_out == pytest.approx([0.3, 0.3, 0.3, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_presets_differ_in_rate_and_time_out_only(name):
+    """The same ramp in m/s², in finer steps; a command lapses after the preset's time-out, not before."""
+    timing, params = CONTROLLERS[name], HuskyParams(controller=name)
+    controller = Controller(params)
+    controller.command(0.0, 1.0, 0.0)
+    carried_out = []
+    for k in range(round(0.8 / timing.period)):
+        controller.update(k * timing.period)
+        carried_out.append(controller.limited_command[0])
+    lapses = int(np.ceil(timing.timeout / timing.period - 1e-9))
+    step = params.max_acceleration * timing.period
+    up = np.minimum(1.0, step * np.arange(1, lapses + 1))
+    down = np.maximum(0.0, up[-1] - step * np.arange(1, len(carried_out) - lapses + 1))
+    np.testing.assert_allclose(carried_out, [*up, *down], atol=1e-12)
+
+
+def test_the_published_presets():
+    """Clearpath's: ROS 1 10 Hz and 0.25 s, by default; ROS 2 20 or 50 Hz and 0.5 s."""
+    assert HuskyParams().timing == CONTROLLERS["ros1"]
+    found = {name: (round(1.0 / timing.period, 9), timing.timeout) for name, timing in CONTROLLERS.items()}
+    assert found == {"ros1": (10.0, 0.25), "ros2": (20.0, 0.5), "ros2_50hz": (50.0, 0.5)}
+    with pytest.raises(InputError, match="controller = 'ros3'; expected ros1 or ros2 or ros2_50hz"):
+        HuskyParams(controller="ros3")
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.04, 0.1, 0.25, 0.3])

@@ -13,18 +13,19 @@ from twin.robot import HuskyParams
 PARAMS = HuskyParams(max_acceleration=1.0, max_wheel_speed=0.8)
 
 
-@pytest.mark.parametrize("period", [0.1, 0.06, 0.24])
-def test_vector_controller_equals_single_controllers(period):
+@pytest.mark.parametrize(("period", "controller"), [(0.1, "ros1"), (0.06, "ros1"), (0.24, "ros1"), (0.1, "ros2_50hz")])
+def test_vector_controller_equals_single_controllers(period, controller):
+    params = replace(PARAMS, controller=controller)
     rng = np.random.default_rng(0)
     model = on_a_plane().model
     latencies = np.array([0.0, 0.013, 0.1, 0.237, 0.05, 0.4])
     n, steps = len(latencies), round(period / model.opt.timestep)
 
     def husky(i: int) -> HuskyPhysics:
-        return HuskyPhysics(model, replace(PARAMS, command_latency=latencies[i]))
+        return HuskyPhysics(model, replace(params, command_latency=latencies[i]))
 
     robots = [husky(i) for i in range(n)]
-    many = VectorController(PARAMS, n, period, model.opt.timestep, robots[0].check_steps)
+    many = VectorController(params, n, period, model.opt.timestep, robots[0].check_steps)
 
     def begin(which: np.ndarray) -> None:
         for i in which:
@@ -53,5 +54,5 @@ def test_vector_controller_equals_single_controllers(period):
                 assert told.times[p, i] == robot.data.time
             robot.data.ctrl[robot.actuators] = course[-1][1]
             assert done == steps and np.isinf(told.times[len(course) :, i]).all()
-    moving = [Controller(replace(PARAMS, command_latency=latency)).phase for latency in latencies]
+    moving = [Controller(replace(params, command_latency=latency)).phase for latency in latencies]
     assert len(set(np.round(moving, 6))) > 3  # or pieces would all have been alike

@@ -115,7 +115,9 @@ def test_the_verb(scene, capsys):
     common = [str(scene), "--task", "ahead", "--quiet", "--worlds", "2"]
     assert train.main([*common, "--run", "one", "--steps", "4", "--observe", "simulator"]) == 0
     assert (scene / "runs/one/success.png").exists()
-    assert load_policy(scene / "runs/one").trained["observe"] == "simulator"
+    trained = load_policy(scene / "runs/one").trained
+    assert trained["observe"] == "simulator"
+    assert trained["camera"] == list(twin.load_scene(scene).world().intrinsics)
     choice = json.loads((scene / "runs/one/choice.json").read_text())
     assert choice["steps"] == 4 and choice["chosen"]["trials"] == FRESH_EPISODES
     assert train.main([*common, "--run", "one", "--steps", "4", "--lighting", "day"]) == 2

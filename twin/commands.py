@@ -299,6 +299,44 @@ def _validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress, no table")
 
 
+def _trial(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Judge a trial on the road from the robot's ROS 2 bag by the twin's rules: a row of real.csv, a film beside "
+        "the twin's, and how far path and pictures are from the twin's."
+    )
+    parser.epilog = (
+        "The bag (a folder, .mcap or .db3; pip install 'twin[ros]') has the front camera's pictures and camera_info, "
+        "velocity commands, and poses: odometry that does not drift (RTK, LiDAR, filtered), or NavSatFix. Topics are "
+        "found by their types."
+    )
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("bag", type=Path, help="the recording of one trial")
+    parser.add_argument("--policy", required=True, help="the policy that drove: a run, a checkpoint or an ONNX file")
+    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument("--lighting", required=True, metavar="NAME", help="of the day or light, as in real.csv")
+    parser.add_argument("--twin-lighting", metavar="NAME", help="the twin's to compare with; default: the same name")
+    parser.add_argument(
+        "--cause",
+        choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),
+        help="what ended the trial, where poses do not show it",
+    )
+    parser.add_argument("--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; rows of trials go beside it")
+    parser.add_argument(
+        "--frame",
+        choices=("pictures", "scene"),
+        default="pictures",
+        help="pictures: locate them to place the poses in the scene; scene: the poses are in its frame",
+    )
+    for name, what in (
+        ("image", "pictures"),
+        ("camera-info", "calibration"),
+        ("poses", "poses"),
+        ("commands", "commands"),
+    ):
+        parser.add_argument(f"--{name}", metavar="TOPIC", help=f"topic of the {what}")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
 def _forecast(parser: argparse.ArgumentParser) -> None:
     parser.description = "Predict success on the road from success in the twin."
     parser.epilog = """\
@@ -365,6 +403,13 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command = add("onboard", "a film by that Husky's own camera, for twin align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
     place(command)
+    command = add("bag", "a ROS 2 bag of one trial of that Husky, for twin trial")
+    command.add_argument("--out", type=Path, required=True, help="folder of the bag")
+    command.add_argument("--policy", type=Path, help="policy folder; default: the robot follows the route")
+    command.add_argument("--task", default="straight", help="{straight,right_turn}; a drawn place names its own")
+    command.add_argument("--lighting", required=True, metavar="NAME", help="a weather of the test")
+    command.add_argument("--seed", type=int, default=0, help="of start, camera and noise")
+    place(command)
     command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
     command.add_argument("--lighting", required=True, metavar="NAME", help="a weather of the test")
     command.add_argument("--out", type=Path, required=True, help="photo.png")
@@ -380,6 +425,7 @@ VERBS = {
     "export": Verb("write the place for other programs: glTF mesh, Gaussian splats", _export, "twin.export"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
     "validate": Verb("measure how often policies succeed, lighting by lighting", _validate, "twin.validate"),
+    "trial": Verb("judge a trial on the road from the robot's recording", _trial, "twin.trial"),
     "forecast": Verb("predict success on the real road from success in the twin", _forecast, "twin.forecast"),
     "reality": Verb("a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__"),
 }

@@ -62,6 +62,24 @@ ZED2 = PixelCamera((530.0, 530.0, 640.0, 360.0), (1280, 720))
 
 
 @dataclass(frozen=True)
+class ControllerTiming:
+    """Timing of a wheel controller."""
+
+    period: float
+    """Time between two updates [s]."""
+    timeout: float
+    """Time without a command after which the robot stops [s]."""
+
+
+CONTROLLERS = {
+    "ros1": ControllerTiming(0.1, 0.25),
+    "ros2": ControllerTiming(0.05, 0.5),
+    "ros2_50hz": ControllerTiming(0.02, 0.5),
+}
+"""Clearpath's configurations by name: ROS 1's for the Husky; ROS 2's for the A200 (20 Hz), and for robots at 50 Hz."""
+
+
+@dataclass(frozen=True)
 class HuskyParams:
     """Parameters that differ between robots or are fitted to logs: `[robot]` in `scene.toml`, and `robot.toml`.
 
@@ -117,6 +135,9 @@ class HuskyParams:
     motor's continuous 8 A give 22 N m at the wheels of a side."""
 
     # Controller.
+    controller: str = "ros1"
+    """Timing of the wheel controller, a key of `CONTROLLERS`: ros1, ros2 or ros2_50hz. Limits are separate: Clearpath's
+    A200 on ROS 2 has 1 m/s², 1 rad/s and 1 rad/s²."""
     max_speed: Annotated[float, Range(0.01, 5)] = 1.0
     """[m/s]"""
     max_acceleration: Annotated[float, Range(0.01, 100)] = 3.0
@@ -165,6 +186,13 @@ class HuskyParams:
                     raise InputError(f"{name} = {value:g}; expected {bound.low:g} to {bound.high:g}")
         if self.wheel_shape not in ("ellipsoid", "cylinder"):
             raise InputError(f"wheel_shape = {self.wheel_shape!r}; expected ellipsoid or cylinder")
+        if self.controller not in CONTROLLERS:
+            raise InputError(f"controller = {self.controller!r}; expected {' or '.join(CONTROLLERS)}")
+
+    @property
+    def timing(self) -> ControllerTiming:
+        """Timing of the wheel controller."""
+        return CONTROLLERS[self.controller]
 
     @property
     def camera_position(self) -> tuple[float, float, float]:

@@ -1,9 +1,10 @@
 """The Husky's wheel controller: turns commands into wheel speeds, for one robot or for many at once.
 
-A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. The controller runs at 10 Hz. It takes the newest command
-that has arrived, `command_latency` after it was given; without one for 0.25 s it stops. It limits v and ω, then their
-change per period, converts them to the speeds of the two sides, and scales both down if one exceeds `max_wheel_speed`.
-This reproduces Clearpath's: ROS's diff_drive_controller with its speed limiter, then husky_hardware's limit.
+A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. The controller runs periodically and takes the newest
+command that has arrived, `command_latency` after it was given; without one for its time-out it stops (by default 10 Hz
+and 0.25 s, see `twin.robot.CONTROLLERS`). It limits v and ω, then their change per period, converts them to the speeds
+of the two sides, and scales both down if one exceeds `max_wheel_speed`. This reproduces Clearpath's: ROS's
+diff_drive_controller with its speed limiter, then husky_hardware's limit.
 """
 
 from collections import deque
@@ -12,13 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
+from twin.robot import CONTROLLERS, TRACK, WHEEL_RADIUS, HuskyParams
 from twin.types import Array
 
 Int32Array = NDArray[np.int32]
 
-CONTROL_PERIOD = 0.1  # [s]
-COMMAND_TIMEOUT = 0.25  # [s] without a command, then the robot stops
+CONTROL_PERIOD = 0.1
+"""Usual time between two commands [s]."""
+COMMAND_TIMEOUT = min(timing.timeout for timing in CONTROLLERS.values())
+"""Longest time between two commands that no controller takes for a stop [s]."""
 
 _TIME_TOLERANCE = 1e-9  # [s] below which two times are equal
 
@@ -71,9 +74,10 @@ class Controller:
 
     @property
     def phase(self) -> float:
-        """Time of the first update [s]; updates follow every 0.1 s. A command given at 0 arrives just then."""
-        phase = self.params.command_latency % CONTROL_PERIOD
-        return 0.0 if phase > CONTROL_PERIOD - _TIME_TOLERANCE else phase
+        """Time of the first update [s]; others follow periodically. A command given at 0 arrives just then."""
+        period = self.params.timing.period
+        phase = self.params.command_latency % period
+        return 0.0 if phase > period - _TIME_TOLERANCE else phase
 
     @property
     def limited_command(self) -> Array:
@@ -89,9 +93,10 @@ class Controller:
         while self._pending and self._pending[0][0] <= time + _TIME_TOLERANCE:
             self._latest = self._pending.popleft()
         wanted = np.zeros(2)
-        if self._latest is not None and time - self._latest[0] <= COMMAND_TIMEOUT - _TIME_TOLERANCE:
+        timing = self.params.timing
+        if self._latest is not None and time - self._latest[0] <= timing.timeout - _TIME_TOLERANCE:
             wanted = self._latest[1]
-        self._limited = limit_command(wanted, self._limited, self.params)
+        self._limited = limit_command(wanted, self._limited, self.params, timing.period)
         return wheel_speeds(self._limited, self.params)
 
 
@@ -130,9 +135,9 @@ class VectorController:
         """
         self._params, self.timestep, self._check_steps = params, timestep, check_steps
         self._steps, self._period = round(period / timestep), period
-        self._steps_per_update = round(CONTROL_PERIOD / timestep)
+        self._steps_per_update = round(params.timing.period / timestep)
         # A segment ends with a contact check; each update, and the end of the control step, may shorten one.
-        self.max_segments = self._steps // check_steps + round(period / CONTROL_PERIOD) + 3
+        self.max_segments = self._steps // check_steps + round(period / params.timing.period) + 3
         self._latency, self._steps_to_update = np.zeros(count), np.zeros(count, int)
         self.time = np.zeros(count)
         """Time of each robot since its episode began [s], shape (n,)."""
@@ -187,5 +192,5 @@ class VectorController:
         arrived = np.take_along_axis(arrivals, newest[None], 0)[0]
         # No command expires: each control step brings one and is no longer than COMMAND_TIMEOUT.
         wanted = np.where(np.isfinite(arrived)[:, None], self._commands[newest, which], 0.0)
-        self._limited[which] = limit_command(wanted, self._limited[which], self._params)
+        self._limited[which] = limit_command(wanted, self._limited[which], self._params, self._params.timing.period)
         return wheel_speeds(self._limited[which], self._params)

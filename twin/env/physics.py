@@ -1,6 +1,6 @@
 """Physics of the Husky, driven by commands: forward speed v [m/s] and yaw rate ω [rad/s].
 
-A *control step* is usually 0.1 s, the period of the wheel controller, and consists of many MuJoCo substeps. Contacts
+A *control step* is the time between two commands, usually 0.1 s, and consists of many MuJoCo substeps. Contacts
 are checked several times within it, so that a short graze is not missed. *Touched* geoms are in contact with the robot;
 the ground does not count. A command reaches the controller after `command_latency`. The newest image is
 `camera_latency` old: it shows robot and obstacles as they were then.
@@ -65,7 +65,7 @@ class HuskyPhysics:
         self.is_collidable = ~self.is_robot & (np.arange(model.ngeom) != self._ground)
         """Mask of all other geoms except for the ground, shape (ngeom,)."""
         self._spawn = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "spawn")
-        self._steps_per_update = round(CONTROL_PERIOD / model.opt.timestep)
+        self._steps_per_update = round(self.params.timing.period / model.opt.timestep)
         self.check_steps = max(1, round(_CHECK_PERIOD / model.opt.timestep))
         """Substeps between two contact checks."""
         self._delayed = mujoco.MjData(model) if self.params.camera_latency else self.data
@@ -115,7 +115,7 @@ class HuskyPhysics:
         )
 
     def command(self, v: float, yaw_rate: float) -> None:
-        """Commands a speed [m/s] and a yaw rate [rad/s]; the command expires after 0.25 s without a new one."""
+        """Commands a speed [m/s] and a yaw rate [rad/s]; the command expires after the controller's time-out."""
         self.controller.command(self.time, v, yaw_rate)
 
     def step(self, period: float = CONTROL_PERIOD) -> None:

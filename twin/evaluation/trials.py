@@ -20,7 +20,7 @@ from pathlib import Path
 from twin.env.options import CAUSES
 from twin.errors import InputError
 from twin.evaluation.statistics import wilson
-from twin.files import read_text
+from twin.files import read_text, wrap_read_errors, write_text
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
 """Columns of `validation/episodes.csv`; `trust` is the trial's mean image reliability (`twin.env.trust`), or empty."""
@@ -116,6 +116,28 @@ def cells_csv(cells: Iterable[Cell]) -> str:
     return csv_text(CELL_COLUMNS, rows)
 
 
+def write_real_trials(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) -> None:
+    """Writes real trials, a row each, to `table`, and their counts to `out`, as `read_results` reads them.
+
+    Cells that `out` already has keep their `twin_lighting`; new ones get the given one.
+    """
+    compared: dict[tuple[str, str, str], str] = {}
+    if out.exists():
+        with wrap_read_errors(out, "give another --out"):
+            for row in csv.DictReader(io.StringIO(read_text(out), newline="")):
+                compared[row["policy"], row["task"], row["lighting"]] = row["twin_lighting"]
+    rows = [
+        (c.policy, c.lighting, str(c.trials), str(c.successes), c.task, compared.get(c.key, twin_lighting))
+        for c in tally(trials)
+    ]
+    for path, text in (
+        (table, csv_text(EPISODE_COLUMNS, [trial.row() for trial in trials])),
+        (out, csv_text((*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS), rows)),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, text)
+
+
 def read_trials(path: Path) -> list[Trial]:
     """Reads `validation/episodes.csv`. Raises InputError: no such file, or an invalid row, with its line."""
     if not path.exists():
@@ -166,6 +188,20 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
             )
         cells[cell.key] = cell
     return list(cells.values())
+
+
+def read_counts(path: Path) -> dict[tuple[str, str, str], tuple[int, int]]:
+    """Trials and successes by policy, task (empty if not given) and lighting in `results.csv`.
+
+    Raises InputError as `read_results` does; names are not compared with the twin's.
+    """
+    return {
+        (row["policy"], row.get("task", ""), row["lighting"]): (
+            _parse_int(where, row, "trials"),
+            _parse_int(where, row, "successes"),
+        )
+        for where, row in _rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS)
+    }
 
 
 def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> tuple[str, str]:

@@ -145,8 +145,9 @@ def train(
 
         envs.meanwhile = learn
         with stop_noted() as stop:
-            scene = twin.scene.root.resolve().name
-            recorder = _RunRecorder(folder, config, settings, scene, before["wall"], resumed, watch, stop)
+            camera = twin.world().camera.resized(config.architecture.size)
+            origin = {"scene": twin.scene.root.resolve().name, "camera": list(camera.intrinsics)}
+            recorder = _RunRecorder(folder, config, settings, origin, before["wall"], resumed, watch, stop)
             left = config.steps - model.num_timesteps
             if left > 0:
                 (folder / CHOICE_FILE).unlink(missing_ok=True)  # more steps invalidate the selection
@@ -238,15 +239,16 @@ class _RunRecorder(BaseCallback):
         folder: Path,
         config: TrainConfig,
         settings: dict[str, Any],
-        scene: str,
+        origin: dict[str, Any],
         wall: float,
         resumed: int,
         watch: Watch | None,
         stop: StopNotice,
     ) -> None:
+        """`origin`: name of the scene, and intrinsics fx, fy, cx, cy [px] of the pictures."""
         super().__init__()
         self.model: PixelSAC
-        self._folder, self._config, self._settings, self._scene = folder, config, settings, scene
+        self._folder, self._config, self._settings, self._origin = folder, config, settings, origin
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
         self._watch, self._stop = watch, stop
 
@@ -318,7 +320,7 @@ class _RunRecorder(BaseCallback):
 
     def _save_policy(self, folder: Path) -> None:
         c = self._config
-        trained: dict[str, Any] = {"scene": self._scene, "run": self._folder.name}
+        trained: dict[str, Any] = {**self._origin, "run": self._folder.name}
         trained |= {name: getattr(c, name) for name in ("task", "observe", "lighting", "seed")}
         trained["step"] = self.model.num_timesteps
         save_policy(folder, c.architecture, c.control, actor_weights(self.model, c.architecture), trained)

@@ -5,11 +5,13 @@
     python -m twin.reality drive --policy FILE... --task straight|right_turn --out results.csv
     python -m twin.reality log --out drive.csv
     python -m twin.reality onboard --out robot.mp4
+    python -m twin.reality bag --lighting dawn --out dawn_1
     python -m twin.reality photo --lighting dawn --out dawn.png
 
 `film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `compare` measures a build against that
 truth. `drive` runs the real test. `log` (drive log) and `onboard` (film by the robot's camera) are inputs of
-`twin.align`; `photo` (the weather of a trial) is an input of `twin.relight`. All seeds are fixed in the code, so the
+`twin.align`; `bag` (a robot's recording of a trial) of `twin.trial`; `photo` (the weather of a trial) of
+`twin.relight`. All seeds are fixed in the code, so the
 same command writes the same files.
 """
 
@@ -138,6 +140,15 @@ def command(options: argparse.Namespace) -> None:
         recordings.write_log(options.out, recordings.record_log(options.duration, options.place))
     elif options.command == "onboard":
         recordings.write_film(options.out, options.place)
+    elif options.command == "bag":
+        from twin.reality.robot_bag import write_robot_bag
+
+        _check_lightings([options.lighting], WEATHER)
+        if options.seed < 0:
+            raise InputError(f"--seed {options.seed}: expected 0 or more")
+        given = options.out, options.policy, options.task, options.lighting, options.seed, options.place
+        trial = write_robot_bag(*given)
+        print(f"{options.out}: {trial.cause} after {trial.progress:.1f} m")
     elif options.command == "photo":
         _check_lightings([options.lighting], WEATHER)
         recordings.write_photo(options.lighting, options.out, options.place)

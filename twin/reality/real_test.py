@@ -8,8 +8,6 @@ The k-th trial in a weather has the same seed for every policy, hence the same s
 policies can be compared in pairs.
 """
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -20,16 +18,8 @@ from twin.config import HELD_OUT, Condition
 from twin.env.options import STEERING, parse_options
 from twin.env.task import CAMERA, control
 from twin.errors import InputError
-from twin.evaluation.trials import (
-    EPISODE_COLUMNS,
-    OPTIONAL_RESULT_COLUMNS,
-    RESULT_COLUMNS,
-    Trial,
-    csv_text,
-    read_trials,
-    tally,
-)
-from twin.files import digest_file, read_json, read_text, wrap_read_errors, write_json, write_text
+from twin.evaluation.trials import Trial, read_trials, write_real_trials
+from twin.files import digest_file, read_json, wrap_read_errors, write_json
 from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import true_world
 from twin.reality.filming import FilmingPlan, write_video
@@ -44,7 +34,6 @@ TASKS = ("straight", "right_turn")
 _FIRST_SEED = 7_000_000  # of the first trial
 _SEEDS_PER_LIGHTING = 10_000  # upper bound of trials per policy and lighting
 _FILM_SCALE = 4  # enlargement of images in a film
-_COLUMNS = (*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS)
 
 
 def load_policy_file(path: Path) -> Policy:
@@ -163,10 +152,10 @@ def run(
                 with bar(f"{policy.name}, {task}, {lighting}", len(missing), "trial") as progress:
                     for seed in missing:
                         done.append(_run_trial(test, lighting, seed, films))
-                        _write_tables(done, table, out, twin_lighting)
+                        write_real_trials(done, table, out, twin_lighting)
                         progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
                         progress.update()
-        _write_tables(done, table, out, twin_lighting)
+        write_real_trials(done, table, out, twin_lighting)
     return done
 
 
@@ -189,24 +178,6 @@ def _write_film(frames: Sequence[Image], path: Path) -> None:
 
 def _key(trial: Trial) -> tuple[str, str, str]:
     return trial.policy, trial.task, trial.lighting
-
-
-def _write_tables(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) -> None:
-    compared: dict[tuple[str, str, str], str] = {}  # existing rows keep their value
-    if out.exists():
-        with wrap_read_errors(out, "give another --out"):
-            for row in csv.DictReader(io.StringIO(read_text(out), newline="")):
-                compared[row["policy"], row["task"], row["lighting"]] = row["twin_lighting"]
-    rows = [
-        (c.policy, c.lighting, str(c.trials), str(c.successes), c.task, compared.get(c.key, twin_lighting))
-        for c in tally(trials)
-    ]
-    for path, text in (
-        (table, csv_text(EPISODE_COLUMNS, [trial.row() for trial in trials])),
-        (out, csv_text(_COLUMNS, rows)),
-    ):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, text)
 
 
 def _check_policy_digests(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -> None:

@@ -109,6 +109,13 @@ def camera_pose_on_ground(
     return opencv_to_mujoco(pose)  # its own inverse
 
 
+def base_below_camera(params: HuskyParams, camera_to_world: Array, ground_at: Callable[[Array], Array]) -> Array:
+    """x, y [m], yaw [rad] (3,) of a robot at rest with its camera at a pose (4, 4), OpenCV axes."""
+    heading = float(base_heading(camera_to_world, np.deg2rad(params.camera_yaw)))
+    base, _ = _base_pose(camera_to_world[:2, 3], heading, ground_at, np.array(params.camera_position))
+    return np.array([*base[:2], heading])
+
+
 def base_heading(camera_to_world: Array, yaw: float) -> Array:
     """Headings [rad] (...) of bases from poses (..., 4, 4) of cameras that are turned left by `yaw` [rad]."""
     return np.arctan2(camera_to_world[..., 1, 2], camera_to_world[..., 0, 2]) - yaw

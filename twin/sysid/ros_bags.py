@@ -6,6 +6,8 @@ PoseWithCovarianceStamped for poses, preferably without a word of `_FROM_WHEELS`
 for accelerations. The table has a row per joint state, with the newest values of the other topics.
 """
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from twin.errors import InputError
 from twin.robot import WHEELS
 from twin.types import Array
 
-_TYPES = {
+TYPES = {
     "commands": ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"),
     "wheels": ("sensor_msgs/msg/JointState",),
     "poses": (
@@ -25,13 +27,15 @@ _TYPES = {
     ),
     "imu": ("sensor_msgs/msg/Imu",),
 }
+"""Message types of each kind of topic."""
 _FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 
 
-def read_bag(path: Path) -> dict[str, Array]:
-    """The columns that `twin.sysid.logs` describes.
+@contextmanager
+def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Any]:
+    """A reader of rosbags.
 
-    Raises InputError: rosbags is not installed, the bag is unreadable, or a kind of message is missing.
+    Raises InputError, also for what goes wrong in the block: rosbags is not installed, or the bag is unreadable.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -40,28 +44,39 @@ def read_bag(path: Path) -> dict[str, Array]:
         raise InputError(f"{path}: reading a ROS 2 bag needs rosbags; pip install 'twin[ros]'") from None
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            chosen = _choose(reader.connections, path)
-            rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
-            kinds = {connection.id: kind for kind, connection in chosen.items()}
-            begin = reader.start_time  # [ns], subtracted as an integer: as a float it would be rounded to 0.2 µs
-            for connection, stamp, raw in reader.messages(connections=list(chosen.values())):
-                kind = kinds[connection.id]
-                values = _VALUES[kind](reader.deserialize(raw, connection.msgtype))
-                if values is not None:
-                    rows[kind].append(((stamp - begin) * 1e-9, *values))
+            yield reader
     except InputError:
         raise
     except Exception as error:  # of the reader: not a bag, a damaged one, unknown messages
-        raise InputError(f"{path}: not a readable ROS 2 bag: {error}; record it anew or give a .csv") from None
+        raise InputError(f"{path}: not a readable ROS 2 bag: {error}; {cure}") from None
+
+
+def read_bag(path: Path) -> dict[str, Array]:
+    """The columns that `twin.sysid.logs` describes.
+
+    Raises InputError: rosbags is not installed, the bag is unreadable, or a kind of message is missing.
+    """
+    with open_bag(path, "record it anew or give a .csv") as reader:
+        chosen = choose_topics(reader.connections, path)
+        rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
+        kinds = {connection.id: kind for kind, connection in chosen.items()}
+        begin = reader.start_time  # [ns], subtracted as an integer: as a float it would be rounded to 0.2 µs
+        for connection, stamp, raw in reader.messages(connections=list(chosen.values())):
+            kind = kinds[connection.id]
+            values = VALUES[kind](reader.deserialize(raw, connection.msgtype))
+            if values is not None:
+                rows[kind].append(((stamp - begin) * 1e-9, *values))
     empty = [kind for kind, values in rows.items() if not values]
     if empty:
         raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected some; record those topics")
     return _columns({kind: np.array(values) for kind, values in rows.items()})
 
 
-def _choose(connections: Any, path: Path) -> dict[str, Any]:
+def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
+    """The connection of each kind, a key of `TYPES`. Raises InputError: a kind other than imu has none."""
     chosen = {}
-    for kind, types in _TYPES.items():
+    for kind in kinds:
+        types = TYPES[kind]
         found = [c for c in connections if c.msgtype in types and c.msgcount]
         if kind == "commands":  # prefer the controller's input to the multiplexer's
             found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
@@ -99,7 +114,8 @@ def _imu(message: Any) -> tuple[float, ...]:
     return message.linear_acceleration.x, message.linear_acceleration.y
 
 
-_VALUES = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
+VALUES = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
+"""Functions from a message of each kind to its numbers: v, ω; wheel speeds; x, y, yaw; accelerations."""
 _NAMES = {
     "commands": ("cmd_v", "cmd_yaw_rate"),
     "wheels": ("left_wheel_vel", "right_wheel_vel"),

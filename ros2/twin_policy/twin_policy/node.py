@@ -1,0 +1,147 @@
+"""ROS 2 node: pictures and camera_info in, velocity commands and diagnostics out, with a deadman switch.
+
+A driving command is published once, when its picture has been seen. Stops are published at `watchdog_rate` for as long
+as the deadman switch is held, and for one second after it was released, so that another source may then drive.
+"""
+
+import signal
+import time
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy
+from std_msgs.msg import Bool
+
+from twin_policy.onnx_policy import OnnxPolicy
+from twin_policy.pictures import Camera, CompressedPicture, PictureError, RawPicture
+from twin_policy.pilot import DEADMAN, Command, Limits, Pilot
+
+_SILENT_AFTER = 1_000_000_000  # [ns] of stops after the deadman switch was released
+
+
+class PolicyNode(Node):
+    """Drives by a policy; parameters are explained in config/twin_policy.yaml."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("twin_policy", **options)
+
+        def parameter(name: str, default: Any) -> Any:
+            return self.declare_parameter(name, default).value
+
+        policy = OnnxPolicy(parameter("policy", ""))
+        limits = Limits(
+            **{
+                name: float(parameter(name, getattr(Limits, name)))
+                for name in ("timeout", "inference", "ahead", "clock_jump", "early", "rest")
+            },
+            deadman=float(parameter("deadman", 0.5)),
+        )
+        pinhole = [float(x) for x in parameter("policy_camera", [0.0]) if x]
+        if len(pinhole) not in (0, 4):
+            raise ValueError(f"policy_camera = {pinhole}; expected fx, fy, cx, cy at {policy.size} px, or nothing")
+        camera = Camera(policy.size, tuple(pinhole)) if pinhole else None
+        self._steady = self._now if self.get_parameter("use_sim_time").value else time.monotonic_ns
+        self.pilot = Pilot(policy, limits, camera, self._now, self._steady)
+        self._rectified, self._frame = parameter("rectified", False), parameter("frame_id", "base_link")
+        self._button, self._said, self._released = int(parameter("deadman_button", -1)), "", self._steady()
+        self._stamped = parameter("stamped", True)
+        self._commands = self.create_publisher(TwistStamped if self._stamped else Twist, "cmd_vel", 1)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        if parameter("compressed", False):
+            self.create_subscription(CompressedImage, "image/compressed", self._on_compressed, newest)
+        else:
+            self.create_subscription(Image, "image", self._on_image, newest)
+        self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, newest)
+        if self._button < 0:
+            self.create_subscription(Bool, "deadman", lambda message: self.pilot.press(message.data), 1)
+        else:
+            self.create_subscription(Joy, "joy", self._on_joy, 1)
+        self.create_timer(1.0 / float(parameter("watchdog_rate", 20.0)), self._watch)
+        self.create_timer(1.0, self._diagnose)
+
+    def _now(self) -> int:
+        return self.get_clock().now().nanoseconds
+
+    # ---- inputs
+
+    def _on_image(self, message: Any) -> None:
+        raw = RawPicture(message.encoding, message.width, message.height, message.step, message.data)
+        self._on_picture(raw, message.header)
+
+    def _on_compressed(self, message: Any) -> None:
+        self._on_picture(CompressedPicture(message.data), message.header)
+
+    def _on_picture(self, picture: Any, header: Any) -> None:
+        stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        command = self.pilot.picture(picture, stamp)
+        if command.drives and command.stamp == stamp:
+            self._publish(command)
+
+    def _on_camera_info(self, message: Any) -> None:
+        try:
+            self.pilot.set_camera(Camera.from_info(message, self._rectified))
+        except PictureError as error:
+            self.get_logger().error(f"camera_info: {error}", throttle_duration_sec=5.0)
+
+    def _on_joy(self, message: Any) -> None:
+        self.pilot.press(self._button < len(message.buttons) and bool(message.buttons[self._button]))
+
+    # ---- outputs
+
+    def _watch(self) -> None:
+        command = self.pilot.command()
+        if command.cause != self._said:
+            self.get_logger().warning(f"stop: {command.cause}") if command.cause else self.get_logger().info("drives")
+            self._said = command.cause
+        if command.cause != DEADMAN:
+            self._released = self._steady()
+        if not command.drives and self._steady() - self._released <= _SILENT_AFTER:
+            self._publish(command)
+
+    def _publish(self, command: Command) -> None:
+        message = TwistStamped() if self._stamped else Twist()
+        twist = message.twist if self._stamped else message
+        twist.linear.x, twist.angular.z = command.v, command.yaw_rate
+        if self._stamped:
+            message.header.stamp, message.header.frame_id = self.get_clock().now().to_msg(), self._frame
+        self._commands.publish(message)
+
+    def _diagnose(self) -> None:
+        pilot, command = self.pilot, self.pilot.command()
+        level = DiagnosticStatus.OK if command.drives or command.cause == DEADMAN else DiagnosticStatus.ERROR
+        facts = {"policy": pilot.policy.name, "milliseconds": f"{1e3 * pilot.duration:.1f}", **pilot.counts}
+        values = [KeyValue(key=key, value=str(value)) for key, value in facts.items()]
+        status = DiagnosticStatus(level=level, name="twin_policy", message=command.cause or "drives", values=values)
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def stop(self) -> None:
+        """Publishes a stop, for the end of the process."""
+        self._publish(Command(cause="shutdown"))
+
+
+def main() -> None:
+    """Runs the node until SIGINT or SIGTERM; then the robot stops."""
+    # With rclpy's own handlers, nothing could be published after a signal.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        node = PolicyNode()
+    except ValueError as error:
+        rclpy.logging.get_logger("twin_policy").fatal(str(error))
+        raise SystemExit(2) from None
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.stop()
+        node.destroy_node()
+        rclpy.shutdown()

@@ -1,0 +1,239 @@
+"""The ROS 2 node: its callbacks on the real rclpy where that is installed, else on stand-ins; its package.
+
+Without ROS, nothing here runs the middleware: topics, executors and launch files are read, not run.
+"""
+
+import ast
+import importlib
+import importlib.util
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import ros_stand_ins
+from ruamel.yaml import YAML
+from test_pilot import LENS, SMALL, picture, small_policy
+
+ROOT = Path(__file__).parents[1] / "ros2" / "twin_policy"
+HAS_ROS = importlib.util.find_spec("rclpy") is not None
+MS = 1_000_000
+
+
+class Rig:
+    """A node with parameters, and messages to it; its clocks stand still between messages where ROS is absent."""
+
+    def __init__(self, monkeypatch, folder: Path, **parameters: Any) -> None:
+        small_policy(folder)
+        parameters = {"policy": str(folder), **parameters}
+        self.steady = 10**9
+        if not HAS_ROS:
+            ros_stand_ins.install(monkeypatch)
+        sys.modules.pop("twin_policy.node", None)
+        self.module = importlib.import_module("twin_policy.node")
+        if HAS_ROS:
+            import rclpy
+            from rclpy.parameter import Parameter
+
+            rclpy.init()
+            overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+            self.node = self.module.PolicyNode(parameter_overrides=overrides)
+            self.published: list[tuple[str, Any]] = []
+            for topic, publisher in (("cmd_vel", self.node._commands), ("/diagnostics", self.node._diagnostics)):
+                monkeypatch.setattr(
+                    publisher, "publish", lambda sent, topic=topic: self.published.append((topic, sent))
+                )
+        else:
+            monkeypatch.setattr(ros_stand_ins.Node, "overrides", parameters)
+            monkeypatch.setattr("time.monotonic_ns", lambda: self.steady)
+            self.node = self.module.PolicyNode()
+            self.published = self.node.published
+        self.wait(0)
+
+    def wait(self, milliseconds: int) -> None:
+        if HAS_ROS:
+            import time
+
+            time.sleep(milliseconds / 1000)
+        else:
+            self.steady += milliseconds * MS
+            self.node.time = 1_700_000_000 * 10**9 + self.steady
+
+    def stamped(self, message: Any) -> Any:
+        now = self.node.get_clock().now().to_msg()
+        message.header.stamp.sec, message.header.stamp.nanosec = now.sec, now.nanosec
+        return message
+
+    def show(self, k: int = 0) -> None:
+        image = self.stamped(self.module.Image())
+        image.encoding, image.height, image.width, image.step = "rgb8", 18, 32, 96
+        image.data = picture(k).tobytes()
+        self.node._on_image(image)
+
+    def calibrate(self) -> None:
+        info = self.stamped(self.module.CameraInfo())
+        info.width, info.height, info.distortion_model, info.d = *SMALL.size, "plumb_bob", [0.0] * 5
+        fx, fy, cx, cy = LENS.intrinsics
+        info.k = [fx, 0.0, cx - 0.5, 0.0, fy, cy - 0.5, 0.0, 0.0, 1.0]
+        self.node._on_camera_info(info)
+
+    def commands(self) -> list[tuple[float, float]]:
+        """v and yaw rate of the messages published so far, which are forgotten."""
+        sent = [getattr(one, "twist", one) for topic, one in self.published if topic == "cmd_vel"]
+        self.published.clear()
+        return [(one.linear.x, one.angular.z) for one in sent]
+
+
+@pytest.fixture
+def rig(monkeypatch, tmp_path):
+    rigs: list[Rig] = []
+
+    def make(**parameters: Any) -> Rig:
+        rigs.append(Rig(monkeypatch, tmp_path, **parameters))
+        return rigs[-1]
+
+    yield make
+    sys.modules.pop("twin_policy.node", None)
+    if HAS_ROS:
+        import rclpy
+
+        for one in rigs:
+            one.node.destroy_node()
+        rclpy.shutdown()
+
+
+def test_it_drives_while_the_switch_is_held(rig):
+    r = rig()
+    r.calibrate()
+    r.show()
+    assert r.commands() == []  # nothing but stops without the switch
+    r.node.pilot.press()
+    for k in range(3):
+        r.wait(100)
+        r.show(k)
+        r.node._watch()
+    stack = np.concatenate([picture(k).transpose(2, 0, 1) for k in (0, 0, 1, 2)])
+    sent = r.published[-1][1]
+    assert type(sent).__name__ == "TwistStamped" and sent.header.frame_id == "base_link"
+    commands = r.commands()
+    assert len(commands) == 3 and commands[-1] == r.node.pilot.policy.command(stack)
+
+
+def test_it_stops_when_pictures_cease_and_is_silent_when_the_switch_is_released(rig):
+    r = rig(deadman_button=1)
+    r.calibrate()
+    joy = r.module.Joy()
+    joy.buttons = [0, 1]
+    r.node._on_joy(joy)
+    r.show()
+    r.commands()
+    r.wait(350)
+    r.node._watch()
+    assert r.commands() == [(0.0, 0.0)] and "old" in r.node.pilot.command().cause
+    joy.buttons = [0]
+    r.node._on_joy(joy)
+    r.node._watch()
+    assert r.commands() == [(0.0, 0.0)]
+    r.wait(1100)
+    r.node._watch()
+    assert r.commands() == []  # another source may drive
+    r.node.stop()
+    assert r.commands() == [(0.0, 0.0)]
+
+
+def test_plain_twists_and_diagnostics(rig):
+    r = rig(stamped=False, deadman=0.0, policy_camera=[20.0, 20.0, 16.0, 9.0])
+    r.node._diagnose()
+    topic, array = r.published[-1]
+    assert topic == "/diagnostics" and array.status[0].level == r.module.DiagnosticStatus.ERROR
+    assert array.status[0].message == "waiting for a picture"
+    r.calibrate()
+    r.show()
+    assert type(r.published[-1][1]).__name__ == "Twist"
+    r.node._diagnose()
+    status = r.published[-1][1].status[0]
+    assert status.level == r.module.DiagnosticStatus.OK and status.message == "drives"
+    assert {one.key: one.value for one in status.values}["used"] == "1"
+
+
+def test_compressed_pictures_and_bad_calibrations(rig):
+    from picture_bag import image
+
+    r = rig(compressed=True, deadman=0.0)
+    if not HAS_ROS:
+        assert "image/compressed" in r.node.subscriptions and "image" not in r.node.subscriptions
+    r.node._on_camera_info(r.module.CameraInfo())  # an uncalibrated camera's, all zeros
+    assert r.node.pilot.command().cause
+    r.calibrate()
+    message = r.stamped(r.module.CompressedImage())
+    message.data = image(picture(0), 0, encoding="png").message.data.tobytes()
+    r.node._on_compressed(message)
+    assert len(r.commands()) == 1
+
+
+def test_bad_parameters_are_one_error(rig):
+    with pytest.raises(ValueError, match="policy_camera"):
+        rig(policy_camera=[1.0, 2.0])
+    with pytest.raises(ValueError, match="timeout = "):
+        rig(timeout=0.0)
+
+
+# ---- what the package says
+
+
+def test_the_yaml_names_every_parameter_of_the_node_with_its_default():
+    """Each is declared, with the same type; no other is there."""
+    text = (ROOT / "config" / "twin_policy.yaml").read_text()
+    given = YAML(typ="safe").load(text)["/**"]["ros__parameters"]
+    tree = ast.parse((ROOT / "twin_policy" / "node.py").read_text())
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
+    literal = {
+        c.args[0].value: c.args[1] for c in calls if c.func.id == "parameter" and isinstance(c.args[0], ast.Constant)
+    }
+    from twin_policy import Limits
+
+    limits = {name: getattr(Limits, name) for name in ("timeout", "inference", "ahead", "clock_jump", "early", "rest")}
+    expected = {name: ast.literal_eval(value) for name, value in literal.items()} | limits
+    assert given == expected
+    assert {name: type(value) for name, value in given.items()} == {
+        name: type(value) for name, value in expected.items()
+    }
+
+
+def test_the_package_is_one_for_colcon():
+    package = ElementTree.parse(ROOT / "package.xml").getroot()
+    assert package.findtext("export/build_type") == "ament_python"
+    depends = {one.text for one in package.findall("exec_depend")}
+    tree = ast.parse((ROOT / "twin_policy" / "node.py").read_text())
+    froms = {node.module.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {name for name in froms if name == "rclpy" or name.endswith("_msgs")} <= depends
+    assert (ROOT / "resource" / package.findtext("name")).exists()
+
+
+def test_the_core_needs_three_packages_and_python_3_10():
+    """Syntax of 3.10; no import but of the standard library, numpy, cv2, onnxruntime, and rclpy's in the node."""
+    for path in (ROOT / "twin_policy").glob("*.py"):
+        tree = ast.parse(path.read_text(), feature_version=(3, 10))
+        names = {alias.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
+        names |= {n.module.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
+        foreign = names - set(sys.stdlib_module_names) - {"numpy", "cv2", "onnxruntime", "twin_policy"}
+        if path.name == "node.py":
+            foreign -= {"rclpy", *ros_stand_ins.MESSAGES}
+        assert not foreign, (path.name, foreign)
+
+
+@pytest.mark.slow
+def test_a_wheel_has_all_that_a_robot_needs(tmp_path):
+    shutil.copytree(ROOT, tmp_path / "source")  # building leaves folders behind
+    command = [sys.executable, "-m", "pip", "wheel", "--no-build-isolation", "--no-deps", "-q", "-w", tmp_path]
+    subprocess.run([*command, tmp_path / "source"], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    for wanted in ("twin_policy/node.py", "launch/twin_policy.launch.py", "config/twin_policy.yaml", "package.xml"):
+        assert any(name.endswith(wanted) for name in names), names
+    assert not any(name.startswith("twin/") for name in names)

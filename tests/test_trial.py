@@ -1,0 +1,261 @@
+"""Trials on the road: a bag of an episode is judged as the episode was, replays to its path, and joins real.csv."""
+
+import json
+import re
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from picture_bag import CAMERA_INFO, MESSAGES, START, TYPES, Recorded, camera_info, command, image, odometry, write
+from scipy.spatial.transform import Rotation
+from test_policy import some_weights
+from tiny_twin import tiny_twin
+
+import twin
+from twin import trial
+from twin.commands import parser_of
+from twin.env.options import CAUSES
+from twin.errors import InputError
+from twin.evaluation.trials import Cell, read_results, read_trials
+from twin.learn.policy import Control, load_policy, save_policy
+from twin.learn.policy_network import Architecture
+from twin.report.video_writer import video_info
+from twin.sysid.trial_recording import fit_frame, read_trial
+
+STEP = 100_000_000  # [ns]
+SMALL = Architecture((64, 36), 2, 1, ((4, 8, 8),), 8, (8,), 1)
+
+
+def drive(scene: Path, name: str, turn: float) -> list[Recorded]:
+    """Saves a policy that turns by about `turn` [rad/s] and drives an episode; returns what a robot records."""
+    weights = some_weights(SMALL)
+    weights["mean.weight"] *= 0.05
+    weights["mean.bias"][:] = np.arctanh(turn)
+    world = twin.load_scene(scene).world()
+    camera = world.camera.resized(SMALL.size)
+    save_policy(scene / "runs" / name, SMALL, Control(), weights, {"camera": list(camera.intrinsics)})
+    policy = load_policy(scene / "runs" / name)
+    options = policy.options() | {"start_offset": 0.1, "start_heading": 2.0}
+    environment = twin.load(scene, "ahead", seed=1, lighting="day", **options)
+    step, k = environment.reset(), 0
+    messages = [camera_info(camera.intrinsics, SMALL.size, START - STEP)]
+    while True:
+        stamp = START + k * STEP
+        messages.append(odometry(environment.physics.base_to_world, stamp))
+        if step.last():
+            break
+        pixels = step.observation["pixels"]
+        messages.append(image(pixels[-1], stamp))
+        stack = pixels.transpose(0, 3, 1, 2).reshape(policy.stack * 3, *SMALL.size[::-1])
+        v, yaw_rate = policy.command(policy(stack))
+        messages.append(command(v, yaw_rate, stamp))
+        step, k = environment.step([yaw_rate]), k + 1
+    messages.append(_outcome(environment.task.cause, environment.task.progress, k))
+    return messages
+
+
+def _outcome(cause: str, progress: float, steps: int) -> Recorded:
+    """What a robot does not record: the episode's truth, beside the bag."""
+    return Recorded("", "", (cause, progress, steps), 0)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> tuple[Path, dict[str, list[Recorded]]]:
+    scene = tiny_twin(tmp_path_factory.mktemp("trials") / "tiny")
+    return scene, {name: drive(scene, name, turn) for name, turn in (("ahead", 0.0), ("left", 0.9))}
+
+
+def bag_of(messages: list[Recorded], folder: Path) -> Path:
+    return write(folder, [one for one in messages if one.topic])
+
+
+@pytest.mark.parametrize("name", ["ahead", "left"])
+def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name, capsys):
+    scene, drives = place
+    cause, progress, steps = drives[name][-1].message
+    assert cause == {"ahead": "goal", "left": "out_of_bounds"}[name]
+    out, bag = tmp_path / "real.csv", bag_of(drives[name], tmp_path / "monday")
+    given = ["--policy", name, "--task", "ahead", "--lighting", "day", "--frame", "scene", "--out", str(out)]
+    assert trial.main([str(scene), str(bag), *given]) == 0
+    printed = capsys.readouterr().out
+    assert f"{name}, ahead, day: {cause} after {progress:.1f} m and {steps * 0.1:.1f} s" in printed
+    (row,) = read_trials(tmp_path / "real_trials.csv")
+    assert (row.cause, row.steps, row.policy) == (cause, steps, name)
+    assert row.progress == pytest.approx(progress, abs=1e-3)
+    (cell,) = read_results(out, [Cell(name, "ahead", "day", 20, 10)])
+    assert (cell.trials, cell.successes) == (1, int(cause == "goal"))
+    figures = json.loads((scene / "trials" / "monday" / "trial.json").read_text())
+    assert figures["policy"] == {"commands": steps, "same": 1.0, "v_rms": 0.0, "yaw_rate_rms": 0.0}
+    # The replay settles on the ground anew, and pictures are rendered from a robot at rest.
+    assert figures["replay"]["end_m"] < 0.02 and abs(figures["replay"]["end_deg"]) < 1.0
+    assert figures["pictures"]["psnr_median"] > 33.0 and figures["pictures"]["lighting"] == "day"
+    film = video_info(scene / "trials" / "monday" / "trial.mp4")
+    assert film["fps"] == 10.0 and film["frames"] >= steps
+
+
+def test_trials_add_up_and_a_bag_counts_once(place, tmp_path):
+    scene, drives = place
+    out = tmp_path / "real.csv"
+    later = [replace(one, stamp=one.stamp + 10**12) for one in deepcopy(drives["left"]) if one.topic]
+    for one in later:
+        one.message.header.stamp.sec += 1000
+    bags = [bag_of(drives["ahead"], tmp_path / "a"), write(tmp_path / "b", later)]
+    for bag in (bags[0], bags[1], bags[0]):
+        trial.record_trial(scene, bag, "ahead", "ahead", "dusk", out, "day+randomised", frame="scene")
+    (cell,) = read_results(out, [Cell("ahead", "ahead", "day+randomised", 20, 10)])
+    assert (cell.trials, cell.successes, cell.lighting) == (2, 1, "dusk")
+
+
+def test_a_table_written_by_hand_is_not_lost(place, tmp_path):
+    scene, drives = place
+    out = tmp_path / "real.csv"
+    out.write_text("policy,lighting,trials,successes\nahead,day,10,8\n")
+    with pytest.raises(
+        InputError, match=r"10 trials of ahead under day, of which real_trials\.csv has 0; give another"
+    ):
+        trial.record_trial(
+            scene, bag_of(drives["ahead"], tmp_path / "bag"), "ahead", "ahead", "day", out, frame="scene"
+        )
+    assert out.read_text().endswith("10,8\n")
+
+
+def test_the_operator_says_what_poses_do_not_show(place, tmp_path):
+    scene, drives = place
+    cut = [one for one in drives["ahead"] if one.topic and one.stamp < START + 20 * STEP]
+    bag, out = write(tmp_path / "cut", cut), tmp_path / "real.csv"
+    common = (scene, bag, "ahead", "ahead", "day", out)
+    with pytest.raises(InputError, match=r"ends after 1\.9 s and \d\.\d m without an outcome; .*--cause collision"):
+        trial.record_trial(*common, frame="scene")
+    row, _, _ = trial.record_trial(*common, cause="collision", frame="scene")
+    assert row.cause == "collision" and not row.success and row.steps == 19
+    with pytest.raises(InputError, match="expected a cause of failure"):
+        trial.record_trial(*common, cause="goal", frame="scene")
+    (action,) = [a for a in parser_of("trial")._actions if a.dest == "cause"]
+    assert {"goal", *action.choices} == set(CAUSES)
+
+
+def _without(topic: str):
+    return lambda messages: [one for one in messages if topic not in one.topic]
+
+
+def _standing(messages: list[Recorded]) -> list[Recorded]:
+    return [command(0.0, 0.0, one.stamp) if one.topic == "/cmd_vel" else one for one in messages]
+
+
+BAD = {
+    "no pictures": (_without("/camera/image"), r"no topic with pictures among /camera/camera_info, /cmd_vel, /odom"),
+    "no camera": (_without("camera_info"), r"no topic of sensor_msgs/msg/CameraInfo among"),
+    "no poses": (_without("/odom"), r"no topic with poses"),
+    "no commands": (_without("/cmd_vel"), r"no topic with commands"),
+    "standing": (_standing, r"no command on /cmd_vel moves the robot; record the whole trial"),
+    "uncalibrated": (
+        lambda m: [camera_info((0.0, 0.0, 0.5, 0.5), (64, 36), START) if o.topic == CAMERA_INFO else o for o in m],
+        r"is the camera calibrated",
+    ),
+    "short": (lambda m: [o for o in m if o.topic != "/odom" or o.stamp <= START], r"1 usable poses; expected many"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_bags_get_one_line(place, tmp_path, kind, capsys):
+    scene, drives = place
+    change, message = BAD[kind]
+    bag = write(tmp_path / "bag", change([one for one in drives["ahead"] if one.topic]))
+    given = ["--policy", "ahead", "--task", "ahead", "--lighting", "day", "--frame", "scene", "--quiet"]
+    assert trial.main([str(scene), str(bag), *given, "--out", str(tmp_path / "real.csv")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert re.search(message, said), said
+    assert not (tmp_path / "real.csv").exists()
+
+
+def test_no_bag_and_rubbish_get_one_line(place, tmp_path):
+    with pytest.raises(InputError, match="no such bag"):
+        read_trial(tmp_path / "none")
+    (tmp_path / "bad.mcap").write_bytes(b"rubbish" * 100)
+    with pytest.raises(InputError, match="not a readable ROS 2 bag"):
+        read_trial(tmp_path / "bad.mcap")
+
+
+# ---- frames and clocks
+
+
+def test_the_frame_of_the_poses_is_found_though_some_pictures_are_misplaced():
+    rng = np.random.default_rng(0)
+    poses = np.column_stack([np.linspace(0, 12, 24), np.sin(np.linspace(0, 3, 24)), np.linspace(0, 0.5, 24)])
+    yaw, shift = 2.3, np.array([40.0, -7.0])
+    located = np.column_stack(
+        [poses[:, :2] @ Rotation.from_euler("z", yaw).as_matrix()[:2, :2].T + shift, poses[:, 2] + yaw]
+    )
+    located[:, :2] += rng.normal(0, 0.02, (24, 2))
+    located[[3, 11, 17], :2] += [[2.0, -1.0], [0.0, 5.0], [-9.0, 0.0]]
+    fit = fit_frame(poses, located, "bag")
+    assert fit.located == 21 and fit.residual < 0.04 and fit.yaw == pytest.approx(yaw, abs=0.005)
+    assert fit.scale == pytest.approx(1.0, abs=0.005)
+    good = np.delete(np.arange(24), [3, 11, 17])
+    np.testing.assert_allclose(fit(poses)[good], located[good], atol=0.07)
+    bent = poses + np.column_stack([np.zeros(24), np.linspace(-1, 1, 24) ** 2 * 3, np.zeros(24)])
+    with pytest.raises(InputError, match=r"differ by \d\.\d+ m .*wheel odometry drifts"):
+        fit_frame(bent, located, "bag")
+    with pytest.raises(InputError, match="4 pictures were located in the scene"):
+        fit_frame(poses[:4], located[:4], "bag")
+
+
+def test_satellite_fixes_are_metres_and_headings_those_of_motion(tmp_path):
+    messages = [camera_info((50.0, 50.0, 32.0, 18.0), (64, 36), START), command(1.0, 0.0, START)]
+    earth = 6_378_137.0
+    for k in range(60):  # 6 m to the north-east
+        stamp, way = START + k * STEP, 0.1 * k / np.sqrt(2)
+        messages.append(image(np.zeros((36, 64, 3), np.uint8), stamp))
+        status = TYPES["sensor_msgs/msg/NavSatStatus"](0 if k != 30 else -1, 1)
+        north, east = np.degrees(way / earth), np.degrees(way / earth / np.cos(np.radians(49.0)))
+        fix = TYPES["sensor_msgs/msg/NavSatFix"](
+            MESSAGES.header(stamp), status, 49.0 + north, 8.0 + east, 100.0, np.zeros(9), 2
+        )
+        messages.append(Recorded("/gps/fix", "sensor_msgs/msg/NavSatFix", fix, stamp))
+    found = read_trial(write(tmp_path / "bag", messages))
+    assert found.topics["poses"] == "/gps/fix" and len(found.poses) == 59  # one had no fix
+    assert np.linalg.norm(found.poses[-1, :2] - found.poses[0, :2]) == pytest.approx(5.9, abs=0.05)
+    np.testing.assert_allclose(found.poses[:, 2], np.pi / 4, atol=0.02)
+
+
+def test_headers_of_another_clock_are_replaced_by_times_of_recording(place, tmp_path):
+    _, drives = place
+    messages = [one for one in drives["ahead"] if one.topic]
+    shifted = [
+        image(np.zeros((36, 64, 3), np.uint8), one.stamp - 10**15, one.stamp) if "image" in one.topic else one
+        for one in messages
+    ]
+    found = read_trial(write(tmp_path / "bag", shifted))
+    np.testing.assert_array_equal(found.shutter, found.arrival)
+    assert abs(found.shutter[0] - found.pose_times[0]) < STEP
+
+
+# ---- the played robot
+
+
+@pytest.mark.slow
+def test_the_played_robots_bag_has_what_its_pilot_saw(tmp_path):
+    """It drives by the pilot on JPEG pictures; the recorded commands are the policy's for the recorded pictures."""
+    from twin.reality.robot_bag import write_robot_bag
+    from twin_policy import Limits, OnnxPolicy, Pilot
+
+    weights = some_weights(SMALL)
+    weights["mean.bias"][:] = np.arctanh(0.95)  # leaves the road soon
+    save_policy(tmp_path / "left", SMALL, Control(), weights, {})
+    row = write_robot_bag(tmp_path / "bag", tmp_path / "left", "straight", "haze", seed=3)
+    assert row.cause in ("out_of_bounds", "collision") and row.policy == "left"
+    found = read_trial(tmp_path / "bag")
+    assert found.camera.size == (640, 360) and len(found.shutter) == len(found.commands) == row.steps + 15
+    now = 0
+    pilot = Pilot(OnnxPolicy(tmp_path / "left"), Limits(), None, lambda: now, lambda: now)
+    pilot.set_camera(found.camera)
+    given = []
+    for (stamp, picture), now in zip(found.pictures(found.shutter), found.arrival.tolist(), strict=True):  # noqa: B007
+        command = pilot.picture(picture, stamp)
+        given.append((command.v, command.yaw_rate))
+    np.testing.assert_array_equal(given, found.commands)
+    with pytest.raises(InputError, match="exists; give another --out"):
+        write_robot_bag(tmp_path / "bag", None, "straight", "haze")

@@ -1,0 +1,151 @@
+"""Judges a trial on the road by the twin's own rules, and measures how far the twin is from it.
+
+The recorded poses, sampled once per control step, go through the environment's `RewardAndTermination`. *Replay*: the
+recorded commands drive the twin's robot from the same start. *Views*: the field rendered from the poses at which the
+robot's pictures were taken. What poses cannot show, such as a collision, the operator says.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.env.suite import EnvFactory
+from twin.env.task import Motion, RewardAndTermination
+from twin.geometry.cameras import Viewpoints
+from twin.geometry.images import psnr
+from twin.mjcf.world import heading_at, heading_error
+from twin.nerf.rendering import Rendering
+from twin.robot import PixelCamera
+from twin.types import Array, Image
+
+_PROBES = 8  # pictures by which a lighting is chosen
+
+
+@dataclass(frozen=True)
+class JudgedTrial:
+    """k instants of a trial, one per control step from its start to its end."""
+
+    times: Array
+    """[s] since the start, shape (k,)."""
+    poses: Array
+    """x, y [m], yaw [rad] of the base in the scene, shape (k, 3)."""
+    cross_track: Array
+    """Distance from the route, left positive [m], shape (k,)."""
+    progress: Array
+    """Distance along the task's route segment [m], shape (k,)."""
+    cause: str
+    """One of `twin.env.options.CAUSES`; empty if the recording ends before an outcome."""
+    start_heading: float
+    """Yaw against the route at the start [rad]."""
+
+
+def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -> JudgedTrial:
+    """Applies the environment's termination to recorded poses.
+
+    Args:
+        factory: Scene, task and options.
+        times: [s] since the start, one control step apart, the first 0; shape (n,).
+        poses: x, y [m], yaw [rad] of the base in the scene, shape (n, 3).
+        uprightness: Cosine of the tilt, shape (n,).
+    """
+    rules = RewardAndTermination(factory.world, factory.segment, factory.options)
+    rules.begin([0], np.array([factory.segment.start]), poses[:1, :2])
+    cross, foot, cause = [float(rules.cross_track[0])], [float(rules.foot[0])], ""
+    for i in range(1, len(times)):
+        still = np.zeros(1), np.zeros(1), uprightness[i : i + 1], np.zeros(1, bool)
+        rules.evaluate([0], Motion(poses[i : i + 1], *still, times[i : i + 1]))
+        cross.append(float(rules.cross_track[0]))
+        foot.append(float(rules.foot[0]))
+        cause = rules.cause(0)
+        if cause:
+            break
+    k = len(cross)
+    heading = float(heading_error(poses[0, 2], float(heading_at(factory.world.route[:, :2], foot[0]))))
+    progress = np.array(foot) - factory.segment.start
+    return JudgedTrial(times[:k], poses[:k], np.array(cross), progress, cause, heading)
+
+
+def replay(factory: EnvFactory, start: Array, times: Array, command_times: Array, commands: Array) -> Array:
+    """Drives the twin's robot by recorded commands; returns its poses (k, 3) at `times` (k,) [s], the first 0.
+
+    Args:
+        factory: Scene and robot.
+        start: x, y [m], yaw [rad] at rest, shape (3,).
+        times: Increasing.
+        command_times: When each command was given [s], increasing, shape (c,).
+        commands: v [m/s], ω [rad/s], shape (c, 2).
+    """
+    robot = factory.make_env(0)[0].robot
+    robot.set_pose(*start.tolist())
+    out, timestep, given = [robot.planar_pose], robot.model.opt.timestep, 0
+    for until in times[1:]:
+        while given < len(commands) and command_times[given] < until - timestep / 2:
+            ahead = command_times[given] - robot.time
+            if ahead >= timestep:
+                robot.step(ahead // timestep * timestep)
+            robot.command(*commands[given].tolist())
+            given += 1
+        robot.step(until - robot.time)
+        out.append(robot.planar_pose)
+    return np.array(out)
+
+
+@dataclass(frozen=True)
+class TrialViews:
+    """The robot's pictures beside the twin's, from the same poses."""
+
+    lighting: str
+    twin: list[Image]
+    """RGB uint8 (h, w, 3), as many as pictures."""
+    psnr: Array
+    """[dB], shape (n,)."""
+    matched_psnr: Array
+    """The same with each color's mean and spread matched, which leaves shape and shadows [dB], shape (n,)."""
+    trust: Array
+    """See `twin.env.trust`, shape (n,)."""
+
+
+def view(
+    factory: EnvFactory, poses: Array, pictures: list[Image], camera: PixelCamera, lighting: str | None
+) -> TrialViews:
+    """Renders the field where pictures were taken.
+
+    Args:
+        factory: Scene, with its field.
+        poses: x, y [m], yaw [rad] of the base, shape (n, 3).
+        pictures: RGB uint8 (h, w, 3) of `camera`.
+        camera: A pinhole camera at the pictures' size.
+        lighting: By name; None: the filmed or added one with the best median PSNR.
+    """
+    field, trust = factory.field, factory.trust
+    assert field is not None and trust is not None  # the options have pixels
+    robot = factory.make_env(0)[0].robot
+    seen = []
+    for pose in poses:
+        robot.set_pose(*pose.tolist())
+        seen.append(robot.camera_to_world)
+    real = [one / np.float32(255.0) for one in pictures]
+    intrinsics = np.array(camera.intrinsics)
+
+    def render(i: int, name: str) -> Rendering:
+        return field.render(Viewpoints.of(seen[i], intrinsics, camera.size), name)
+
+    if lighting is None:
+        some = np.unique(np.linspace(0, len(seen) - 1, _PROBES).round().astype(int)).tolist()
+        scores = {name: np.median([psnr(render(i, name).rgb[0], real[i]) for i in some]) for name in field.lightings}
+        lighting = max(scores, key=lambda name: float(scores[name]))
+    renderings = [render(i, lighting) for i in range(len(seen))]
+    twin = [np.clip(one.rgb[0], 0.0, 1.0) for one in renderings]
+    return TrialViews(
+        lighting,
+        [(one * 255.0 + 0.5).astype(np.uint8) for one in twin],
+        np.array([psnr(a, b) for a, b in zip(twin, real, strict=True)]),
+        np.array([psnr(_matched(a, b), b) for a, b in zip(twin, real, strict=True)]),
+        np.array([trust.of(pose[None], one)[0] for pose, one in zip(seen, renderings, strict=True)]),
+    )
+
+
+def _matched(picture: Array, reference: Array) -> Array:
+    """A picture with the mean and standard deviation of each of the reference's colors."""
+    mean, std = picture.mean((0, 1)), picture.std((0, 1))
+    return np.clip((picture - mean) / np.maximum(std, 1e-3) * reference.std((0, 1)) + reference.mean((0, 1)), 0.0, 1.0)
