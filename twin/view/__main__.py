@@ -1,0 +1,153 @@
+"""Verb: shows a built scene in the browser, and drives the Husky in it; or renders a camera path to a film.
+
+    python -m twin.view scenes/demo
+    python -m twin.view scenes/demo --policy first --task straight
+    python -m twin.view scenes/demo --path scenes/demo/paths/path.json --out film.mp4
+
+The page needs no GPU and no network. It is served to this machine alone unless `--host` names another address; then its
+address has a token.
+"""
+
+import argparse
+import sys
+import threading
+import warnings
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from twin import commands, runtime
+from twin.errors import InputError
+from twin.loading import Twin, load_scene
+
+if TYPE_CHECKING:
+    from twin.env.episode_lighting import EpisodeLighting
+    from twin.nerf.baked import BakedField
+    from twin.view.page import Page
+
+_MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120
+
+
+def command(given: argparse.Namespace) -> None:
+    """Runs the verb with the options parsed by `twin.commands`."""
+    twin = load_scene(given.scene)
+    if (given.path is None) != (given.out is None):
+        raise InputError("--path and --out belong together: --path path.json --out film.mp4")
+    if given.path is not None:
+        film_path(twin, given.path, given.out, given.size, given.fps, given.quiet)
+    else:
+        serve(twin, given)
+
+
+def film_path(twin: Twin, path: Path, out: Path, size: str, fps: int, quiet: bool = False) -> None:
+    """Renders a camera path to an mp4.
+
+    Raises:
+        InputError: the scene is not built, or a bad path, size, number of frames per second or output.
+    """
+    width, height = parse_size(size)
+    if not 1 <= fps <= _MAX_FPS:
+        raise InputError(f"--fps {fps}: expected 1 to {_MAX_FPS}")
+    if out.suffix.lower() != ".mp4" or not out.parent.is_dir():
+        raise InputError(f"--out {out}: expected an .mp4 in a folder that exists")
+    from twin.view.camera_path import CameraPath, path_frames, write_path_film
+    from twin.view.scene_picture import ScenePicture
+
+    field = twin.field()
+    track = CameraPath.load(path, field)
+    with runtime.bar("film", len(path_frames(track, fps)), "frame") as progress:
+        frames = write_path_film(
+            out, track, ScenePicture(field), (width, height), fps, lambda done, total: progress.update()
+        )
+    if not quiet:
+        print(f"{out}: {frames} frames, {track.duration:.1f} s")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height [px] of `1280x720`. Raises InputError for another form, odd sides, or sides out of range."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and len(part) < 6 for part in parts):
+        raise InputError(f"--size {text!r}: expected WIDTHxHEIGHT, such as 1280x720")
+    width, height = map(int, parts)
+    if not all(_MIN_SIDE <= side <= _MAX_SIDE and side % 2 == 0 for side in (width, height)):
+        raise InputError(f"--size {text!r}: expected even sides from {_MIN_SIDE} to {_MAX_SIDE} px")
+    return width, height
+
+
+def serve(twin: Twin, given: argparse.Namespace) -> None:
+    """Serves the page until it is stopped by a signal."""
+    if not 0 <= given.port <= 65535:
+        raise InputError(f"--port {given.port}: expected 0 to 65535")
+    page = open_page(twin, given.host, given.port, given.lighting)
+    try:
+        if not given.quiet:
+            print(f"open {page.guarded.url} (Ctrl+C stops)", flush=True)
+        load_driving(page, given.task, given.policy, given.seed, given.trust)
+        threading.Event().wait()
+    finally:
+        page.close()
+
+
+def open_page(twin: Twin, host: str = "127.0.0.1", port: int = 8080, lighting: str | None = None) -> "Page":
+    """Opens the page of a built scene, without the robot.
+
+    Raises:
+        InputError: viser is missing, the scene has no field, or an unknown lighting or unusable address.
+    """
+    try:
+        import viser  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise InputError(f"{error}: the page needs viser; pip install 'twin[view]'") from None
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a page that was just closed
+    from twin.view.camera_path import named_lighting
+    from twin.view.guarded_server import open_server
+    from twin.view.page import Page
+
+    field = twin.field()
+    shown: EpisodeLighting = named_lighting(field, lighting or field.lightings[0])
+    server = open_server(host, port, "twin view")
+    try:
+        return Page(twin, field, server, shown)
+    except BaseException:
+        server.stop()
+        raise
+
+
+def load_driving(page: "Page", task: str | None, policy: str | None, seed: int, trust: bool) -> None:
+    """Adds the robot to an open page; a scene that cannot be driven says so there.
+
+    Raises:
+        InputError: an unknown policy or task was asked for.
+    """
+    asked = task is not None or policy is not None
+    try:
+        driving = _driving(page, task, policy, seed, trust)
+    except InputError as error:
+        if asked:
+            raise
+        page.no_driving(str(error))
+        return
+    page.add_driving(driving)
+
+
+def _driving(page: "Page", task: str | None, policy: str | None, seed: int, trust: bool) -> Any:
+    from twin.view.driving import Driving
+
+    twin: Twin = page.twin
+    field: BakedField = page.field
+    if seed < 0:
+        raise InputError(f"--seed {seed}: expected 0 or more")
+    loaded = None
+    if policy:
+        from twin.learn.policy import find_policy, load_policy
+
+        loaded = load_policy(find_policy(twin.scene.root, policy), trust)
+    driving = Driving(twin, field, task or "route", loaded, page.lighting, page.guarded.keys.held, page.drove, seed)
+    page.picture.add_objects(driving.world, driving.obstacles.pool)
+    return driving
+
+
+main = partial(commands.main, "view")
+
+if __name__ == "__main__":
+    sys.exit(main())
