@@ -3,6 +3,7 @@
 Pages are drawn without a GPU (SwiftShader). A page's errors, in its console or thrown, are collected in `errors`.
 """
 
+import atexit
 import base64
 import itertools
 import json
@@ -55,6 +56,7 @@ class Chromium:
         self._process = subprocess.Popen(
             [program, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
         )
+        atexit.register(self.close)
         try:
             self._page = self._connect()
             for domain in ("Page", "Runtime", "Log", "DOM"):
@@ -148,15 +150,35 @@ class Chromium:
             f"""(() => {{
               for (const e of document.querySelectorAll({json.dumps(kind)})) {{
                 let row = e;
-                for (let k = 0; k < 5 && row !== null && row.textContent.trim() === ""; k++) row = row.parentElement;
+                for (let k = 0; k < 9 && row !== null && row.textContent.trim() === ""; k++) row = row.parentElement;
+                if (row === null || row.textContent.trim() !== {json.dumps(text)} || e.offsetParent === null) continue;
+                e.scrollIntoView({{block: "nearest"}});
                 const box = e.getBoundingClientRect();
-                if (row !== null && row.textContent.trim() === {json.dumps(text)} && box.width > 0)
-                  return [box.x + box.width / 2, box.y + box.height / 2];
+                return [box.x + box.width / 2, box.y + box.height / 2];
               }}
               return null;
             }})()"""
         )
         self.click(*found)
+
+    def slide(self, label: str, share: float) -> None:
+        """Clicks a slider of viser's panel, found by the beginning of its row's text, at a share of its length."""
+        left, width, y = self.wait(
+            f"""(() => {{
+              for (const e of document.querySelectorAll("[role=slider]")) {{
+                let row = e;
+                while (row !== null && !row.textContent.trim().startsWith({json.dumps(label)})) row = row.parentElement;
+                const track = e.parentElement;
+                if (row === null || e.offsetParent === null) continue;
+                if (row.querySelectorAll("[role=slider]").length > 1) continue;
+                track.scrollIntoView({{block: "nearest"}});
+                const box = track.getBoundingClientRect();
+                return [box.x, box.width, box.y + box.height / 2];
+              }}
+              return null;
+            }})()"""
+        )
+        self.click(left + share * width, y)
 
     def key(self, letter: str, down: bool) -> None:
         """Presses or releases a letter's key."""
@@ -170,6 +192,7 @@ class Chromium:
         )
 
     def close(self) -> None:
+        atexit.unregister(self.close)
         if hasattr(self, "_page"):
             self._page.close()
         try:

@@ -3,8 +3,8 @@
     {"format": 1, "views": [{"time": 0.0, "camera_to_world": [[...], ...], "fov": 60.0, "lighting": "sun"}, ...]}
 
 `time` [s] increases, `camera_to_world` is 4×4 with OpenCV axes in the scene's frame, `fov` [°] is the vertical angle of
-view, and `lighting` is a name or mixture as for `twin film`, or an embedding as a list of numbers; without it, it is the
-first filmed one. Positions follow a cubic spline, rotations a spline of their own; angle of view, lighting and fog are
+view, and `lighting` is a name or mixture as for `twin film`, or an embedding as a list of numbers, by default the first
+filmed one. Positions follow a cubic spline, rotations a spline of their own; angle of view, lighting and fog are
 interpolated linearly.
 """
 

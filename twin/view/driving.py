@@ -208,14 +208,16 @@ class Driving:
             "speed": self.world.robot.max_speed,
             "yaw_rate": self.world.robot.max_yaw_rate,
         }
-        self._drivers: dict[str, tuple[Driver, DriveEnvironment]] = {}
         loose = EnvFactory.open(shared, "route", {**common, **free})
-        self._add(KEYS_DRIVER, KeyDriver(held), self._environment(loose, FreeDrive))
         bound = EnvFactory.open(shared, task, {**common, **(policy.options() if policy else {})})
-        tasked = self._environment(bound, DriveTask)
-        self._add(SCRIPTED_DRIVER, RouteDriver(), tasked)
+        by_keys, by_others = ("keys", loose, FreeDrive), ("task", bound, DriveTask)
+        self._drivers: dict[str, tuple[Driver, tuple[str, EnvFactory, type[DriveTask]]]] = {
+            KEYS_DRIVER: (KeyDriver(held), by_keys),
+            SCRIPTED_DRIVER: (RouteDriver(), by_others),
+        }
         if policy:
-            self._add(f"policy {policy.name}", PolicyDriver(policy), tasked)
+            self._drivers[f"policy {policy.name}"] = PolicyDriver(policy), by_others
+        self._environments: dict[str, DriveEnvironment] = {}
         self._name = KEYS_DRIVER
         self._lock = threading.RLock()
         self._running, self._closed = threading.Event(), threading.Event()
@@ -224,9 +226,6 @@ class Driving:
         self.reset()
         self._thread = threading.Thread(target=self._run, daemon=True, name="driving")
         self._thread.start()
-
-    def _add(self, name: str, driver: Driver, environment: DriveEnvironment) -> None:
-        self._drivers[name] = driver, environment
 
     def _environment(self, factory: EnvFactory, kind: type[DriveTask]) -> DriveEnvironment:
         factory = replace(factory, obstacles=self.obstacles)
@@ -250,12 +249,11 @@ class Driving:
 
     @property
     def environment(self) -> DriveEnvironment:
-        return self._drivers[self._name][1]
-
-    @property
-    def camera_fov(self) -> float:
-        """Vertical angle of view of the robot's camera [rad]."""
-        return float(2.0 * np.arctan(self.world.camera.size[1] / 2.0 / self.world.camera.intrinsics[1]))
+        """The environment of the present driver; made when first driven."""
+        name, factory, kind = self._drivers[self._name][1]
+        if name not in self._environments:
+            self._environments[name] = self._environment(factory, kind)
+        return self._environments[name]
 
     def choose(self, driver: str) -> None:
         """Another driver takes over, from the start of its task."""
@@ -329,7 +327,7 @@ class Driving:
             self._rate += 0.2 * (period / max(time.monotonic() - began, 1e-3) - self._rate)
 
     def _advance(self) -> None:
-        driver, environment = self._drivers[self._name]
+        driver, environment = self._drivers[self._name][0], self.environment
         assert self._step is not None
         action = np.asarray(driver(environment, self._step), float)
         try:

@@ -43,6 +43,7 @@ KEYS = "wasd"
 _KEYS_PATH = "/keys"
 _HELD_TIME = 0.35  # [s] for which a report of held keys is valid; the page repeats it every 0.1 s
 _MAX_REPORT = 200  # characters
+_STOP_TIME = 3.0  # [s]
 _PORTS = 50  # that are tried from the given one on
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
@@ -109,8 +110,11 @@ class Gate:
 class GuardedServer:
     """A running viser server behind a gate."""
 
-    def __init__(self, server: viser.ViserServer, keys: HeldKeys, url: str, port: int) -> None:
-        self.viser, self.keys, self.url, self.port = server, keys, url, port
+    def __init__(
+        self, server: viser.ViserServer, keys: HeldKeys, url: str, port: int, threads: list[threading.Thread]
+    ) -> None:
+        """`threads` are those that the server started."""
+        self.viser, self.keys, self.url, self.port, self._threads = server, keys, url, port, threads
         self._pages: set[ServerConnection] = set()
         self._driving = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -125,6 +129,8 @@ class GuardedServer:
     def stop(self) -> None:
         with _silent():
             self.viser.stop()
+            for thread in self._threads:  # one prints when it ends
+                thread.join(_STOP_TIME)
 
     async def _tell_pages(self) -> None:
         for page in tuple(self._pages):
@@ -178,6 +184,7 @@ def open_server(host: str, port: int, label: str) -> GuardedServer:
 
         return guarded_handler, guarded_check
 
+    before = set(threading.enumerate())
     with _silent(), _wrapped_serve(wrap):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     if not checked:
@@ -189,7 +196,8 @@ def open_server(host: str, port: int, label: str) -> GuardedServer:
     name = f"[{host}]" if ":" in host else host
     shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, name)
     url = f"http://{shown}:{server.get_port()}/" + (f"?token={token}" if token else "")
-    opened.append(GuardedServer(server, keys, url, server.get_port()))
+    started = [thread for thread in threading.enumerate() if thread not in before]
+    opened.append(GuardedServer(server, keys, url, server.get_port(), started))
     return opened[0]
 
 
@@ -246,22 +254,16 @@ def _is_loopback(host: str) -> bool:
 
 def _index_page() -> Callable[[Request], Response]:
     """viser's page with our script in it."""
-    import gzip
-
     page = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
     script = resources.files("twin.view").joinpath("page.js").read_text(encoding="utf-8")
     head = page.index("</head>")
     content = (page[:head] + f"<script>{script}</script>" + page[head:]).encode()
-    packed = gzip.compress(content, 6)
 
     def answer(request: Request) -> Response:
-        zipped = "gzip" in (_header(request, "Accept-Encoding") or "")
-        body = packed if zipped else content
-        headers = Headers({"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body))})
-        headers["Content-Encoding"] = "gzip" if zipped else "identity"
+        headers = Headers({"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(content))})
         headers["Cache-Control"] = "no-store"
         headers["Referrer-Policy"] = "no-referrer"
-        return Response(http.HTTPStatus.OK, "OK", headers, body)
+        return Response(http.HTTPStatus.OK, "OK", headers, content)
 
     return answer
 

@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import viser
-from viser import uplot
 
 from twin.config import OBSTACLE_KINDS
 from twin.env.mujoco_renderer import ChaseCamera
@@ -29,10 +28,11 @@ from twin.geometry.images import read_image
 from twin.loading import Twin
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import added_lightings
-from twin.report.episode_video import CAUSE_TEXT
+from twin.report.episode_video import CAUSE_TEXT, draw_curves
+from twin.report.video_layout import ACCENT, AMBER
 from twin.runtime import child_environment
 from twin.scene import check_name
-from twin.types import Array
+from twin.types import Array, Image
 from twin.view.camera_path import (
     CameraPath,
     EpisodeLighting,
@@ -44,7 +44,7 @@ from twin.view.camera_path import (
 )
 from twin.view.driving import KEYS_DRIVER, DriveFacts, Driving
 from twin.view.guarded_server import GuardedServer
-from twin.view.layers import scene_layers, wxyz_of
+from twin.view.layers import FILMED_CAMERAS, clicked_frame, scene_layers, wxyz_of
 from twin.view.picture_loop import FilmedFrame, PictureLoop, Shot
 from twin.view.scene_picture import ScenePicture
 
@@ -56,6 +56,7 @@ _PATH_SPEED, _MIN_STEP = 1.5, 1.0  # [m/s] along a path, [s] between two key vie
 _MOVED, _TURNED = 0.03, 0.02  # [m], of the look direction: more leaves the comparison with the film
 _ECHO_TIME = 1.0  # [s] in which the page answers with the camera that it was given
 _HISTORY = 100  # control steps in the plot of torques
+_PLOT_SIZE = 320, 150  # [px]
 _FACTS_PERIOD = 0.24  # [s] between two updates of the panel's facts
 _MAX_PHOTO = 60 << 20  # [bytes]
 _PATH_COLOR = (255, 64, 129)
@@ -91,7 +92,7 @@ class Page:
         self.loop = PictureLoop(self.picture, self._shot)
         self._build_panel()
         self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self.loop.remove)
+        self.server.on_client_disconnect(self._disconnected)
 
     # ---- cameras of the pages
 
@@ -107,6 +108,9 @@ class Page:
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._moved(client))
         self.loop.add(client)
+
+    async def _disconnected(self, client: viser.ClientHandle) -> None:
+        self.loop.remove(client)
 
     def _moved(self, client: viser.ClientHandle) -> None:
         if self._film_index is not None and time.monotonic() - self._film_placed > _ECHO_TIME:
@@ -145,13 +149,12 @@ class Page:
     def _build_panel(self) -> None:
         gui = self.server.gui
         gui.configure_theme(
-            control_layout="collapsible",
-            control_width="medium",
             dark_mode=True,
             show_logo=False,
             show_share_button=False,
             brand_color=(255, 193, 7),
         )
+        gui.main_panel.dock_right()
         self._status = gui.add_markdown("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Look", viser.Icon.SUN):
@@ -220,12 +223,14 @@ class Page:
             self._show_robot = gui.add_checkbox("robot and obstacles", True)
             self._on_update(self._show_robot, self.loop.touch)
             self._layer_boxes = []
-            for layer in scene_layers(self.server, self.twin, self.field, self._frame_clicked):
+            for layer in scene_layers(self.server.scene, self.twin, self.field):
                 box = gui.add_checkbox(layer.name, False, hint=layer.hint)
                 self._layer_boxes.append(box)
 
                 def changed(box: Any = box, layer: Any = layer) -> None:
                     layer.show(box.value)
+                    if layer.name == FILMED_CAMERAS:
+                        self._listen_to_clicks(box.value)
                     self.loop.touch()
 
                 self._on_update(box, changed)
@@ -359,7 +364,16 @@ class Page:
         for client in self._clients():
             self._place(client, pose, fov, level=False)
 
-    def _frame_clicked(self, client: viser.ClientHandle, index: int) -> None:
+    def _listen_to_clicks(self, listen: bool) -> None:
+        """Clicks on filmed cameras are heard while they are shown."""
+        self.server.scene.remove_click_callback()
+        if listen:
+            self.server.scene.on_click()(self._clicked)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        index = clicked_frame(self.cameras, np.array(event.ray_origin), np.array(event.ray_direction))
+        if index is None:
+            return
         with self._told():
             source = self.cameras.sources[index]
             if self._source.value != source:
@@ -500,18 +514,7 @@ class Page:
             self._behind = gui.add_checkbox("follow the robot", True)
             self._drive_facts = gui.add_markdown("")
             self._robot_image = gui.add_image(np.zeros((180, 320, 3), np.uint8), label="the robot's picture")
-            self._plot = gui.add_uplot(
-                (np.zeros(2), np.zeros(2), np.zeros(2)),
-                series=(
-                    uplot.Series(label="time [s]"),
-                    uplot.Series(label="left [N m]", stroke="#ffb74d", width=2),
-                    uplot.Series(label="right [N m]", stroke="#64b5f6", width=2),
-                ),
-                scales={"x": uplot.Scale(time=False)},
-                axes=(uplot.Axis(stroke="#bbb"), uplot.Axis(stroke="#bbb", size=60)),
-                title="motor torque at the wheels",
-                height=180,
-            )
+            self._plot = gui.add_image(_plot([]), label="torque at the wheels [N m], last 10 s", format="png")
         with self._obstacle_folder:
             self._kind = gui.add_dropdown("kind", OBSTACLE_KINDS)
             add = gui.add_button("Add in front of the camera", icon=viser.Icon.PLUS)
@@ -576,8 +579,7 @@ class Page:
             self._facts_shown = now
             self._robot_image.image = facts.image.repeat(2, 0).repeat(2, 1)  # the panel does not enlarge it
             self._drive_facts.content = drive_table(facts)
-            if len(self._torques) > 1:
-                self._plot.data = tuple(np.array(column) for column in zip(*self._torques, strict=True))
+            self._plot.image = _plot(self._torques)
         if facts.cause:
             good = facts.cause == "goal"
             text = CAUSE_TEXT[facts.cause]
@@ -677,6 +679,16 @@ def slider_lighting(field: BakedField, value: float) -> EpisodeLighting:
     if share <= 0.0 or len(names) == 1:
         return named_lighting(field, names[k])
     return named_lighting(field, names[k + 1] if share >= 1.0 else f"{names[k]}:{names[k + 1]}:{share:g}")
+
+
+def _plot(torques: Iterable[tuple[float, float, float]]) -> Image:
+    """Curves of the torques (time [s], left, right [N m]) of the last control steps."""
+    width, height = _PLOT_SIZE
+    canvas = np.zeros((height, width, 3), np.uint8)
+    times, left, right = np.array(list(torques) or [(0.0, 0.0, 0.0)]).T
+    rows = [("left", left, AMBER), ("right", right, ACCENT)]
+    draw_curves(canvas, (0, 0, width, height), rows, times, len(times) - 1, 13)
+    return canvas
 
 
 def drive_table(facts: DriveFacts) -> str:

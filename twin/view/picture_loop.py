@@ -23,7 +23,7 @@ COARSE_AREA, FINE_AREA = 320 * 180, 1280 * 720
 _REST = 0.12  # [s] without a change, then the fine picture is rendered
 _MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs the cores, too
 _COARSE_QUALITY, _FINE_QUALITY = 80, 92
-_DEPTH_MARGIN, _DEPTH_SHARE = 0.15, 0.02  # [m], of depth: layers up to this far behind the field's surface are shown
+_DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # [m], of depth: layers up to this far behind the field's surface are shown
 _MAX_DEPTH = 160.0  # [m] that viser can transmit; beyond, layers cover the picture
 
 
@@ -195,6 +195,6 @@ def add_film(image: Image, film: FilmedFrame, camera: FreeCamera) -> None:
     image[:, max(0, edge - 1) : edge + 1] = 255
     text = max(9, height // 34)
     if edge - left > 6 * text:
-        draw_label(image, "film", (left, top, edge - left, bottom - top), size=text, bold=True)
+        draw_label(image, "film", (left, top, edge - left, bottom - top), "bottom left", size=text, bold=True)
     if right - edge > 6 * text:
-        draw_label(image, "twin", (edge, top, right - edge, bottom - top), "top right", size=text, bold=True)
+        draw_label(image, "twin", (edge, top, right - edge, bottom - top), "bottom right", size=text, bold=True)
