@@ -122,7 +122,7 @@ class Chromium:
         assert "exceptionDetails" not in out, out["exceptionDetails"]
         return out["result"].get("value")
 
-    def wait(self, condition: str | Callable[[], Any], seconds: float = 20.0) -> Any:
+    def wait(self, condition: str | Callable[[], Any], seconds: float = 120.0) -> Any:
         """Waits until a JavaScript expression or a function is true, and returns its value."""
         end = time.monotonic() + seconds
         while True:
