@@ -173,9 +173,14 @@ def random_clicks(browser: Chromium, served: Served, seconds: float, seed: int =
         time.sleep(0.1)
         if not early and now > seconds / 5:
             early = served.bytes
-    browser.evaluate("1")
-    return {"minutes": seconds / 60.0, "actions": actions, "errors": len(browser.errors), "messages": browser.errors[:5],
-            "early_bytes": early, "growth_bytes": served.bytes - early}  # fmt: skip
+    return {
+        "minutes": seconds / 60.0,
+        "actions": actions,
+        "errors": len(browser.errors),
+        "messages": browser.errors[:5],
+        "early_bytes": early,
+        "growth_bytes": served.bytes - early,
+    }
 
 
 def measure(scene: Path, minutes: float) -> dict[str, Any]:
@@ -194,7 +199,9 @@ def measure(scene: Path, minutes: float) -> dict[str, Any]:
                 "first_picture_after_open_s": first - served.served_after,
             }
             browser.click_on("[role=tab]", "Drive")
-            browser.wait("[...document.querySelectorAll('button')].some((e) => e.textContent === 'Start driving')")
+            browser.wait(
+                "[...document.querySelectorAll('button')].some((e) => e.textContent.trim() === 'Start driving')"
+            )
             out["robot_ready_s"] = time.monotonic() - served.began
             time.sleep(3.0)
             mine = [os.getpid()]
@@ -250,9 +257,7 @@ def main(arguments: list[str] | None = None) -> int:
         if value is not None:
             met = value <= target if sense == "≤" else value >= target
             print(f"{name}: {value:,.2f} ({sense} {target:,.2f}: {'yes' if met else 'no'})")
-    if given.json:
-        save(given.json, figures, given.replace_record)
-    return 0
+    return save(given.json, figures, given.replace_record)
 
 
 if __name__ == "__main__":

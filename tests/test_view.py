@@ -1,6 +1,7 @@
 """`twin view`: who is let in, camera paths, the film beside the twin, driving, and the page in a real browser."""
 
 import json
+import shlex
 import threading
 import time
 import urllib.error
@@ -26,6 +27,7 @@ from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
 from twin.loading import Twin
 from twin.nerf.fog import Fog
+from twin.report import build_report as report_page
 from twin.report.video_layout import to_uint8
 from twin.report.video_writer import read_frames, video_info
 from twin.scene import write_stamp
@@ -337,6 +339,13 @@ def test_a_click_finds_the_filmed_camera(scene):
         aside = np.array([-1.0, 3.0, 2.0])
         assert clicked_frame(cameras, aside, cameras.positions[i] - aside) == i
     assert clicked_frame(cameras, origin, np.array([-1.0, 0.0, 0.0])) is None
+
+
+def test_the_report_says_how_to_look_at_the_scene(scene):
+    commands = [line for _, lines in report_page._next_steps(scene.scene, {}) for line in lines]
+    assert f"python -m twin.view {scene.scene.root}" in commands
+    viewer = next(line for line in commands if "mujoco.viewer" in line)
+    assert Path(shlex.split(viewer)[-1].removeprefix("--mjcf=")).is_file()
 
 
 # ---- driving

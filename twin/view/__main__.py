@@ -12,6 +12,7 @@ import argparse
 import sys
 import threading
 import warnings
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +20,14 @@ from typing import TYPE_CHECKING, Any
 from twin import commands, runtime
 from twin.errors import InputError
 from twin.loading import Twin, load_scene
+from twin.scene import require_stage
 
 if TYPE_CHECKING:
     from twin.env.episode_lighting import EpisodeLighting
     from twin.nerf.baked import BakedField
     from twin.view.page import Page
 
+_HEAD_START = 6.0  # [s] given to the first picture, before the robot is loaded
 _MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120
 
 
@@ -78,18 +81,30 @@ def serve(twin: Twin, given: argparse.Namespace) -> None:
     """Serves the page until it is stopped by a signal."""
     if not 0 <= given.port <= 65535:
         raise InputError(f"--port {given.port}: expected 0 to 65535")
-    page = open_page(twin, given.host, given.port, given.lighting)
-    try:
+
+    def announce(url: str) -> None:
         if not given.quiet:
-            print(f"open {page.guarded.url} (Ctrl+C stops)", flush=True)
+            print(f"open {url} (Ctrl+C stops)", flush=True)
+
+    page = open_page(twin, given.host, given.port, given.lighting, announce)
+    try:
+        page.loop.has_shown.wait(_HEAD_START)  # the first picture needs both cores
         load_driving(page, given.task, given.policy, given.seed, given.trust)
         threading.Event().wait()
     finally:
         page.close()
 
 
-def open_page(twin: Twin, host: str = "127.0.0.1", port: int = 8080, lighting: str | None = None) -> "Page":
+def open_page(
+    twin: Twin,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    lighting: str | None = None,
+    announce: Callable[[str], None] = lambda url: None,
+) -> "Page":
     """Opens the page of a built scene, without the robot.
+
+    `announce` is called with its address as soon as it can be opened, before the field is loaded.
 
     Raises:
         InputError: viser is missing, the scene has no field, or an unknown lighting or unusable address.
@@ -99,14 +114,19 @@ def open_page(twin: Twin, host: str = "127.0.0.1", port: int = 8080, lighting: s
     except ModuleNotFoundError as error:
         raise InputError(f"{error}: the page needs viser; pip install 'twin[view]'") from None
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a page that was just closed
-    from twin.view.camera_path import named_lighting
     from twin.view.guarded_server import open_server
-    from twin.view.page import Page
 
-    field = twin.field()
-    shown: EpisodeLighting = named_lighting(field, lighting or field.lightings[0])
+    for stage in ("metric", "field"):
+        require_stage(twin.scene, stage)
     server = open_server(host, port, "twin view")
     try:
+        announce(server.url)
+        # A browser loads the page while this goes on.
+        from twin.view.camera_path import named_lighting
+        from twin.view.page import Page
+
+        field = twin.field()
+        shown: EpisodeLighting = named_lighting(field, lighting or field.lightings[0])
         return Page(twin, field, server, shown)
     except BaseException:
         server.stop()

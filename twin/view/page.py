@@ -107,6 +107,10 @@ class Page:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._moved(client))
+        # A page may have been open before its initial camera was known.
+        first = self.cameras.camera_to_world[0]
+        if np.linalg.norm(client.camera.position - first[:3, 3]) > _MOVED:
+            self._place(client, first, float(_FOV))
         self.loop.add(client)
 
     async def _disconnected(self, client: viser.ClientHandle) -> None:

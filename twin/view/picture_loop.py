@@ -74,6 +74,8 @@ class PictureLoop:
         self._closed = False
         self.coarse = self.fine = 0
         """Numbers of pictures sent."""
+        self.has_shown = threading.Event()
+        """Set once a fine picture was sent."""
         self._thread = threading.Thread(target=self._run, daemon=True, name="pictures")
         self._thread.start()
 
@@ -154,6 +156,7 @@ class PictureLoop:
         client.flush()
         if fine:
             self.fine += 1
+            self.has_shown.set()
         else:
             self.coarse += 1
 
