@@ -110,8 +110,8 @@ def _frustums(scene: viser.SceneApi, path: str, cameras: Cameras) -> list[viser.
             center = np.broadcast_to(pose[:3, 3], corners.shape)
             segments += [np.stack([corners, np.roll(corners, -1, 0)], 1), np.stack([center, corners], 1)]
         color = PALETTE[number % len(PALETTE)]
-        lines = {"thickness": 1.5, "thickness_units": "screen"}
-        out.append(scene.add_line_segments(f"{path}/{number}", np.concatenate(segments), color, **lines))
+        lines = np.concatenate(segments)
+        out.append(scene.add_line_segments(f"{path}/{number}", lines, color, thickness=1.5, thickness_units="screen"))
     return out
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from twin.config import OBSTACLE_KINDS
 from twin.env.mujoco_renderer import ChaseCamera
@@ -210,7 +211,8 @@ class Page:
         gui = self.server.gui
         self._light_folder = gui.add_folder("Lighting")
         with self._light_folder:
-            self._slider = self._add_slider(0.0)
+            # The type of a handle's value lacks its setter.
+            self._slider: Any = self._add_slider(0.0)
             button = gui.add_button("Sample a lighting", hint="one that nobody filmed but could have", order=10.0)
             self._on_click(button, lambda event: self._sample())
             self._photo_name = gui.add_text("Name", "", hint="of the lighting that a photo adds", order=11.0)
@@ -320,10 +322,10 @@ class Page:
     def _build_film(self) -> None:
         gui = self.server.gui
         gui.add_markdown("Move the dividing line between a filmed frame and the twin, seen from the same place.")
-        self._compare = gui.add_checkbox("compare", False)
+        self._compare: Any = gui.add_checkbox("compare", False)
         sources = list(dict.fromkeys(self.cameras.sources))
-        self._source = gui.add_dropdown("film", sources)
-        self._frame = gui.add_slider("frame", 0, max(1, len(self._frames(sources[0])) - 1), 1, 0)
+        self._source: Any = gui.add_dropdown("film", sources)
+        self._frame: Any = gui.add_slider("frame", 0, max(1, len(self._frames(sources[0])) - 1), 1, 0)
         self._divider = gui.add_slider("film | twin", 0.0, 1.0, 0.005, 0.5)
         self._film_note = gui.add_markdown("")
         self._on_update(self._compare, self._film_changed)
@@ -331,7 +333,7 @@ class Page:
         self._on_update(self._source, self._source_changed)
         self._on_update(self._divider, self._divider_changed)
 
-    def _frames(self, source: str) -> Array:
+    def _frames(self, source: str) -> NDArray[np.int64]:
         return np.flatnonzero([name == source for name in self.cameras.sources])
 
     def _source_changed(self) -> None:
@@ -403,7 +405,7 @@ class Page:
         self._on_click(gui.add_button("Load", icon=viser.Icon.FOLDER_OPEN), lambda event: self._load_path())
         self._film_button = gui.add_button("Render to a film", icon=viser.Icon.MOVIE)
         self._on_click(self._film_button, lambda event: self._render_path())
-        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._progress: Any = gui.add_progress_bar(0.0, visible=False)
         self._show_path()
 
     def path(self) -> CameraPath:
@@ -570,7 +572,7 @@ class Page:
         driving = self.driving
         if driving is None:
             return
-        self._torques.append((facts.time, *(float(x) for x in facts.torque)))
+        self._torques.append((facts.time, float(facts.torque[0]), float(facts.torque[1])))
         if driving.running and self._behind.value and self._film_index is None:
             if self._follow is None:
                 self._follow = ChaseCamera(facts.base_to_world)
