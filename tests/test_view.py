@@ -483,7 +483,7 @@ def _picture(browser: Chromium, size: tuple[int, int]) -> np.ndarray:
 def test_the_page_in_a_browser(scene):
     size = (960, 540)
     page = open_page(scene, port=0)
-    loading = threading.Thread(target=load_driving, args=(page, "ahead", None, 0, False))
+    loading = threading.Thread(target=load_driving, args=(page, "ahead"))
     try:
         with Chromium(size) as browser:
             browser.call("Page.addScriptToEvaluateOnNewDocument", source=_COUNT_PICTURES)

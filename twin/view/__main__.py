@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from twin import commands, runtime
 from twin.errors import InputError
@@ -24,7 +24,7 @@ from twin.scene import require_stage
 
 if TYPE_CHECKING:
     from twin.env.episode_lighting import EpisodeLighting
-    from twin.nerf.baked import BakedField
+    from twin.learn.policy import Policy
     from twin.view.page import Page
 
 _HEAD_START = 6.0  # [s] given to the first picture, before the robot is loaded
@@ -82,6 +82,8 @@ def serve(twin: Twin, given: argparse.Namespace) -> None:
     if not 0 <= given.port <= 65535:
         raise InputError(f"--port {given.port}: expected 0 to 65535")
 
+    policy = _check_driver(twin, given)
+
     def announce(url: str) -> None:
         if not given.quiet:
             print(f"open {url} (Ctrl+C stops)", flush=True)
@@ -89,7 +91,7 @@ def serve(twin: Twin, given: argparse.Namespace) -> None:
     page = open_page(twin, given.host, given.port, given.lighting, announce)
     try:
         page.loop.has_shown.wait(_HEAD_START)  # the first picture needs both cores
-        load_driving(page, given.task, given.policy, given.seed, given.trust)
+        load_driving(page, given.task, policy, given.seed)
         threading.Event().wait()
     finally:
         page.close()
@@ -133,38 +135,40 @@ def open_page(
         raise
 
 
-def load_driving(page: "Page", task: str | None, policy: str | None, seed: int, trust: bool) -> None:
+def _check_driver(twin: Twin, given: argparse.Namespace) -> "Policy | None":
+    """The policy that may drive. Raises InputError: an unknown policy or task, or a negative seed."""
+    if given.seed < 0:
+        raise InputError(f"--seed {given.seed}: expected 0 or more")
+    if given.task is not None:
+        from twin.config_file import load_config
+        from twin.env.route_segments import find_task
+
+        find_task(given.task, twin.world(), load_config(twin.scene.config_file).task)
+    if given.policy is None:
+        return None
+    from twin.learn.policy import find_policy, load_policy
+
+    return load_policy(find_policy(twin.scene.root, given.policy), given.trust)
+
+
+def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" = None, seed: int = 0) -> None:
     """Adds the robot to an open page; a scene that cannot be driven says so there.
 
     Raises:
-        InputError: an unknown policy or task was asked for.
+        InputError: a policy or task was asked for and cannot be driven.
     """
-    asked = task is not None or policy is not None
     try:
-        driving = _driving(page, task, policy, seed, trust)
+        from twin.view.driving import Driving
+
+        held, lighting = page.guarded.keys.held, page.lighting
+        driving = Driving(page.twin, page.field, task or "route", policy, lighting, held, page.drove, seed)
     except InputError as error:
-        if asked:
+        if task is not None or policy is not None:
             raise
         page.no_driving(str(error))
         return
-    page.add_driving(driving)
-
-
-def _driving(page: "Page", task: str | None, policy: str | None, seed: int, trust: bool) -> Any:
-    from twin.view.driving import Driving
-
-    twin: Twin = page.twin
-    field: BakedField = page.field
-    if seed < 0:
-        raise InputError(f"--seed {seed}: expected 0 or more")
-    loaded = None
-    if policy:
-        from twin.learn.policy import find_policy, load_policy
-
-        loaded = load_policy(find_policy(twin.scene.root, policy), trust)
-    driving = Driving(twin, field, task or "route", loaded, page.lighting, page.guarded.keys.held, page.drove, seed)
     page.picture.add_objects(driving.world, driving.obstacles.pool)
-    return driving
+    page.add_driving(driving)
 
 
 main = partial(commands.main, "view")
