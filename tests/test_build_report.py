@@ -441,9 +441,15 @@ def test_the_page_says_what_to_do_next_in_commands_that_parse(scene: SceneDir) -
         parser = argparse.ArgumentParser()
         VERBS[module.removeprefix("twin.")].define(parser)
         parser.parse_args(arguments)
-    assert [line.split()[2] for line in commands] == ["twin.align", "twin.build", "twin.train", "twin.validate"]
+    assert [line.split()[2] for line in commands] == [
+        "twin.view",
+        "twin.align",
+        "twin.build",
+        "twin.train",
+        "twin.validate",
+    ]
     without = changed("review.not_applicable", "this is no drive")
-    assert [line.split()[2] for line in next_commands(odd, without)] == ["twin.export"]
+    assert [line.split()[2] for line in next_commands(odd, without)] == ["twin.view", "twin.export"]
 
 
 def next_commands(scene: SceneDir, report: dict[str, Any]) -> list[str]:

@@ -232,6 +232,30 @@ def _film(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
+def _view(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Show a built scene in the browser: look around under any lighting, drive the Husky by keys or a policy, put "
+        "obstacles in its way, compare film and twin, place camera paths. Or render such a path to a film."
+    )
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
+    parser.add_argument("--task", help="of a policy or the scripted driver: straight, right_turn, ... (default: route)")
+    parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function that may drive")
+    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
+    parser.add_argument("--seed", type=int, default=0, help="of the task's episodes")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to serve on; other than this machine's loopback, the page's address has a token",
+    )
+    parser.add_argument("--port", type=int, default=8080, help="port, or the next free one; 0: any")
+    parser.add_argument("--path", type=Path, help="render this camera path instead of showing the page")
+    parser.add_argument("--out", type=Path, help="the mp4 of --path")
+    parser.add_argument("--size", default="1280x720", help="of the film [px]")
+    parser.add_argument("--fps", type=int, default=30, help="of the film")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no address, no summary")
+
+
 def _export(parser: argparse.ArgumentParser) -> None:
     parser.description = "Write a built place for other programs: its mesh as glTF, its field as Gaussian splats."
     parser.add_argument("scene", type=Path, help="folder of a built scene")
@@ -421,6 +445,7 @@ VERBS = {
     "build": Verb("turn a scene folder into a drivable twin, with a report and a review film", _build, "twin.build"),
     "relight": Verb("add a lighting to a built scene, from one photo", _relight, "twin.relight"),
     "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),
+    "view": Verb("look at a built scene and drive in it, in the browser", _view, "twin.view.__main__"),
     "film": Verb("film a drive in a built scene", _film, "twin.film"),
     "export": Verb("write the place for other programs: glTF mesh, Gaussian splats", _export, "twin.export"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),

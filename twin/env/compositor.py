@@ -6,6 +6,7 @@ blended in with the remaining transmittance. Uncovered pixels, and uncovered par
 """
 
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -279,10 +280,11 @@ def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
 Lighting = str | NDArray
 
 _WINDOW_STEP = 32  # [px] windows of the second march come in multiples of this, so that few sizes occur
+_MAX_WINDOWS = 16  # sizes of windows whose render targets are kept; pictures of 160×90 px have no more than 15
 
 
 class Compositor:
-    """Renders the front cameras of envs of one model."""
+    """Renders a camera of the envs of one model."""
 
     def __init__(
         self,
@@ -291,17 +293,19 @@ class Compositor:
         size: tuple[int, int] = (160, 90),
         max_envs: int = 1,
         shaded: bool = True,
+        camera: str = FRONT_CAMERA,
     ):
         """
         Args:
-            model: A model with a camera `front`, compiled after `add_obstacles` (which may add none).
+            model: A model with that camera, compiled after `add_obstacles` (which may add none).
             field: The place.
             size: Width, height of the pictures [px].
             max_envs: Largest number of envs per call.
             shaded: False draws obstacles in their own plain colors, for comparison.
+            camera: Name of the camera.
         """
         self.size, self.max_envs, self._field = size, max_envs, field
-        self._camera = model.camera(FRONT_CAMERA).id
+        self._camera = model.camera(camera).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
@@ -321,7 +325,7 @@ class Compositor:
         noise: Sequence[CameraNoise] | None = None,
         weather: Sequence[Weather | None] = (),
     ) -> Rendering:
-        """Renders the front camera of every env.
+        """Renders the camera of every env.
 
         Args:
             datas: State of every env, with poses of geoms and cameras (after `mj_kinematics` and `mj_camlight`).
@@ -387,7 +391,7 @@ class _CompositorWorker:
     def __init__(self, model: mujoco.MjModel, field: BakedField, camera: int, size: tuple[int, int]):
         self.renderer = ObjectRenderer(model, camera, size)
         self._field, self._intrinsics = field, camera_intrinsics(model, camera, size)
-        self._fields: dict[tuple[int, int], BakedField] = {}
+        self._fields: OrderedDict[tuple[int, int], BakedField] = OrderedDict()
 
     def foreground(self, pose: Array, drawn: RenderedObjects, lighting: Lighting) -> Rendering:
         """The part of the field in front of drawn objects, in their window, arrays (height, width)."""
@@ -398,6 +402,9 @@ class _CompositorWorker:
         # One per window size, since a field keeps render targets of few sizes.
         if (across, down) not in self._fields:
             self._fields[across, down] = self._field.single_threaded()
+            if len(self._fields) > _MAX_WINDOWS:
+                self._fields.popitem(last=False)
+        self._fields.move_to_end((across, down))
         view = Viewpoints.of(pose, self._intrinsics - np.array([0.0, 0.0, left, top]), (across, down))
         out = self._fields[across, down].render(view, lighting, stop=stop)
         inner = np.s_[0, :height, :width]

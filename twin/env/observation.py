@@ -74,14 +74,26 @@ class PixelObserver:
                 )
             if o.camera:
                 self._noise[i] = CameraNoise(o.camera, task.rng(CAMERA))
-            fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
-            # A photo without fog determines the weather, too.
-            if fog is not None and o.randomise and o.randomise.hold_known:
-                task.set_weather(task.sample.for_known_weather())
-            has_weather = fog is not None or o.randomise
-            self._weather[i] = Weather(task.sample, task.rng(WEATHER), fog) if has_weather else None
+            self._begin_weather(i)
         if len(which):
             self._add_frames(which, fill=True)
+
+    def set_lighting(self, i: int, lighting: EpisodeLighting, fill: bool) -> None:
+        """Replaces the lighting of env i's episode from the next frame on; `fill` renders its frame stack again."""
+        self.lightings[i] = lighting
+        self._begin_weather(i)
+        if fill:
+            self._add_frames([i], fill=True)
+
+    def _begin_weather(self, i: int) -> None:
+        """Sets up the weather of env i's episode under its lighting."""
+        o, task = self.options, self.envs[i][1]
+        fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
+        # A photo without fog determines the weather, too.
+        if fog is not None and o.randomise and o.randomise.hold_known:
+            task.set_weather(task.sample.for_known_weather())
+        has_weather = fog is not None or o.randomise
+        self._weather[i] = Weather(task.sample, task.rng(WEATHER), fog) if has_weather else None
 
     def observe(self, which: Sequence[int]) -> None:
         """Adds a new frame to the stacks of some envs."""

@@ -23,6 +23,7 @@ from twin.config_file import load_config
 from twin.env import episode_lighting
 from twin.env.compositor import Compositor, ObjectRenderer
 from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, PAYLOAD, VERSION, Ranges
+from twin.env.episode_lighting import EpisodeLighting
 from twin.env.mujoco_renderer import SceneRenderer
 from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.obstacles import EpisodeObstacles, add_obstacles
@@ -167,6 +168,11 @@ class DriveEnvironment(control.Environment):
         if starts_episode:
             return step
         self.pixels.observe([0])
+        return self._with_pixels(step)
+
+    def relight(self, step: dm_env.TimeStep, lighting: EpisodeLighting) -> dm_env.TimeStep:
+        """Replaces the lighting of the episode whose first step is given; returns that step in the new lighting."""
+        self.pixels.set_lighting(0, lighting, fill=True)
         return self._with_pixels(step)
 
     def observation_spec(self) -> dict[str, specs.BoundedArray]:

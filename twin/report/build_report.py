@@ -4,6 +4,7 @@ The page is self-contained except for the review video beside it. Pictures and f
 from `twin.report.build_sections`.
 """
 
+import shlex
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from twin.env.route_segments import scene_tasks
 from twin.files import read_json, wrap_read_errors, write_text
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.passes import find_passes
-from twin.mjcf.world import World
+from twin.mjcf.world import SCENE_XML, World
 from twin.report import figures
 from twin.report.build_sections import SECTIONS, costs_section, headline_sections, sections
 from twin.report.html import Chart, Picture, command, data_url, duration, flatten, number, numbers, pick, render
@@ -248,6 +249,12 @@ def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list
             "or in the films, and build again; only what depends on the change is computed again:"
         )
     out = [(first, [build] if wrong else [])]
+    drive = " and drive the robot there" if scene.has_route else ""
+    look = f"Look around in the browser, in any lighting,{drive} (needs the extra “view”: pip install 'twin[view]'):"
+    out.append((look, [command("view", root)]))
+    if scene.has_route:
+        shown = shlex.join(["python", "-m", "mujoco.viewer", f"--mjcf={scene.stage('mjcf') / SCENE_XML}"])
+        out.append(("MuJoCo’s own viewer shows the physical scene, with its solid parts:", [shown]))
     if pick(report, "review.not_applicable"):
         mesh = command("export", root, "--glb", "place.glb")
         return [*out, ("There is no drive here, so no policy can be trained. Other programs can use the mesh:", [mesh])]

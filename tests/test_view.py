@@ -1,0 +1,530 @@
+"""`twin view`: who is let in, camera paths, the film beside the twin, driving, and the page in a real browser."""
+
+import json
+import shlex
+import threading
+import time
+import urllib.error
+import urllib.request
+from http import HTTPStatus
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from chromium import Chromium, find_chromium
+from tiny_twin import tiny_twin
+from websockets.exceptions import InvalidStatus
+from websockets.http11 import Headers, Request
+from websockets.sync.client import connect
+
+import twin
+from twin.__main__ import main
+from twin.env.episode_lighting import EpisodeLighting
+from twin.errors import InputError
+from twin.geometry.cameras import Cameras, Viewpoints
+from twin.geometry.images import write_image
+from twin.geometry.poses import look_at
+from twin.loading import Twin
+from twin.nerf.fog import Fog
+from twin.report import build_report as report_page
+from twin.report.video_layout import to_uint8
+from twin.report.video_writer import read_frames, video_info
+from twin.scene import write_stamp
+from twin.view.__main__ import load_driving, open_page
+from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
+from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, station_and_lateral
+from twin.view.guarded_server import Gate, HeldKeys, open_server
+from twin.view.layers import clicked_frame
+from twin.view.page import slider_lighting
+from twin.view.picture_loop import COARSE_AREA, FilmedFrame, add_film, film_camera, picture_size
+from twin.view.scene_picture import FreeCamera, ScenePicture
+
+SIZE = (160, 90)
+INTRINSICS = np.array([100.0, 100.0, 80.0, 45.0])
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """The tiny twin, filmed from four places along its route: pictures of its field."""
+    root = tiny_twin(tmp_path_factory.mktemp("view") / "scene")
+    opened = twin.load_scene(root)
+    poses = np.array([look_at(np.array([x, 0.0, 1.3]), np.array([x + 3.0, 0.2, 1.0])) for x in (0.0, 0.5, 1.0, 1.5)])
+    images = opened.scene.stage("cameras") / "images"
+    names = tuple(f"day/{k:06d}" for k in range(4))
+    shown = opened.field().render(Viewpoints.of(poses, INTRINSICS, SIZE), "day")
+    for name, rgb in zip(names, shown.rgb, strict=True):
+        (images / name).parent.mkdir(parents=True, exist_ok=True)
+        write_image(images / f"{name}.png", to_uint8(rgb))
+    Cameras(
+        names=names,
+        camera_to_world=poses,
+        intrinsics=np.tile(INTRINSICS, (4, 1)),
+        sizes=np.tile(SIZE, (4, 1)),
+        lightings=("day",) * 4,
+        sources=("day",) * 4,
+        times=np.arange(4.0),
+        held_out=np.array([False, True, False, False]),
+        images=images,
+    ).save(opened.scene.stage("metric"))
+    write_stamp(opened.scene.stage("metric"), "metric")
+    return root
+
+
+@pytest.fixture(scope="module")
+def scene(root) -> Twin:
+    return twin.load_scene(root)
+
+
+@pytest.fixture(scope="module")
+def field(scene):
+    return scene.field()
+
+
+# ---- who is let in
+
+
+def _request(path: str = "/", **headers: str) -> Request:
+    return Request(path, Headers({name.replace("_", "-"): value for name, value in headers.items()}))
+
+
+def test_without_a_token_only_this_machines_own_pages_are_answered():
+    gate = Gate(8080, None)
+    for host in ("127.0.0.1:8080", "localhost:9000", "LOCALHOST", "[::1]:8080"):  # any port: there may be a tunnel
+        assert gate.refusal(_request(Host=host)) is None
+    for host in ("evil.example", "127.0.0.1.evil.example:8080", "[::2]:8080", ""):
+        assert gate.refusal(_request(Host=host)).status_code == HTTPStatus.FORBIDDEN
+    assert gate.refusal(Request("/", Headers())).status_code == HTTPStatus.FORBIDDEN
+    own, other = "http://localhost:8080", "http://evil.example"
+    assert gate.refusal(_request(Host="localhost:8080", Upgrade="websocket", Origin=own)) is None
+    for origin in (other, "null", "http://localhost:9000"):
+        refused = gate.refusal(_request(Host="localhost:8080", Upgrade="websocket", Origin=origin))
+        assert refused.status_code == HTTPStatus.FORBIDDEN
+
+
+def test_a_token_is_asked_of_every_request_and_handshake():
+    gate = Gate(8080, "secret")
+    assert gate.refusal(_request(Host="robot:8080", Cookie="a=b; twin_8080=secret")) is None
+    for request in (
+        _request(Host="robot:8080"),
+        _request("/?token=wrong", Host="robot:8080"),
+        _request("/?token=secret&token=secret", Host="robot:8080"),
+        _request(Host="robot:8080", Cookie="twin_8080=secre"),
+        _request(Host="robot:8080", Cookie="twin_9000=secret"),
+        _request("/?token=secret", Host="robot:8080", Upgrade="websocket"),  # a handshake needs the cookie
+    ):
+        assert gate.refusal(request).status_code == HTTPStatus.UNAUTHORIZED
+    answer = gate.refusal(_request("/?token=secret", Host="robot:8080"))
+    assert answer.status_code == HTTPStatus.SEE_OTHER and answer.headers["Location"] == "/"
+    assert "HttpOnly" in answer.headers["Set-Cookie"] and "twin_8080=secret" in answer.headers["Set-Cookie"]
+    other_site = _request(Host="robot:8080", Upgrade="websocket", Origin="http://evil", Cookie="twin_8080=secret")
+    assert gate.refusal(other_site).status_code == HTTPStatus.FORBIDDEN
+
+
+def test_the_server_itself_asks_for_the_token(capsys):
+    served = open_server("0.0.0.0", 0, "test")
+    try:
+        port, token = served.port, served.url.partition("?token=")[2]
+        assert len(token) >= 32 and f":{port}/" in served.url
+        at = f"127.0.0.1:{port}"
+        for path in ("/", "/index.html", "/?token=x"):
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                urllib.request.urlopen(f"http://{at}{path}")
+            assert refused.value.code == HTTPStatus.UNAUTHORIZED
+            refused.value.close()
+        for path in ("", "/keys"):
+            with pytest.raises(InvalidStatus) as rejected:
+                connect(f"ws://{at}{path}")
+            assert rejected.value.response.status_code == HTTPStatus.UNAUTHORIZED
+        cookies = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        with cookies.open(f"http://{at}/?token={token}") as page:
+            assert page.url == f"http://{at}/" and b'"/keys"' in page.read()
+        cookie = {"Cookie": f"twin_{port}={token}"}
+        with connect(f"ws://{at}/keys", additional_headers=cookie) as keys:
+            assert json.loads(keys.recv()) == {"driving": False}
+            keys.send("wx")
+            _wait(lambda: served.keys.held() == {"w"})
+            served.set_driving(True)
+            assert json.loads(keys.recv()) == {"driving": True}
+        _wait(lambda: not served.keys.held())
+    finally:
+        served.stop()
+    assert capsys.readouterr().out == ""
+
+
+def test_keys_count_only_while_they_are_reported(monkeypatch):
+    now = [10.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    keys = HeldKeys()
+    keys.report(1, "wq")
+    keys.report(2, "a")
+    assert keys.held() == {"w", "a"}
+    keys.report(2, "")
+    assert keys.held() == {"w"}
+    now[0] += 0.4  # the page has fallen silent
+    assert keys.held() == frozenset()
+
+
+# ---- camera paths
+
+
+def _path(field, count: int = 4) -> CameraPath:
+    rng = np.random.default_rng(0)
+    poses = [look_at(rng.normal(0, 2, 3), rng.normal(0, 2, 3) + np.array([9.0, 0.0, 0.0])) for _ in range(count)]
+    times, lights = spaced_times(poses, 1.0, 0.5), [named_lighting(field, name) for name in ("day", "night")]
+    return CameraPath(
+        tuple(KeyView(t, p, 50.0 + k, lights[k % 2]) for k, (t, p) in enumerate(zip(times, poses, strict=True)))
+    )
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_path_passes_its_views_and_moves_smoothly(field, count):
+    path = _path(field, count)
+    knots = np.array([view.time for view in path.views])
+    for (pose, fov, lighting), view in zip(path.at(knots), path.views, strict=True):
+        np.testing.assert_allclose(pose, view.camera_to_world, atol=1e-9)
+        assert fov == pytest.approx(view.fov)
+        np.testing.assert_allclose(lighting.start, view.lighting.start, atol=1e-6)
+    fine = np.linspace(0.0, path.duration, 2001)
+    poses = np.array([pose for pose, _, _ in path.at(fine)])
+    products = poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-9)
+    step = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert np.abs(np.diff(step)).max() < 0.02 * step.max()
+    middle = path.at(np.array([(knots[0] + knots[1]) / 2]))[0][2]
+    np.testing.assert_allclose(middle.start, 0.5 * (field.embedding("day") + field.embedding("night")), atol=1e-6)
+
+
+def test_a_saved_path_is_the_same(field, tmp_path):
+    path = _path(field)
+    sampled = KeyView(99.0, np.eye(4), 70.0, EpisodeLighting("sampled lighting 1", np.full(4, 0.3, np.float32)))
+    path = CameraPath((*path.views, sampled))
+    path.save(tmp_path / "path.json")
+    again = CameraPath.load(tmp_path / "path.json", field)
+    for one, other in zip(path.views, again.views, strict=True):
+        assert (one.time, one.fov) == (other.time, other.fov)
+        np.testing.assert_array_equal(one.camera_to_world, other.camera_to_world)
+        np.testing.assert_array_equal(one.lighting.start, other.lighting.start)
+
+
+_VIEW = {"time": 0.0, "camera_to_world": np.eye(4).tolist(), "fov": 60.0, "lighting": "day"}
+
+
+@pytest.mark.parametrize(
+    "views, said",
+    [
+        ([_VIEW], "1 views; expected 2"),
+        ([_VIEW, _VIEW], "increasing"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "lighting": "noon"}], "'noon': unknown"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "lighting": [1.0]}], "expected a name, or 4 numbers"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "fov": 179.0}], "fov 179"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "camera_to_world": (2.0 * np.eye(4)).tolist()}], "no rotation"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "camera_to_world": [[1.0]]}], "4×4"),
+        ([_VIEW, {"time": 1.0}], "camera_to_world"),
+        ("views", "expected a list"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_a_bad_path_is_one_line(root, tmp_path, capsys, views, said):
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps({"format": 1, "views": views}))
+    assert main(["view", str(root), "--path", str(file), "--out", str(tmp_path / "a.mp4")]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: ") and said in told and told.count("\n") == 1
+    assert not list(tmp_path.glob("*.mp4*"))
+
+
+def test_a_path_becomes_a_film(root, field, tmp_path, capsys):
+    pose = look_at(np.array([0.0, 0.0, 1.3]), np.array([3.0, 0.0, 1.0]))
+    ahead = pose.copy()
+    ahead[0, 3] += 1.0
+    day, night = (named_lighting(field, name) for name in ("day", "night"))
+    CameraPath((KeyView(0.0, pose, 60.0, day), KeyView(1.0, ahead, 60.0, night))).save(tmp_path / "path.json")
+    out = tmp_path / "film.mp4"
+    given = ["--path", str(tmp_path / "path.json"), "--out", str(out), "--size", "96x54", "--fps", "8"]
+    assert main(["view", str(root), *given]) == 0
+    assert "9 frames, 1.0 s" in capsys.readouterr().out
+    about = video_info(out)
+    assert (about["width"], about["height"], about["fps"], about["frames"]) == (96, 54, 8.0, 9)
+    shown = list(read_frames(out))
+    errors = np.empty((2, 2))
+    for k, (where, lighting) in enumerate(((pose, "day"), (ahead, "night"))):
+        camera = FreeCamera.of_fov(where, np.deg2rad(60.0), (96, 54))
+        rendered = field.render(Viewpoints.of(camera.camera_to_world, camera.intrinsics, camera.size), lighting).rgb[0]
+        errors[k] = [np.abs(frame - 255.0 * np.clip(rendered, 0.0, 1.0)).mean() for frame in (shown[0], shown[-1])]
+    assert errors[0, 0] < 12.0 and errors[1, 1] < 12.0 and min(errors[0, 1], errors[1, 0]) > 25.0
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        (["--path", "a.json"], "--path and --out belong together"),
+        (["--path", "none.json", "--out", "a.avi"], "expected an .mp4"),
+        (["--path", "none.json", "--out", "a.mp4"], "none.json"),
+        (["--path", "a", "--out", "a.mp4", "--size", "100x33"], "even sides"),
+        (["--path", "a", "--out", "a.mp4", "--fps", "0"], "--fps 0"),
+        (["--port", "70000"], "--port 70000"),
+        (["--lighting", "noon"], "'noon': unknown"),
+        (["--host", "203.0.113.9"], "--host '203.0.113.9'"),
+        (["--port", "0", "--task", "none"], "task 'none'"),
+        (["--port", "0", "--policy", "none"], "none"),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else "",
+)
+def test_wrong_options_are_one_line(root, tmp_path, monkeypatch, capsys, given, said):
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", str(root), "--quiet", *given]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: ") and said in told and told.count("\n") == 1
+
+
+# ---- pictures
+
+
+def test_the_slider_goes_from_lighting_to_lighting(field):
+    np.testing.assert_array_equal(slider_lighting(field, 0.0).start, field.embedding("day"))
+    np.testing.assert_array_equal(slider_lighting(field, 1.0).start, field.embedding("night"))
+    np.testing.assert_array_equal(slider_lighting(field, 0.25).start, field.embedding("day:night:0.25"))
+
+
+def test_pictures_have_the_shape_of_the_page_and_at_most_their_area():
+    assert picture_size((1280, 720), COARSE_AREA) == (320, 180)
+    assert picture_size((200, 100), COARSE_AREA) == (200, 100)
+    assert picture_size((0, 600), COARSE_AREA) is None
+    for page in ((956, 720), (720, 956), (3840, 300)):
+        width, height = picture_size(page, COARSE_AREA)
+        assert width * height == pytest.approx(COARSE_AREA, rel=0.05)
+        assert width / height == pytest.approx(page[0] / page[1], rel=0.03)
+
+
+def test_film_and_twin_meet_at_the_dividing_line(scene, field):
+    cameras = scene.cameras()
+    film = np.full((90, 160, 3), 200, np.uint8)
+    film[:, 40:] = (10, 200, 30)
+    for size, (left, top) in {(320, 180): (0, 0), (320, 240): (0, 30), (400, 180): (40, 0)}.items():
+        frame = FilmedFrame(film, cameras.camera_to_world[0], INTRINSICS, 0.5)
+        camera = film_camera(frame, size)
+        rendered = to_uint8(ScenePicture(field).render(camera, named_lighting(field, "day")).rgb[0])
+        both = rendered.copy()
+        add_film(both, frame, camera)
+        middle, row = size[0] // 2, size[1] // 2
+        np.testing.assert_array_equal(both[row, middle + 2 :], rendered[row, middle + 2 :])
+        np.testing.assert_array_equal(both[row, :left], rendered[row, :left])
+        expected = cv2.resize(film, (320, 180), interpolation=cv2.INTER_CUBIC)[row - top, : middle - left]
+        np.testing.assert_array_equal(both[row, left : middle - 1], expected[:-1])
+    # The frame itself was rendered: with it as film, the line cannot be seen.
+    frame = FilmedFrame(cv2.imread(str(cameras.image_path(0)))[..., ::-1], cameras.camera_to_world[0], INTRINSICS, 1.0)
+    camera = film_camera(frame, SIZE)
+    rendered = to_uint8(ScenePicture(field).render(camera, named_lighting(field, "day")).rgb[0])
+    both = rendered.copy()
+    add_film(both, frame, camera)
+    assert np.abs(both[:60, :-2].astype(int) - rendered[:60, :-2]).max() <= 1  # the label is below
+
+
+def test_a_lightings_fog_is_laid_over_the_picture(field):
+    camera = FreeCamera.of_fov(look_at(np.array([0.0, 0.0, 1.3]), np.array([3.0, 0.0, 1.0])), 1.0, SIZE)
+    clear, picture = named_lighting(field, "day"), ScenePicture(field)
+    foggy = EpisodeLighting("day", clear.start, fog=Fog(0.2, (1.0, 0.0, 0.5)))
+    one, other = picture.render(camera, clear), picture.render(camera, foggy)
+    v, u = np.mgrid[:90, :160] + 0.5
+    rays = np.stack([(u - 80) / camera.intrinsics[0], (v - 45) / camera.intrinsics[1], np.ones_like(u)], -1)
+    distance = (one.depth[0] * np.linalg.norm(rays, axis=-1)).astype(np.float32)
+    np.testing.assert_allclose(other.rgb[0], foggy.fog.apply(one.rgb[0], distance), atol=1e-5)
+
+
+def test_a_click_finds_the_filmed_camera(scene):
+    cameras = scene.cameras()
+    origin = np.array([-3.0, 0.0, 1.3])
+    for i in range(4):
+        aside = np.array([-1.0, 3.0, 2.0])
+        assert clicked_frame(cameras, aside, cameras.positions[i] - aside) == i
+    assert clicked_frame(cameras, origin, np.array([-1.0, 0.0, 0.0])) is None
+
+
+def test_the_report_says_how_to_look_at_the_scene(scene):
+    commands = [line for _, lines in report_page._next_steps(scene.scene, {}) for line in lines]
+    assert f"python -m twin.view {scene.scene.root}" in commands
+    viewer = next(line for line in commands if "mujoco.viewer" in line)
+    assert Path(shlex.split(viewer)[-1].removeprefix("--mjcf=")).is_file()
+
+
+# ---- driving
+
+
+def test_station_and_lateral_are_the_inverse_of_the_pose(scene):
+    from twin.config import ObstacleConfig
+    from twin.env.obstacles import obstacle_pose
+
+    route = scene.world().route
+    for xy in ([1.0, 0.4], [6.5, 0.2], [7.5, -2.0], [8.3, -4.5], [-1.0, 0.5], [3.0, -0.7]):
+        station, lateral = station_and_lateral(route, np.array(xy))
+        x, y, _ = obstacle_pose(ObstacleConfig(station=station, lateral=lateral), route, 0.0)
+        np.testing.assert_allclose([x, y], xy, atol=2e-3)
+
+
+class _Drive:
+    """A drive whose keys and facts a test sees; its thread stands still, and the test steps."""
+
+    def __init__(self, scene, field, **more):
+        self.keys, self.facts = frozenset(), []
+        lighting = named_lighting(field, "day")
+        self.driving = Driving(scene, field, "ahead", None, lighting, lambda: self.keys, self.facts.append, **more)
+
+    def steps(self, count: int, keys: str = ""):
+        self.keys = frozenset(keys)
+        for _ in range(count):
+            self.driving._advance()
+        return self.facts[-1]
+
+
+@pytest.fixture(scope="module")
+def drive(scene, field):
+    drive = _Drive(scene, field)
+    yield drive
+    drive.driving.close()
+
+
+def test_keys_drive_ahead_back_and_around(drive):
+    drive.driving.choose(KEYS_DRIVER)
+    drive.driving.reset()
+    start = drive.facts[-1].base_to_world
+    ahead = drive.steps(15, "w")
+    forward = (ahead.base_to_world[:3, 3] - start[:3, 3]) @ start[:3, 0]
+    assert 0.5 < forward < 1.6 and ahead.speed > 0.7 and ahead.torque.shape == (2,)
+    back = drive.steps(25, "s")
+    assert (back.base_to_world[:3, 3] - ahead.base_to_world[:3, 3]) @ start[:3, 0] < -0.5
+    turned = drive.steps(10, "a")
+    assert turned.yaw_rate > 0.2 and turned.torque[1] > turned.torque[0]
+    still = drive.steps(20)
+    assert abs(still.speed) < 0.05 and abs(still.yaw_rate) < 0.05
+    assert still.image.shape == (90, 160, 3) and still.image.std() > 5.0
+
+
+def test_the_lighting_of_the_robots_picture_follows(drive, field):
+    drive.driving.choose(KEYS_DRIVER)
+    drive.driving.set_lighting(named_lighting(field, "day"))
+    drive.driving.reset()
+    day = drive.facts[-1].image.astype(float)
+    drive.driving.set_lighting(named_lighting(field, "night"))
+    drive.driving.reset()
+    assert np.abs(drive.facts[-1].image - day).mean() > 5.0
+
+
+def test_an_obstacle_stands_where_it_was_put_and_stops_the_robot(drive):
+    driving = drive.driving
+    driving.choose(KEYS_DRIVER)
+    driving.reset()
+    x, y, _ = drive.facts[-1].base_to_world[:3, 3]
+    name = driving.obstacles.free("car")
+    driving.obstacles.put(name, x + 4.2, y, np.pi / 2)
+    driving.update_obstacles()
+    body = driving.environment.physics.model.ptr.body(f"obstacle_{name}")
+    np.testing.assert_allclose(driving.environment.physics.data.ptr.xpos[body.id, :2], [x + 4.2, y], atol=0.01)
+    np.testing.assert_allclose(driving.obstacles.pose(name), [x + 4.2, y, np.pi / 2], atol=0.01)
+    assert f'name = "{name}"' in driving.obstacles.toml()
+    facts = drive.steps(60, "w")
+    assert any(touched.startswith(f"obstacle_{name}") for one in drive.facts[-60:] for touched in one.touched)
+    assert facts.cause == "" and facts.base_to_world[0, 3] < x + 3.9
+    driving.reset()  # it is still there in the next drive
+    np.testing.assert_allclose(driving.environment.physics.data.ptr.xpos[body.id, :2], [x + 4.2, y], atol=0.01)
+    driving.obstacles.standing.clear()
+    driving.update_obstacles()
+    assert driving.environment.physics.data.ptr.xpos[body.id, 2] < -50.0
+    assert driving.obstacles.free("car") == name
+
+
+def test_the_scripted_driver_reaches_the_goal_of_its_task(drive):
+    drive.driving.choose(SCRIPTED_DRIVER)
+    count = len(drive.facts)
+    for _ in range(200):
+        facts = drive.steps(1)
+        if facts.cause:
+            break
+    assert facts.cause == "goal" and not drive.driving.running and len(drive.facts) > count
+    drive.driving.choose(KEYS_DRIVER)
+
+
+def test_a_start_on_an_obstacle_is_refused(drive):
+    driving = drive.driving
+    driving.choose(KEYS_DRIVER)
+    x, y, _ = drive.facts[-1].base_to_world[:3, 3]
+    driving.reset()
+    x, y = drive.facts[-1].base_to_world[:2, 3]
+    driving.obstacles.put(driving.obstacles.free("box"), x, y, 0.0)
+    with pytest.raises(InputError, match="touches"):
+        driving.reset()
+    driving.obstacles.standing.clear()
+    driving.reset()
+
+
+# ---- in the browser
+
+_COUNT_PICTURES = """
+window.pictures = 0;
+const revoke = URL.revokeObjectURL;
+URL.revokeObjectURL = (url) => { window.pictures += 1; return revoke.call(URL, url); };
+"""
+
+
+def _wait(condition, seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"not within {seconds:g} s"
+        time.sleep(0.02)
+
+
+def _picture(browser: Chromium, size: tuple[int, int]) -> np.ndarray:
+    """The page's picture, without the panel at its right and notices at its left."""
+    page = cv2.imdecode(np.frombuffer(browser.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    return page[: size[1], size[0] // 3 : size[0] // 2].astype(float)
+
+
+@pytest.mark.skipif(find_chromium() is None, reason="no chromium on this machine")
+def test_the_page_in_a_browser(scene):
+    size = (960, 540)
+    page = open_page(scene, port=0)
+    loading = threading.Thread(target=load_driving, args=(page, "ahead"))
+    try:
+        with Chromium(size) as browser:
+            browser.call("Page.addScriptToEvaluateOnNewDocument", source=_COUNT_PICTURES)
+            browser.open(page.guarded.url)
+            browser.wait("window.pictures > 0")
+            loading.start()
+            loading.join()
+            # What the page shows is what the field renders; it fades in.
+            client = next(iter(page.server.get_clients().values()))
+            shot = page._shot(client)
+            seen = client.camera.image_width, client.camera.image_height
+            camera = FreeCamera.of_fov(shot.camera_to_world, shot.fov, seen)
+            own = to_uint8(page.picture.render(camera, shot.lighting, shot.objects).rgb[0])
+            own = own[: size[1], size[0] // 3 : size[0] // 2].astype(float)
+            assert own.std() > 5.0
+            _wait(lambda: np.abs(_picture(browser, size) - own).mean() < 4.0)
+            day = _picture(browser, size)
+
+            before = page.loop.fine
+            browser.slide("lighting", 0.98)
+            _wait(lambda: page.lighting.name.startswith(("night", "day:night")) and page.loop.fine > before)
+            _wait(lambda: np.abs(_picture(browser, size) - day).mean() > 5.0)
+
+            browser.click_on("[role=tab]", "Drive")
+            browser.click_on("button", "Start driving")
+            browser.wait("document.documentElement.dataset.driving === 'true'")
+            start = page.driving.objects().qpos[:2].copy()
+            eye = client.camera.position.copy()
+            browser.key("w", True)
+            _wait(lambda: np.linalg.norm(page.driving.objects().qpos[:2] - start) > 0.3)
+            browser.key("w", False)
+            _wait(lambda: not page.guarded.keys.held())
+            browser.click_on("button", "Stop")
+            browser.wait("document.documentElement.dataset.driving === 'false'")
+            assert np.linalg.norm(client.camera.position - eye) > 0.1  # it followed the robot
+
+            browser.click_on("[role=tab]", "Film")
+            browser.click_on("input[type=checkbox]", "compare")
+            _wait(lambda: page._film_index == 0)
+            assert page.lighting.name == "day"  # that of the frame
+            time.sleep(0.5)
+            assert browser.errors == []
+    finally:
+        page.close()

@@ -1,0 +1,177 @@
+"""Verb: shows a built scene in the browser, and drives the Husky in it; or renders a camera path to a film.
+
+    python -m twin.view scenes/demo
+    python -m twin.view scenes/demo --policy first --task straight
+    python -m twin.view scenes/demo --path scenes/demo/paths/path.json --out film.mp4
+
+The page needs no GPU and no network. It is served to this machine alone unless `--host` names another address; then its
+address has a token.
+"""
+
+import argparse
+import sys
+import threading
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from twin import commands, runtime
+from twin.errors import InputError
+from twin.loading import Twin, load_scene
+from twin.scene import require_stage
+
+if TYPE_CHECKING:
+    from twin.env.episode_lighting import EpisodeLighting
+    from twin.learn.policy import Policy
+    from twin.view.page import Page
+
+_HEAD_START = 6.0  # [s] given to the first picture, before the robot is loaded
+_MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120
+
+
+def command(given: argparse.Namespace) -> None:
+    """Runs the verb with the options parsed by `twin.commands`."""
+    twin = load_scene(given.scene)
+    if (given.path is None) != (given.out is None):
+        raise InputError("--path and --out belong together: --path path.json --out film.mp4")
+    if given.path is not None:
+        film_path(twin, given.path, given.out, given.size, given.fps, given.quiet)
+    else:
+        serve(twin, given)
+
+
+def film_path(twin: Twin, path: Path, out: Path, size: str, fps: int, quiet: bool = False) -> None:
+    """Renders a camera path to an mp4.
+
+    Raises:
+        InputError: the scene is not built, or a bad path, size, number of frames per second or output.
+    """
+    width, height = parse_size(size)
+    if not 1 <= fps <= _MAX_FPS:
+        raise InputError(f"--fps {fps}: expected 1 to {_MAX_FPS}")
+    if out.suffix.lower() != ".mp4" or not out.parent.is_dir():
+        raise InputError(f"--out {out}: expected an .mp4 in a folder that exists")
+    from twin.view.camera_path import CameraPath, path_frames, write_path_film
+    from twin.view.scene_picture import ScenePicture
+
+    field = twin.field()
+    track = CameraPath.load(path, field)
+    with runtime.bar("film", len(path_frames(track, fps)), "frame") as progress:
+        frames = write_path_film(
+            out, track, ScenePicture(field), (width, height), fps, lambda done, total: progress.update()
+        )
+    if not quiet:
+        print(f"{out}: {frames} frames, {track.duration:.1f} s")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height [px] of `1280x720`. Raises InputError for another form, odd sides, or sides out of range."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and len(part) < 6 for part in parts):
+        raise InputError(f"--size {text!r}: expected WIDTHxHEIGHT, such as 1280x720")
+    width, height = map(int, parts)
+    if not all(_MIN_SIDE <= side <= _MAX_SIDE and side % 2 == 0 for side in (width, height)):
+        raise InputError(f"--size {text!r}: expected even sides from {_MIN_SIDE} to {_MAX_SIDE} px")
+    return width, height
+
+
+def serve(twin: Twin, given: argparse.Namespace) -> None:
+    """Serves the page until it is stopped by a signal."""
+    if not 0 <= given.port <= 65535:
+        raise InputError(f"--port {given.port}: expected 0 to 65535")
+
+    policy = _check_driver(twin, given)
+
+    def announce(url: str) -> None:
+        if not given.quiet:
+            print(f"open {url} (Ctrl+C stops)", flush=True)
+
+    page = open_page(twin, given.host, given.port, given.lighting, announce)
+    try:
+        page.loop.has_shown.wait(_HEAD_START)  # the first picture needs both cores
+        load_driving(page, given.task, policy, given.seed)
+        threading.Event().wait()
+    finally:
+        page.close()
+
+
+def open_page(
+    twin: Twin,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    lighting: str | None = None,
+    announce: Callable[[str], None] = lambda url: None,
+) -> "Page":
+    """Opens the page of a built scene, without the robot.
+
+    `announce` is called with its address as soon as it can be opened, before the field is loaded.
+
+    Raises:
+        InputError: viser is missing, the scene has no field, or an unknown lighting or unusable address.
+    """
+    try:
+        import viser  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise InputError(f"{error}: the page needs viser; pip install 'twin[view]'") from None
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a page that was just closed
+    from twin.view.guarded_server import open_server
+
+    for stage in ("metric", "field"):
+        require_stage(twin.scene, stage)
+    server = open_server(host, port, "twin view")
+    try:
+        announce(server.url)
+        # A browser loads the page while this goes on.
+        from twin.view.camera_path import named_lighting
+        from twin.view.page import Page
+
+        field = twin.field()
+        shown: EpisodeLighting = named_lighting(field, lighting or field.lightings[0])
+        return Page(twin, field, server, shown)
+    except BaseException:
+        server.stop()
+        raise
+
+
+def _check_driver(twin: Twin, given: argparse.Namespace) -> "Policy | None":
+    """The policy that may drive. Raises InputError: an unknown policy or task, or a negative seed."""
+    if given.seed < 0:
+        raise InputError(f"--seed {given.seed}: expected 0 or more")
+    if given.task is not None:
+        from twin.config_file import load_config
+        from twin.env.route_segments import find_task
+
+        find_task(given.task, twin.world(), load_config(twin.scene.config_file).task)
+    if given.policy is None:
+        return None
+    from twin.learn.policy import find_policy, load_policy
+
+    return load_policy(find_policy(twin.scene.root, given.policy), given.trust)
+
+
+def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" = None, seed: int = 0) -> None:
+    """Adds the robot to an open page; a scene that cannot be driven says so there.
+
+    Raises:
+        InputError: a policy or task was asked for and cannot be driven.
+    """
+    try:
+        from twin.view.driving import Driving
+
+        held, lighting = page.guarded.keys.held, page.lighting
+        driving = Driving(page.twin, page.field, task or "route", policy, lighting, held, page.drove, seed)
+    except InputError as error:
+        if task is not None or policy is not None:
+            raise
+        page.no_driving(str(error))
+        return
+    page.picture.add_objects(driving.world, driving.obstacles.pool)
+    page.add_driving(driving)
+
+
+main = partial(commands.main, "view")
+
+if __name__ == "__main__":
+    sys.exit(main())

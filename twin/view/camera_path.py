@@ -1,0 +1,198 @@
+"""Camera paths: key views in time, smooth interpolation between them, their JSON file, and the film of a path.
+
+    {"format": 1, "views": [{"time": 0.0, "camera_to_world": [[...], ...], "fov": 60.0, "lighting": "sun"}, ...]}
+
+`time` [s] increases, `camera_to_world` is 4×4 with OpenCV axes in the scene's frame, `fov` [°] is the vertical angle of
+view, and `lighting` is a name or mixture as for `twin film`, or an embedding as a list of numbers, by default the first
+filmed one. Positions follow a cubic spline, rotations a spline of their own; angle of view, lighting and fog are
+interpolated linearly.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from twin.env.episode_lighting import EpisodeLighting
+from twin.errors import short_repr
+from twin.files import json_bytes, read_json, wrap_read_errors, write_bytes
+from twin.nerf.baked import BakedField
+from twin.nerf.fog import mixed
+from twin.report.video_layout import to_uint8
+from twin.report.video_writer import VideoWriter
+from twin.types import Array, Image
+from twin.view.scene_picture import FreeCamera, ScenePicture
+
+_FORMAT = 1
+_CRF = 20
+_MAX_VIEWS, _MAX_DURATION = 1000, 3600.0  # [s]
+_MIN_FOV, _MAX_FOV = 5.0, 150.0  # [°]
+_CURE = "save the path again in twin view, or correct the file"
+
+
+@dataclass(frozen=True)
+class KeyView:
+    """A camera pose at a time on a path."""
+
+    time: float
+    """[s]"""
+    camera_to_world: Array
+    """OpenCV axes, shape (4, 4)."""
+    fov: float
+    """Vertical angle of view [°]."""
+    lighting: EpisodeLighting
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Key views of increasing time; two or more."""
+
+    views: tuple[KeyView, ...]
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: too few or too many views, or times that do not increase."""
+        times = [view.time for view in self.views]
+        if not 2 <= len(times) <= _MAX_VIEWS:
+            raise ValueError(f"{len(times)} views; expected 2 to {_MAX_VIEWS}")
+        if np.min(np.diff(times)) < 1e-3 or self.duration > _MAX_DURATION:
+            raise ValueError(f"times {short_repr(times)}; expected increasing ones, within {_MAX_DURATION:g} s")
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return self.views[-1].time - self.views[0].time
+
+    def at(self, times: Array) -> list[tuple[Array, float, EpisodeLighting]]:
+        """Pose (4, 4), vertical angle of view [°] and lighting at times after the start [s], shape (k,)."""
+        knots = np.array([view.time for view in self.views]) - self.views[0].time
+        poses = np.array([view.camera_to_world for view in self.views])
+        t = np.clip(times, 0.0, knots[-1])
+        # The cubic spline is smooth; two views, or a standstill, must not swing out.
+        still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
+        curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
+        out = np.tile(np.eye(4), (len(t), 1, 1))
+        out[:, :3, 3] = curve(knots, poses[:, :3, 3])(t)
+        out[:, :3, :3] = RotationSpline(knots, Rotation.from_matrix(poses[:, :3, :3]))(t).as_matrix()
+        fov = np.interp(t, knots, [view.fov for view in self.views])
+        before = np.clip(np.searchsorted(knots, t, "right") - 1, 0, len(knots) - 2)
+        share = (t - knots[before]) / (knots[before + 1] - knots[before])
+        return [
+            (pose, float(angle), mixed_lighting(self.views[i].lighting, self.views[i + 1].lighting, float(s)))
+            for pose, angle, i, s in zip(out, fov, before, share, strict=True)
+        ]
+
+    def save(self, path: Path) -> None:
+        write_bytes(path, self.to_json())
+
+    def to_json(self) -> bytes:
+        return json_bytes({"format": _FORMAT, "views": [_view_row(view) for view in self.views]})
+
+    @staticmethod
+    def load(path: Path, field: BakedField) -> "CameraPath":
+        """Reads a path's JSON file. Raises InputError: it is missing or damaged, or names an unknown lighting."""
+        head = read_json(path)
+        with wrap_read_errors(path, _CURE):
+            if not isinstance(head, dict) or head.get("format") != _FORMAT:
+                found = head.get("format") if isinstance(head, dict) else head
+                raise ValueError(f"format {short_repr(found)}, expected {_FORMAT}")
+            rows = head["views"]
+            if not isinstance(rows, list):
+                raise ValueError(f"views = {short_repr(rows)}, expected a list")
+            return CameraPath(tuple(_parse_view(row, k, field) for k, row in enumerate(rows)))
+
+
+def mixed_lighting(one: EpisodeLighting, other: EpisodeLighting, share: float) -> EpisodeLighting:
+    """The lighting `share` of the way from one to another, both constant."""
+    if share <= 0.0 or one is other:
+        return one
+    if share >= 1.0:
+        return other
+    start = ((1.0 - share) * one.start + share * other.start).astype(np.float32)
+    return EpisodeLighting(f"{one.name} → {other.name}", start, fog=mixed(one.fog, other.fog, share))
+
+
+def named_lighting(field: BakedField, name: str) -> EpisodeLighting:
+    """A lighting of the field by its name or mixture. Raises InputError: it is unknown."""
+    return EpisodeLighting(name, field.embedding(name), fog=field.fog(name))
+
+
+def _view_row(view: KeyView) -> dict[str, Any]:
+    # Names have no blanks; that of a sampled lighting has.
+    named = None if " " in view.lighting.name else view.lighting.name
+    return {
+        "time": view.time,
+        "camera_to_world": view.camera_to_world.tolist(),
+        "fov": view.fov,
+        "lighting": named or [float(x) for x in view.lighting.start],
+    }
+
+
+def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
+    if not isinstance(row, dict):
+        raise ValueError(f"view {number} is {short_repr(row)}, expected a table")
+    pose = np.array(row["camera_to_world"], np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"view {number}: camera_to_world of shape {pose.shape}; expected 4×4 finite numbers")
+    turn = pose[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0.0:
+        raise ValueError(f"view {number}: the upper left 3×3 of camera_to_world is no rotation")
+    time, fov = float(row["time"]), float(row.get("fov", 60.0))
+    if not np.isfinite(time) or not _MIN_FOV <= fov <= _MAX_FOV:
+        raise ValueError(f"view {number}: time {time}, fov {fov}; expected an angle from {_MIN_FOV:g} to {_MAX_FOV:g}°")
+    given = row.get("lighting", field.lightings[0])
+    if isinstance(given, str):
+        return KeyView(time, pose, fov, named_lighting(field, given))
+    embedding = np.array(given, np.float32)
+    dim = field.lightings_by_name.vectors.shape[1]
+    if embedding.shape != (dim,) or not np.isfinite(embedding).all():
+        raise ValueError(f"view {number}: lighting {short_repr(given)}; expected a name, or {dim} numbers")
+    return KeyView(time, pose, fov, EpisodeLighting("sampled lighting", embedding))
+
+
+def path_frames(path: CameraPath, fps: int) -> Array:
+    """Times after the start of a film's frames [s], shape (k,)."""
+    return np.arange(round(path.duration * fps) + 1) / fps
+
+
+def write_path_film(
+    out: Path,
+    path: CameraPath,
+    picture: ScenePicture,
+    size: tuple[int, int],
+    fps: int,
+    on_frame: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Renders a path to an mp4 and returns its number of frames.
+
+    Args:
+        out: The mp4.
+        path: The camera path.
+        picture: Renders the scene; robot and obstacles are left out.
+        size: Width, height [px]; even.
+        fps: Frames per second.
+        on_frame: Called with the numbers of written and of all frames; may raise to stop, and no file is left.
+    """
+    views = path.at(path_frames(path, fps))
+    with VideoWriter(out, size, fps, _CRF) as writer:
+        for k, (pose, fov, lighting) in enumerate(views):
+            writer.write(path_image(picture, pose, fov, lighting, size))
+            on_frame(k + 1, len(views))
+    return len(views)
+
+
+def path_image(
+    picture: ScenePicture, pose: Array, fov: float, lighting: EpisodeLighting, size: tuple[int, int]
+) -> Image:
+    """One frame of a path's film, uint8, shape (height, width, 3)."""
+    return to_uint8(picture.render(FreeCamera.of_fov(pose, float(np.deg2rad(fov)), size), lighting).rgb[0])
+
+
+def spaced_times(views: Sequence[Array], speed: float, least: float) -> list[float]:
+    """Times at which a camera passes poses (4, 4) at a speed [m/s], with at least `least` [s] between two of them."""
+    points = np.array(views)[:, :3, 3]
+    steps = np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1) / speed, least)
+    return np.concatenate([[0.0], np.cumsum(steps)]).round(3).tolist()

@@ -1,0 +1,364 @@
+"""Driving in the page: the Husky in the scene's own environment, stepped in real time by keys, a policy or a script.
+
+Two environments share one set of obstacles, which may be added, moved and removed at any time. By keys the robot may
+reverse and go anywhere, and contacts are only told; a policy or the scripted driver drives a *task* of the scene, which
+ends as it does in `twin validate`.
+"""
+
+import copy
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_control.rl.control import PhysicsError
+
+from twin.config import OBSTACLE_KINDS, ObstacleConfig
+from twin.config_file import load_config
+from twin.env.drivers import Driver, PolicyDriver, RouteDriver
+from twin.env.episode_lighting import EpisodeLighting
+from twin.env.obstacles import EpisodeObstacles, ObstacleMotion, ground_height, obstacle_pose, place
+from twin.env.physics import camera_pose
+from twin.env.route_segments import RouteSegment, find_task
+from twin.env.suite import DriveEnvironment, EnvFactory
+from twin.env.task import DrivePhysics, DriveTask
+from twin.loading import Twin
+from twin.mjcf.world import World, arc_lengths, heading_at, nearest_on_route
+from twin.nerf.baked import BakedField
+from twin.types import Array, Image
+from twin.view.scene_picture import ObjectState
+
+KEYS_DRIVER, SCRIPTED_DRIVER = "keys W A S D", "scripted driver"
+
+_PER_KIND = 4  # obstacles of each kind that may stand at once
+_REACH = 25.0  # [m] beside the route, within which solid parts stop the robot when driven by keys
+_LONG = 1e6  # [s] time limit of a drive by keys
+_MAX_LAG = 0.5  # [s] behind real time that is caught up; more is dropped
+_POSE_STEPS = 12  # of the search for station and lateral of a point
+
+
+@dataclass(frozen=True)
+class LoadedTwin(Twin):
+    """A scene whose field is in memory already."""
+
+    baked: BakedField
+
+    def field(self, device: str = "cpu") -> BakedField:
+        return self.baked
+
+
+@dataclass(frozen=True)
+class DriveFacts:
+    """State of the drive after a control step."""
+
+    time: float
+    """[s]"""
+    base_to_world: Array
+    camera_to_world: Array
+    """Of the robot's camera, OpenCV axes."""
+    image: Image
+    """The robot's picture, shape (h, w, 3)."""
+    command: Array
+    """v [m/s] and yaw rate [rad/s]."""
+    speed: float
+    yaw_rate: float
+    torque: Array
+    """Motor torque of the left and right side at the wheels [N m]."""
+    current: Array
+    """[A], shape (2,)."""
+    cross_track: float
+    progress: float
+    trust: float
+    touched: tuple[str, ...]
+    cause: str
+    """Cause of the episode's end; empty while it goes on."""
+    rate: float
+    """Simulated over real time since the last steps; 1 is real time."""
+
+
+class PlacedObstacles(EpisodeObstacles):
+    """The obstacles that now stand in the scene, out of a pool of each kind."""
+
+    def __init__(self, world: World, segment: RouteSegment, given: tuple[ObstacleConfig, ...]) -> None:
+        """`given` are those of scene.toml, which stand from the beginning."""
+        super().__init__((), world, segment)
+        self._world = world
+        named = tuple(replace(one, name=one.name or f"{one.kind}_{k}") for k, one in enumerate(given))
+        spare = [ObstacleConfig(f"added_{kind}_{k}", kind) for kind in OBSTACLE_KINDS for k in range(_PER_KIND)]
+        self._pool = (*named, *spare)
+        self.standing: dict[str, ObstacleConfig] = {one.name: one for one in named}
+        """By name."""
+
+    @property
+    def pool(self) -> tuple[ObstacleConfig, ...]:
+        return self._pool
+
+    def sample(self, rng: np.random.Generator, beside: int = 0) -> tuple[ObstacleConfig, ...]:
+        return tuple(self.standing.values())
+
+    def free(self, kind: str) -> str | None:
+        """Name of an obstacle of a kind that does not stand; None if all do."""
+        return next((one.name for one in self._pool if one.kind == kind and one.name not in self.standing), None)
+
+    def put(self, name: str, x: float, y: float, yaw: float) -> None:
+        """Puts the obstacle of a name to x, y [m] and yaw [rad] in the world; it stands still from then on."""
+        mine = next(one for one in self._pool if one.name == name)
+        station, lateral = station_and_lateral(self._world.route, np.array([x, y]))
+        turn = np.rad2deg(yaw - float(heading_at(self._world.route, station)))
+        turn = (turn + 180.0) % 360.0 - 180.0
+        self.standing[name] = replace(
+            mine, station=round(station, 3), lateral=round(lateral, 3), yaw=round(turn, 1), to=(), delay=0.0
+        )
+
+    def pose(self, name: str, time: float = 0.0) -> tuple[float, float, float]:
+        """x, y [m] and yaw [rad] of a standing obstacle."""
+        return obstacle_pose(self.standing[name], self._world.route, time)
+
+    def toml(self) -> str:
+        """The standing obstacles as [[obstacle]] tables of scene.toml."""
+        rows = []
+        for one in self.standing.values():
+            rows.append(
+                f'[[obstacle]]\nname = "{one.name}"\nkind = "{one.kind}"\nstation = {one.station:.2f}\n'
+                f"lateral = {one.lateral:.2f}\nyaw = {one.yaw:.0f}"
+                + (f"\nto = [{one.to[0]:.2f}, {one.to[1]:.2f}]\nspeed = {one.speed:.2f}" if one.to else "")
+            )
+        return "\n\n".join(rows)
+
+
+def station_and_lateral(route: Array, xy: Array) -> tuple[float, float]:
+    """Station and lateral [m] of a point (2,), such that `obstacle_pose` gives the point; see `twin.env.obstacles`."""
+    length = float(arc_lengths(route)[-1])
+    foot, cross = nearest_on_route(route[:, :2], xy)
+    station, lateral = float(foot), float(cross)
+    for _ in range(_POSE_STEPS):
+        x, y, _ = obstacle_pose(ObstacleConfig(station=station, lateral=lateral), route, 0.0)
+        heading = float(heading_at(route, station))
+        along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+        error = xy - np.array([x, y])
+        station = float(np.clip(station + error @ along, -2.0 * length, 3.0 * length))
+        lateral += float(error @ left)
+    return station, lateral
+
+
+class FreeDrive(DriveTask):
+    """A task without an end, whose robot may reverse."""
+
+    def _bounds(self) -> tuple[Array, Array]:
+        high = np.array([self.options.speed, self.options.yaw_rate])
+        return -high, high
+
+    def get_termination(self, physics: DrivePhysics) -> None:
+        return None
+
+
+class KeyDriver:
+    """Drives by the held keys: W and S ahead and back, A and D to the left and right."""
+
+    def __init__(self, held: Callable[[], frozenset[str]]) -> None:
+        self._held = held
+
+    def __call__(self, environment: Any, step: dm_env.TimeStep) -> Array:
+        keys, limits = self._held(), environment.action_spec().maximum
+        return limits * np.array([("w" in keys) - ("s" in keys), ("a" in keys) - ("d" in keys)], float)
+
+
+class Driving:
+    """The environments, and the thread that steps the one being driven."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        field: BakedField,
+        task: str,
+        policy: Any,
+        lighting: EpisodeLighting,
+        held: Callable[[], frozenset[str]],
+        on_step: Callable[[DriveFacts], None],
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            twin: A built scene with a route.
+            field: Its field.
+            task: That a policy or the scripted driver drives.
+            policy: A `twin.learn.policy.Policy`, or None.
+            lighting: Of the robot's pictures.
+            held: Returns the held keys.
+            on_step: Called after every control step and reset, from the stepping thread.
+            seed: Of the task's episodes.
+
+        Raises:
+            InputError: the scene cannot be driven, or has no such task.
+        """
+        self.world, self._lighting, self._on_step, self._seed = twin.world(), lighting, on_step, seed
+        shared = LoadedTwin(twin.scene, field.single_threaded())
+        config = load_config(twin.scene.config_file)
+        options: dict[str, Any] = {"lighting": field.lightings[0], "observe": "nerf"}
+        self.obstacles = PlacedObstacles(self.world, find_task(task, self.world, config.task), config.obstacle)
+        common = {**options, "obstacles": self.obstacles.pool}
+        free = {
+            "half_width": max(_REACH, self.world.half_width),
+            "start_offset": 0.0,
+            "start_heading": 0.0,
+            "time_limit": _LONG,
+            "speed": self.world.robot.max_speed,
+            "yaw_rate": self.world.robot.max_yaw_rate,
+        }
+        loose = EnvFactory.open(shared, "route", {**common, **free})
+        bound = EnvFactory.open(shared, task, {**common, **(policy.options() if policy else {})})
+        by_keys, by_others = ("keys", loose, FreeDrive), ("task", bound, DriveTask)
+        self._drivers: dict[str, tuple[Driver, tuple[str, EnvFactory, type[DriveTask]]]] = {
+            KEYS_DRIVER: (KeyDriver(held), by_keys),
+            SCRIPTED_DRIVER: (RouteDriver(), by_others),
+        }
+        if policy:
+            self._drivers[f"policy {policy.name}"] = PolicyDriver(policy), by_others
+        self._environments: dict[str, DriveEnvironment] = {}
+        self._name = KEYS_DRIVER
+        self._lock = threading.RLock()
+        self._running, self._closed = threading.Event(), threading.Event()
+        self._rate = 1.0
+        self._step: dm_env.TimeStep | None = None
+        self.reset()
+        self._thread = threading.Thread(target=self._run, daemon=True, name="driving")
+        self._thread.start()
+
+    def _environment(self, factory: EnvFactory, kind: type[DriveTask]) -> DriveEnvironment:
+        factory = replace(factory, obstacles=self.obstacles)
+        physics = DrivePhysics.of(copy.copy(factory.model), factory.world.robot)
+        task = kind(factory.world, factory.segment, factory.options, self.obstacles, factory.model, self._seed)
+        pixels = factory.make_observer([(physics, task)])
+        assert pixels is not None
+        return DriveEnvironment(physics, task, pixels)
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        return tuple(self._drivers)
+
+    @property
+    def driver(self) -> str:
+        return self._name
+
+    @property
+    def running(self) -> bool:
+        return self._running.is_set()
+
+    @property
+    def environment(self) -> DriveEnvironment:
+        """The environment of the present driver; made when first driven."""
+        name, factory, kind = self._drivers[self._name][1]
+        if name not in self._environments:
+            self._environments[name] = self._environment(factory, kind)
+        return self._environments[name]
+
+    def choose(self, driver: str) -> None:
+        """Another driver takes over, from the start of its task."""
+        with self._lock:
+            self.pause()
+            if driver != self._name:
+                self._name = driver
+                self.reset()
+
+    def start(self) -> None:
+        with self._lock:
+            if self._step is not None and self._step.last():
+                self.reset()
+        self._running.set()
+
+    def pause(self) -> None:
+        self._running.clear()
+
+    def reset(self) -> None:
+        """Back to the start of a new episode."""
+        with self._lock:
+            environment = self.environment
+            self._step = environment.relight(environment.reset(), self._lighting)
+            self._report(np.zeros(2))
+
+    def set_lighting(self, lighting: EpisodeLighting) -> None:
+        """Changes the lighting of the robot's pictures, from the next one on."""
+        with self._lock:
+            self._lighting = lighting
+            self.environment.pixels.set_lighting(0, lighting, fill=False)
+
+    def objects(self) -> ObjectState:
+        """Where robot and obstacles are now."""
+        with self._lock:
+            return ObjectState.of(self.environment.physics.data.ptr)
+
+    def update_obstacles(self) -> None:
+        """Applies a change of `obstacles` to the drive."""
+        with self._lock:
+            environment = self.environment
+            task, data = environment.task, environment.physics.data.ptr
+            task.obstacles = tuple(self.obstacles.standing.values())
+            environment.physics.robot.move_obstacles = ObstacleMotion(task.obstacles, data)
+            place(task.obstacles, data, float(data.time))
+            environment.physics.forward()
+
+    def ground_height(self, x: float, y: float) -> float:
+        """[m]"""
+        return ground_height(self.environment.physics.model.ptr, x, y)
+
+    def close(self) -> None:
+        self._closed.set()
+        self._running.set()
+        self._thread.join(5.0)
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while True:
+            if not self._running.is_set():
+                self._running.wait()
+                due = time.monotonic()
+            if self._closed.is_set():
+                return
+            began = time.monotonic()
+            with self._lock:
+                if self._running.is_set():
+                    self._advance()
+            period = self.environment.task.options.control_timestep
+            due = max(due + period, time.monotonic() - _MAX_LAG)
+            time.sleep(max(0.0, due - time.monotonic()))
+            self._rate += 0.2 * (period / max(time.monotonic() - began, 1e-3) - self._rate)
+
+    def _advance(self) -> None:
+        driver, environment = self._drivers[self._name][0], self.environment
+        assert self._step is not None
+        action = np.asarray(driver(environment, self._step), float)
+        try:
+            self._step = environment.step(action)
+        except PhysicsError:  # the simulation diverged, as in a violent collision
+            self.reset()
+            return
+        if self._step.last():
+            self.pause()
+        self._report(environment.task.commands(action[None])[0])
+
+    def _report(self, command: Array) -> None:
+        environment = self.environment
+        physics, task, robot = environment.physics, environment.task, environment.physics.robot
+        assert self._step is not None
+        self._on_step(
+            DriveFacts(
+                time=float(physics.time()),
+                base_to_world=physics.base_to_world,
+                camera_to_world=camera_pose(physics.data.ptr, physics.model.ptr.camera("front").id),
+                image=self._step.observation["pixels"][-1],
+                command=command,
+                speed=physics.speed,
+                yaw_rate=physics.yaw_rate,
+                torque=robot.motor_torque,
+                current=robot.motor_current,
+                cross_track=task.cross_track,
+                progress=task.progress,
+                trust=float(environment.pixels.trust[0]),
+                touched=physics.touched,
+                cause=task.cause if self._step.last() else "",
+                rate=self._rate,
+            )
+        )

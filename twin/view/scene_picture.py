@@ -1,0 +1,131 @@
+"""Pictures of a scene from a free camera: the field under a lighting, with the robot and obstacles in it.
+
+The field alone needs nothing but itself. Robot and obstacles are composited by `twin.env.compositor` once `add_objects`
+was called; they are drawn where a state of their model is given.
+"""
+
+import copy
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from twin.config import ObstacleConfig
+from twin.env.compositor import Compositor
+from twin.env.episode_lighting import EpisodeLighting
+from twin.env.obstacles import add_obstacles
+from twin.env.suite import episode_spec
+from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, pixel_grid, unproject
+from twin.mjcf.world import World
+from twin.nerf.baked import BakedField
+from twin.nerf.rendering import Rendering
+from twin.types import Array, Array32
+
+_CAMERA = "view"  # name of the free camera in the model
+_MAX_COMPOSITORS = 3  # coarse, fine, and those of a page that is being resized
+_MAX_RAYS = 4  # sizes whose rays are kept
+
+
+@dataclass(frozen=True)
+class FreeCamera:
+    """A pinhole camera."""
+
+    camera_to_world: Array
+    """OpenCV axes, shape (4, 4)."""
+    intrinsics: Array
+    """fx, fy, cx, cy [px], shape (4,)."""
+    size: tuple[int, int]
+    """Width, height [px]."""
+
+    @staticmethod
+    def of_fov(camera_to_world: Array, fov: float, size: tuple[int, int]) -> "FreeCamera":
+        """A camera with a vertical angle of view [rad] and its principal point in the center."""
+        focal = size[1] / 2.0 / np.tan(fov / 2.0)
+        return FreeCamera(camera_to_world, np.array([focal, focal, size[0] / 2.0, size[1] / 2.0]), size)
+
+    @property
+    def fov(self) -> float:
+        """Vertical angle of view [rad]."""
+        return float(2.0 * np.arctan(self.size[1] / 2.0 / self.intrinsics[1]))
+
+
+@dataclass(frozen=True)
+class ObjectState:
+    """Positions of robot and obstacles."""
+
+    qpos: Array
+    mocap_pos: Array
+    mocap_quat: Array
+
+    @staticmethod
+    def of(data: mujoco.MjData) -> "ObjectState":
+        """A copy of the positions in `data`."""
+        return ObjectState(data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy())
+
+
+class ScenePicture:
+    """Renders a scene from free cameras, from several threads."""
+
+    def __init__(self, field: BakedField) -> None:
+        self.field = field
+        self._model: mujoco.MjModel | None = None
+        self._compositors: OrderedDict[tuple[int, int, float], Compositor] = OrderedDict()
+        self._rays: OrderedDict[tuple[int, int, bytes], Array32] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def add_objects(self, world: World, obstacles: tuple[ObstacleConfig, ...]) -> None:
+        """Adds the robot of a world, and obstacles, to the pictures; a state has their positions in this order."""
+        spec = episode_spec(world, 0.0, 0.0, 0.0)  # solid parts are not drawn
+        add_obstacles(spec, obstacles, world)
+        spec.worldbody.add_camera(name=_CAMERA)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        with self._lock:
+            self._model, self._data = model, data
+            self._compositors.clear()
+
+    def render(self, camera: FreeCamera, lighting: EpisodeLighting, objects: ObjectState | None = None) -> Rendering:
+        """Renders one picture, with the lighting's fog; `objects` are drawn if the camera's center is its middle."""
+        with self._lock:
+            if objects is None or self._model is None:
+                view = Viewpoints.of(camera.camera_to_world, camera.intrinsics, camera.size)
+                out = self.field.render(view, lighting.start)
+            else:
+                out = self._render_objects(camera, lighting, objects)
+            if lighting.fog is not None and lighting.fog.extinction:
+                out.rgb[0] = lighting.fog.apply(out.rgb[0], out.depth[0] * self._ray_lengths(camera))
+        return out
+
+    def _render_objects(self, camera: FreeCamera, lighting: EpisodeLighting, objects: ObjectState) -> Rendering:
+        compositor = self._compositor(camera)
+        data = self._data
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = objects.qpos, objects.mocap_pos, objects.mocap_quat
+        mujoco.mj_kinematics(data.model, data)
+        pose, number = opencv_to_mujoco(camera.camera_to_world), data.model.camera(_CAMERA).id
+        data.cam_xpos[number], data.cam_xmat[number] = pose[:3, 3], pose[:3, :3].ravel()
+        return compositor.render([data], lighting.start)
+
+    def _compositor(self, camera: FreeCamera) -> Compositor:
+        key = (*camera.size, round(camera.fov, 4))
+        if key not in self._compositors:
+            model = copy.copy(self._model)
+            assert model is not None
+            model.cam_fovy[model.camera(_CAMERA).id] = np.rad2deg(camera.fov)
+            self._compositors[key] = Compositor(model, self.field, camera.size, camera=_CAMERA)
+            if len(self._compositors) > _MAX_COMPOSITORS:
+                self._compositors.popitem(last=False)
+        self._compositors.move_to_end(key)
+        return self._compositors[key]
+
+    def _ray_lengths(self, camera: FreeCamera) -> Array32:
+        """Length of the rays of unit z-depth, shape (height, width)."""
+        key = (*camera.size, camera.intrinsics.tobytes())
+        if key not in self._rays:
+            rays = unproject(pixel_grid(*camera.size), camera.intrinsics)
+            self._rays[key] = np.linalg.norm(rays, axis=-1).astype(np.float32)
+            if len(self._rays) > _MAX_RAYS:
+                self._rays.popitem(last=False)
+        return self._rays[key]
