@@ -410,7 +410,7 @@ def _mean_colors(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDA
     sums = np.stack([np.bincount(node[inside], rgb[inside, k], len(count)) for k in range(3)], -1)
     sums = (sums / np.maximum(count, 1)[:, None]).reshape(grid.rows, grid.columns, 3)
     seen = (count > 0).reshape(grid.rows, grid.columns).astype(np.float64)
-    colors = np.empty_like(sums)
+    colors: Array = np.empty_like(sums)
     colors[:] = sums[seen > 0].mean(0)
     for width in reversed(_COLOR_WIDTHS):
         sigma = width / grid.cell
