@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.config_file import parse_table
 from twin.errors import InputError, join_names
@@ -63,7 +64,7 @@ from twin.evaluation.statistics import (
 )
 from twin.evaluation.trials import Cell
 from twin.files import exists, read_json, wrap_read_errors, write_json
-from twin.types import Array
+from twin.types import Array, Indices
 
 ALL_TASKS = "all tasks"
 _FILE = "forecast.json"
@@ -391,7 +392,7 @@ def _scores(real: Sequence[Cell], twin: Cells) -> tuple[float, float]:
     return float(np.mean([twin[c.twin_key].rate for c in real])), float(np.mean([c.rate for c in real]))
 
 
-def _counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Array, Array]:
+def _counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
     """Successes and trials of each policy's units: its cells, or single episodes unless `by_day`."""
     if by_day:
         return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
@@ -499,7 +500,7 @@ def _statistic(name: str, of: Callable[..., float], data: PairedCells) -> Estima
     return Estimate(value, float(low), float(high), data.policies)
 
 
-def _winner(data: PairedCells) -> dict[str, Estimate]:
+def _winner(data: PairedCells) -> dict[str, Any]:
     """Agreement and regret of the winner, as means over tasks with two policies or more."""
     n, names = data.policies, ("winner_agreement", "winner_regret")
     if all(len(members) < 2 for members in data.strata):
@@ -531,7 +532,7 @@ def _mean_real(data: PairedCells, candidates: list[Candidate]) -> Estimate:
     further = [c.twin.value for c in candidates if not c.driven and c.twin.value is not None]
     rates = data.rates()
     try:
-        mean = prediction_powered_mean(**rates, twin_only=further)
+        mean = prediction_powered_mean(twin=rates["twin"], real=rates["real"], twin_only=further)
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
     return Estimate(mean.value, n=data.policies + len(further), no_interval="none: it would not count days")
@@ -593,7 +594,7 @@ def _real_rows(real: Sequence[Cell]) -> list[list[Cell]]:
     return [[cell for cell in real if (cell.policy, cell.task) == key] for key in keys]
 
 
-def _trials_and_days(real: Sequence[Cell]) -> tuple[Array, Array]:
+def _trials_and_days(real: Sequence[Cell]) -> tuple[Indices, NDArray[np.object_]]:
     """Trials and day of each cell, in the layout of `pair_cells`."""
     rows = _real_rows(real)
     shape = len(rows), max(map(len, rows))
@@ -680,10 +681,10 @@ def _pair(cell: Cell, mate: Cell) -> CellPair:
         real_trials=cell.trials,
     )
     alone = "none for a single cell"
-    rates = (Estimate(c.rate, n=c.trials, no_interval=alone) for c in (mate, cell))
+    in_twin, on_road = (Estimate(c.rate, n=c.trials, no_interval=alone) for c in (mate, cell))
     bias = Estimate(float(value), n=cell.trials, no_interval=alone)
     within = bool(low <= 0.0 <= high)
-    return CellPair(cell.policy, cell.task, cell.lighting, mate.lighting, *rates, bias, within)
+    return CellPair(cell.policy, cell.task, cell.lighting, mate.lighting, in_twin, on_road, bias, within)
 
 
 def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int) -> TrialAllocation:

@@ -80,7 +80,7 @@ def mean_score(data: PairedCells, score: Array) -> float:
     return float(((data.weight * score).sum(-1) / data.weight.sum(-1)).mean())
 
 
-def twin_probabilities(successes: Array, trials: Array) -> Array:
+def twin_probabilities(successes: Array | Indices, trials: Array | Indices) -> Array:
     """The twin's probability for each of its cells, shrunk towards the policy's rate in the twin, shapes (n, k)."""
     return RateModel.fit(successes, trials, shared_days=False, road=False).cell_means()
 
