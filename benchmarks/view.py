@@ -36,13 +36,12 @@ TARGETS = {
 """Figure → sense and target."""
 
 _SIZE = (960, 540)  # of the page [px]; the panel leaves 640×540 of it to the picture
+# The picture's images alone are loaded by a script that sets the property `src`; the panel's have it as attribute.
 _COUNT = """
-window.pictures = 0; window.shown = [];
-const revoke = URL.revokeObjectURL, load = HTMLImageElement.prototype;
-URL.revokeObjectURL = (url) => { window.pictures += 1; window.last = performance.now(); return revoke.call(URL, url); };
-const source = Object.getOwnPropertyDescriptor(load, "src");
-Object.defineProperty(load, "src", {...source, set(value) {
-  this.addEventListener("load", () => { window.width = Math.max(this.naturalWidth, 1); });
+window.pictures = 0;
+const source = Object.getOwnPropertyDescriptor(HTMLImageElement.prototype, "src");
+Object.defineProperty(HTMLImageElement.prototype, "src", {...source, set(value) {
+  this.addEventListener("load", () => { window.pictures += 1; window.width = this.naturalWidth; }, {once: true});
   source.set.call(this, value); }});
 """
 _EVENTS_PER_S = 25.0
@@ -119,6 +118,7 @@ def drag(browser: Chromium, seconds: float) -> float:
         k += 1
         time.sleep(max(0.0, began + k / _EVENTS_PER_S - time.monotonic()))
     shown = (browser.evaluate("window.pictures") - before) / (time.monotonic() - began)
+    browser.evaluate("window.width = 0")
     browser.mouse("mouseReleased", float(x), 300, button="left", buttons=0, clickCount=1)
     return float(shown)
 
@@ -228,7 +228,6 @@ def measure(scene: Path, minutes: float) -> dict[str, Any]:
                 "(document.body.textContent.match(/([0-9.]+)× real time/) || [0, '0'])[1]",
             )
             browser.click_on("button", "Stop")
-            # Two of these a second are the robot's picture and the plot in the panel.
             out["driving"] = {"pictures_per_s": shown, "real_time_factor": float(rate), "others_cores": other.cores}
             if minutes > 0:
                 out["random"] = random_clicks(browser, served, 60.0 * minutes)

@@ -77,6 +77,7 @@ class Page:
         self.driving: Driving | None = None
         self._lock = threading.RLock()
         self._jobs = ThreadPoolExecutor(1, thread_name_prefix="jobs")
+        self._closed = threading.Event()
         self._rng = np.random.default_rng()
         self._film_index: int | None = None
         self._film_share = 0.5
@@ -186,6 +187,10 @@ class Page:
             except InputError as error:
                 self.notify("That did not work", str(error), "red")
 
+    def _submit(self, job: Callable[..., None], *given: Any) -> None:
+        """Runs a job after those before it; a bug's traceback is printed."""
+        self._jobs.submit(job, *given).add_done_callback(lambda future: future.cancelled() or future.result())
+
     def notify(self, title: str, body: str, color: Any = None, seconds: float | None = 12.0) -> None:
         """Shows a notice on all pages."""
         for client in self._clients():
@@ -282,7 +287,7 @@ class Page:
             check_name(lighting, "name")
             self._upload.disabled = True
             self.notify("Relighting", f"{name}: finding where it was taken, then fitting its light: about a minute.")
-            self._jobs.submit(self._relight, lighting, Path(name).suffix, content)
+            self._submit(self._relight, lighting, Path(name).suffix, content)
 
     def _relight(self, name: str, suffix: str, content: bytes) -> None:
         """Adds a photo's lighting by `twin relight`, in a process of its own: it needs much memory for a minute."""
@@ -303,7 +308,7 @@ class Page:
                 self.reload_lightings()
                 self._slider.value = float(self.field.lightings.index(name))
                 self._slid()
-                self.notify(f"Lighting {name}", done.stdout.strip().splitlines()[-2], "green")
+                self.notify(f"Lighting {name} added", done.stdout.strip().splitlines()[1], "green")
         finally:
             self._upload.disabled = False
 
@@ -490,10 +495,12 @@ class Page:
         out = self.twin.scene.root / "films" / f"{file.stem}.mp4"
         out.parent.mkdir(exist_ok=True)
         self._film_button.disabled, self._progress.visible = True, True
-        self._jobs.submit(self._write_film, path, out)
+        self._submit(self._write_film, path, out)
 
     def _write_film(self, path: CameraPath, out: Path) -> None:
         def on_frame(done: int, total: int) -> None:
+            if self._closed.is_set():
+                raise OSError("the page was closed")
             if done % 10 == 0 or done == total:
                 self._progress.value = 100.0 * done / total
 
@@ -540,7 +547,6 @@ class Page:
 
     def _choose_driver(self, driving: Driving) -> None:
         driving.choose(self._driver.value)
-        self._torques.clear()
         self._show_running(driving)
 
     def _toggle_drive(self, driving: Driving) -> None:
@@ -555,7 +561,6 @@ class Page:
 
     def _restart(self, driving: Driving) -> None:
         driving.reset()
-        self._torques.clear()
         self._follow = None
 
     def _show_running(self, driving: Driving) -> None:
@@ -572,6 +577,8 @@ class Page:
         driving = self.driving
         if driving is None:
             return
+        if self._torques and facts.time < self._torques[-1][0]:  # a new drive
+            self._torques.clear()
         self._torques.append((facts.time, float(facts.torque[0]), float(facts.torque[1])))
         if driving.running and self._behind.value and self._film_index is None:
             if self._follow is None:
@@ -661,6 +668,7 @@ class Page:
         self._obstacle_text.content = note + keep
 
     def close(self) -> None:
+        self._closed.set()
         self.loop.close()
         if self.driving is not None:
             self.driving.close()
