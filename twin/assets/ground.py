@@ -408,14 +408,14 @@ def _mean_colors(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDA
     if not count.any():
         return np.full((grid.rows, grid.columns, 3), 128, np.uint8)
     sums = np.stack([np.bincount(node[inside], rgb[inside, k], len(count)) for k in range(3)], -1)
-    sums = (sums / np.maximum(count, 1)[:, None]).reshape(grid.rows, grid.columns, 3)
+    mean: Array = (sums / np.maximum(count, 1)[:, None]).reshape(grid.rows, grid.columns, 3)
     seen = (count > 0).reshape(grid.rows, grid.columns).astype(np.float64)
-    colors: Array = np.empty_like(sums)
-    colors[:] = sums[seen > 0].mean(0)
+    colors: Array = np.empty_like(mean)
+    colors[:] = mean[seen > 0].mean(0)
     for width in reversed(_COLOR_WIDTHS):
         sigma = width / grid.cell
         weight = gaussian_filter(seen, sigma, mode="constant")
-        near = gaussian_filter(sums, (sigma, sigma, 0.0), mode="constant") / np.maximum(weight, 1e-12)[..., None]
+        near = gaussian_filter(mean, (sigma, sigma, 0.0), mode="constant") / np.maximum(weight, 1e-12)[..., None]
         share = np.clip(weight / _COLOR_WEIGHT, 0.0, 1.0)[..., None]
         colors += share * (near - colors)
     return np.clip(colors + 0.5, 0, 255).astype(np.uint8)

@@ -6,7 +6,7 @@ PoseWithCovarianceStamped for poses, preferably without a word of `_FROM_WHEELS`
 for accelerations. The table has a row per joint state, with the newest values of the other topics.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -114,7 +114,7 @@ def _imu(message: Any) -> tuple[float, ...]:
     return message.linear_acceleration.x, message.linear_acceleration.y
 
 
-VALUES = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
+VALUES: dict[str, Callable[[Any], Any]] = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
 """Functions from a message of each kind to its numbers: v, ω; wheel speeds; x, y, yaw; accelerations."""
 _NAMES = {
     "commands": ("cmd_v", "cmd_yaw_rate"),

@@ -64,7 +64,7 @@ class TrialRecording:
             mine = [one for one in reader.connections if one.topic == self.topics["pictures"]]
             for connection, recorded, raw in reader.messages(connections=mine):
                 stamp = shift.get(recorded)
-                if stamp in wanted:
+                if stamp is not None and stamp in wanted:
                     wanted.discard(stamp)
                     yield stamp, picture_of(reader.deserialize(raw, connection.msgtype))
 
