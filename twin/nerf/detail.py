@@ -136,7 +136,7 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
     grid = detail_grid(ground, baked.device)
     rng = np.random.default_rng([seed, 7])
     share = min(1.0, _MAX_HITS / max(1, int(0.7 * pixels.start[-1])))
-    parts = []
+    parts: list[list[NDArray[Any]]] = []
     with bar("surfaces", len(pixels.cameras), "frame") as progress:
         for i in range(len(pixels.cameras)):
             width, height = int(pixels.width[i]), int(pixels.height[i])
@@ -166,13 +166,12 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
             ray = local @ pose[:3, :3].T
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
             base = features[0].reshape(volume.CHANNELS, -1)[1:, at].T.astype(np.float16)
-            parts.append(
-                (hit[at], base, ray.astype(np.float16), pixels.colors[rows][at], np.full(len(at), i, np.int32))
-            )
+            frame = np.full(len(at), i, np.int32)
+            parts.append([hit[at], base, ray.astype(np.float16), pixels.colors[rows][at], frame])
             progress.update()
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    order = rng.permutation(len(columns[0]))
-    return SurfacePixels(*(column[order] for column in columns))
+    order = rng.permutation(sum(len(part[0]) for part in parts))
+    # Column by column, as all of them twice would be the build's peak of memory.
+    return SurfacePixels(*(np.concatenate([part.pop(0) for part in parts])[order] for _ in range(5)))
 
 
 def _choose_tiles(hits: NDArray[np.float32], map_shape: tuple[int, ...]) -> tuple[NDArray[np.int32], float]:
