@@ -13,7 +13,7 @@ from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField, Detail, detail_grid
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
-from twin.nerf.kernels import detail as kernels
+from twin.nerf.kernels import surface_detail as kernels
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.trainer import train_field
 from twin.runtime import set_quiet

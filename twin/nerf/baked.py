@@ -23,8 +23,8 @@ from twin.files import check_shapes, load_tensors, read_json, require_text, wrap
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
 from twin.nerf.fog import Fog
-from twin.nerf.kernels import detail as detail_kernels
 from twin.nerf.kernels import march as kernels
+from twin.nerf.kernels import surface_detail as detail_kernels
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
 from twin.nerf.kernels.color_head import LANES as HEAD_LANES
@@ -133,7 +133,7 @@ def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str,
 
 @dataclass(frozen=True)
 class Detail:
-    """Features at surfaces, finer than bricks; terms as in `kernels/detail.py`."""
+    """Features at surfaces, finer than bricks; terms as in `kernels/surface_detail.py`."""
 
     heights: Array32
     """Height map [m], shape (along x, along y)."""

@@ -1,4 +1,4 @@
-"""Detail of a baked field: fits it to the training frames; terms as in `kernels/detail.py`.
+"""Detail of a baked field: fits it to the training frames; terms as in `kernels/surface_detail.py`.
 
 Bricks blur surfaces that are seen at grazing angles, the ground most of all: a ray runs through many of their cells
 before it is blocked. But where it is blocked is known better than that, and on the ground to a few centimeters, as its
@@ -21,7 +21,7 @@ from twin.nerf.baked import BakedField, Detail, detail_grid
 from twin.nerf.buffers import parallel, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import detail as kernels
+from twin.nerf.kernels import surface_detail as kernels
 from twin.runtime import bar
 from twin.warp_runtime import wp
 
@@ -211,7 +211,7 @@ class _DetailFitter:
             values, gradient = new(rows, volume.CHANNELS), new(rows, volume.CHANNELS)
             tables.append((values[1], gradient[1], new(rows, dtype=wp.float32)[1]))
         self.texels, self.vertices = tables
-        wp.load_module("twin.nerf.kernels.detail", device=self.device)
+        wp.load_module("twin.nerf.kernels.surface_detail", device=self.device)
 
     def run(self, steps: int) -> tuple[float, float]:
         """Fits the detail; returns the PSNR [dB] of the first and of the last tenth of the batches."""
