@@ -64,7 +64,7 @@ class TrialRecording:
             mine = [one for one in reader.connections if one.topic == self.topics["pictures"]]
             for connection, recorded, raw in reader.messages(connections=mine):
                 stamp = shift.get(recorded)
-                if stamp in wanted:
+                if stamp is not None and stamp in wanted:
                     wanted.discard(stamp)
                     yield stamp, picture_of(reader.deserialize(raw, connection.msgtype))
 
@@ -180,7 +180,7 @@ def _value(kind: str, message: Any) -> Any:
     if kind == "poses":
         pose = getattr(message.pose, "pose", message.pose)
         q = pose.orientation
-        return (*VALUES["poses"](message), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
+        return (*(VALUES["poses"](message) or ()), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
     return VALUES[kind](message)
 
 
