@@ -100,19 +100,11 @@ def record_trial(
     trial = _with_cause(_judge(recording, factory, fit, begin, bag), cause, bag)
     end = begin + round(float(trial.times[-1]) * 1e9)
 
-    replayed = replay(
-        *(
-            factory,
-            trial.poses[0],
-            trial.times,
-            1e-9 * (recording.command_times - begin).astype(np.float64),
-            recording.commands,
-        )
-    )
+    since = np.asarray((recording.command_times - begin) * 1e-9, np.float64)
+    replayed = replay(factory, trial.poses[0], trial.times, since, recording.commands)
     used, pictures, apart = _pictures(recording, rectify, policy, begin, end)
     width, height = rectify.pinhole.size
-    fx, fy, cx, cy = rectify.pinhole.intrinsics
-    camera = PixelCamera((fx, fy, cx, cy), (width, height))
+    camera = PixelCamera(rectify.pinhole.intrinsics, (width, height))
     views = view(factory, fit(recording.poses_at(used)), pictures, camera, chosen)
 
     folder = root / "trials" / bag.stem
@@ -128,21 +120,20 @@ def record_trial(
     from twin.report.trial_video import write_trial_video
 
     write_trial_video(
-        *(
-            folder / "trial.mp4",
-            trial,
-            replayed,
-            pictures,
-            1e-9 * (used - begin).astype(np.float64),
-            views,
-            factory.world,
-        ),
-        *(factory.options.half_width or factory.world.half_width, (factory.segment.start, factory.segment.end)),
-        *(load_ground_and_parts(scene.scene), f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"),
+        folder / "trial.mp4",
+        trial,
+        replayed,
+        pictures,
+        np.asarray((used - begin) * 1e-9, np.float64),
+        views,
+        factory.world,
+        factory.options.half_width or factory.world.half_width,
+        (factory.segment.start, factory.segment.end),
+        load_ground_and_parts(scene.scene),
+        f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}",
     )
     write_json(folder / "trial.json", figures)
-    trials = [one for one in known if (one.policy, one.task, one.lighting, one.seed) != _key(row)] + [row]
-    write_real_trials(trials, table, out, compared)
+    write_real_trials([*(one for one in known if _key(one) != _key(row)), row], table, out, compared)
     return row, figures, folder
 
 
@@ -208,7 +199,7 @@ def _judge(recording: TrialRecording, factory: EnvFactory, fit: FrameFit, begin:
             f"{bag}: {recording.topics['poses']} has poses from {(int(recording.pose_times[0]) - begin) * 1e-9:.1f} "
             f"to {left:.1f} s after the first command; expected the whole trial"
         )
-    times = period * np.arange(steps + 1, dtype=np.float64)
+    times = np.arange(steps + 1) * np.float64(period)
     stamps = begin + np.round(times * 1e9).astype(np.int64)
     upright = np.interp(stamps - begin, recording.pose_times - begin, recording.uprightness)
     return judge(factory, times, fit(recording.poses_at(stamps)), upright)

@@ -180,7 +180,7 @@ def _value(kind: str, message: Any) -> Any:
     if kind == "poses":
         pose = getattr(message.pose, "pose", message.pose)
         q = pose.orientation
-        return (*VALUES["poses"](message), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
+        return (*(VALUES["poses"](message) or ()), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
     return VALUES[kind](message)
 
 

@@ -44,7 +44,7 @@ class PolicyNode(Node):
         pinhole = [float(x) for x in parameter("policy_camera", [0.0]) if x]
         if len(pinhole) not in (0, 4):
             raise ValueError(f"policy_camera = {pinhole}; expected fx, fy, cx, cy at {policy.size} px, or nothing")
-        camera = Camera(policy.size, tuple(pinhole)) if pinhole else None
+        camera = Camera(policy.size, (pinhole[0], pinhole[1], pinhole[2], pinhole[3])) if pinhole else None
         self._steady = self._now if self.get_parameter("use_sim_time").value else time.monotonic_ns
         self.pilot = Pilot(policy, limits, camera, self._now, self._steady)
         self._rectified, self._frame = parameter("rectified", False), parameter("frame_id", "base_link")

@@ -59,8 +59,10 @@ class OnnxPolicy:
             self.timestep = float(control["control_timestep"])
             self.size = int(network["size"][0]), int(network["size"][1])
             self.stack = int(network["stack"])
-            given = trained.get("camera")
-            self.camera = Camera(self.size, tuple(float(x) for x in given)) if given else None
+            self.camera: Camera | None = None
+            if trained.get("camera"):
+                fx, fy, cx, cy = map(float, trained["camera"])
+                self.camera = Camera(self.size, (fx, fy, cx, cy))
         except (KeyError, TypeError, ValueError, IndexError, PictureError) as error:
             raise ValueError(f"{path}: {type(error).__name__}: {error}; expected a policy of twin train") from None
         numbers = (self.speed, self.max_yaw_rate, self.timestep)

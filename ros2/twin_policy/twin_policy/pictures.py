@@ -105,7 +105,7 @@ class Camera:
 
     size: tuple[int, int]
     """Width, height [px]."""
-    intrinsics: tuple[float, ...]
+    intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [px]; (0, 0) is the outer corner of the top-left pixel."""
     model: str = ""
     """plumb_bob, rational_polynomial, equidistant (fisheye), or empty for none."""
@@ -222,8 +222,8 @@ class Rectifier:
                 f"{max_outside:.0%}: enter its intrinsics in [robot], build, train and validate with them"
             )
         # OpenCV counts pixels from the center of the first one.
-        first, second = ((one - 0.5).astype(np.float32) for one in (column, row))
-        self._maps = cv2.convertMaps(first, second, cv2.CV_16SC2)
+        column, row = ((one - 0.5).astype(np.float32) for one in (column, row))
+        self._columns_rows, self._fractions = cv2.convertMaps(column, row, cv2.CV_16SC2)
 
     def __call__(self, picture: np.ndarray) -> np.ndarray:
         """RGB (h, w, 3) of the camera → RGB of the pinhole camera. Raises PictureError: another size."""
@@ -235,5 +235,6 @@ class Rectifier:
             )
         if self.is_identity:
             return picture
-        fine = cv2.remap(picture, self._maps[0], self._maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        near = cv2.BORDER_REPLICATE
+        fine = cv2.remap(picture, self._columns_rows, self._fractions, cv2.INTER_LINEAR, borderMode=near)
         return cv2.resize(fine, self.pinhole.size, interpolation=cv2.INTER_AREA)
