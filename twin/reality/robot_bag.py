@@ -5,6 +5,7 @@ bag has those pictures, camera_info, commands, and poses such as RTK gives them,
 on for a moment after the trial's end.
 """
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +20,7 @@ from twin.env.options import STEERING, TWIST, parse_options
 from twin.env.task import CAMERA, control
 from twin.errors import InputError
 from twin.evaluation.trials import Trial
+from twin.files import remove
 from twin.learn.policy import Control
 from twin.reality import SEED, true_world
 from twin.reality.lighting import WEATHER
@@ -96,7 +98,11 @@ def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, s
     steps, left = 0, round(_AFTER / driving.control_timestep)
     path.parent.mkdir(parents=True, exist_ok=True)
     limit = round(drive.time_limit / driving.control_timestep) + left
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer, bar("trial", limit, "step") as progress:
+    with contextlib.ExitStack() as stack:
+        unfinished = stack.enter_context(contextlib.ExitStack())  # what Ctrl-C leaves behind is no bag
+        unfinished.callback(remove, path)
+        writer = stack.enter_context(Writer(path, version=9, storage_plugin=StoragePlugin.MCAP))
+        progress = stack.enter_context(bar("trial", limit, "step"))
         topics = {kind: writer.add_connection(*topic, typestore=messages.store) for kind, topic in _TOPICS.items()}
 
         def write(kind: str, message: Any) -> None:
@@ -125,6 +131,7 @@ def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, s
                 environment.step(np.array([yaw_rate] if driving.action == STEERING else [v, yaw_rate]))
                 steps += 1
             progress.update()
+        unfinished.pop_all()
     name = onnx.name if onnx else "route follower"
     return Trial(name, drive.segment.name, lighting, seed, drive.cause, drive.progress, steps)
 
