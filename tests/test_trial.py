@@ -57,7 +57,7 @@ def drive(scene: Path, name: str, turn: float) -> list[Recorded]:
 
 
 def _outcome(cause: str, progress: float, steps: int) -> Recorded:
-    """What a robot does not record: the episode's truth, beside the bag."""
+    """The episode's truth, which a robot does not record, beside the bag."""
     return Recorded("", "", (cause, progress, steps), 0)
 
 

@@ -221,7 +221,7 @@ class DayScores:
     gain: float
     """Log score of the predictor minus the twin's: above 0 the twin is better."""
     interval: tuple[float, float] | None
-    """Of the gain."""
+    """Interval of the gain."""
 
 
 def probabilities(policies: Sequence[PolicyRecord], days: Sequence[str]) -> tuple[PairedCells, dict[str, np.ndarray]]:

@@ -54,7 +54,7 @@ class RateModel:
     """Posterior of the rates of n policies; see the module."""
 
     successes: Array
-    """Of each cell, shape (n, k)."""
+    """Per cell, shape (n, k)."""
     trials: Array
     """Shape (n, k); 0 in padding."""
     likelihood: Array

@@ -27,14 +27,14 @@ DEADMAN = "deadman switch is not held"
 
 @dataclass(frozen=True)
 class Limits:
-    """What is tolerated before the robot stops. Raises ValueError: a value out of range."""
+    """Limits beyond which the robot stops. Raises ValueError: a value out of range."""
 
     timeout: float = 0.3
     """Age of the newest picture that a command may depend on [s]; 0.3 s bears one lost picture at 10 Hz."""
     inference: float = 0.1
     """Longest time from a picture's arrival to its command [s]."""
     ahead: float = 0.05
-    """How far a stamp may be ahead of the clock [s]."""
+    """Greatest lead of a stamp over the clock [s]."""
     clock_jump: float = 0.05
     """Sudden change of the clock against the steady one [s]."""
     early: float = 0.25
@@ -56,7 +56,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Command:
-    """What the robot is to do."""
+    """A command, or the cause of a stop."""
 
     v: float = 0.0
     """[m/s]"""

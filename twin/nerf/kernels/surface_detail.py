@@ -288,6 +288,7 @@ def adam_row(
     gradient: wp.array(dtype=Channels),
     second: wp.array(dtype=wp.float32),
 ):
+    """Adam step of one row, if it has a gradient."""
     g = gradient[row]
     squared = wp.dot(g, g)
     if squared > 0.0:
