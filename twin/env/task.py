@@ -49,10 +49,10 @@ STATE_SIZES = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, 
 """Components of the state and their sizes; see `RewardAndTermination.state`."""
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
-_BUMPER_OFFSET = 0.5  # [m] ahead of the base
+BUMPER_OFFSET = 0.5  # [m] ahead of the base
 _SEARCH_WINDOW = (1.0, 3.0)  # [m] behind and ahead of the last foot
-_ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
-_STUCK_TIME, _STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: stuck if it moves less than this distance in this time
+ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
+STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: stuck if it moves less than this distance in this time
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, in multiples of the controller's own limits
 _LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route, at which the state contains the change of heading
 
@@ -98,7 +98,7 @@ class RewardAndTermination:
         self._cause = np.zeros(count, int)
         self._route = world.route[:, :2]
         self._previous_foot, self._steering = np.zeros(count), np.zeros(count)
-        # Position and time of the last movement by _STUCK_DISTANCE.
+        # Position and time of the last movement by STUCK_DISTANCE.
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
@@ -125,16 +125,16 @@ class RewardAndTermination:
         position = motion.pose[:, :2]
         self._previous_foot[which] = self.foot[which]
         foot, cross = self.foot[which], self.cross_track[which] = self._nearest(position, self.foot[which])
-        moved = np.linalg.norm(position - self._anchor[which], axis=-1) > _STUCK_DISTANCE
+        moved = np.linalg.norm(position - self._anchor[which], axis=-1) > STUCK_DISTANCE
         self._anchor[which] = np.where(moved[:, None], position, self._anchor[which])
         self._anchor_time[which] = np.where(moved, motion.time, self._anchor_time[which])
         conditions = {  # the first that holds takes precedence
-            "rollover": motion.uprightness < _ROLLOVER_COSINE,
+            "rollover": motion.uprightness < ROLLOVER_COSINE,
             "collision": motion.touched,
             "out_of_bounds": np.abs(cross) > self.half_width,
-            "goal": foot >= self.segment.end - _BUMPER_OFFSET,
+            "goal": foot >= self.segment.end - BUMPER_OFFSET,
             "timeout": motion.time > self.time_limit - 1e-6,
-            "stuck": motion.time - self._anchor_time[which] >= _STUCK_TIME,
+            "stuck": motion.time - self._anchor_time[which] >= STUCK_TIME,
         }
         self._cause[which] = np.select(list(conditions.values()), [_CODES[cause] for cause in conditions], 0)
 

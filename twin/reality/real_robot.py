@@ -1,225 +1,552 @@
-"""The robot of the real test: a Husky with hidden parameters, the true road it drives on, and its camera.
+"""The robot of the real test: a Husky by number, in equations of its own, without MuJoCo.
 
-Each hidden value is uniform in the range stated here, sampled with a fixed seed, and stays the same in all trials and
-the drive log. Published values (the controller's limits, the track) are unchanged.
+The chassis is a rigid body with three degrees of freedom in the plane of the ground beneath it. Each of four tires has
+its own load and its own slip; the two tires of a side turn together, behind one motor with gear. Height, pitch and roll
+follow the ground under the tires as a lightly damped oscillator, which bumps and the road's texture excite: at 1 m/s
+the ground changes over tenths of a second, a bounce on the tires over hundredths.
+
+Tire: the averaged lumped LuGre model (Canudas de Wit, Tsiotras, Velenis, Basset, Gissinger 2003, Vehicle System Dynamics
+39(3)) in its anisotropic planar form (Velenis, Tsiotras, Canudas de Wit, Sorine 2005, Vehicle System Dynamics 43(1)).
+For the deflection z of the bristles [m] along the tire's two axes i, slip velocity v, friction coefficients μ, rolling
+speed u = |r ω| and the patch's length L:
+
+    dz_i/dt = v_i − (σ₀ |M v| / (μ_i² g) + κ₀ u / L) z_i,    |M v| = √((μ_x v_x)² + (μ_y v_y)²)
+    F_i = −(σ₀ z_i + σ₁ dz_i/dt) N,    κ₀ = 7/6 (Deur 2001, IFAC Workshop Advances in Automotive Control)
+
+with g = 1 + (s − 1) exp(−√(|v| / v_s)), Stribeck's excess s of static over sliding friction. In steady sliding the force
+is that of Coulomb's ellipse; a rolling tire creeps in proportion to its force; at rest it holds like a spring.
+
+Loads: on four equal springs the weight, the load transfer of acceleration (h ΣF/L along, h ΣF/B across) and the warp of
+the ground under the four tires superpose. Motor: torque k i, current i = (U − k ω) / R within ±the limit of the current;
+U is at most the battery's voltage, which sags by its resistance times the current drawn. A velocity loop (PI) per
+side sets U; above it a controller turns commands into the two speeds. Both have their own clock, whose period jitters.
+
+`RANGES` are the ranges of drawn robots; `TRAINED` are those that the twin's training randomises, as facts about it.
 """
 
-from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
+from collections import deque
+from dataclasses import asdict, dataclass, fields
+from math import atan2, copysign, cos, exp, hypot, pi, sin, sqrt, tanh
 
-import mujoco
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from twin.config import MjcfConfig, TaskConfig
-from twin.env.camera_noise import CameraNoise, CameraOptions
-from twin.env.obstacles import EpisodeObstacles
-from twin.env.options import Options
-from twin.env.route_segments import RouteSegment, find_task
-from twin.env.task import DrivePhysics, DriveTask
-from twin.geometry.cameras import pixel_grid, unproject
-from twin.geometry.passes import path_length, smooth_path
-from twin.mjcf import husky
-from twin.mjcf.scene_xml import rest_pose
-from twin.mjcf.world import World, heading_at, point_at
-from twin.reality import SEED, true_world
-from twin.reality import place as places
-from twin.reality.centerline import RoadLine
-from twin.reality.drawn_place import build_number
-from twin.reality.filming import FilmingPlan, sensor_image, smooth_noise, trajectory
-from twin.reality.lighting import Lighting, apply_haze
-from twin.reality.place_objects import DrivenLine, KnownPlace, PlaceObject
-from twin.reality.place_spec import draw, tasks
-from twin.reality.rasterizer import SHADOW_RANGE, Rasterizer
-from twin.robot import WHEEL_RADIUS, HuskyParams
+from twin.errors import InputError
+from twin.reality import SEED
+from twin.reality.place_objects import KnownPlace
 from twin.types import Array
+
+# ---- facts (Clearpath's description of the Husky A200)
+
+_EMPTY_MASS = 56.582  # [kg]
+_WHEELBASE, _TRACK, _RADIUS = 0.512, 0.5708, 0.1651  # [m]
+_EMPTY_HEIGHT = 0.18  # [m] of the empty robot's center of mass above the ground
+_EMPTY_YAW_INERTIA = 4.0  # [kg m²] of chassis and wheels: 2.03 and 4 × 2.64 kg at 0.38 m, and the tires' own
+_WHEEL_INERTIA = 0.0441  # [kg m²]
+_GEAR = 79.0
+_MULTIPLIER = 1.875  # Clearpath's wheel_separation_multiplier
+_MAX_SPEED, _MAX_YAW_RATE = 1.0, 2.0  # [m/s], [rad/s]
+_MAX_ACCELERATION, _MAX_YAW_ACCELERATION = 3.0, 6.0  # [m/s²], [rad/s²]
+FOOTPRINT = (0.9874, 0.6851)  # [m] length over the bumpers, width over the tires
+_LOW, _HIGH = 0.03, 0.40  # [m] above the ground between which the robot hits an object
+
+_GRAVITY = 9.81
+_STEP = 0.002  # [s]
+_GROUND_STEPS = 10  # steps between two samples of the ground: 2 cm at 1 m/s
+_KAPPA = 7.0 / 6.0
+_STRIBECK_SPEED = 0.1  # [m/s]
+_LOAD_LAG = 0.03  # [s] in which loads follow the forces
+_HISTORY = 2.0  # [s] of poses that a delayed camera may ask for
+_TIRES = ((1, 1, 0), (1, -1, 1), (-1, 1, 0), (-1, -1, 1))  # front or rear, left or right, index of the side
 
 
 @dataclass(frozen=True)
 class HiddenRobot:
-    """A Husky with hidden parameters and its front camera."""
+    """The numbers of one robot."""
 
-    params: HuskyParams
-    camera_misalignment: tuple[float, float, float]
-    """Rotation of the mounted camera about its axes right, up, back [°]."""
-    camera: CameraOptions
-    """Vibration and shutter. Exposure is separate, since here it acts on light and not on a finished image."""
-    exposure_drift: float
-    """Standard deviation of the log exposure."""
+    number: int = 0
+
+    # Body.
+    payload: float = 10.0
+    """Mass on the top plate [kg]."""
+    payload_height: float = 0.45
+    """Of its center above the ground [m]."""
+    center_forward: float = -0.02
+    """Center of mass, ahead of the middle between the axles [m]."""
+    center_left: float = 0.0
+    """[m]"""
+
+    # Tires.
+    friction: float = 0.7
+    """Sliding friction coefficient along the tire."""
+    lateral_grip: float = 1.1
+    """Friction coefficient across the tire, relative to the one along it."""
+    static_excess: float = 1.05
+    """Static friction relative to sliding friction."""
+    bristle_stiffness: float = 200.0
+    """σ₀ [1/m]."""
+    bristle_damping: float = 1.5
+    """σ₁ [s/m]."""
+    patch_length: float = 0.09
+    """L [m]."""
+    rolling_resistance: float = 0.02
+    """Force / load."""
+    wheel_radius: float = 1.0
+    """Mean radius, relative to the nominal one that the controller uses."""
+    wheel_difference: float = 0.0
+    """Relative excess of the right tires' radius over the left ones'."""
+    tire_stiffness: float = 50_000.0
+    """Vertical stiffness of a tire [N/m]."""
+
+    # Bounce on the tires.
+    bounce_frequency: float = 9.0
+    """Natural frequency of height, pitch and roll [Hz]."""
+    bounce_damping: float = 0.15
+    """Damping ratio."""
+    shake: float = 0.2
+    """Standard deviation of pitch and roll at 1 m/s from the road's texture [°]."""
+
+    # Drivetrain.
+    torque_constant: float = 0.035
+    """Of a motor, net of the gear's losses [N m/A]; also its back-EMF [V s/rad]."""
+    resistance: float = 0.35
+    """Of a motor with its leads [Ω]."""
+    current_limit: float = 24.0
+    """Of a motor [A]."""
+    gear_friction: float = 1.5
+    """Coulomb friction of motor and gear, at the wheels of a side [N m]."""
+    rotor_inertia: float = 0.3
+    """Of motor and gear, at the wheels of a side [kg m²]."""
+    battery_voltage: float = 25.0
+    """Without load [V]."""
+    battery_resistance: float = 0.08
+    """[Ω]"""
+
+    # Control.
+    loop_gain: float = 2.2
+    """Of the velocity loop [V s/rad]."""
+    loop_integral: float = 25.0
+    """Of the velocity loop [V/rad]."""
+    loop_period: float = 0.01
+    """[s]"""
+    controller_period: float = 0.1
+    """Of the controller that takes commands [s]."""
+    timeout: float = 0.25
+    """Time without a command after which the controller stops [s]."""
+    jitter: float = 0.1
+    """Largest relative deviation of a period."""
+    deadband: float = 0.01
+    """Speed of a side below which the controller commands standstill [m/s]."""
+    command_latency: float = 0.05
+    """From a command to its arrival at the controller [s]."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not np.isfinite(getattr(self, field.name)):
+                raise InputError(f"robot: {field.name} = {getattr(self, field.name)}; expected a finite number")
 
 
-def hidden_robot() -> HiddenRobot:
-    """The robot of the real test."""
-    rng = np.random.default_rng([SEED, 41])
+RANGES: dict[str, tuple[float, float]] = {
+    "payload": (0.0, 26.0),
+    "payload_height": (0.38, 0.55),
+    "center_forward": (-0.05, 0.02),
+    "center_left": (-0.012, 0.012),
+    "friction": (0.42, 0.98),
+    "lateral_grip": (1.0, 1.35),
+    "static_excess": (1.0, 1.12),
+    "bristle_stiffness": (140.0, 320.0),
+    "bristle_damping": (1.0, 2.0),
+    "patch_length": (0.07, 0.11),
+    "rolling_resistance": (0.012, 0.04),
+    "wheel_radius": (0.97, 1.02),
+    "wheel_difference": (-0.009, 0.009),
+    "tire_stiffness": (35_000.0, 70_000.0),
+    "bounce_frequency": (6.5, 11.0),
+    "bounce_damping": (0.08, 0.25),
+    "shake": (0.08, 0.35),
+    "torque_constant": (0.031, 0.038),
+    "resistance": (0.28, 0.45),
+    "current_limit": (18.0, 28.0),
+    "gear_friction": (0.8, 2.5),
+    "rotor_inertia": (0.2, 0.4),
+    "battery_voltage": (23.5, 27.0),
+    "battery_resistance": (0.04, 0.14),
+    "loop_gain": (1.4, 2.8),
+    "loop_integral": (14.0, 35.0),
+    "loop_period": (0.008, 0.02),
+    "jitter": (0.0, 0.25),
+    "deadband": (0.0, 0.03),
+    "command_latency": (0.02, 0.15),
+}
+"""Ranges of drawn robots; each value is uniform in its range."""
 
-    def between(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
+TRAINED: dict[str, tuple[float, float]] = {
+    "payload": (0.0, 20.0),
+    "friction": (0.49, 0.91),
+    "command_latency": (0.0, 0.1),
+    "wheel_radius": (0.98, 1.02),
+    "wheel_difference": (-0.006, 0.006),
+}
+"""What training randomises by default, for the published robot; a test holds these to the twin's values."""
 
-    radius = WHEEL_RADIUS * between(0.975, 1.0)
-    film = FilmingPlan()
-    zoom = between(0.985, 1.015)
-    fx, fy, cx, cy = film.intrinsics.tolist()
-    params = HuskyParams(
-        center_of_mass=(between(-0.05, 0.0), between(-0.01, 0.01), 0.062),
-        payload_mass=between(6.0, 14.0),
-        payload_position=(between(-0.10, 0.10), between(-0.04, 0.04), 0.33),
-        friction=between(0.55, 0.9),
-        rolling_resistance=between(0.015, 0.03),
-        wheel_radius=(radius * between(0.996, 1.004), radius * between(0.996, 1.004)),
-        servo_lag=between(0.05, 0.12),
-        motor_torque=between(50.0, 65.0),
-        command_latency=between(0.03, 0.08),
-        camera_height=0.6 + between(-0.015, 0.015),
-        camera_offset=(0.36 + between(-0.02, 0.02), between(-0.015, 0.015)),
-        camera_pitch=5.0 + between(-0.8, 0.8),
-        camera_latency=between(0.04, 0.09),
-        camera_intrinsics=(fx * zoom, fy * zoom, cx + between(-4.0, 4.0), cy + between(-4.0, 4.0)),
-        camera_size=(film.width, film.height),
-    )
-    turn = (between(-0.4, 0.4), between(-0.6, 0.6), between(-0.6, 0.6))
-    camera = CameraOptions(vibration=between(0.15, 0.35), shutter=between(0.008, 0.02))
-    return HiddenRobot(params, turn, camera, between(0.06, 0.12))
+_CONTROLLERS = ((0.1, 0.25), (0.05, 0.5), (0.02, 0.5))  # period, timeout [s] of Clearpath's configurations
 
 
-# ---- road
+def draw_robot(number: int) -> HiddenRobot:
+    """The robot of a number, always the same. Robot 0 drives the demo's trials; it lies within `TRAINED`.
 
-_COLLISION_REACH = 1.5  # [m] beyond the corridor; as in the twin, the robot touches nothing further away
-_LENGTH_TOLERANCE = 0.98  # fraction of the longest path; the first film above it gives the route
-
-
-def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
-    """The route: the filmed path on the true ground [m], shape (m, 3).
-
-    As in a build, the first film within 2 % of the longest gives the path.
+    Raises:
+        InputError: a negative number.
     """
-    plan, line = plan or FilmingPlan(), line or RoadLine()
-    paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
-    lengths = np.array([path_length(path) for path in paths])
-    xy = paths[int(np.argmax(lengths >= _LENGTH_TOLERANCE * lengths.max()))]
-    return np.column_stack([xy, line.ground_height(xy)])
+    if number < 0:
+        raise InputError(f"robot {number}: expected 0 or more")
+    rng = np.random.default_rng([SEED, 200, number])
+    values = {}
+    for name, (low, high) in RANGES.items():
+        if number == 0 and name in TRAINED:
+            low, high = max(low, TRAINED[name][0]), min(high, TRAINED[name][1])
+        values[name] = float(rng.uniform(low, high))
+    period, timeout = _CONTROLLERS[int(rng.integers(len(_CONTROLLERS))) if number else 0]
+    return HiddenRobot(number, controller_period=period, timeout=timeout, **values)
 
 
-@cache
-def place_on_test_day(number: int = 0) -> KnownPlace:
-    """The place of a number on the day of the trials, after small objects have moved."""
-    return build_number(number, displaced=True) if number else places.build(displaced=True)
+def outside_training(robot: HiddenRobot) -> list[str]:
+    """Names of the robot's numbers that lie outside what training randomises."""
+    values = asdict(robot)
+    return [name for name, (low, high) in TRAINED.items() if not low <= values[name] <= high]
 
 
-def shadow_range(place: KnownPlace) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """The box [m] in which the rasterizer casts shadows."""
-    if place.number == 0:
-        return SHADOW_RANGE
-    (x0, y0), (x1, y1) = place.layout.field
-    height = place.route.ground_height(place.route.at(np.linspace(0.0, place.route.length, 100)))
-    return (x0, y0, float(height.min()) - 1.5), (x1, y1, float(height.max()) + 6.0)
+# ---- dynamics
 
 
-class TrueRoad:
-    """One task of the real test on the true ground, with the twin's task names and episode rules."""
+class RealRobot:
+    """One Husky on the ground of a place. The *base* is the point on the ground in the middle between the wheels."""
 
-    def __init__(self, task: str, robot: HiddenRobot, options: Options, number: int = 0) -> None:
-        """
-        Args:
-            task: straight, right_turn or route; on a drawn place one of `place_spec.tasks`.
-            robot: The robot that drives.
-            options: Environment options of the policy, without images.
-            number: Number of the place.
+    def __init__(self, robot: HiddenRobot, place: KnownPlace) -> None:
+        self.robot = robot
+        self._ground = place.route.ground_height
+        self._solids = Solids(place)
+        self._mass = _EMPTY_MASS + robot.payload
+        self._height = (_EMPTY_MASS * _EMPTY_HEIGHT + robot.payload * robot.payload_height) / self._mass
+        self._yaw_inertia = _EMPTY_YAW_INERTIA + 0.03 * robot.payload
+        self._side_inertia = 2.0 * _WHEEL_INERTIA + robot.rotor_inertia
+        mean, half = _RADIUS * robot.wheel_radius, 0.5 * robot.wheel_difference
+        self._radius = (mean * (1.0 - half), mean * (1.0 + half))
+        self.set_pose(0.0, 0.0, 0.0, np.random.default_rng(0))
 
-        Raises:
-            InputError: unknown task.
-        """
-        self.place = place_on_test_day(number)
-        spec = draw(number) if number else None
-        line = true_route(FilmingPlan.of(spec) if spec else None, self.place.route)
-        offered = tasks(spec.line) if spec else {}
-        half_width = MjcfConfig().half_width
-        yaw = float(heading_at(line, 0.0))
-        start, quaternion = rest_pose(self.place.route.ground_height, line[0, :2], yaw)
-        self.world = World(line, half_width, (*start.tolist(), yaw), Path(), robot=robot.params)
-        self.segment: RouteSegment = find_task(
-            task, self.world, tuple(TaskConfig(name, start, length) for name, (start, length) in offered.items())
+    def set_pose(self, x: float, y: float, yaw: float, rng: np.random.Generator) -> None:
+        """Puts the robot at rest at a base position [m] and yaw [rad], at time 0; `rng` is that of jitter and shake."""
+        r = self.robot
+        self._rng = rng
+        self._x, self._y, self._yaw = x, y, yaw
+        self._vx = self._vy = self._rate = 0.0  # of the center of mass, in the robot's axes
+        self._wheel = [0.0, 0.0]  # [rad/s] per side
+        self._z = [[0.0, 0.0] for _ in _TIRES]
+        self._force = [0.0, 0.0]  # lagged sum of the tires' forces
+        self._acceleration = (0.0, 0.0)
+        self._voltage, self._integral, self._target = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+        self._current = [0.0, 0.0]
+        self._limited = (0.0, 0.0)
+        self._arrivals: deque[tuple[float, float, float]] = deque()
+        self._newest = (-np.inf, 0.0, 0.0)
+        self._time, self._steps = 0.0, 0
+        self._next_control = float(rng.uniform(0.0, r.controller_period))
+        self._next_loop = float(rng.uniform(0.0, r.loop_period))
+        self._last_control, self._last_loop = 0.0, 0.0
+        self.touched = False
+        """True where the robot has touched an object since `set_pose`."""
+        self._sample_ground()
+        self._attitude = [*self._rest]  # height [m], pitch up, roll right [rad] of the chassis
+        self._attitude_rate = [0.0, 0.0, 0.0]
+        self._poses: deque[tuple[float, ...]] = deque([(0.0, x, y, yaw, *self._attitude)])
+        self._touch()
+
+    def command(self, v: float, yaw_rate: float) -> None:
+        """Sends a command: speed [m/s] and yaw rate [rad/s]. It arrives after the command latency."""
+        self._arrivals.append((self._time + self.robot.command_latency, v, yaw_rate))
+
+    def step(self, period: float) -> None:
+        """Advances by `period` [s]."""
+        steps = round(period / _STEP)
+        r = self.robot
+        omega = 2.0 * pi * r.bounce_frequency
+        spread = np.deg2rad(r.shake)
+        # White acceleration of intensity q gives an oscillator the variance q / (4 ζ ω³).
+        push = spread * sqrt(4.0 * r.bounce_damping * omega**3 / _STEP)
+        noise = (self._rng.standard_normal((steps, 3)) * np.array([0.1 * push, push, push])).tolist()
+        for k in range(steps):
+            if self._time >= self._next_control - 1e-9:
+                self._control()
+            if self._time >= self._next_loop - 1e-9:
+                self._velocity_loop()
+            self._advance()
+            if self._steps % _GROUND_STEPS == 0:
+                self._sample_ground()
+                self._touch()
+            shaking, kick = sqrt(min(hypot(self._vx, self._vy), 2.0)), noise[k]
+            pitch_lag = self._height * self._force[0] / (2.0 * r.tire_stiffness * _WHEELBASE**2)
+            roll_lag = self._height * self._force[1] / (2.0 * r.tire_stiffness * _TRACK**2)
+            targets = (self._rest[0], self._rest[1] + 2.0 * pitch_lag, self._rest[2] + 2.0 * roll_lag)
+            for i in range(3):
+                gap = targets[i] - self._attitude[i]
+                rate = self._attitude_rate[i]
+                rate += _STEP * (omega * omega * gap - 2.0 * r.bounce_damping * omega * rate + shaking * kick[i])
+                self._attitude_rate[i] = rate
+                self._attitude[i] += _STEP * rate
+            self._steps += 1
+            self._time = self._steps * _STEP
+            self._poses.append((self._time, self._x, self._y, self._yaw, *self._attitude))
+        while self._poses[0][0] < self._time - _HISTORY:
+            self._poses.popleft()
+
+    # ---- control
+
+    def _control(self) -> None:
+        """The controller: limits of speed and acceleration, the two sides' speeds, deadband and timeout."""
+        r = self.robot
+        elapsed = self._time - self._last_control
+        self._last_control = self._time
+        self._next_control = self._time + r.controller_period * (1.0 + r.jitter * float(self._rng.uniform(-1.0, 1.0)))
+        while self._arrivals and self._arrivals[0][0] <= self._time + 1e-9:
+            self._newest = self._arrivals.popleft()
+        stale = self._time - self._newest[0] > r.timeout
+        wanted = (0.0, 0.0) if stale else self._newest[1:]
+        out = []
+        for value, before, most, change in zip(
+            wanted, self._limited, (_MAX_SPEED, _MAX_YAW_RATE), (_MAX_ACCELERATION, _MAX_YAW_ACCELERATION), strict=True
+        ):
+            value = min(max(value, -most), most)
+            out.append(min(max(value, before - change * elapsed), before + change * elapsed))
+        self._limited = (out[0], out[1])
+        turn = 0.5 * _TRACK * _MULTIPLIER * out[1]
+        sides = (out[0] - turn, out[0] + turn)
+        scale = min(1.0, _MAX_SPEED / max(abs(sides[0]), abs(sides[1]), 1e-9))
+        for i in (0, 1):
+            speed = scale * sides[i]
+            self._target[i] = 0.0 if abs(speed) < r.deadband else speed / _RADIUS
+
+    def _velocity_loop(self) -> None:
+        """PI of both sides, with the battery's sagging voltage as the limit, beyond which the integral stops."""
+        r = self.robot
+        elapsed = self._time - self._last_loop
+        self._last_loop = self._time
+        self._next_loop = self._time + r.loop_period * (1.0 + r.jitter * float(self._rng.uniform(-1.0, 1.0)))
+        drawn = sum(abs(self._current[i] * self._voltage[i]) for i in (0, 1)) / r.battery_voltage
+        most = r.battery_voltage - r.battery_resistance * drawn
+        for i in (0, 1):
+            error = self._target[i] - self._wheel[i]
+            feed = r.torque_constant * _GEAR * self._target[i]
+            wanted = feed + r.loop_gain * error + self._integral[i]
+            self._voltage[i] = min(max(wanted, -most), most)
+            if wanted == self._voltage[i]:
+                self._integral[i] += r.loop_integral * error * elapsed
+            if self._target[i] == 0.0 and abs(self._wheel[i]) < 0.02:
+                self._integral[i] *= 0.9  # a side at rest brakes and does not push
+
+    # ---- motion
+
+    def _advance(self) -> None:
+        """One step of tires, wheels and body; semi-implicit: bristles first, then the forces that they give."""
+        r = self.robot
+        mass, vx, vy, rate = self._mass, self._vx, self._vy, self._rate
+        _, pitch, roll = self._rest
+        weight = mass * _GRAVITY * cos(pitch) * cos(roll)
+        front = 0.25 * weight * 2.0 * r.center_forward / _WHEELBASE - 0.5 * self._height * (
+            self._force[0] / _WHEELBASE
         )
-        model = true_world.collision_spec(self._near(half_width + _COLLISION_REACH))
-        husky.set_options(model, robot.params)
-        husky.add_husky(model, start, quaternion, robot.params)
-        self.model = model.compile()
-        _rotate_camera(self.model, robot.camera_misalignment)
-        self.physics = DrivePhysics.of(self.model, robot.params)
-        none = EpisodeObstacles((), self.world, self.segment)
-        self.drive = DriveTask(self.world, self.segment, options, none, self.model)
-
-    def intrinsics(self, size: tuple[int, int]) -> Array:
-        """fx, fy, cx, cy [px] of the robot's camera for images of a size (width, height), shape (4,)."""
-        return np.array(self.world.robot.camera().resized(size).intrinsics)
-
-    def _near(self, reach: float) -> KnownPlace:
-        """The place without solid objects further than `reach` [m] from the segment."""
-        s = self.segment
-        along = cKDTree(point_at(self.world.route[:, :2], np.arange(s.start, s.end + 0.1, 0.1)))
-
-        def near(obj: PlaceObject) -> bool:
-            return any(
-                along.query(one.center[:2])[0] - np.hypot(one.half[0], one.half[1]) <= reach for one in obj.solids
+        left = 0.25 * weight * 2.0 * r.center_left / _TRACK - 0.5 * self._height * self._force[1] / _TRACK
+        loads = [
+            max(0.0, 0.25 * weight + f * front + s * left + f * s * self._warp_load) for f, s, _ in _TIRES
+        ]
+        share = weight / max(sum(loads), 1e-9)
+        mu_x, mu_y = r.friction, r.friction * r.lateral_grip
+        along = across = moment = 0.0
+        side_torque = [0.0, 0.0]
+        for i, (f, s, side) in enumerate(_TIRES):
+            load = share * loads[i]
+            px = f * 0.5 * _WHEELBASE - r.center_forward
+            py = s * 0.5 * _TRACK - r.center_left
+            radius, spin = self._radius[side], self._wheel[side]
+            slip_x, slip_y = vx - rate * py - radius * spin, vy + rate * px
+            speed = hypot(slip_x, slip_y)
+            weighted = hypot(mu_x * slip_x, mu_y * slip_y)
+            excess = 1.0 + (r.static_excess - 1.0) * exp(-sqrt(speed / _STRIBECK_SPEED))
+            rolled = _KAPPA * abs(radius * spin) / r.patch_length
+            z = self._z[i]
+            new_x = (z[0] + _STEP * slip_x) / (
+                1.0 + _STEP * (r.bristle_stiffness * weighted / (mu_x * mu_x * excess) + rolled)
             )
+            new_y = (z[1] + _STEP * slip_y) / (
+                1.0 + _STEP * (r.bristle_stiffness * weighted / (mu_y * mu_y * excess) + rolled)
+            )
+            fx = -load * (r.bristle_stiffness * new_x + r.bristle_damping * (new_x - z[0]) / _STEP)
+            fy = -load * (r.bristle_stiffness * new_y + r.bristle_damping * (new_y - z[1]) / _STEP)
+            z[0], z[1] = new_x, new_y
+            along, across, moment = along + fx, across + fy, moment + px * fy - py * fx
+            side_torque[side] -= radius * fx + r.rolling_resistance * load * radius * tanh(spin / 0.1)
+        gain = _GEAR * r.torque_constant
+        for side in (0, 1):
+            spin = self._wheel[side]
+            current = (self._voltage[side] - gain * spin) / r.resistance
+            current = min(max(current, -r.current_limit), r.current_limit)
+            self._current[side] = current
+            torque = gain * current - r.gear_friction * tanh(spin / 0.1) + side_torque[side]
+            self._wheel[side] = spin + _STEP * torque / self._side_inertia
+        keep = _STEP / _LOAD_LAG
+        self._force[0] += keep * (along - self._force[0])
+        self._force[1] += keep * (across - self._force[1])
+        self._acceleration = (along / mass, across / mass)
+        ax = along / mass - _GRAVITY * sin(pitch)
+        ay = across / mass - _GRAVITY * sin(roll) * cos(pitch)
+        self._vx = vx + _STEP * (ax + rate * vy)
+        self._vy = vy + _STEP * (ay - rate * vx)
+        self._rate = rate + _STEP * moment / self._yaw_inertia
+        base_x, base_y = self._vx + self._rate * r.center_left, self._vy - self._rate * r.center_forward
+        c, s = cos(self._yaw), sin(self._yaw)
+        level = cos(pitch)
+        self._x += _STEP * level * (c * base_x - s * base_y)
+        self._y += _STEP * level * (s * base_x + c * base_y)
+        self._yaw += _STEP * self._rate
 
-        return replace(self.place, objects=[obj for obj in self.place.objects if near(obj)], lamp_heads=[])
+    def _sample_ground(self) -> None:
+        """The plane through the ground under the four tires, and the load that its warp shifts between diagonals."""
+        c, s = cos(self._yaw), sin(self._yaw)
+        at = [
+            (
+                self._x + c * f * 0.5 * _WHEELBASE - s * b * 0.5 * _TRACK,
+                self._y + s * f * 0.5 * _WHEELBASE + c * b * 0.5 * _TRACK,
+            )
+            for f, b, _ in _TIRES
+        ]
+        fl, fr, rl, rr = self._ground(np.array(at)).tolist()
+        pitch = atan2(0.5 * (fl + fr - rl - rr), _WHEELBASE)  # nose up
+        roll = atan2(0.5 * (fr + rr - fl - rl), _TRACK)  # right side up
+        self._rest = (0.25 * (fl + fr + rl + rr), pitch, -roll)
+        self._warp_load = 0.25 * self.robot.tire_stiffness * (fl - fr - rl + rr)
+
+    def _touch(self) -> None:
+        if not self.touched:
+            low = self._rest[0]
+            self.touched = self._solids.hit(self._x, self._y, self._yaw, low + _LOW, low + _HIGH)
+
+    # ---- what others see
+
+    @property
+    def time(self) -> float:
+        """Since `set_pose` [s]."""
+        return self._time
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """x, y [m] and yaw [rad] of the base."""
+        return self._x, self._y, self._yaw
+
+    @property
+    def tilt(self) -> float:
+        """Angle between the chassis's and the world's up axes [rad]."""
+        return hypot(self._attitude[1], self._attitude[2])
+
+    @property
+    def wheel_speeds(self) -> tuple[float, float]:
+        """Encoders of the left and right side [rad/s]."""
+        return self._wheel[0], self._wheel[1]
+
+    @property
+    def velocity(self) -> tuple[float, float, float]:
+        """Forward and leftward velocity of the base [m/s], yaw rate [rad/s]."""
+        r = self.robot
+        return self._vx + self._rate * r.center_left, self._vy - self._rate * r.center_forward, self._rate
+
+    @property
+    def acceleration(self) -> tuple[float, float]:
+        """The IMU's proper acceleration, forward and left [m/s²]."""
+        return self._acceleration
+
+    @property
+    def currents(self) -> tuple[float, float]:
+        """Of the two motors [A]."""
+        return self._current[0], self._current[1]
+
+    def base_to_world(self, at: float) -> Array:
+        """Pose of the base at a past time [s], but not before the start; axes forward, left, up, shape (4, 4)."""
+        return pose_matrix(self._pose_at(at))
+
+    def _pose_at(self, at: float) -> tuple[float, ...]:
+        first = self._poses[0][0]
+        k = min(max((at - first) / _STEP, 0.0), len(self._poses) - 1.0)
+        before = int(k)
+        share = k - before
+        a, b = self._poses[before], self._poses[min(before + 1, len(self._poses) - 1)]
+        return tuple(p + share * (q - p) for p, q in zip(a[1:], b[1:], strict=True))
 
 
-def _rotate_camera(model: mujoco.MjModel, turn: tuple[float, float, float]) -> None:
-    """Rotates the front camera about its axes right, up, back by angles [°]."""
-    camera = model.camera("front").id
-    rotation, quaternion = np.zeros(4), np.zeros(4)
-    mujoco.mju_euler2Quat(rotation, np.deg2rad(turn), "xyz")
-    mujoco.mju_mulQuat(quaternion, model.cam_quat[camera], rotation)
-    model.cam_quat[camera] = quaternion
+def pose_matrix(pose: tuple[float, ...]) -> Array:
+    """x, y [m], yaw [rad], z [m], pitch up, roll to the right [rad] as a matrix (4, 4) of axes forward, left, up."""
+    x, y, yaw, z, pitch, roll = pose
+    cy, sy, cp, sp, cr, sr = cos(yaw), sin(yaw), cos(pitch), sin(pitch), cos(roll), sin(roll)
+    turn = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    nose = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
+    lean = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = turn @ nose @ lean, (x, y, z)
+    return out
 
 
-# ---- camera
-
-_SKY_DISTANCE = 1.0e4  # [m] depth of the sky for motion blur
-_DRIFT_TIME = 9.0  # [s] period of the exposure drift
-_DRIFT_STEP = 0.1  # [s] between values of the exposure drift
-_NOISE_SCALE = 0.5  # of a film frame's noise: its pixels are a quarter as wide, and a resized image has less
+# ---- collision
 
 
-class RealCamera:
-    """The robot's camera in one trial: vibration, motion blur, haze, exposure drift and sensor noise.
+class Solids:
+    """The solid objects of a place, tested against the robot's footprint by separating axes."""
 
-    The same generator and poses give the same images.
+    def __init__(self, place: KnownPlace) -> None:
+        solids = [one for obj in place.objects for one in obj.solids]
+        self._center = np.array([one.center for one in solids]).reshape(-1, 3)
+        self._half = np.array([one.half for one in solids]).reshape(-1, 3)
+        self._round = np.array([one.kind == "cylinder" for one in solids], bool)
+        # A cylinder's half sizes are its radius, half its height and 0.
+        self._up = np.where(self._round, self._half[:, 1], self._half[:, 2])
+        self._reach = np.where(self._round, self._half[:, 0], np.hypot(self._half[:, 0], self._half[:, 1]))
+        self._reach += 0.5 * hypot(*FOOTPRINT)
+        self._yaw = np.array([one.yaw for one in solids])
+
+    def hit(self, x: float, y: float, yaw: float, low: float, high: float) -> bool:
+        """True if the footprint at a pose [m], [rad] overlaps an object between two heights [m]."""
+        off = self._center[:, :2] - (x, y)
+        near = np.flatnonzero(
+            (np.hypot(off[:, 0], off[:, 1]) < self._reach)
+            & (self._center[:, 2] - self._up < high)
+            & (self._center[:, 2] + self._up > low)
+        )
+        return any(self._overlaps(int(i), off[i], yaw) for i in near)
+
+    def _overlaps(self, i: int, off: Array, yaw: float) -> bool:
+        long, wide = 0.5 * FOOTPRINT[0], 0.5 * FOOTPRINT[1]
+        c, s = cos(yaw), sin(yaw)
+        ahead, aside = float(c * off[0] + s * off[1]), float(c * off[1] - s * off[0])
+        if self._round[i]:
+            return hypot(max(abs(ahead) - long, 0.0), max(abs(aside) - wide, 0.0)) < self._half[i, 0]
+        # Separating axes of two rectangles: the axes of either.
+        turn = float(self._yaw[i]) - yaw
+        ct, st = cos(turn), sin(turn)
+        a, b = float(self._half[i, 0]), float(self._half[i, 1])
+        if abs(ahead) > long + a * abs(ct) + b * abs(st) or abs(aside) > wide + a * abs(st) + b * abs(ct):
+            return False
+        u, v = ct * ahead + st * aside, ct * aside - st * ahead
+        return abs(u) <= a + long * abs(ct) + wide * abs(st) and abs(v) <= b + long * abs(st) + wide * abs(ct)
+
+
+def follow(line: Array, pose: tuple[float, float, float], station: float, speed: float, most: float) -> float:
+    """Yaw rate [rad/s] that steers a base at x, y, yaw towards the line (m, 2): pure pursuit.
+
+    Args:
+        line: [m].
+        pose: x, y [m], yaw [rad].
+        station: Of the nearest point of the line [m].
+        speed: [m/s].
+        most: Bound of the yaw rate [rad/s].
     """
-
-    def __init__(
-        self,
-        rasterizer: Rasterizer,
-        lighting: Lighting,
-        robot: HiddenRobot,
-        intrinsics: Array,
-        size: tuple[int, int],
-        rng: np.random.Generator,
-    ) -> None:
-        """
-        Args:
-            rasterizer: Renders the place under the lighting with these intrinsics and this size.
-            lighting: Exposure, noise and haze.
-            robot: Camera effects.
-            intrinsics: fx, fy, cx, cy [px], shape (4,).
-            size: Width, height [px].
-            rng: Random generator of the trial.
-        """
-        self._rasterizer, self._intrinsics, self._rng = rasterizer, intrinsics, rng
-        self._lighting = replace(lighting, noise=_NOISE_SCALE * lighting.noise)
-        self._rays = unproject(pixel_grid(*size), intrinsics)
-        self._effects = CameraNoise(robot.camera, rng)
-        self._times = np.arange(0.0, 600.0, _DRIFT_STEP)
-        self._gains = np.exp(robot.exposure_drift * smooth_noise(rng, self._times, _DRIFT_TIME))
-
-    def capture(self, camera_to_world: Array, time: float) -> NDArray[np.uint8]:
-        """The image (h, w, 3) at a time [s] from a pose (4, 4), to which vibration is added."""
-        pose = self._effects.perturb_pose(camera_to_world, time)
-        light, depth = self._rasterizer(pose)
-        light = apply_haze(light, depth, self._lighting)
-        far = np.where(depth > 0.0, depth, np.float32(_SKY_DISTANCE))
-        light = self._effects.apply(light, far, pose, time, self._rays, self._intrinsics)
-        return sensor_image(self._rng, light, self._lighting, float(np.interp(time, self._times, self._gains)))
+    ahead = 0.6 + 0.6 * speed
+    knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    x, y = (float(np.interp(station + ahead, knots, line[:, k])) for k in (0, 1))
+    bearing = atan2(y - pose[1], x - pose[0]) - pose[2]
+    rate = 2.0 * speed * sin(bearing) / max(hypot(x - pose[0], y - pose[1]), 0.2)
+    return copysign(min(abs(rate), most), rate)

@@ -1,0 +1,413 @@
+"""The front camera of the robot of the real test, by number: its seat, and all that stands between light and picture.
+
+A picture is made in the order of nature. *Air*: haze scatters by the length of each ray, and thins out with height.
+*Shutter*: rows are read one after another while the robot moves, and each is open for a while. *Lens*: dirt, vignetting,
+bloom around what is brighter than the sensor takes. *Exposure*: a second-order automatic exposure that sees the last
+pictures, lags and overshoots. *White balance* drifts over seconds. *Sensor*: noise, a response curve of its own.
+*Compression*: JPEG. The light comes from `rasterizer.py`.
+"""
+
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from twin.errors import InputError
+from twin.geometry.cameras import pixel_grid, unproject
+from twin.reality import SEED
+from twin.reality.filming import FilmingPlan, smooth_noise
+from twin.reality.lighting import Lighting
+from twin.reality.rasterizer import Rasterizer
+from twin.reality.real_robot import RealRobot
+from twin.types import Array, Array32, Image
+
+# ---- one camera's numbers
+
+_SEAT = (0.36, 0.0, 0.6)  # [m] forward, left and up from the base on the ground, as on the drawing
+_PITCH = 5.0  # [°] downwards, as on the drawing
+
+
+@dataclass(frozen=True)
+class HiddenCamera:
+    """The numbers of one camera."""
+
+    number: int
+
+    # Seat.
+    shift_forward: float
+    """Of the lens against the drawing [m]."""
+    shift_left: float
+    """[m]"""
+    shift_up: float
+    """[m]"""
+    turn_right: float
+    """Rotation about the camera's axis to the right, in addition to the drawing's pitch [°]."""
+    turn_up: float
+    """[°]"""
+    turn_back: float
+    """[°]"""
+    zoom: float
+    """Focal length relative to the nominal one."""
+    center_x: float
+    """Offset of the principal point, as a fraction of the width."""
+    center_y: float
+    """As a fraction of the width."""
+
+    # Time.
+    latency: float
+    """From the middle of the exposure to the policy's receipt [s]."""
+    readout: float
+    """From the first row to the last [s]."""
+    shutter: float
+    """Time that a row is open by day [s]."""
+
+    # Exposure and color.
+    exposure_target: float
+    """Mean brightness that automatic exposure aims at."""
+    exposure_range: float
+    """Largest deviation of its logarithm from the weather's usual exposure."""
+    exposure_rate: float
+    """Natural frequency of automatic exposure [rad/s]."""
+    exposure_damping: float
+    """Damping ratio; below 1 it overshoots."""
+    white_drift: float
+    """Standard deviation of the logarithm of red's and blue's gain."""
+    gamma: float
+    """Exponent of the response curve's middle."""
+    contrast: float
+    """Strength of its S around middle gray."""
+
+    # Lens and sensor.
+    vignetting: float
+    """Loss of light at half a width from the center."""
+    bloom: float
+    """Fraction of the light beyond the sensor's range that spreads."""
+    dirt: float
+    """Largest opacity of the spots on the lens."""
+    spots: float
+    """Number of spots, rounded down."""
+    noise: float
+    """Noise relative to that of the weather's films."""
+    quality: float
+    """Of JPEG, rounded down."""
+
+
+RANGES: dict[str, tuple[float, float]] = {
+    "shift_forward": (-0.028, 0.028),
+    "shift_left": (-0.028, 0.028),
+    "shift_up": (-0.028, 0.028),
+    "turn_right": (-1.4, 1.4),
+    "turn_up": (-1.4, 1.4),
+    "turn_back": (-1.4, 1.4),
+    "zoom": (0.98, 1.02),
+    "center_x": (-0.008, 0.008),
+    "center_y": (-0.008, 0.008),
+    "latency": (0.03, 0.10),
+    "readout": (0.010, 0.033),
+    "shutter": (0.002, 0.016),
+    "exposure_target": (0.36, 0.48),
+    "exposure_range": (0.25, 0.5),
+    "exposure_rate": (2.0, 5.0),
+    "exposure_damping": (0.35, 0.8),
+    "white_drift": (0.015, 0.05),
+    "gamma": (0.85, 1.18),
+    "contrast": (-0.1, 0.35),
+    "vignetting": (0.08, 0.3),
+    "bloom": (0.1, 0.4),
+    "dirt": (0.1, 0.45),
+    "spots": (0.0, 7.0),
+    "noise": (0.4, 1.2),
+    "quality": (45.0, 90.0),
+}
+"""Ranges of drawn cameras; each value is uniform in its range."""
+
+TRAINED: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("shift_forward", "shift_left", "shift_up"), (-0.02, 0.02)),
+    **dict.fromkeys(("turn_right", "turn_up", "turn_back"), (-1.0, 1.0)),
+}
+"""What training randomises by default; a test holds these to the twin's values."""
+
+
+def draw_camera(number: int) -> HiddenCamera:
+    """The camera of a number, always the same. Camera 0 takes the demo's pictures; it lies within `TRAINED`.
+
+    Raises:
+        InputError: a negative number.
+    """
+    if number < 0:
+        raise InputError(f"camera {number}: expected 0 or more")
+    rng = np.random.default_rng([SEED, 201, number])
+    values = {}
+    for name, (low, high) in RANGES.items():
+        if number == 0 and name in TRAINED:
+            low, high = TRAINED[name]
+        values[name] = float(rng.uniform(low, high))
+    return HiddenCamera(number, **values)
+
+
+def askew(camera: HiddenCamera) -> list[str]:
+    """Names of the camera's numbers that lie outside what training randomises."""
+    return [name for name, (low, high) in TRAINED.items() if not low <= getattr(camera, name) <= high]
+
+
+def native_size() -> tuple[int, int]:
+    """Width, height of the camera's own pictures [px]."""
+    film = FilmingPlan()
+    return film.width, film.height
+
+
+def intrinsics_of(camera: HiddenCamera, size: tuple[int, int]) -> Array:
+    """fx, fy, cx, cy of the camera for pictures of a size (width, height) [px], shape (4,).
+
+    Another aspect ratio than the native one crops or extends the height about its middle.
+    """
+    film = FilmingPlan()
+    scale = size[0] / film.width
+    fx, fy, cx, cy = film.intrinsics.tolist()
+    cut = (film.height * scale - size[1]) / 2
+    cx, cy = cx + camera.center_x * film.width, cy + camera.center_y * film.width
+    return np.array([scale * camera.zoom * fx, scale * camera.zoom * fy, scale * cx, scale * cy - cut])
+
+
+def camera_to_base(camera: HiddenCamera) -> Array:
+    """Pose of the camera in the base on the ground (axes forward, left, up), OpenCV axes, shape (4, 4)."""
+    pitch = np.deg2rad(_PITCH)
+    # Columns: right, down, forward.
+    nominal = np.array(
+        [[0.0, -np.sin(pitch), np.cos(pitch)], [-1.0, 0.0, 0.0], [0.0, -np.cos(pitch), -np.sin(pitch)]]
+    )
+    flip = np.diag([1.0, -1.0, -1.0])  # between axes right, up, back and right, down, forward
+    angles = (camera.turn_right, camera.turn_up, camera.turn_back)
+    turn = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
+    out = np.eye(4)
+    out[:3, :3] = nominal @ flip @ turn @ flip
+    out[:3, 3] = np.array(_SEAT) + (camera.shift_forward, camera.shift_left, camera.shift_up)
+    return out
+
+
+# ---- air
+
+_HAZE_HEIGHT = 25.0  # [m] over which haze thins out to 1/e
+_FORWARD_SCATTER = 0.35  # excess of the haze's brightness towards the sun
+_SKY = 400.0  # [m] length of a level ray through haze to the sky
+
+
+def haze_by_ray(
+    light: Array32, depth: Array32, rays: Array, camera_to_world: Array, lighting: Lighting, ground: float
+) -> Array32:
+    """An image with haze whose extinction falls exponentially with height above the ground.
+
+    Args:
+        light: Linear RGB, shape (h, w, 3).
+        depth: z-depth [m], 0 = sky, shape (h, w).
+        rays: Rays of the pixels at z = 1 in the camera, shape (h, w, 3).
+        camera_to_world: OpenCV axes, shape (4, 4).
+        lighting: `visibility` is the haze's at the ground; its color is that of the horizon.
+        ground: Height of the ground [m].
+    """
+    if np.isinf(lighting.visibility):
+        return light
+    world = rays @ camera_to_world[:3, :3].T
+    per_depth = np.linalg.norm(rays, axis=-1)
+    length = np.where(depth > 0.0, depth * per_depth, _SKY)
+    rise = world[..., 2] / per_depth * length / _HAZE_HEIGHT
+    start = np.exp(-max(float(camera_to_world[2, 3]) - ground, 0.0) / _HAZE_HEIGHT)
+    # The mean of exp(−h) over the ray's heights 0 to `rise`; a ray into the ground gains little, so it is bounded.
+    rise = np.clip(rise, -3.0, 60.0)
+    mean = np.where(np.abs(rise) < 1e-4, 1.0, -np.expm1(-rise) / np.where(rise == 0.0, 1.0, rise))
+    through = np.exp(-length / lighting.visibility * start * mean)[..., None]
+    toward = -np.asarray(lighting.suns[0][0]) / np.linalg.norm(lighting.suns[0][0])
+    facing = np.clip((world * toward).sum(-1) / per_depth, 0.0, 1.0)
+    airlight = np.asarray(lighting.horizon) * (1.0 + _FORWARD_SCATTER * facing[..., None] ** 4)
+    return (through * light + (1.0 - through) * airlight).astype(np.float32)
+
+
+# ---- lens, exposure and sensor
+
+_SKY_DISTANCE = 1.0e4  # [m] depth of the sky for the motion of pixels
+_OPEN_SAMPLES = 3  # instants that a row's exposure is the mean of
+_DRIFT_TIME, _DRIFT_STEP, _DRIFT_END = 14.0, 0.2, 900.0  # [s] of the white balance
+_FULL = 0.92  # of the sensor's range; light beyond it blooms
+_DARK = 1.5  # exposures of a lighting above which the shutter is open longer
+
+
+def response(signal: Array32, gamma: float, contrast: float) -> Array32:
+    """The response curve, from light to values in [0, 1]: exponent, S around middle gray, and a soft shoulder.
+
+    It rises strictly, and maps 0 to 0.
+    """
+    knee = 0.8
+    over = np.maximum(signal - knee, 0.0)
+    signal = np.minimum(signal, knee) + (1.0 - knee) * (1.0 - np.exp(-over / (1.0 - knee)))
+    raised = np.clip(signal, 0.0, 1.0) ** gamma
+    return (raised + contrast * raised * (1.0 - raised) * (2.0 * raised - 1.0)).astype(np.float32)
+
+
+class AutoExposure:
+    """A second-order loop on the logarithm of the exposure: e'' = ω² (target − e) − 2 ζ ω e'."""
+
+    def __init__(self, camera: HiddenCamera, start: float) -> None:
+        """`start`: mean brightness of the first scene at the weather's usual exposure."""
+        self._camera = camera
+        self.value = float(np.clip(self._wanted(start), -camera.exposure_range, camera.exposure_range))
+        """Logarithm of the exposure against the weather's usual one."""
+        self._rate, self._time = 0.0, 0.0
+
+    def _wanted(self, brightness: float) -> float:
+        return float(np.log(self._camera.exposure_target / max(brightness, 1e-3)))
+
+    def see(self, brightness: float, time: float) -> None:
+        """Takes the mean brightness of a picture at the weather's usual exposure, at a time [s]."""
+        c, steps = self._camera, max(1, round((time - self._time) / 0.01))
+        dt, self._time = (time - self._time) / steps, time
+        wanted = float(np.clip(self._wanted(brightness), -c.exposure_range, c.exposure_range))
+        for _ in range(steps):
+            push = c.exposure_rate**2 * (wanted - self.value) - 2.0 * c.exposure_damping * c.exposure_rate * self._rate
+            self._rate += dt * push
+            self.value += dt * self._rate
+
+
+class RealCamera:
+    """The robot's camera in one trial; the same generator and the same drive give the same pictures."""
+
+    def __init__(
+        self,
+        rasterizer: Rasterizer,
+        lighting: Lighting,
+        camera: HiddenCamera,
+        size: tuple[int, int],
+        rng: np.random.Generator,
+    ) -> None:
+        """
+        Args:
+            rasterizer: Renders the place under the lighting with `intrinsics_of` the camera at this size.
+            lighting: Exposure, noise and haze.
+            camera: The camera.
+            size: Width, height [px].
+            rng: Random generator of the trial.
+        """
+        self.camera, self._lighting, self._rasterizer, self._rng = camera, lighting, rasterizer, rng
+        self._size, self._intrinsics = size, intrinsics_of(camera, size)
+        self._rays = unproject(pixel_grid(*size), self._intrinsics).astype(np.float32)
+        self._seat = camera_to_base(camera)
+        self._shutter = camera.shutter * (2.0 if lighting.exposure > _DARK else 1.0)
+        times = np.arange(0.0, _DRIFT_END, _DRIFT_STEP)
+        self._drift_times = times
+        self._drift = [camera.white_drift * smooth_noise(rng, times, _DRIFT_TIME) for _ in range(2)]
+        self._exposure: AutoExposure | None = None
+        width, height = size
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
+        self._falloff = (1.0 - camera.vignetting * radius2)[..., None].astype(np.float32)
+        self._dirt = dirt_mask(camera, size)
+
+    def pose(self, robot: RealRobot, at: float) -> Array:
+        """camera_to_world at a past time [s], OpenCV axes, shape (4, 4)."""
+        return robot.base_to_world(at) @ self._seat
+
+    def capture(self, robot: RealRobot) -> Image:
+        """The picture (h, w, 3) that has just arrived; it was taken `latency` ago."""
+        middle = robot.time - self.camera.latency
+        half = 0.5 * self.camera.readout
+        pose = self.pose(robot, middle)
+        motion = motion_between(self.pose(robot, middle - half), self.pose(robot, middle + half), pose)
+        ground = float(robot.base_to_world(middle)[2, 3])
+        return self.develop(*self._rasterizer(pose), pose, motion, ground, robot.time)
+
+    def develop(
+        self, light: Array32, depth: Array32, pose: Array, motion: Array, ground: float, time: float
+    ) -> Image:
+        """A picture (h, w, 3) of the light (h, w, 3) and z-depth (h, w) [m] at a pose (4, 4).
+
+        Args:
+            light: Linear RGB.
+            depth: 0 = sky.
+            pose: camera_to_world in the middle of the readout.
+            motion: Rotation vector [rad] and translation [m] of the camera over the readout, in its axes, shape (6,).
+            ground: Height of the ground below [m].
+            time: [s].
+        """
+        camera, lighting = self.camera, self._lighting
+        light = haze_by_ray(light, depth, self._rays, pose, lighting, ground)
+        light = self._read(light, depth, motion)
+        light = light * (self._falloff * np.float32(lighting.exposure))
+        brightness = float(light.mean())
+        if self._exposure is None:
+            self._exposure = AutoExposure(camera, brightness)
+        else:
+            self._exposure.see(brightness, time)
+        light = light * np.float32(np.exp(self._exposure.value))
+        light = light + self._dirt * (0.7 * light.mean((0, 1)) - light)
+        red, blue = (float(np.exp(np.interp(time, self._drift_times, one))) for one in self._drift)
+        light = light * (np.asarray(lighting.gain, np.float32) * np.array([red, 1.0, blue], np.float32))
+        if camera.bloom > 0.0:
+            light = light + np.float32(camera.bloom) * self._glare(light)
+        sigma = camera.noise * lighting.noise * np.sqrt(0.35 + 1.3 * np.clip(light, 0.0, 1.0))
+        light = light + sigma * self._rng.standard_normal(light.shape).astype(np.float32)
+        out = (response(light.astype(np.float32), camera.gamma, camera.contrast) * 255.0 + 0.5).astype(np.uint8)
+        return compressed(out, int(camera.quality))
+
+    def _glare(self, light: Array32) -> Array32:
+        """The light beyond the sensor's range, spread over near and far."""
+        over = np.maximum(light - _FULL, 0.0) * 3.0
+        near, far = (0.012 * self._size[0], 0.05 * self._size[0])
+        return np.asarray(0.6 * cv2.GaussianBlur(over, (0, 0), near) + 0.4 * cv2.GaussianBlur(over, (0, 0), far))
+
+    def _read(self, light: Array32, depth: Array32, motion: Array) -> Array32:
+        """Rolling shutter and motion blur: every row as the camera saw it at its own time.
+
+        A point at X in the camera in the middle of the readout lies at X − f (ω × X + t) for a camera that has moved by
+        the fraction f of the motion (ω, t); so a row's pixel shows the middle's pixel of X + f (ω × X + t).
+        """
+        if not np.any(motion):
+            return light
+        width, height = self._size
+        points = self._rays * np.where(depth > 0.0, depth, np.float32(_SKY_DISTANCE))[..., None]
+        flow = np.cross(motion[:3], points) + motion[3:]
+        rows = (np.arange(height) + 0.5) / height - 0.5
+        fx, fy, cx, cy = self._intrinsics
+        opened = self._shutter / self.camera.readout
+        total = np.zeros_like(light)
+        for k in range(_OPEN_SAMPLES):
+            share = rows + opened * ((k + 0.5) / _OPEN_SAMPLES - 0.5)
+            at = points + share[:, None, None] * flow
+            z = np.maximum(at[..., 2], 0.05)
+            x, y = fx * at[..., 0] / z + cx - 0.5, fy * at[..., 1] / z + cy - 0.5
+            total += cv2.remap(
+                light, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+        return total / np.float32(_OPEN_SAMPLES)
+
+
+def motion_between(before: Array, after: Array, middle: Array) -> Array:
+    """Rotation vector [rad] and translation [m] from one camera pose to another, in a third one's axes, shape (6,)."""
+    turn = Rotation.from_matrix(middle[:3, :3].T @ after[:3, :3] @ before[:3, :3].T @ middle[:3, :3]).as_rotvec()
+    return np.concatenate([turn, middle[:3, :3].T @ (after[:3, 3] - before[:3, 3])])
+
+
+def dirt_mask(camera: HiddenCamera, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Opacity of the dirt on the lens, shape (h, w, 1); the same at any size."""
+    width, height = size
+    rng = np.random.default_rng([SEED, 202, camera.number])
+    y, x = np.mgrid[:height, :width].astype(np.float32) / width
+    clear = np.ones((height, width), np.float32)
+    for _ in range(int(camera.spots)):
+        at = rng.uniform(0.0, (1.0, height / width))
+        radius, opacity = rng.uniform(0.02, 0.09), rng.uniform(0.3, 1.0) * camera.dirt
+        stretch, angle = rng.uniform(0.5, 1.0), rng.uniform(0.0, np.pi)
+        u = (x - at[0]) * np.cos(angle) + (y - at[1]) * np.sin(angle)
+        v = (y - at[1]) * np.cos(angle) - (x - at[0]) * np.sin(angle)
+        distance = np.sqrt(u**2 + (v / stretch) ** 2) / radius
+        clear *= 1.0 - np.float32(opacity) / (1.0 + np.exp(6.0 * (distance - 1.0))).astype(np.float32)
+    return (1.0 - clear)[..., None]
+
+
+def compressed(picture: Image, quality: int) -> Image:
+    """A picture (h, w, 3) after JPEG of a quality."""
+    data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+assert set(RANGES) == {one.name for one in fields(HiddenCamera)} - {"number"}

@@ -1,0 +1,80 @@
+"""The judge of a trial on the road: off the road, touched, stuck, at the goal, out of time, rolled over.
+
+It knows the task's numbers and what it sees of the robot, and shares no code with the twin's `RewardAndTermination`. A
+test compares both on a thousand paths.
+"""
+
+from math import hypot
+
+from twin.reality.road_task import RoadTask
+
+_BEHIND, _AHEAD = 1.5, 4.0  # [m] of the line in which the nearest point is sought around the last one
+
+
+class RealJudge:
+    """Follows one trial."""
+
+    def __init__(self, task: RoadTask) -> None:
+        self._task = task
+        self._points = task.line.tolist()
+        self._knots = task.knots.tolist()
+
+    def begin(self, x: float, y: float) -> None:
+        """Starts a trial at a position [m]."""
+        self.cause = ""
+        """Why the trial has ended: goal, collision, out_of_bounds, timeout, rollover or stuck; empty while it goes on."""
+        self.station, self.offset = self._task.start, 0.0
+        """Station of the nearest point of the line, and the distance from it, left positive [m]."""
+        self._locate(x, y)
+        self._rested, self._since = (x, y), 0.0
+
+    def see(self, x: float, y: float, tilt: float, touched: bool, time: float) -> str:
+        """Looks at the robot once per control step; returns the cause.
+
+        Args:
+            x: [m].
+            y: [m].
+            tilt: [rad].
+            touched: True if it touched an object since the last look.
+            time: Since the start [s].
+        """
+        task = self._task
+        self._locate(x, y)
+        distance, patience = task.give_up
+        if hypot(x - self._rested[0], y - self._rested[1]) > distance:
+            self._rested, self._since = (x, y), time
+        if tilt > task.max_tilt:
+            self.cause = "rollover"
+        elif touched:
+            self.cause = "collision"
+        elif abs(self.offset) > task.half_width:
+            self.cause = "out_of_bounds"
+        elif self.station >= task.goal:
+            self.cause = "goal"
+        elif time > task.time_limit - 1e-6:
+            self.cause = "timeout"
+        elif time - self._since >= patience:
+            self.cause = "stuck"
+        return self.cause
+
+    @property
+    def progress(self) -> float:
+        """Station since the task's start [m]."""
+        return self.station - self._task.start
+
+    def _locate(self, x: float, y: float) -> None:
+        """Moves on to the nearest point of the line around the last one."""
+        low, high = self.station - _BEHIND, self.station + _AHEAD
+        best = (float("inf"), self.station, 0.0)
+        for k in range(len(self._points) - 1):
+            if self._knots[k + 1] < low or self._knots[k] > high:
+                continue
+            (ax, ay), (bx, by) = self._points[k], self._points[k + 1]
+            dx, dy = bx - ax, by - ay
+            squared = dx * dx + dy * dy
+            share = min(max(((x - ax) * dx + (y - ay) * dy) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+            away = hypot(x - ax - share * dx, y - ay - share * dy)
+            if away < best[0]:
+                left = dx * (y - ay) - dy * (x - ax)
+                best = (away, self._knots[k] + share * (self._knots[k + 1] - self._knots[k]), left)
+        self.station, self.offset = best[1], best[0] if best[2] >= 0.0 else -best[0]

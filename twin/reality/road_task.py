@@ -1,0 +1,181 @@
+"""The task of a trial: a line on the road, its width, start, goal and limits, as numbers.
+
+The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it
+and brings it from the scene's frame into the true one. Where no twin has been built, `task_of_place` states a
+place's tasks on its filmed path with the default rules. *Station*: arc length along the line [m].
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from math import cos, radians, sin
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin.errors import InputError, short_repr
+from twin.files import read_json, wrap_read_errors
+from twin.geometry.poses import Similarity
+from twin.reality.filming import FilmingPlan
+from twin.reality.place_spec import draw, tasks
+from twin.reality.trial_place import place_on_test_day, true_route
+from twin.types import Array
+
+CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0.0, 60.349)}
+"""Start and length [m] of the tasks of place 0, by name; a test holds them to what the twin finds on the same line."""
+
+_HALF_WIDTH = 1.0  # [m]
+_BUMPER = 0.5  # [m] ahead of the base
+_STUCK = (0.1, 5.0)  # [m], [s]
+_MAX_TILT = radians(60.0)
+_START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°]
+_HEADING_WINDOW = 1.0  # [m]
+
+
+@dataclass(frozen=True)
+class RoadTask:
+    """A task on a road."""
+
+    name: str
+    line: Array
+    """In driving order [m], shape (m, 2)."""
+    half_width: float
+    """Largest distance of the base from the line [m]."""
+    start: float
+    """Station near which trials start [m]."""
+    start_offset: float
+    """Bound of the start's distance from the line [m]."""
+    start_heading: float
+    """Bound of the start's angle against the line [°]."""
+    goal: float
+    """Station that the base must reach [m]."""
+    time_limit: float
+    """[s]"""
+    give_up: tuple[float, float]
+    """A trial ends that moves less than this distance [m] in this time [s]."""
+    max_tilt: float
+    """Tilt beyond which the robot has rolled over [rad]."""
+    speed: float
+    """Largest speed of a command [m/s]."""
+    yaw_rate: float
+    """Largest yaw rate of a command [rad/s]."""
+    control_timestep: float
+    """[s]"""
+    size: tuple[int, int] = (160, 90)
+    """Width, height of the policy's pictures [px]."""
+    stack: int = 4
+    """Pictures that the policy gets at once."""
+
+    def __post_init__(self) -> None:
+        line = self.line
+        knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))) if line.ndim == 2 else np.zeros(1)
+        wrong = (
+            f"line of shape {line.shape}; expected (m, 2), m ≥ 2"
+            if line.ndim != 2 or line.shape[1] != 2 or len(line) < 2
+            else f"start {self.start:g} m and goal {self.goal:g} m on a line of {knots[-1]:.2f} m"
+            if not -1e-6 <= self.start < self.goal <= knots[-1] + 1e-6
+            else "half width, time limit, speed, yaw rate and control step; expected all above 0"
+            if min(self.half_width, self.time_limit, self.speed, self.yaw_rate, self.control_timestep) <= 0.0
+            else ""
+        )
+        if wrong:
+            raise InputError(f"task {self.name!r}: {wrong}")
+
+    @property
+    def knots(self) -> Array:
+        """Station of each point of the line [m], shape (m,)."""
+        return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.line, axis=0).T)))
+
+    def at(self, station: float) -> tuple[float, float, float]:
+        """x, y [m] of the line at a station, and its heading [rad] over 1 m around it."""
+        knots, total = self.knots, float(self.knots[-1])
+
+        def point(s: float) -> Array:
+            return np.array([np.interp(s, knots, self.line[:, k]) for k in (0, 1)])
+
+        window = min(_HEADING_WINDOW, total)
+        middle = min(max(station, window / 2), total - window / 2)
+        chord = point(middle + window / 2) - point(middle - window / 2)
+        x, y = point(station).tolist()
+        return x, y, float(np.arctan2(chord[1], chord[0]))
+
+    def sample_start(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """A start pose: x, y [m], yaw [rad]."""
+        x, y, heading = self.at(self.start)
+        off = float(rng.uniform(-self.start_offset, self.start_offset))
+        turn = radians(float(rng.uniform(-self.start_heading, self.start_heading)))
+        return x - off * sin(heading), y + off * cos(heading), heading + turn
+
+
+def read_task(path: Path, to_truth: Similarity | None = None) -> RoadTask:
+    """Reads a task that the twin wrote; `to_truth` maps the scene's frame to the true one.
+
+    Raises:
+        InputError: no such file, another format, or impossible numbers.
+    """
+    table = read_json(path)
+    if not isinstance(table, dict) or (table.get("format"), table.get("version")) != ("twin task", 1):
+        raise InputError(f"{path}: {short_repr(table)} is not a task; write one: python -m twin.export SCENE --task-file")
+    with wrap_read_errors(path, "write it again: python -m twin.export SCENE --task NAME --task-file FILE"):
+        return parse_task(table, to_truth)
+
+
+def parse_task(table: dict[str, Any], to_truth: Similarity | None = None) -> RoadTask:
+    """A task from the contents of its file. Raises KeyError, TypeError or ValueError for missing or wrong entries."""
+    line = np.array(table["line"], float)
+    line = to_truth.points(line) if to_truth else line
+    start, limits, pictures = table["start"], table["limits"], table["pictures"]
+    width, height = pictures["size"]
+    return RoadTask(
+        name=str(table["name"]),
+        line=line[:, :2],
+        half_width=float(table["half_width"]),
+        start=float(start["station"]),
+        start_offset=float(start["offset"]),
+        start_heading=float(start["heading"]),
+        goal=float(table["goal"]),
+        time_limit=float(table["time_limit"]),
+        give_up=(float(table["give_up"]["distance"]), float(table["give_up"]["time"])),
+        max_tilt=float(table["max_tilt"]),
+        speed=float(limits["speed"]),
+        yaw_rate=float(limits["yaw_rate"]),
+        control_timestep=float(table["control_timestep"]),
+        size=(int(width), int(height)),
+        stack=int(pictures["stack"]),
+    )
+
+
+@cache
+def _filmed_line(number: int) -> Array:
+    place = place_on_test_day(number)
+    return true_route(FilmingPlan.of(draw(number)) if number else None, place.route)[:, :2]
+
+
+def task_names(number: int) -> tuple[str, ...]:
+    """Names of the tasks of a place."""
+    return tuple(tasks(draw(number).line) if number else CAMPUS_TASKS)
+
+
+def task_of_place(
+    number: int, name: str, speed: float = 1.0, yaw_rate: float = 1.0, control_timestep: float = 0.1
+) -> RoadTask:
+    """A task of a place on its filmed path, for a policy's speed [m/s], yaw rate [rad/s] and control step [s].
+
+    Raises:
+        InputError: no such task in this place.
+    """
+    offered = tasks(draw(number).line) if number else CAMPUS_TASKS
+    if name not in offered:
+        raise InputError(f"task {name!r}: place {number} has {', '.join(offered)}")
+    start, length = offered[name]
+    line = _filmed_line(number)
+    end = min(start + length, float(np.hypot(*np.diff(line, axis=0).T).sum()))
+    return RoadTask(
+        *(name, line, _HALF_WIDTH, start, _START_OFFSET, _START_HEADING, end - _BUMPER),
+        time_limit=2.0 * (end - start) / speed,
+        give_up=_STUCK,
+        max_tilt=_MAX_TILT,
+        speed=speed,
+        yaw_rate=yaw_rate,
+        control_timestep=control_timestep,
+    )

@@ -1,0 +1,43 @@
+"""The place of a number on the day of the trials: small objects have moved since the film."""
+
+from functools import cache
+
+import numpy as np
+
+from twin.geometry.passes import path_length, smooth_path
+from twin.reality import place as places
+from twin.reality.centerline import RoadLine
+from twin.reality.drawn_place import build_number
+from twin.reality.filming import FilmingPlan, trajectory
+from twin.reality.place_objects import DrivenLine, KnownPlace
+from twin.reality.rasterizer import SHADOW_RANGE
+from twin.types import Array
+
+_LENGTH_TOLERANCE = 0.98  # fraction of the longest path; the first film above it gives the route
+
+
+def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
+    """The route: the filmed path on the true ground [m], shape (m, 3).
+
+    As in a build, the first film within 2 % of the longest gives the path.
+    """
+    plan, line = plan or FilmingPlan(), line or RoadLine()
+    paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
+    lengths = np.array([path_length(path) for path in paths])
+    xy = paths[int(np.argmax(lengths >= _LENGTH_TOLERANCE * lengths.max()))]
+    return np.column_stack([xy, line.ground_height(xy)])
+
+
+@cache
+def place_on_test_day(number: int = 0) -> KnownPlace:
+    """The place of a number on the day of the trials, after small objects have moved."""
+    return build_number(number, displaced=True) if number else places.build(displaced=True)
+
+
+def shadow_range(place: KnownPlace) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """The box [m] in which the rasterizer casts shadows."""
+    if place.number == 0:
+        return SHADOW_RANGE
+    (x0, y0), (x1, y1) = place.layout.field
+    height = place.route.ground_height(place.route.at(np.linspace(0.0, place.route.length, 100)))
+    return (x0, y0, float(height.min()) - 1.5), (x1, y1, float(height.max()) + 6.0)
