@@ -26,8 +26,12 @@ EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "pr
 """Columns of `validation/episodes.csv`; `trust` is the trial's mean image reliability (`twin.env.trust`), or empty."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
-RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS = ("policy", "lighting", "trials", "successes"), ("task", "twin_lighting")
+RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
 """Columns of `results.csv`."""
+ROBOT_COLUMNS = ("robot", "camera", "outside_training")
+"""Which robot and camera drove, and what of them lies outside training's ranges; `twin.reality` writes them."""
+OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *ROBOT_COLUMNS)
+"""Further columns that `results.csv` may have."""
 RECENT_EPISODES = 20
 """Number of latest complete episodes in a training's success rate, of about 40 in a training on a CPU."""
 
@@ -116,23 +120,31 @@ def cells_csv(cells: Iterable[Cell]) -> str:
     return csv_text(CELL_COLUMNS, rows)
 
 
-def write_real_trials(trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str) -> None:
+def write_real_trials(
+    trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str, robot: Sequence[str] = ()
+) -> None:
     """Writes real trials, a row each, to `table`, and their counts to `out`, as `read_results` reads them.
 
-    Cells that `out` already has keep their `twin_lighting`; new ones get the given one.
+    Cells that `out` already has keep their `twin_lighting` and `ROBOT_COLUMNS`; new ones get the given ones, where
+    `robot` has a value for each of `ROBOT_COLUMNS`, or none.
     """
-    compared: dict[tuple[str, str, str], str] = {}
+    known: dict[tuple[str, str, str], tuple[str, ...]] = {}
+    with_robot = bool(robot)
     if out.exists():
         with wrap_read_errors(out, "give another --out"):
             for row in csv.DictReader(io.StringIO(read_text(out), newline="")):
-                compared[row["policy"], row["task"], row["lighting"]] = row["twin_lighting"]
+                with_robot |= ROBOT_COLUMNS[0] in row
+                kept = (row["twin_lighting"], *(row.get(name) or "" for name in ROBOT_COLUMNS))
+                known[row["policy"], row["task"], row["lighting"]] = kept
+    new = (twin_lighting, *(robot or ("",) * len(ROBOT_COLUMNS)))
+    columns = (*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS)[: None if with_robot else -len(ROBOT_COLUMNS)]
     rows = [
-        (c.policy, c.lighting, str(c.trials), str(c.successes), c.task, compared.get(c.key, twin_lighting))
+        (c.policy, c.lighting, str(c.trials), str(c.successes), c.task, *known.get(c.key, new))[: len(columns)]
         for c in tally(trials)
     ]
     for path, text in (
         (table, csv_text(EPISODE_COLUMNS, [trial.row() for trial in trials])),
-        (out, csv_text((*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS), rows)),
+        (out, csv_text(columns, rows)),
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)

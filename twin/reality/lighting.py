@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.errors import InputError, short_repr
 from twin.reality import SEED
 from twin.reality.textures import fbm
 
@@ -404,3 +405,26 @@ colors, and the air may be hazy or the ground wet. A trial adds only a drift of 
 The five stated ones were used during development, and `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was
 measured on images of these and of days 1 to 5, so only days 6 to 15 took no part in any choice.
 """
+
+
+def weather(name: str) -> Lighting:
+    """A weather of the real test: one of `WEATHER`, or `day_N` of any number N from 1 on.
+
+    Raises:
+        InputError: no such weather.
+    """
+    if name in WEATHER:
+        return WEATHER[name]
+    _, _, number = name.partition("day_")
+    if name.startswith("day_") and number.isascii() and number.isdecimal() and str(int(number)) == number != "0":
+        return _day(int(number))
+    named = ", ".join(list(WEATHER)[: len(WEATHER) - _DAYS])
+    raise InputError(f"no lighting {short_repr(name)} in the real test; expected one of {named}, day_1, day_2, ...")
+
+
+def weather_index(name: str) -> int:
+    """A number of its own for every weather: its place in `WEATHER`, and so on for further days."""
+    weather(name)
+    if name in WEATHER:
+        return list(WEATHER).index(name)
+    return len(WEATHER) - _DAYS - 1 + int(name.removeprefix("day_"))

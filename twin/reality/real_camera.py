@@ -7,7 +7,7 @@ pictures, lags and overshoots. *White balance* drifts over seconds. *Sensor*: no
 *Compression*: JPEG. The light comes from `rasterizer.py`.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -409,5 +409,3 @@ def compressed(picture: Image, quality: int) -> Image:
     data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
-
-assert set(RANGES) == {one.name for one in fields(HiddenCamera)} - {"number"}

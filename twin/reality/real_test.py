@@ -1,39 +1,68 @@
-"""The real test: a policy file drives the hidden robot on the true road, in weather that was never filmed.
+"""The real test: a policy file drives a robot on the true road, in weather that was never filmed.
 
-A policy receives images only, and its file is the only input from the training side. The robot model, its controller,
-the camera effects and the termination rules are those of the twin. Two constants of the twin were measured on images of
-this world (`twin.env.domain_randomization.KNOWN_WEATHER_FRACTION`, `twin.env.irradiance.GROUND_ALBEDO`).
+A policy receives images only, and its file is the only input from the training side. Robot, camera, haze and judge are
+equations of their own (`real_robot.py`, `real_camera.py`, `real_judge.py`), the renderer is `rasterizer.py`: of the twin
+only the loader of policy files and the format of tables are used. Robots, cameras and days have numbers; what of a robot
+or camera lies outside the ranges of training is written into the results (`outside_training`).
 
-The k-th trial in a weather has the same seed for every policy, hence the same start and camera vibration, so that
-policies can be compared in pairs.
+The k-th trial in a weather has the same seed for every policy, hence the same start, shake and noise, so that policies
+can be compared in pairs.
+
+Up to version 1 the robot, its controller, the camera's effects, the haze and the rules were the twin's own. Tables of
+that time can be read and reported on, not continued. Two constants of the twin were measured on its images
+(`twin.env.domain_randomization.KNOWN_WEATHER_FRACTION`, `twin.env.irradiance.GROUND_ALBEDO`).
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from twin.config import HELD_OUT, Condition
-from twin.env.options import STEERING, parse_options
-from twin.env.task import CAMERA, control
 from twin.errors import InputError
 from twin.evaluation.trials import Trial, read_trials, write_real_trials
 from twin.files import digest_file, read_json, wrap_read_errors, write_json
 from twin.learn.policy import JSON, Policy, load_policy
-from twin.reality import true_world
+from twin.reality import REALITY_VERSION, true_world
 from twin.reality.filming import FilmingPlan, write_video
-from twin.reality.lighting import WEATHER
+from twin.reality.lighting import weather, weather_index
 from twin.reality.rasterizer import Rasterizer
-from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day, shadow_range
+from twin.reality.real_camera import RealCamera, askew, draw_camera, intrinsics_of
+from twin.reality.real_judge import RealJudge
+from twin.reality.real_robot import RealRobot, draw_robot, outside_training
+from twin.reality.road_task import CAMPUS_TASKS, RoadTask, task_of_place
+from twin.reality.trial_place import place_on_test_day, shadow_range
 from twin.runtime import bar, exclusive_lock
 from twin.types import Image
 
 TASKS = ("straight", "right_turn")
+"""Tasks of place 0 that the demo's figures are of."""
+assert set(TASKS) <= set(CAMPUS_TASKS)
 
 _FIRST_SEED = 7_000_000  # of the first trial
 _SEEDS_PER_LIGHTING = 10_000  # upper bound of trials per policy and lighting
 _FILM_SCALE = 4  # enlargement of images in a film
+_START, _ROBOT, _CAMERA = range(3)  # random streams of a trial
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Where and with what trials are driven."""
+
+    place: int = 0
+    robot: int = 0
+    camera: int = 0
+
+    @property
+    def outside(self) -> list[str]:
+        """Names of the robot's and camera's numbers that lie outside what training randomises."""
+        return outside_training(draw_robot(self.robot)) + askew(draw_camera(self.camera))
+
+    def columns(self) -> tuple[str, str, str]:
+        """Values of `twin.evaluation.trials.ROBOT_COLUMNS`."""
+        return str(self.robot), str(self.camera), " ".join(self.outside)
 
 
 def load_policy_file(path: Path) -> Policy:
@@ -47,10 +76,11 @@ def load_policy_file(path: Path) -> Policy:
     return load_policy(path)
 
 
-@cache
-def _rasterizer(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int) -> Rasterizer:
+@lru_cache(maxsize=8)
+def rasterizer(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int) -> Rasterizer:
+    """Renders a place in a weather of the real test; see `Rasterizer`."""
     place = place_on_test_day(number)
-    model = true_world.world_spec(WEATHER[lighting], place).compile()
+    model = true_world.world_spec(weather(lighting), place).compile()
     return Rasterizer(model, np.array(intrinsics), size, shadow_range(place))
 
 
@@ -59,104 +89,143 @@ class RealTest:
 
     __test__ = False  # not a pytest class
 
-    def __init__(self, policy: Policy, task: str, number: int = 0) -> None:
-        """Raises InputError for an unknown task or a policy with options that the robot does not support."""
-        self.policy, self._robot = policy, hidden_robot()
-        options = {key: value for key, value in policy.options().items() if key not in ("size", "stack")}
-        self.road = TrueRoad(task, self._robot, parse_options({**options, "pixels": False}), number)
-        self._environment = control.Environment(
-            self.road.physics, self.road.drive, control_timestep=policy.control.control_timestep
-        )
+    def __init__(self, policy: Policy, task: str | RoadTask, setup: Setup | None = None) -> None:
+        """
+        Args:
+            policy: Drives.
+            task: A task, or the name of one of the place's.
+            setup: Place, robot and camera.
+
+        Raises:
+            InputError: unknown task, place, robot or camera, or a task whose pictures are not the policy's.
+        """
+        self.policy, self.setup = policy, setup or Setup()
+        c = policy.control
+        if isinstance(task, str):
+            task = task_of_place(self.setup.place, task, c.speed, c.yaw_rate, c.control_timestep)
+        elif (task.size, task.stack) != (policy.size, policy.stack):
+            raise InputError(
+                f"task {task.name!r} has {task.stack} pictures of {task.size}; policy {policy.name} takes {policy.stack} "
+                f"of {policy.size}; write the task for this policy: twin export SCENE --policy RUN --task-file FILE"
+            )
+        self.task = task
+        self.robot = RealRobot(draw_robot(self.setup.robot), place_on_test_day(self.setup.place))
+        self.camera = draw_camera(self.setup.camera)
+        self.judge = RealJudge(self.task)
 
     def reset(self, lighting: str, seed: int) -> RealCamera:
-        """Starts a trial and returns its camera; arguments as in `run_trial`."""
-        self.road.drive.seed(seed)
-        self._environment.reset()
+        """Puts the robot at the start of a trial and returns its camera; arguments as in `run_trial`."""
+        start = self.task.sample_start(np.random.default_rng([seed, _START]))
+        self.robot.set_pose(*start, np.random.default_rng([seed, _ROBOT]))
+        self.judge.begin(*start[:2])
         size = self.policy.size
-        intrinsics = self.road.intrinsics(size)
-        raster = _rasterizer(lighting, tuple(intrinsics.tolist()), size, self.road.place.number)
-        return RealCamera(raster, WEATHER[lighting], self._robot, intrinsics, size, self.road.drive.rng(CAMERA))
+        raster = rasterizer(lighting, tuple(intrinsics_of(self.camera, size).tolist()), size, self.setup.place)
+        return RealCamera(raster, weather(lighting), self.camera, size, np.random.default_rng([seed, _CAMERA]))
 
     def run_trial(self, lighting: str, seed: int, on_image: Callable[[Image], None] | None = None) -> Trial:
         """Drives one trial.
 
         Args:
-            lighting: One of `WEATHER`.
+            lighting: See `twin.reality.lighting.weather`.
             seed: Seed of all randomness in the trial.
             on_image: Called with every image (h, w, 3).
         """
-        policy, drive, physics = self.policy, self.road.drive, self.road.physics
+        policy, robot, judge = self.policy, self.robot, self.judge
         camera = self.reset(lighting, seed)
         width, height = policy.size
-        stack, steps, ended = np.zeros((policy.stack, 3, height, width), np.uint8), 0, False
-        while not ended:
-            image = camera.capture(physics.camera_to_world, physics.time())
+        stack, steps = np.zeros((policy.stack, 3, height, width), np.uint8), 0
+        while not judge.cause:
+            image = camera.capture(robot)
             if on_image:
                 on_image(image)
             newest = image.transpose(2, 0, 1)
             stack = np.concatenate([stack[1:], newest[None]]) if steps else np.repeat(newest[None], policy.stack, 0)
             v, yaw_rate = policy.command(policy(stack.reshape(3 * policy.stack, height, width)))
-            action = [yaw_rate] if policy.control.action == STEERING else [v, yaw_rate]
-            ended, steps = self._environment.step(np.array(action)).last(), steps + 1
-        return Trial(policy.name, drive.segment.name, lighting, seed, drive.cause, drive.progress, steps)
+            self.drive(v, yaw_rate)
+            steps += 1
+        return Trial(policy.name, self.task.name, lighting, seed, judge.cause, judge.progress, steps)
+
+    def drive(self, v: float, yaw_rate: float) -> None:
+        """One control step under a command [m/s], [rad/s], within the task's limits, and the judge's look at it."""
+        robot, task = self.robot, self.task
+        bounded = min(max(yaw_rate, -task.yaw_rate), task.yaw_rate)
+        robot.command(min(max(v, 0.0), task.speed), bounded)
+        robot.step(task.control_timestep)
+        self.judge.see(robot.pose[0], robot.pose[1], robot.tilt, robot.touched, robot.time)
 
 
 def run(
     policies: Sequence[Path],
-    task: str,
+    task: str | RoadTask,
     lightings: Sequence[str],
     trials: int,
     out: Path,
     twin_lighting: str = str(Condition(HELD_OUT, True)),
     films: Path | None = None,
-    number: int = 0,
+    setup: Setup | None = None,
 ) -> list[Trial]:
     """Drives the trials that are not in the table yet, and writes the table and its summary.
 
     Args:
         policies: Policy files.
-        task: One of `TASKS`, on a drawn place one of `place_spec.tasks`.
-        lightings: Names from `WEATHER`.
+        task: A task, or the name of one of the place's.
+        lightings: See `twin.reality.lighting.weather`.
         trials: Trials per policy and lighting.
         out: Results file as read by `twin.forecast`. `<name>_trials.csv` beside it has a row per trial,
-            `<name>_policies.json` the digests of the policy files.
+            `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera.
         twin_lighting: Value of the column of this name in new rows.
         films: Folder for a film of every trial, by the robot's camera.
-        number: Number of the place; a table is of one place.
+        setup: Place, robot and camera; a table is of one.
 
     Returns:
         All trials of the table, including those of earlier calls.
 
     Raises:
-        InputError: unknown names, unusable policy files, a different file under a known policy name, or another process
-            that writes the same table.
+        InputError: unknown names, unusable policy files, a different file under a known policy name, a table of another
+            setup, or another process that writes the same table.
     """
+    setup = setup or Setup()
     for name in lightings:
-        if name not in WEATHER:
-            raise InputError(f"unknown lighting {name!r}; the real test offers {', '.join(WEATHER)}")
+        weather(name)
     if not 1 <= trials <= _SEEDS_PER_LIGHTING:
         raise InputError(f"trials = {trials}; expected 1 to {_SEEDS_PER_LIGHTING}")
     table = out.with_name(f"{out.stem}_trials.csv")
     loaded = [load_policy_file(path) for path in policies]
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
+        _check_setup(setup, table, out.with_name(f"{out.stem}_setup.json"))
         _check_policy_digests(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
         done = read_trials(table) if table.exists() else []
         known = {(*_key(one), one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
-            test = RealTest(policy, task, number)
+            test = RealTest(policy, task, setup)
             for lighting in dict.fromkeys(lightings):
                 # Each weather has its own seeds; shared ones would repeat the same ten starts in every weather.
-                first = _FIRST_SEED + _SEEDS_PER_LIGHTING * list(WEATHER).index(lighting)
+                first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
                 seeds = [first + k for k in range(trials)]
-                missing = [seed for seed in seeds if (policy.name, task, lighting, seed) not in known]
-                with bar(f"{policy.name}, {task}, {lighting}", len(missing), "trial") as progress:
+                missing = [seed for seed in seeds if (policy.name, test.task.name, lighting, seed) not in known]
+                with bar(f"{policy.name}, {test.task.name}, {lighting}", len(missing), "trial") as progress:
                     for seed in missing:
                         done.append(_run_trial(test, lighting, seed, films))
-                        write_real_trials(done, table, out, twin_lighting)
+                        write_real_trials(done, table, out, twin_lighting, setup.columns())
                         progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
                         progress.update()
-        write_real_trials(done, table, out, twin_lighting)
+        write_real_trials(done, table, out, twin_lighting, setup.columns())
     return done
+
+
+def _check_setup(setup: Setup, table: Path, record: Path) -> None:
+    """Records what a table is of. Raises InputError if it is of something else, or of an earlier version's reality."""
+    given = {**asdict(setup), "version": REALITY_VERSION}
+    if record.exists():
+        with wrap_read_errors(record, "give another --out"):
+            known = {name: read_json(record)[name] for name in given}
+        if known != given:
+            raise InputError(f"{table} is of {known}; this is {given}; give another --out")
+    elif table.exists():
+        raise InputError(f"{table} was driven in the reality of version 1; this is {REALITY_VERSION}; give another --out")
+    record.parent.mkdir(parents=True, exist_ok=True)
+    robot, camera = asdict(draw_robot(setup.robot)), asdict(draw_camera(setup.camera))
+    write_json(record, {**given, "outside_training": setup.outside, "robot_values": robot, "camera_values": camera})
 
 
 def _run_trial(test: RealTest, lighting: str, seed: int, films: Path | None) -> Trial:
