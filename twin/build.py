@@ -45,8 +45,8 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.trainer", 4, ("nerf", "mjcf.route"), ("cameras", "metric")),
-    Stage("mesh", "twin.assets.mesh", 3, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
+    Stage("field", "twin.nerf.trainer", 5, ("nerf", "mjcf.route"), ("cameras", "metric")),
+    Stage("mesh", "twin.assets.mesh", 4, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",

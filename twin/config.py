@@ -205,7 +205,7 @@ class NerfConfig:
     """Fraction of each step's rays with depth supervision; the others belong to triples and single pixels."""
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
-    bake_steps: Annotated[int, Range(1)] = 300
+    bake_steps: Annotated[int, Range(1)] = 600
     """Fine-tuning steps of the baked field, which renders images."""
     detail_passes: Annotated[float, Range(0, 100)] = 2.0
     """How often each training pixel on a near surface is used to fit the detail that bricks lack; 0 = no detail."""
@@ -230,9 +230,9 @@ class NerfConfig:
 
 
 QUALITIES: dict[str, dict[str, int | float]] = {
-    "draft": {"steps": 1200, "bake_steps": 200, "detail_passes": 1.0},
+    "draft": {"steps": 1000, "bake_steps": 300, "detail_passes": 1.0},
     "standard": {},
-    "high": {"steps": 10000, "bake_steps": 1000, "detail_passes": 4.0, "max_width": 640},
+    "high": {"steps": 8000, "bake_steps": 3000, "detail_passes": 4.0, "max_width": 640},
 }
 """Settings of `NerfConfig` by quality, where they differ from the defaults."""
 
