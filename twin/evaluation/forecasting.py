@@ -5,9 +5,10 @@ lightings that real cells of the task are compared with, or all of them without 
 real trials. A *group* is the driven candidates of one task, or of all tasks. A *day* is a lighting of the real trials;
 a *training* is a run, with all its checkpoints.
 
-Every number is an `Estimate` with its count and, where one is known to hold, its 90 % interval, or with the reason for
-the absence of either. Intervals are about the population of trainings and days of which these are a sample (modules
-`jackknife` and `rate_model`, with their coverage in `benchmarks/intervals.py`), not about these cells.
+Every number is an `Estimate`: a value with its count, or the reason why there is no value; and a 90 % interval where
+one is known to have that coverage, or the reason why there is none. Intervals are about the population of trainings and
+days of which these are a sample (modules `jackknife` and `rate_model`, with their coverage in
+`benchmarks/intervals.py`), not about these cells.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -85,7 +86,7 @@ class Estimate:
     missing: str = ""
     """The reason; empty if there is a value."""
     no_interval: str = ""
-    """The reason why there is a value and no interval, and what is missing for one; empty if it needs none."""
+    """The reason why the value has no interval, and what is missing for one; else empty."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,8 @@ class Candidate:
     lightings: tuple[str, ...]
     """The twin's lightings of its score."""
     twin: Estimate
-    """Twin score. Its interval is over days if it has several lightings that days are compared with, else over the
-    episodes under these lightings."""
+    """Twin score. Its interval is over days if days are compared with several of its lightings; otherwise over the
+    episodes under its lightings."""
     twin_rank: Estimate
     """Expected rank among the task's candidates (1 is best), and its interval."""
     twin_ranks: tuple[float, ...]
@@ -122,7 +123,7 @@ class Candidate:
     real: Estimate
     """Mean over its real cells; its interval is over days."""
     real_ranks: tuple[float, ...]
-    """Probability of each rank on the road among the driven candidates; empty if it is not one of several."""
+    """Probability of each rank on the road among the driven candidates; empty unless it and another one are driven."""
     corrected: Estimate
     """Real rate predicted from its twin score and the driven candidates of other trainings."""
     trained: Estimate = Estimate(missing="its training on this task is not known")
@@ -163,7 +164,7 @@ class Agreement:
     policies: int
     cells: int
     missing: tuple[str, ...]
-    """Missing data, because of which the estimates below have no values."""
+    """Data that are missing; if any are, the estimates below have no values."""
     pearson: Estimate
     spearman: Estimate
     mmrv: Estimate
@@ -262,7 +263,7 @@ class Forecast:
 
 
 def _without_nulls(value: Any) -> Any:
-    """A JSON value without its nulls, whose fields have defaults."""
+    """A JSON value without entries that are null, so that the records' fields take their defaults."""
     if isinstance(value, dict):
         return {key: _without_nulls(item) for key, item in value.items() if item is not None}
     return [_without_nulls(item) for item in value] if isinstance(value, list) else value
@@ -328,7 +329,7 @@ def _candidates(
         lightings = tuple(name for name in lightings if name in compared)
     policies = list(dict.fromkeys(cell.policy for cell in twin))
     cells = [[c for c in twin if c.policy == p and c.lighting in lightings] for p in policies]
-    # A policy without any compared lighting gets a score over its own lightings, which is not compared.
+    # A policy that was not validated under any compared lighting is scored over all of its own lightings instead.
     cells = [mine or [c for c in twin if c.policy == p] for p, mine in zip(policies, cells, strict=True)]
     driven = [[c for c in real if c.policy == p] for p in policies]
     rng = np.random.default_rng([seed, 1])
@@ -393,7 +394,7 @@ def _scores(real: Sequence[Cell], twin: Cells) -> tuple[float, float]:
 
 
 def _counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
-    """Successes and trials of each policy's units: its cells, or single episodes unless `by_day`."""
+    """Successes and trials of each policy's units: a unit is a cell if `by_day`, else a single episode."""
     if by_day:
         return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
     won = [sum(c.successes for c in row) for row in rows]
@@ -402,7 +403,8 @@ def _counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indi
 
 
 def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.Generator) -> Array:
-    """Samples of the policies' true rates, shape (samples, n). A day's effect on all policies hardly moves ranks."""
+    """Samples of the policies' true rates, shape (samples, n). Effects of a day that all policies share are not
+    modeled, since they hardly change ranks."""
     return RateModel.fit(*_counts(rows, by_day), shared_days=False).sample(rng, ranking.SAMPLES)
 
 
@@ -535,7 +537,8 @@ def _mean_real(data: PairedCells, candidates: list[Candidate]) -> Estimate:
         mean = prediction_powered_mean(twin=rates["twin"], real=rates["real"], twin_only=further)
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
-    return Estimate(mean.value, n=data.policies + len(further), no_interval="none: it would not count days")
+    alike = "none: it would take a day's trials as independent"
+    return Estimate(mean.value, n=data.policies + len(further), no_interval=alike)
 
 
 TWIN, RECALIBRATED, OTHERS, SHUFFLED = (
