@@ -54,7 +54,7 @@ from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Verdict, command, r
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Rank correlations above which twin and road rank policies alike, or roughly alike."""
 SMALL_REGRET = 0.05
-_SMALL_GAP = 0.1  # difference in the twin from which on an order that may be believed counts as good
+_SMALL_GAP = 0.1  # largest difference of twin scores at which a reliable order is good news
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -84,8 +84,8 @@ PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage",
 INTERVALS_NOTE = (
     "Intervals (90%) are about repetitions with other trainings and other days, of which these are a sample: days and "
     "trainings are left out in turn, not trials. More days and more trainings make them narrower; more checkpoints of "
-    "one training, or more trials on the same day, hardly do. Where there are too few for an interval that holds, none "
-    "is given."
+    "one training, or more trials on the same day, hardly do. No interval is given where there are too few of them for "
+    "a reliable one."
 )
 """Note wherever intervals of the agreement of twin and road are shown; coverage: `benchmarks/intervals.py`."""
 
@@ -95,7 +95,7 @@ CSV_COLUMNS = (
     *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
 )
 
-_RELIABLE = 0.95  # share of pairs in the road's order from which on the twin's order may be believed
+_RELIABLE = 0.95  # least share of pairs in the road's order for which the twin's order may be believed
 _ENOUGH_PAIRS = 10
 _POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
 _TRIALS_NEEDED = (
@@ -163,15 +163,15 @@ def believable(group: Agreement) -> Verdict:
             closer = [(m, r) for low, m, r in pairs if low < start]
             m, r = sum(m for m, _ in closer), sum(r for _, r in closer)
             gap = f"that differ by {100 * start:.0f} percentage points or more" if start else "that differ at all"
-            rest = f", while closer ones were right in {r:g} of {m}" if m else ""
+            rest = f", and in {r:g} of {m} closer pairs" if m else ""
             text = (
-                f"What may be believed: the order of two policies {gap} in the twin, which the road had in {right:g} "
-                f"of {n} pairs{rest} ({where})."
+                f"What may be believed: the order of two policies {gap} in the twin. The road had the same order in "
+                f"{right:g} of {n} such pairs{rest} ({where})."
             )
             enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
             return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
     n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
-    text = f"No order of two policies in the twin may be believed yet: the road had it in {right:g} of {n} pairs"
+    text = f"No order of two policies in the twin may be believed yet: the road had the same in {right:g} of {n} pairs"
     return Verdict(f"{text} ({where}).", "bad")
 
 
@@ -220,7 +220,7 @@ def _bias(group: Agreement) -> Verdict:
 
 
 def _skill(group: Agreement) -> list[Verdict]:
-    """Whether the twin predicts single days and policies better than a guess without it."""
+    """The verdict on whether the twin predicts single days better than a guess without it; none without scores."""
     gains = {it.predictor: it.gain for it in group.scores}
     gain = gains.get(OTHERS)
     if gain is None or gain.value is None:
@@ -278,7 +278,7 @@ def limitations(forecast: Forecast) -> list[Caution]:
     for group in forecast.groups:
         if group.spearman.no_interval:
             what = f"{group.task}: correlations have no interval ({group.spearman.no_interval})."
-            out.append(Caution(what, "the same: further days, further trainings."))
+            out.append(Caution(what, "drive on further days, and with policies of further trainings."))
     lightings = join_names(sorted({name for c in forecast.candidates for name in c.lightings}))
     cure = (
         "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
@@ -322,7 +322,7 @@ def next_trials(forecast: Forecast) -> list[str]:
         best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
         if len(best) > 1:
             odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], 6)
-            out.append(f"{task}: drive again those that may be the best of the driven, with this probability: {odds}.")
+            out.append(f"{task}: drive these again, each of which may be the best (probability): {odds}.")
         elif best:
             out.append(f"{task}: drive {best[0].policy} on further days, in light that it has not met; it leads.")
         if unseen := [c.policy for c in mine if not c.driven]:
@@ -412,7 +412,7 @@ _SQUARE_SIZE = 4.6  # [in]
 
 @styled
 def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "success in the twin") -> Figure:
-    """Real rate over another one of every driven candidate, colored by task; on the diagonal they are equal.
+    """Real rate of every driven candidate over its rate in `field`, colored by task; on the diagonal they are equal.
 
     `field` of the candidate is "twin" or "corrected" (predicted from the other candidates); `label` names it.
     """
