@@ -13,7 +13,8 @@ from scipy.special import expit
 
 from twin.env.options import CAUSES
 from twin.errors import InputError
-from twin.evaluation.forecasting import ALL_TASKS, OTHERS, SHUFFLED, TWIN, Estimate, Forecast, make_forecast
+from twin.evaluation.agreement import OTHERS, SHUFFLED, TWIN, Estimate
+from twin.evaluation.forecasting import ALL_TASKS, Forecast, make_forecast
 from twin.evaluation.jackknife import STATISTICS as WITH_INTERVAL
 from twin.evaluation.jackknife import jackknife_interval, pair_cells
 from twin.evaluation.statistics import MIN_POLICIES, mean_rate, mmrv, pearson, rate_difference, spearman

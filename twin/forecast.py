@@ -13,7 +13,8 @@ from pathlib import Path
 
 from twin import commands
 from twin.errors import InputError
-from twin.evaluation.forecasting import Estimate, Forecast
+from twin.evaluation.agreement import Estimate
+from twin.evaluation.forecasting import Forecast
 from twin.evaluation.trials import read_results, read_trials, tally
 from twin.files import write_text
 from twin.scene import SceneDir

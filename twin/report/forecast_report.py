@@ -14,17 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.errors import join_names
-from twin.evaluation.forecasting import (
-    ALL_TASKS,
-    OTHERS,
-    SHUFFLED,
-    Agreement,
-    Candidate,
-    CellPair,
-    Estimate,
-    Forecast,
-    TrialAllocation,
-)
+from twin.evaluation.agreement import OTHERS, SHUFFLED, Agreement, CellPair, Estimate
+from twin.evaluation.forecasting import ALL_TASKS, Candidate, Forecast, TrialAllocation
 from twin.evaluation.jackknife import MIN_DAYS, MIN_TRAININGS, training_of
 from twin.evaluation.ranking import MAX_TRIALS
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS

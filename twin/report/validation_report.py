@@ -20,7 +20,7 @@ from scipy.stats import binomtest
 
 from twin.config import ANY, HELD_OUT, TRAINING, Condition
 from twin.errors import join_names
-from twin.evaluation.forecasting import Estimate
+from twin.evaluation.agreement import Estimate
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS, rate_summary
 from twin.evaluation.training_curves import plot_success_curve
 from twin.evaluation.trials import RECENT_EPISODES, Trial, csv_text, tally
