@@ -354,7 +354,7 @@ def test_every_kind_of_caution_is_among_them(monkeypatch: pytest.MonkeyPatch) ->
         if "Caution(" in path.read_text(encoding="utf-8").replace("class Caution", "")
     }
     # The pages of a validation and of a forecast have their own.
-    assert elsewhere == {"build_sections", "validation_report", "forecast_report"}
+    assert elsewhere == {"build_sections", "validation_report", "forecast_text"}
 
 
 @pytest.mark.usefixtures("no_charts")

@@ -22,12 +22,12 @@ from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
 from twin.report import forecast_report
 from twin.report.figures import lighting_labels
-from twin.report.forecast_report import (
+from twin.report.forecast_report import forecast_page
+from twin.report.forecast_text import (
     CSV_COLUMNS,
     INTERVALS_NOTE,
     STATISTICS,
     candidates_csv,
-    forecast_page,
     format_estimate,
     limitations,
     next_trials,

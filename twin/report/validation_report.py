@@ -43,7 +43,7 @@ from twin.report.figures import (
     styled,
     svg,
 )
-from twin.report.forecast_report import format_estimate
+from twin.report.forecast_text import format_estimate
 from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Picture, Verdict, command, data_url, render
 from twin.scene import SceneDir
 
