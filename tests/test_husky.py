@@ -63,7 +63,7 @@ def test_visual_geoms_have_no_mass_and_no_contacts():
     assert not model.geom_contype[looks].any() and not model.geom_conaffinity[looks].any()
 
 
-def test_the_coulomb_track_ratio_equals_its_closed_form():
+def test_the_coulomb_track_ratio_of_a_centered_mass_equals_its_closed_form():
     assert coulomb_track_ratio(np.zeros(2)) == pytest.approx(1 + (WHEELBASE / TRACK) ** 2, rel=1e-6)
     rear = coulomb_track_ratio(np.array([-0.07, 0.0]))
     assert rear == pytest.approx(coulomb_track_ratio(np.array([0.07, 0.0])), rel=1e-6)

@@ -137,7 +137,7 @@ def test_windows_in_which_the_robot_stands_are_left_out(drive):
     assert len(logs.cut_windows(parked, "log")) >= len(whole) + 199
 
 
-def test_windows_continue_right_after_a_gap(drive):
+def test_a_clock_set_after_the_first_row_loses_no_window(drive):
     """One row before the clock was set: two seconds of the log are lost to the grid at most, and no memory."""
     late = {name: np.concatenate([column[:1], column]) for name, column in drive.items()}
     late["time"][1:] += 1.7e9

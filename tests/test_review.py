@@ -190,7 +190,7 @@ def test_the_nearest_frame_is_at_the_same_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, []), (1, [5]), (2, [0, 9]), (3, [0, 4, 9]), (99, list(range(10)))])
-def test_evenly_spaced_indices_include_both_ends(count: int, expected: list[int]) -> None:
+def test_evenly_spaced_picks_the_middle_or_both_ends(count: int, expected: list[int]) -> None:
     assert evenly_spaced(range(10), count) == expected
 
 
