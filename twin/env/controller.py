@@ -53,12 +53,6 @@ def wheel_speeds(command: Array, params: HuskyParams) -> Array:
     return limit_sides(sides, params.max_wheel_speed) / WHEEL_RADIUS
 
 
-def wheel_speeds_to_twist(speeds: Array, params: HuskyParams) -> Array:
-    """Inverse of `wheel_speeds` within its limits: the controller's v [m/s], ω [rad/s], shape (2,)."""
-    left, right = np.asarray(speeds) * WHEEL_RADIUS
-    return np.array([(left + right) / 2, (right - left) / (params.separation_multiplier * TRACK)])
-
-
 class Controller:
     """Controller of one robot. Times are in seconds on a clock that starts with `reset`."""
 

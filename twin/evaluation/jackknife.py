@@ -35,7 +35,6 @@ from twin.evaluation.statistics import (
     mmrv_batched,
     pearson_batched,
     spearman_batched,
-    winner_batched,
 )
 from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
@@ -180,11 +179,6 @@ def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedC
     rates = data.rates()
     each = [statistic(twin=rates["twin"][..., of], real=rates["real"][..., of]) for of in data.strata if len(of) > 1]
     return np.mean([one[0] for one in each], 0), np.mean([one[1] for one in each], 0)
-
-
-def mean_regret(data: PairedCells) -> Array:
-    """Regret of the twin's best policy, mean over tasks, shape (...)."""
-    return mean_over_tasks(winner_batched, data)[1]
 
 
 # ---- intervals
