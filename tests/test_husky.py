@@ -11,7 +11,7 @@ from twin.mjcf.husky import HUSKY_XML, add_husky, center_of_mass, coulomb_track_
 from twin.robot import GEAR_RATIO, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams, PixelCamera
 
 
-def test_names():
+def test_bodies_joints_and_sensors_have_the_documented_names():
     model = mujoco.MjModel.from_xml_path(str(HUSKY_XML))
     for name in ("front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"):
         assert model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE
@@ -21,7 +21,7 @@ def test_names():
     assert model.camera("front").bodyid[0] == model.body("base_link").id
 
 
-def test_centre_of_mass_and_balance():
+def test_the_robot_balances_at_its_center_of_mass():
     model = on_plane()
     assert model.body("base_link").mass[0] == pytest.approx(46.034)
     data = mujoco.MjData(model)
@@ -32,7 +32,7 @@ def test_centre_of_mass_and_balance():
     np.testing.assert_allclose(base.subtree_com - base.xpos, center_of_mass(HuskyParams()))
 
 
-def test_payload_moves_the_centre_of_mass():
+def test_payload_moves_the_center_of_mass():
     params = HuskyParams(payload_mass=10.0, payload_position=(0.2, 0.1, 0.4))
     expected = (MASS * center_of_mass(HuskyParams()) + 10.0 * np.array([0.2, 0.1, 0.4])) / (MASS + 10.0)
     np.testing.assert_allclose(center_of_mass(params), expected)
@@ -63,7 +63,7 @@ def test_visual_geoms_have_no_mass_and_no_contacts():
     assert not model.geom_contype[looks].any() and not model.geom_conaffinity[looks].any()
 
 
-def test_coulomb_reference():
+def test_the_coulomb_track_ratio_of_a_centered_mass_equals_its_closed_form():
     assert coulomb_track_ratio(np.zeros(2)) == pytest.approx(1 + (WHEELBASE / TRACK) ** 2, rel=1e-6)
     rear = coulomb_track_ratio(np.array([-0.07, 0.0]))
     assert rear == pytest.approx(coulomb_track_ratio(np.array([0.07, 0.0])), rel=1e-6)
@@ -91,7 +91,7 @@ def test_the_robot_turns_to_the_side_of_smaller_wheels():
     assert 1.6 < (right - left) / TRACK / run.yaw_rate < 2.3  # chi of a bend of 38 m
 
 
-def test_sensors_and_currents():
+def test_sensors_and_motor_currents_agree_with_the_motion():
     physics = HuskyPhysics(on_plane())
     for _ in range(5):
         physics.step()
@@ -147,7 +147,7 @@ def test_front_camera_has_the_given_intrinsics():
     np.testing.assert_allclose(np.array(edges) / view.frustum_near, expected, rtol=1e-5)
 
 
-def test_tyre_mesh_has_the_wheel_s_size():
+def test_tire_mesh_has_the_size_of_the_wheel():
     model = on_plane(HuskyParams(wheel_radius=(WHEEL_RADIUS, 0.16)))
     assert model.geom("front_left_tyre").size[1] * 2 == pytest.approx(WHEEL_WIDTH)
     for name, radius in (("husky_tyre_0", WHEEL_RADIUS), ("husky_tyre_1", 0.16)):

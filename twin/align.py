@@ -5,9 +5,10 @@
     python -m twin.align husky drive.npz --out aligned
 
 From a log, system identification fits the controller's limits and latency, the servo's lag, tires, ground, center of
-mass and effective wheel radii to one half, and scores them on the other against a kinematic model fitted to the same
-half. Each value has a standard error; parameters that the log does not determine keep their values and are listed.
-Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json` and four figures.
+mass and effective wheel radii to half of the log. The other half scores them, against a kinematic model fitted to the
+first half, too. Each value has a standard error; parameters that the log does not determine keep their values and are
+listed. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json` and four
+figures.
 
 From a film that the robot's front camera records in the built place, the camera's extrinsics (height, yaw, pitch, roll)
 are fitted, and its focal length unless `[robot] camera_intrinsics` is given. They go to the same `robot.toml`;
@@ -144,7 +145,7 @@ def _scene_robot_table(folder: Path) -> dict[str, Any]:
 def summary(result: Identification) -> str:
     """The printed summary."""
     scoring = ~result.windows.fitting
-    rows = [f"{'2 s ahead, on windows not fitted to':36} {'median':>16} {'90th percentile':>18}  wheels"]
+    rows = [f"{'errors after 2 s, held-out windows':36} {'median':>16} {'90th percentile':>18}  wheels"]
     for prediction in (result.nominal, result.baseline, result.level, result.fitted):
         s = prediction.score(scoring)
         wheels = f"{s.wheels_rad_s:.2f} rad/s" if prediction.wheels is not result.windows.wheels else "as measured"

@@ -53,7 +53,7 @@ class Verb:
     define: Callable[[argparse.ArgumentParser], None]
     """Adds the verb's description and options to a parser."""
     module: str
-    """Its function `command` does the work, given the parsed options."""
+    """Module whose function `command` does the work, given the parsed options."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -173,9 +173,11 @@ twin new SCENE VIDEO... writes such a folder.
 """
     parser.add_argument("scene", type=Path, help="folder with scene.toml and input/")
     parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"stop after: {', '.join(STAGES)}")
-    parser.add_argument("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="run it again")
     parser.add_argument(
-        "--quality", choices=tuple(QUALITIES), help="of the pictures; default: scene.toml's, or standard"
+        "--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again"
+    )
+    parser.add_argument(
+        "--quality", choices=tuple(QUALITIES), help="picture quality of the field; default: scene.toml's, or standard"
     )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
@@ -195,15 +197,16 @@ def _relight(parser: argparse.ArgumentParser) -> None:
 
 def _align(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Fit the Husky's parameters to a log of a real one driving, scored on windows not fitted to; or fit the pose "
-        "of its camera to a film by that camera."
+        "Fit the Husky's parameters to the log of a real Husky's drive, and score them on parts of the log that were "
+        "held out; or fit the pose of its camera to a film by that camera."
     )
     parser.epilog = (
         "A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
         "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
         "acceleration_x, acceleration_y [m/s²] and group. Or the folder of a ROS 2 bag with cmd_vel, joint states, a "
-        "pose and an IMU (pip install 'twin[ros]'). A film (.mp4, ...) is of the robot's front camera, rectified, "
-        "driving ten metres or more on the built scene's place, mostly ahead, in light like that of one of its films."
+        "pose and an IMU (pip install 'twin[ros]'). A film (.mp4, ...) is one by the robot's front camera, "
+        "rectified: the robot drives ten metres or more in the built scene's place, mostly straight ahead, in light "
+        "like that of one of the scene's films."
     )
     parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` for the published one")
     parser.add_argument("log", type=Path, help="a .csv, an .npz, the folder of a ROS 2 bag, or a film")
@@ -226,7 +229,7 @@ def _film(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
     parser.add_argument("--obstacles", default="scene", help="number of random ones; scene: those of scene.toml")
-    parser.add_argument("--randomise", action="store_true", help="the seed also draws robot, weather and bystanders")
+    parser.add_argument("--randomise", action="store_true", help="randomize robot, weather and distractor objects")
     parser.add_argument("--seed", type=int, default=0, help="of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; default: a file in SCENE/films")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -246,7 +249,7 @@ def _view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve on; other than this machine's loopback, the page's address has a token",
+        help="address to serve on; unless it is this machine's loopback, the page's URL contains a secret token",
     )
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one; 0: any")
     parser.add_argument("--path", type=Path, help="render this camera path instead of showing the page")
@@ -276,7 +279,9 @@ def _train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
     parser.add_argument("--steps", type=int, help="control steps of all worlds together (default: 12000; gpu: 120000)")
     parser.add_argument("--worlds", type=int, help="number of worlds driven at once (default: 8; gpu: 32)")
-    parser.add_argument("--processes", type=int, help="processes that step the worlds (default: as many as pay)")
+    parser.add_argument(
+        "--processes", type=int, help="processes that step the worlds (default: a core each, at most 8)"
+    )
     parser.add_argument("--updates", type=float, help="updates of the networks per step (default: 0.5)")
     parser.add_argument(
         "--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)"
@@ -292,7 +297,7 @@ def _train(parser: argparse.ArgumentParser) -> None:
         "--randomise",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="another robot in every episode and, where the lighting varies, weather and bystanders (the default)",
+        help="randomize the robot and, where the lighting varies, weather and distractor objects (the default)",
     )
     parser.add_argument(
         "--privileged",
@@ -337,8 +342,8 @@ def _trial(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", type=Path, help="the recording of one trial")
     parser.add_argument("--policy", required=True, help="the policy that drove: a run, a checkpoint or an ONNX file")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--lighting", required=True, metavar="NAME", help="of the day or light, as in real.csv")
-    parser.add_argument("--twin-lighting", metavar="NAME", help="the twin's to compare with; default: the same name")
+    parser.add_argument("--lighting", required=True, metavar="NAME", help="name of the day or light for real.csv")
+    parser.add_argument("--twin-lighting", metavar="NAME", help="the twin's lighting to compare with; default: NAME")
     parser.add_argument(
         "--cause",
         choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),
@@ -370,8 +375,8 @@ results.csv, one line per policy and lighting:
   first,morning,10,8
   first,dusk,10,6
 
-Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task. A lighting
-that the twin does not know by name is compared with one that it does, named in a column twin_lighting, such as
+Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task.
+If the twin has no lighting of that name, a column twin_lighting names the one to compare with, such as
 held-out+randomised.
 """
     parser.add_argument("scene", type=Path, help="folder of a scene with validated policies")
@@ -414,7 +419,10 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
     command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
     command.add_argument(
-        "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
+        "--out",
+        type=Path,
+        required=True,
+        help="results.csv, with a table of trials beside it; two commands cannot share it",
     )
     command.add_argument(
         "--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with"

@@ -1,7 +1,8 @@
 """Settings of `scene.toml`: one frozen dataclass per stage, with units, ranges and defaults; read by `config_file.py`.
 
 A *source* is one film (or photo folder, or posed image set) under one *lighting*. Several sources may share a lighting.
-Outside the ranges a stage fails for lack of memory, by its arithmetic, or never ends, often minutes into a build.
+With values outside their ranges a stage, often minutes into a build, runs out of memory, fails in its arithmetic or
+never ends.
 """
 
 from dataclasses import dataclass, field
@@ -178,7 +179,7 @@ class MetricConfig:
     camera_height: Annotated[float, Range(0)] = 0.0
     """Lens above the ground [m], for a camera carried at constant height. 0 = not given."""
     camera_height_tolerance: Annotated[float, Range(0, 1)] = 0.01
-    """Standard deviation of the error with which it was measured [m]."""
+    """Standard deviation of the error of `camera_height` [m]."""
     distance: DistanceConfig | None = None
     marker: MarkerConfig | None = None
     gps: bool = False
@@ -202,7 +203,8 @@ class NerfConfig:
     samples: Annotated[int, Range(1, 1024)] = 16
     """Samples per ray and step."""
     sightings: Annotated[float, Range(0, 0.7)] = 0.35
-    """Fraction of each step's rays with depth supervision; the others belong to triples and single pixels."""
+    """Fraction of each step's rays with depth supervision. The others are single pixels, and triples of neighboring
+    pixels."""
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
     bake_steps: Annotated[int, Range(1)] = 600
@@ -286,8 +288,9 @@ class MjcfConfig:
     half_width: Annotated[float, Range(0.1, 100)] = 1.0
     """Half width of the drivable corridor around the route [m]."""
     hfield_cell: Annotated[float, Range(0.01, 10)] = 0.3
-    """Cell of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge touches several
-    facets, so larger cells vibrate and cost less; the ground is smoothed to this scale (`mesh.ground_smoothing`)."""
+    """Cell of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge between cells
+    touches several facets, so smaller cells cause more vibration and cost more; the ground is smoothed to this scale
+    (`mesh.ground_smoothing`)."""
     corridor_margin: Annotated[float, Range(0, 100)] = 0.0
     """Extra clearance between the corridor and convex parts [m]."""
 

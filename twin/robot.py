@@ -114,8 +114,8 @@ class HuskyParams:
     """Stiffness of tire friction relative to normal contact (MuJoCo's `impratio`). Below 1, tires creep as on soft
     ground: force grows with slip speed before they slide."""
     ground_viscosity: Annotated[float, Range(0, 1_000)] = 0.0
-    """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]; drag of about 2.4 N per tire,
-    Pa s and m/s."""
+    """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]. The drag of a tire is about
+    2.4 m × viscosity × speed."""
     wheel_shape: str = "ellipsoid"
     """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
 

@@ -169,7 +169,7 @@ class Stamp:
     device: str
     packages: dict[str, str]
     sha256: dict[str, str] = field(default_factory=dict)
-    """Digest of every file; empty in older stamps, whose folders are compared with `result`."""
+    """Digest of every file. Older stamps have none; their folders are compared with `result` instead."""
     itself: str = ""
     """Digest of all fields above; empty in older stamps."""
 

@@ -45,7 +45,7 @@ def command(given: argparse.Namespace) -> None:
         low, high = wilson(won, trials)
         print(
             f"{folder}: the policy of step {chosen['step']}, which without exploring arrives in {won} of {trials} "
-            f"episodes like those of the training ({low:.2f} to {high:.2f}); success along it: {picture}"
+            f"episodes like those of the training ({low:.2f} to {high:.2f}); success during the training: {picture}"
         )
 
 

@@ -89,7 +89,7 @@ class PixelObserver:
         """Sets up the weather of env i's episode under its lighting."""
         o, task = self.options, self.envs[i][1]
         fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
-        # A photo without fog determines the weather, too.
+        # The weather is also known if a photo shows that there is no fog.
         if fog is not None and o.randomise and o.randomise.hold_known:
             task.set_weather(task.sample.for_known_weather())
         has_weather = fog is not None or o.randomise
@@ -146,8 +146,8 @@ def _push_frames(
 ):
     """Adds frames to the stacks of some envs, or fills the stacks with them.
 
-    `below` sums up, over the lower halves (from pixel `lower` on), opacity and the number of pixels with less than
-    `sky`.
+    `below` accumulates, over the lower half of each frame (pixels from `lower` on), the opacity and the number of
+    pixels whose opacity is less than `sky`.
     """
     k, pixel = wp.tid()
     env, depth = which[k], stacks.shape[1]

@@ -83,7 +83,7 @@ class Options:
     lighting_drift: bool = False
     """The lighting changes during an episode."""
     obstacles: str | int | Sequence[ObstacleConfig] = "scene"
-    """`scene`: those of scene.toml; a number: as many static ones, sampled for every episode; or these."""
+    """`scene`: those of scene.toml; a number: that many static ones, sampled per episode; a list: exactly these."""
     camera: CameraOptions | None = None
     """Camera noise: vibration, exposure, blur. None: no noise."""
     randomise: Ranges | None = None
@@ -97,7 +97,7 @@ class Options:
 _MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES = 1e6, 4096, 64, 1000
 
 Check = tuple[Callable[[Any], bool], str]
-"""Whether a value is valid, and the expectation that an error states."""
+"""A test of whether a value is valid, and the expectation that an error states."""
 
 
 def _is_number(value: Any) -> bool:

@@ -155,7 +155,8 @@ def _chassis_inertia(params: HuskyParams) -> tuple[float, Array, Array]:
 def disable_fluid_drag(body: mujoco.MjsBody, name: str) -> None:
     """Exempts a body from the drag of `ground_viscosity`.
 
-    MuJoCo's fluid acts on a whole body, or only on its geoms with `fluid_ellipsoid` if there are any: here a tiny one.
+    MuJoCo's fluid acts on a whole body unless it has geoms with `fluid_ellipsoid`; then it acts on these alone. So a
+    tiny one is added.
     """
     body.add_geom(
         name=f"{name}_dry",

@@ -38,7 +38,7 @@ from twin.types import Array, Image
 
 _MIN_FRAMES, _MIN_WAY = 16, 6.0  # frames, [m]
 _PARTS = 8  # consecutive parts of the film for the jackknife
-_NOISE, _OUTLYING = 0.01, 0.03  # [m] a sum of sideways steps: standard deviation, threshold of the robust loss
+_NOISE, _OUTLYING = 0.01, 0.03  # [m] standard deviation of a sum of sideways steps; threshold of the robust loss
 _PIVOT = 0.1  # [m] prior standard deviation of the turning point's forward offset from the base's origin
 _ROUNDS = 3  # alternations of base poses and extrinsics
 _FAR_OFF, _JUMP = 8.0, 3.0  # outliers: multiples of the median deviation, and of the median step
@@ -149,7 +149,8 @@ def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
     def sideways(unknown: Array) -> Array:
         """Sideways drift [m] of the point that the robot turns about, `pivot` [m] ahead of the base's origin.
 
-        Sums of steps up to each frame of a segment, minus the segment's mean; then the prior of `pivot`.
+        Per segment, the sum of sideways steps up to each frame, minus its mean over the segment; the last value is the
+        residual of the prior of `pivot`.
         """
         yaw, pivot = unknown
         heads = headings - yaw

@@ -1,7 +1,7 @@
 """System identification of a robot from a log, and the text of `robot.toml`.
 
-`robot.toml` has a line with value and standard error for each identified field, after its previous fields; the others
-have their published values or those of `scene.toml`. `align.json` has all numbers.
+`robot.toml` keeps its previous fields and gets a line with value and standard error for each identified field. All
+other fields have their published values or those of `scene.toml`. `align.json` has all numbers.
 """
 
 from collections.abc import Callable

@@ -44,7 +44,7 @@ ACCELERATION = ("acceleration_x", "acceleration_y")
 
 _MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are left out
 _MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
-_FAST = 1.75  # samples; for sensors of a shorter period, times of appearance are more accurate than counts of poses
+_FAST = 1.75  # samples; if a sensor's period is shorter, times of appearance are used, see `measurement_times`
 _JITTER = 4  # samples between measurement and appearance of a pose, at most, apart from the common delay
 _UNSTEADY = 0.1  # fraction of windows that contradict the period, above which the sensor counts as aperiodic
 _DROPOUT = 30  # samples without a fresh pose; windows with more are left out if the wheels turn
@@ -100,7 +100,7 @@ def _steady(appeared: Array, period: float) -> Array:
         return np.zeros(1)
     number = np.arange(1.0, len(appeared) + 1)
     lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
-    number += np.minimum.accumulate(lost[::-1])[::-1]  # a pose that later ones catch up with is late, not lost
+    number += np.minimum.accumulate(lost[::-1])[::-1]  # if later poses are on time again, the pose was late, not lost
     start = float(np.median(appeared - period * number))
     if start > period / 2:  # the robot rested, or the first poses were lost
         first = start - period * np.ceil(start / period)
@@ -111,7 +111,9 @@ def _steady(appeared: Array, period: float) -> Array:
 
 
 def _as_appeared(appeared: Array, period: float) -> Array:
-    """The same by times of appearance; `period` is the interval for a single fresh pose."""
+    """Measurement times as in `_steady`, taken from the times of appearance; `period` is used if only one pose is
+    fresh.
+    """
     apart = float(np.median(np.diff(appeared))) if len(appeared) > 1 else period
     return np.append(max(min(float(appeared[0]) - apart, 0.0), -MAX_POSE_AGE), appeared)
 

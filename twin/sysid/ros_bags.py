@@ -35,7 +35,8 @@ _FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Any]:
     """A reader of rosbags.
 
-    Raises InputError, also for what goes wrong in the block: rosbags is not installed, or the bag is unreadable.
+    Raises InputError: rosbags is not installed, or the bag is unreadable. Errors of rosbags inside the `with` block
+    become an InputError, too.
     """
     try:
         from rosbags.highlevel import AnyReader

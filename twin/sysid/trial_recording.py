@@ -236,7 +236,7 @@ class FrameFit:
     residual: float = 0.0
     """Root mean square distance between the poses and the located pictures [m]."""
     scale: float = 1.0
-    """Metres of the scene per metre of the poses, of the same pictures; not applied."""
+    """Metres of the scene per metre of the poses, by the same pictures; reported only, not applied to poses."""
     located: int = 0
     """Pictures used."""
 
