@@ -277,7 +277,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
     parser.add_argument(
         "--lighting",
-        help="of --glb and --ply, and shown first by --usd: a name or mixture, sun:night:0.5; default: the first filmed "
+        help="of --glb and --ply, and shown first by --usd: a name, or a mixture sun:night:0.5; default: first filmed "
         "one",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")

@@ -47,6 +47,15 @@ class Gaussians:
     opacity: NDArray[np.float32]
     """In (0, 1), shape (k,)."""
 
+    def render_settings(self) -> dict[str, NDArray[np.float32]]:
+        """Arguments of `mujoco_warp.create_render_context` that make it draw these splats."""
+        return {
+            "splat_position": np.ascontiguousarray(self.positions),
+            "splat_rotation": np.ascontiguousarray(self.rotations),
+            "splat_scale": np.ascontiguousarray(self.scales),
+            "splat_rgba": np.concatenate([self.rgb, self.opacity[:, None]], 1).astype(np.float32),
+        }
+
     def to_ply(self) -> bytes:
         """Binary `.ply` for 3DGS viewers: colors as spherical harmonics, opacities as logits, scales as logarithms."""
         columns = {
