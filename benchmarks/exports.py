@@ -1,4 +1,4 @@
-"""How near exported files are to the film: PSNR at held-out frames of what they hold, drawn by ray casting.
+"""How near exported files are to the film: PSNR at held-out frames of what they hold, by ray casting.
 
     python benchmarks/exports.py --scene scenes/demo --only mesh      # the .glb, against colors per vertex
     python benchmarks/exports.py --scene scenes/demo --only splats    # the .ply in MuJoCo Warp's splat renderer
@@ -107,13 +107,30 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
     texture = read.visual.material.baseColorTexture
     print(f"{lighting}: texture {texture.size[0]}×{texture.size[1]}, {len(content) / 1e6:.1f} MB, {seconds:.0f} s")
     drawings = {"colors per vertex": MeshDrawing(plain), "texture": MeshDrawing(read)}
-    scores: dict[str, list[float]] = {name: [] for name in drawings}
-    for _, pose, rays, photo in held_out_frames(twin, lighting, size):
-        for name, drawing in drawings.items():
-            rgb, hit = drawing.draw(pose[:3, 3], rays.reshape(-1, 3) @ pose[:3, :3].T)
-            scores[name].append(psnr(rgb / 255.0, photo.reshape(-1, 3) / 255.0, hit))
-    for name, values in scores.items():
-        print(f"{lighting}: {name}: {np.mean(values):.2f} dB over {len(values)} held-out frames")
+    scores: dict[tuple[str, int], list[float]] = {}
+    for i, pose, rays, photo in held_out_frames(twin, lighting, size):
+        shown = {
+            name: drawing.draw(pose[:3, 3], rays.reshape(-1, 3) @ pose[:3, :3].T) for name, drawing in drawings.items()
+        }
+        hit = shown["texture"][1].reshape(size[::-1])
+        pictures = {name: rgb.reshape(photo.shape) for name, (rgb, _) in shown.items()}
+        pictures["field"] = (
+            field.render(cameras.select(np.array([i])), lighting, size).rgb[0].astype(np.float64) * 255.0
+        )
+        for k in (1, 4):  # in full, and averaged over squares, as policies see it
+            for name, rgb in pictures.items():
+                value = psnr(_averaged(rgb, k) / 255.0, _averaged(photo, k) / 255.0, _averaged(hit, k) == 1.0)
+                scores.setdefault((name, k), []).append(value)
+    for (name, k), values in scores.items():
+        where = f"{len(values)} held-out frames of {size[0] // k}×{size[1] // k}"
+        print(f"{lighting}: {name}: {np.mean(values):.2f} dB over {where}")
+
+
+def _averaged(image: np.ndarray, k: int) -> np.ndarray:
+    """Means over squares of k × k pixels."""
+    height, width = (n // k * k for n in image.shape[:2])
+    cut = image[:height, :width].astype(np.float64)
+    return cut.reshape(height // k, k, width // k, k, *image.shape[2:]).mean((1, 3))
 
 
 def score_splats(twin: Twin, lighting: str, size: tuple[int, int], frames: int) -> None:

@@ -109,8 +109,9 @@ def read_ply(path: Path) -> Gaussians:
                 raise InputError(f"{path}: property {' '.join(line[1:])!r} is unknown; {cure}")
             names.append((line[2], _TYPES[line[1]]))
     wanted = ["x", "y", "z", "opacity", *(f"{kind}_{c}" for kind, n in _COLUMNS.items() for c in range(n))]
-    if missing := [name for name in wanted if name not in dict(names)] or len(dict(names)) < len(names):
-        raise InputError(f"{path} lacks {missing if isinstance(missing, list) else 'unique properties'}; {cure}")
+    missing = [name for name in wanted if name not in dict(names)]
+    if missing or len(dict(names)) < len(names):
+        raise InputError(f"{path} lacks {missing or 'different names of its properties'}; {cure}")
     row = np.dtype(names)
     start = len(head) + len(found)
     if len(content) - start < count * row.itemsize:

@@ -31,8 +31,10 @@ _SIDE = 4096  # [px] of the texture, which every viewer takes
 _MIN_TEXEL = 0.01  # [m]
 _MAX_TILE = 256  # [px]
 _COARSER = 1.1  # factor by which texels grow until all tiles fit
-_DEPTH_TOLERANCE = 0.03  # relative difference of depth up to which a point is visible
-_SHARPNESS = 3.0  # exponent of a view's weight, cos(slant) / depth²
+_DEPTH_TOLERANCE = 0.03  # relative difference of depth up to which a vertex is visible
+# The mesh is smoother than the field, so that a texel may lie some way in front of or behind what a view shows there.
+_TEXEL_TOLERANCE = 0.08
+_SHARPNESS = 2.0  # exponent of a view's weight, cos(slant) / depth²
 _CHUNK = 2_000_000  # texels at once
 _JPEG_QUALITY = 95
 
@@ -213,7 +215,7 @@ class _Baker:
         given = [wp.array(x.astype(np.float32), dtype=wp.vec3, device="cpu") for x in (points, normals)]
         out = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
         total = wp.zeros(len(points), dtype=float, device="cpu")
-        settings = [_DEPTH_TOLERANCE, _SHARPNESS]
+        settings = [_TEXEL_TOLERANCE, _SHARPNESS]
         wp.launch(_gather, len(points), [*given, *self._views, *settings], [out, total], device="cpu")
         return out.numpy().copy(), total.numpy()
 
