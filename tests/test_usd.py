@@ -68,10 +68,12 @@ def test_validators_find_nothing(tmp_path, world, splats, suffix) -> None:
         stage.GetDefaultPrim().GetVariantSet("lighting").SetVariantSelection(variant_name(lighting))
         assert _errors(stage) == []
     assert [one.name for one in tmp_path.iterdir()] == [path.name]  # nothing temporary is left
-    # They do find a body within a body, and a stage without units.
-    inner = UsdGeom.Cube.Define(stage, "/World/Husky/base_link/inner")
-    UsdPhysics.RigidBodyAPI.Apply(inner.GetPrim())
-    assert _errors(stage)
+    # They do speak, of units, bodies, joints and articulations.
+    stage.GetRootLayer().pseudoRoot.ClearInfo("upAxis")
+    UsdPhysics.RigidBodyAPI.Apply(stage.GetPrimAtPath("/World/Husky/Joints"))
+    UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath("/World/Husky/base_link"))
+    stage.RemovePrim("/World/Husky/rear_left_wheel")
+    assert len(_errors(stage)) >= 4
 
 
 def test_units_and_axes(stage) -> None:
