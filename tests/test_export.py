@@ -1,0 +1,213 @@
+"""The verb: files and folders for other programs, read back by their own readers; bad arguments get one line."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import trimesh
+from test_gaussians import floor_views
+from tiny_twin import tiny_twin
+
+from twin.assets.gaussians import read_ply
+from twin.capture.formats import read_model, read_transforms
+from twin.export import gltf
+from twin.export.__main__ import main
+from twin.geometry.cameras import Cameras, SparsePoints, project
+from twin.geometry.images import read_image, write_image
+from twin.geometry.poses import look_at
+from twin.scene import write_stamp
+
+SIZE = (96, 64)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """A tiny twin filmed by six cameras under two lightings; the first frame is held out, two have masks."""
+    root = tiny_twin(tmp_path_factory.mktemp("export") / "scene")
+    build = root / "build"
+    names = [f"{lighting}/{k:06d}" for lighting in ("day", "night") for k in range(3)]
+    eyes = np.array([[k * 1.5, 0.1 * k, 1.5] for k in range(3)] * 2)
+    rng = np.random.default_rng(0)
+    for i, name in enumerate(names):
+        image = build / "2_cameras" / "images" / f"{name}.png"
+        image.parent.mkdir(parents=True, exist_ok=True)
+        write_image(image, rng.integers(0, 255, (SIZE[1], SIZE[0], 3)).astype(np.uint8))
+        if i in (1, 4):
+            mask = build / "1_capture" / "masks" / f"{name}.png"
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            write_image(mask, np.full((SIZE[1], SIZE[0]), 255 * (i == 1), np.uint8))
+    cameras = Cameras(
+        names=tuple(names),
+        camera_to_world=np.array([look_at(eye, eye + np.array([3.0, 0.4, -0.8])) for eye in eyes]),
+        intrinsics=np.array([[60.0, 61.0, 47.0, 33.0]] * 3 + [[70.0, 70.5, 48.5, 31.0]] * 3),
+        sizes=np.tile(SIZE, (6, 1)),
+        lightings=("day",) * 3 + ("night",) * 3,
+        sources=("day",) * 3 + ("night",) * 3,
+        times=np.arange(6.0),
+        held_out=np.arange(6) == 0,
+        images=build / "2_cameras" / "images",
+        masks=build / "1_capture" / "masks",
+    )
+    xyz = rng.uniform([3, -1, 0], [6, 1, 1], (40, 3))
+    point, frame = np.divmod(np.arange(240), 6)
+    rgb = rng.integers(0, 255, (40, 3)).astype(np.uint8)
+    cameras.save(build / "2_metric")
+    SparsePoints(xyz, rgb, rng.uniform(0, 1, 40), point, frame).save(build / "2_metric")
+    write_stamp(build / "2_metric", "metric")
+    return root
+
+
+@pytest.fixture(scope="module")
+def out(scene, tmp_path_factory) -> Path:
+    """Everything that the verb writes."""
+    out = tmp_path_factory.mktemp("out")
+    options = {"usd": "p.usdz", "glb": "p.glb", "ply": "p.ply", "nerfstudio": "ns", "colmap": "cm"}
+    given = [text for name, value in options.items() for text in (f"--{name}", str(out / value))]
+    assert main([str(scene), *given, "--lighting", "night", "--quiet"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == sorted(options.values())
+    return out
+
+
+def _cameras(scene) -> Cameras:
+    return Cameras.load(scene / "build" / "2_metric")
+
+
+def test_colmap_reads_the_same_poses(scene, out) -> None:
+    cameras, points = _cameras(scene), SparsePoints.load(scene / "build" / "2_metric")
+    model = pycolmap.Reconstruction(str(out / "cm" / "sparse" / "0"))
+    assert model.num_reg_images() == 6 and len(model.cameras) == 2
+    for image in model.images.values():
+        i = cameras.names.index(image.name.removesuffix(".png"))
+        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        assert np.abs(np.linalg.inv(pose) - cameras.camera_to_world[i]).max() < 1e-12
+        assert np.allclose(model.cameras[image.camera_id].params, cameras.intrinsics[i], atol=0)
+        assert (read_image(out / "cm" / "images" / image.name) == read_image(cameras.image_path(i))).all()
+        # COLMAP projects its points to where we do.
+        for seen in image.points2D:
+            xyz = model.points3D[seen.point3D_id].xyz
+            ours, _ = project(xyz, cameras.camera_to_world[i], cameras.intrinsics[i])
+            assert np.abs(image.project_point(xyz) - ours).max() < 1e-9 and np.abs(seen.xy - ours).max() < 1e-9
+    for key, point in model.points3D.items():
+        assert np.allclose(point.xyz, points.xyz[key - 1], atol=0) and (point.color == points.rgb[key - 1]).all()
+    assert model.compute_mean_reprojection_error() < 1.1
+    assert {p.relative_to(out / "cm" / "masks").as_posix() for p in (out / "cm" / "masks").rglob("*.png")} == {
+        "day/000001.png.png",
+        "night/000001.png.png",
+    }
+    assert len(read_model(out / "cm" / "sparse" / "0")) == 6
+
+
+def test_nerfstudio_has_opengl_axes_and_meters(scene, out) -> None:
+    cameras = _cameras(scene)
+    table = json.loads((out / "ns" / "transforms.json").read_text())
+    assert table["applied_transform"] == np.eye(4)[:3].tolist() and table["camera_model"] == "OPENCV"
+    assert len(table["frames"]) == 6
+    for i, frame in enumerate(table["frames"]):
+        pose = np.array(frame["transform_matrix"])
+        right, up, back, eye = pose[:3].T
+        assert (eye == cameras.positions[i]).all()
+        assert np.allclose(right, cameras.camera_to_world[i, :3, 0]) and np.allclose(
+            -back, cameras.camera_to_world[i, :3, 2]
+        )
+        assert up[2] > 0.5  # a level camera's up points up
+        assert [frame[k] for k in ("fl_x", "fl_y", "cx", "cy")] == cameras.intrinsics[i].tolist()
+        assert (read_image(out / "ns" / frame["file_path"]) == read_image(cameras.image_path(i))).all()
+        white = i != 4
+        assert (read_image(out / "ns" / frame["mask_path"]) == 255 * white).all()
+    # All lists or none, as nerfstudio demands, of paths that frames have.
+    assert table["val_filenames"] == table["test_filenames"] == ["images/day/000000.png"]
+    assert set(table["train_filenames"]) == {f["file_path"] for f in table["frames"][1:]}
+    night = json.loads((out / "ns" / "transforms_night.json").read_text())
+    assert [f["lighting"] for f in night["frames"]] == ["night"] * 3
+    cloud = trimesh.load(out / "ns" / table["ply_file_path"])
+    points = SparsePoints.load(scene / "build" / "2_metric")
+    assert np.allclose(cloud.vertices, points.xyz, atol=1e-5) and (cloud.colors[:, :3] == points.rgb).all()
+    # Our own reader of such files finds the poses again.
+    again = read_transforms(out / "ns" / "transforms.json")
+    assert np.abs(again.camera_to_world - cameras.camera_to_world).max() < 1e-12
+
+
+def test_splats_and_mesh_have_the_lighting(out, scene) -> None:
+    splats = read_ply(out / "p.ply")
+    assert len(splats.rgb) > 1000 and np.abs(splats.positions).max() < 200.0
+    mesh = trimesh.load(io.BytesIO((out / "p.glb").read_bytes()), file_type="glb").to_geometry()
+    stored = np.load(scene / "build" / "4_mesh" / "visual.npz")
+    corners = stored["vertices"][stored["faces"]].reshape(-1, 3)
+    assert np.allclose(mesh.vertices, corners[:, [0, 2, 1]] * [1, 1, -1], atol=1e-6)  # y up
+    head = (out / "p.glb").read_bytes()[20:]
+    assert b"KHR_materials_unlit" in head and b"image/jpeg" in head and mesh.visual.uv is not None
+
+
+# ---- texture
+
+
+def test_a_baked_texture_shows_what_the_views_show() -> None:
+    views = floor_views([(0.0, -0.8, 2.0), (0.6, -0.5, 1.5), (-0.5, 0.4, 1.8)])
+    vertices = np.array(
+        [[-0.6, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.6, 0], [-0.6, 0.6, 0], [0, 0, -3], [1, 0, -3], [0, 1, -3.0]]
+    )
+    faces = np.array([[0, 1, 2], [2, 3, 0], [4, 5, 6]])
+    texture, coordinates = gltf.bake(vertices, faces, views)
+    rng = np.random.default_rng(0)
+    for face in range(2):
+        share = rng.dirichlet([1, 1, 1], 300)
+        point, at = share @ vertices[faces[face]], share @ coordinates[face]
+        u, v = np.floor(at * texture.shape[1::-1]).astype(int).T
+        away = np.abs(point[:, :2]).min(1) > 0.12  # from where colors change
+        expected = np.stack([np.where(point[:, 0] > 0, 220, 40), np.where(point[:, 1] > 0, 200, 60)], 1)
+        assert np.abs(texture[v, u, :2].astype(int) - expected)[away].max() <= 2
+    # The face that no view sees has the mean color of the nearest one.
+    u, v = np.floor(coordinates[2].mean(0) * texture.shape[1::-1]).astype(int)
+    assert texture[v, u].min() > 30
+
+
+def test_tiles_do_not_overlap() -> None:
+    side = np.random.default_rng(0).integers(2, 60, 500)
+    side, x, y, width = gltf.pack_tiles(side)
+    used = np.zeros(((y + side).max(), width), int)
+    for n, left, top in zip(side, x, y, strict=True):
+        used[top : top + n, left : left + n] += 1
+    assert used.max() == 1 and used.sum() == (side**2).sum()
+
+
+def test_vertices_have_the_colors_of_the_views() -> None:
+    vertices = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [0.3, 0.31, -0.5]])
+    colours = gltf.vertex_colors(floor_views(), vertices)
+    assert np.abs(colours[:3, :2].astype(int) - [[220, 200], [40, 200], [220, 60]]).max() <= 1
+    assert (colours[3] == colours[0]).all()  # hidden below the floor: as the nearest seen
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "nothing to write"),
+        (["--glb", "absent/a.glb"], "there is no folder absent"),
+        (["--ply", "a.ply"], "no scene.toml"),
+        (["--usd", "a.obj"], "expected a file ending in .usdz"),
+        (["--usd", "folder"], "is a folder; give a file"),
+        (["--colmap", "folder"], "is there already"),
+        (["--nerfstudio", "file"], "is there already"),
+    ],
+)
+def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, words) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    assert main(["nowhere", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_an_unknown_lighting_is_refused(scene, tmp_path, capsys) -> None:
+    assert main([str(scene), "--ply", str(tmp_path / "a.ply"), "--lighting", "noon"]) == 2
+    assert "noon" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_usd_without_its_package_is_told(scene, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+    assert main([str(scene), "--usd", str(tmp_path / "a.usdz")]) == 2
+    assert "pip install 'twin[usd]'" in capsys.readouterr().err
