@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from twin.assets.views import ColorField, Views, render_views
@@ -25,6 +26,7 @@ FAR = 100.0  # [m] beyond which geometry becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
 _MIN_SKY, _MAX_SKY = 500, 50_000  # pixels that the sky's color is fitted to
 _SKY_TOLERANCE = 30.0  # rms difference over lightings and channels, of 255, up to which a color is the sky's
+_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # the same, and within how many pixels [px], beside the former
 _MIN_CELL = 0.01  # [m] side of the smallest thinning cell, which keeps one Gaussian
 _DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
 _MAX_ELONGATION = 4.0  # length / width of a disk seen at a grazing angle
@@ -162,7 +164,7 @@ def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
 
     Seen from elsewhere they would be blue clumps; they belong to the background. The sky's color is fitted to the
     pixels of the background as a quadratic function of the direction; a pixel above the horizon has that color if it
-    does under every lighting.
+    does under every lighting. Pixels beside such ones may differ more from it, as they blend it with leaves.
 
     Args:
         views: The same views under each filmed lighting.
@@ -181,7 +183,11 @@ def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
         colors = one.rgb.reshape(-1, 3)[some].astype(np.float64)
         fitted, *_ = np.linalg.lstsq(basis.reshape(-1, 9)[some], colors, rcond=None)
         error += ((one.rgb - basis @ fitted) ** 2).mean(-1)
-    return (z > 0.0) & ~sky & (error / len(views) < _SKY_TOLERANCE**2)
+    error[(z <= 0.0) | sky] = np.inf
+    found, blended = (error / len(views) < limit**2 for limit in (_SKY_TOLERANCE, _BLEND_TOLERANCE))
+    reach = np.zeros((3, 3, 3), bool)
+    reach[1] = True  # within a view
+    return ndimage.binary_dilation(found, reach, _BLEND_REACH, mask=blended)
 
 
 def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDArray[np.int64]]:

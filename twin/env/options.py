@@ -78,8 +78,8 @@ class Options:
     start_along: float = 0.0
     """Half of the episodes start further along, uniform up to this fraction of the route segment."""
     observe: str = NERF
-    """nerf: images of the field; simulator: MuJoCo's images of the extracted mesh, under MuJoCo's lights; splats: those of
-    the Gaussian splats of a file, with obstacles and robot under MuJoCo's lights."""
+    """nerf: images of the field; simulator: MuJoCo's images of the extracted mesh, under MuJoCo's lights; splats: of a
+    file's Gaussian splats, with obstacles and robot under MuJoCo's lights."""
     splats: str | Path | None = None
     """A 3DGS .ply in the scene's frame (meters, z up), for `observe="splats"`; its lighting is the only one."""
     lighting: str | Sequence[str] = TRAINING
