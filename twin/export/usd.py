@@ -76,10 +76,12 @@ def write_usd(
         selected: The lighting shown at first.
 
     Raises:
-        InputError: another suffix, or usd-core is missing.
+        InputError: another suffix, usd-core is missing, or two lightings would have one name.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected a file ending in {', '.join(SUFFIXES)}")
+    if len({variant_name(name) for name in splats}) < len(splats):
+        raise InputError(f"of the lightings {', '.join(splats)} two have one name in USD; give another name to one")
     require_usd()
     from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
