@@ -140,6 +140,7 @@ def score_splats(twin: Twin, lighting: str, size: tuple[int, int], frames: int) 
     spec = mujoco.MjSpec()
     spec.worldbody.add_camera(name="eye")
     spec.worldbody.add_geom(size=[0.01] * 3, pos=[0, 0, -1000])
+    spec.stat.extent = 20.0  # draws as far as the scene does: 1 km
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
