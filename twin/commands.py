@@ -260,11 +260,29 @@ def _view(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Write a built place for other programs: its mesh as glTF, its field as Gaussian splats."
+    parser.description = (
+        "Write a built place for other programs: all of it as USD, its mesh as glTF, its field as Gaussian splats, its "
+        "frames and cameras for other trainers."
+    )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("--glb", type=Path, help="write the visual mesh with colors per vertex (binary glTF, y up)")
-    parser.add_argument("--ply", type=Path, help="write Gaussians as 3DGS viewers read them (z up)")
-    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
+    parser.add_argument(
+        "--usd",
+        type=Path,
+        metavar="FILE",
+        help="write splats in every lighting, collision shapes, the Husky, its camera and route as .usdz, .usd, .usdc "
+        "(pip install 'twin[usd]')",
+    )
+    parser.add_argument("--glb", type=Path, metavar="FILE", help="write the visual mesh, textured (binary glTF, y up)")
+    parser.add_argument("--ply", type=Path, metavar="FILE", help="write Gaussians as 3DGS viewers read them (z up)")
+    parser.add_argument(
+        "--nerfstudio", type=Path, metavar="DIR", help="write transforms.json, frames, masks and sparse points"
+    )
+    parser.add_argument("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
+    parser.add_argument(
+        "--lighting",
+        help="of --glb and --ply, and shown first by --usd: a name, or a mixture sun:night:0.5; default: first filmed "
+        "one",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
@@ -455,7 +473,7 @@ VERBS = {
     "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),
     "view": Verb("look at a built scene and drive in it, in the browser", _view, "twin.view.__main__"),
     "film": Verb("film a drive in a built scene", _film, "twin.film"),
-    "export": Verb("write the place for other programs: glTF mesh, Gaussian splats", _export, "twin.export"),
+    "export": Verb("write the place for other programs: USD, glTF, splats, cameras", _export, "twin.export.__main__"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
     "validate": Verb("measure how often policies succeed, lighting by lighting", _validate, "twin.validate"),
     "trial": Verb("judge a trial on the road from the robot's recording", _trial, "twin.trial"),

@@ -16,7 +16,7 @@ from twin.env.camera_noise import CameraNoise
 from twin.env.compositor import Compositor
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.mujoco_renderer import FRONT_CAMERA, SceneRenderer, camera_intrinsics
-from twin.env.options import SIMULATOR, Options
+from twin.env.options import Options
 from twin.env.task import CAMERA, LIGHTING, WEATHER, DrivePhysics, DriveTask
 from twin.env.trust import SKY_OPACITY, Trust
 from twin.env.weather import Weather
@@ -27,9 +27,6 @@ from twin.warp_runtime import wp
 
 if TYPE_CHECKING:
     import torch
-
-
-_SIMULATOR_LIGHTING = EpisodeLighting(SIMULATOR, np.zeros(0, np.float32))
 
 
 class PixelObserver:
@@ -46,7 +43,7 @@ class PixelObserver:
         """
         Args:
             renderer: Renders the envs.
-            field: Contains the lightings; None: MuJoCo renders the mesh under its own lights.
+            field: Contains the lightings; None: MuJoCo renders the mesh, or splats, under its own lights.
             trust: From the filmed frames.
             options: Of the envs.
             envs: Physics and task of every env.
@@ -67,7 +64,7 @@ class PixelObserver:
         o = self.options
         for i in which:
             task = self.envs[i][1]
-            self.lightings[i] = _SIMULATOR_LIGHTING
+            self.lightings[i] = EpisodeLighting(o.observe, np.zeros(0, np.float32))
             if self._sets:
                 self.lightings[i] = sample_lighting(
                     o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHTING)
