@@ -145,10 +145,16 @@ def _describe(error: OSError) -> str:
 
 
 def _new(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Start a scene folder from films."
+    parser.description = (
+        "Start a scene folder from films or robots' bags (ROS 2, or .bag of ROS 1; pip install 'twin[ros]'). A bag "
+        "also brings the camera's calibration, GPS and odometry for the scale, and the camera's pose on the robot."
+    )
     parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
-    parser.add_argument("films", type=Path, nargs="+", metavar="VIDEO", help="films or image folders, one per lighting")
+    parser.add_argument(
+        "films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting"
+    )
     parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
+    parser.add_argument("--topic", help="of the pictures in a bag; default: the one with most of them")
 
 
 def _build(parser: argparse.ArgumentParser) -> None:
@@ -157,7 +163,7 @@ def _build(parser: argparse.ArgumentParser) -> None:
 a scene.toml of your own road:
 
   [[source]]                      # one per film; several lightings make one twin
-  path = "input/morning.mp4"      # video, photo folder, COLMAP model or transforms.json
+  path = "input/morning.mp4"      # video, bag, photo folder, COLMAP model or transforms.json
   lighting = "morning"
   # mask = "input/robot.png"      # 0 = ignore (an image, or a folder named like the frames)
   # camera = { model = "PINHOLE", params = [fx, fy, cx, cy], width = 1280, height = 720 }

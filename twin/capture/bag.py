@@ -50,7 +50,7 @@ _MAX_CHUNK = 1 << 30  # [bytes] of an MCAP chunk, unpacked
 
 def is_bag(path: Path) -> bool:
     """True for the folder of a ROS 2 bag and for a file named like a bag's."""
-    return path.suffix.lower() in BAG_SUFFIXES and not path.is_dir() or is_file(path / METADATA)
+    return (path.suffix.lower() in BAG_SUFFIXES and not path.is_dir()) or is_file(path / METADATA)
 
 
 def bag_files(path: Path) -> list[Path]:

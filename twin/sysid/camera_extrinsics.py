@@ -29,7 +29,7 @@ from twin.geometry.cameras import Viewpoints, opencv_to_mujoco
 from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
 from twin.mjcf.scene_xml import rest_pose
-from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
+from twin.robot import BASE_HEIGHT, CAMERA_AHEAD, HuskyParams, PixelCamera
 from twin.scene import SceneDir, require_stage
 from twin.types import Array, Image
 
@@ -42,8 +42,6 @@ _NOISE, _OUTLYING = 0.01, 0.03  # [m] a sum of sideways steps: standard deviatio
 _PIVOT = 0.1  # [m] prior standard deviation of the turning point's forward offset from the base's origin
 _ROUNDS = 3  # alternations of base poses and extrinsics
 _FAR_OFF, _JUMP = 8.0, 3.0  # outliers: multiples of the median deviation, and of the median step
-_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Axes right, down and forward (columns) of a camera that looks straight ahead, in the base."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,7 @@ def base_heading(camera_to_world: Array, yaw: float) -> Array:
 
 def _headings(poses: Array, pitch_roll: Array) -> Array:
     """Headings [rad] (n,) of bases from camera poses (n, 4, 4) with zero yaw and given pitch and roll [rad] (2,)."""
-    base = poses[:, :3, :3] @ _AHEAD.T @ Rotation.from_euler("YX", pitch_roll).as_matrix().T
+    base = poses[:, :3, :3] @ CAMERA_AHEAD.T @ Rotation.from_euler("YX", pitch_roll).as_matrix().T
     return np.arctan2(base[:, 1, 0], base[:, 0, 0])
 
 
@@ -173,7 +171,7 @@ def _relative_to_base(
     angles, heights, bases = np.zeros((len(poses), 3)), np.zeros(len(poses)), np.zeros((len(poses), 2))
     for i, (pose, heading) in enumerate(zip(poses, headings, strict=True)):
         base, rotation = _base_pose(pose[:2, 3], heading, ground_at, lens)
-        angles[i] = Rotation.from_matrix(rotation.T @ pose[:3, :3] @ _AHEAD.T).as_euler("ZYX")
+        angles[i] = Rotation.from_matrix(rotation.T @ pose[:3, :3] @ CAMERA_AHEAD.T).as_euler("ZYX")
         heights[i], bases[i] = (rotation.T @ (pose[:3, 3] - base))[2], base[:2]
     return angles, heights, bases
 

@@ -1,7 +1,8 @@
 """A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
-Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK); `fit_frame` finds that frame
-in the scene from pictures that were located there. Pictures stay in the bag until they are wanted.
+Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
+`fit_frame` finds that frame in the scene from pictures that were located there. Pictures stay in the bag until they are
+wanted.
 """
 
 from collections.abc import Iterator
