@@ -18,7 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from twin.capture.bag import (
     CAMERA_INFO,
+    COMPRESSED,
     FIX,
+    RAW,
     TRANSFORMS,
     TYPES,
     choose_camera_info,
@@ -75,6 +77,8 @@ class BagContents:
     encoding: str
     size: tuple[int, int]
     """Width, height of the first picture [px]."""
+    recorded: int
+    """Number of pictures that the bag promises."""
     stamps: NDArray[np.int64]
     """Of the pictures that are used, increasing [ns], shape (n,)."""
     position: NDArray[np.int64]
@@ -109,7 +113,7 @@ class BagContents:
     def film(self) -> Film:
         """The pictures as a film."""
         times = (self.stamps - self.stamps[0]) * 1e-9
-        return Film(self.path, FilmTiming(times, 0.0, len(times)), partial(_decode, self))
+        return Film(self.path, FilmTiming(times, 0.0, self.recorded), partial(_decode, self))
 
 
 def read_contents(path: Path, topic: str = "") -> BagContents:
@@ -136,6 +140,7 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
                 _add_transforms(transforms, message)
             elif kind != "camera":
                 rows[kind].append((header_time(message), recorded, *_values(kind, message)))
+        recorded = messages_by_topic(bag.connections, (RAW, COMPRESSED))[topics["pictures"]]
         others = tuple(name for name in picture_topics(bag.connections) if name != topics["pictures"])
     if not rows["pictures"]:
         raise InputError(f"{path}: no message on {topics['pictures']}; record it")
@@ -152,7 +157,7 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
     arm = np.zeros(3) if camera_to_base is None else camera_to_base[:3, 3]
     encoding = getattr(picture, "encoding", None) or str(getattr(first["pictures"], "format", "")) or "compressed"
     return BagContents(
-        *(path, topics, others, encoding, (width, height), stamps, position, lens, note, fix_times, fixes),
+        *(path, topics, others, encoding, (width, height), recorded, stamps, position, lens, note, fix_times, fixes),
         *(pose_times, _lens_positions(poses, arm), _seat(camera_to_base, transforms)),
     )
 
