@@ -207,12 +207,15 @@ def _align(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
         "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
-        "acceleration_x, acceleration_y [m/s²] and group. Or the folder of a ROS 2 bag with cmd_vel, joint states, a "
-        "pose and an IMU (pip install 'twin[ros]'). A film (.mp4, ...) is of the robot's front camera, rectified, "
+        "acceleration_x, acceleration_y [m/s²] and group. Or a ROS bag with cmd_vel, joint states (or the wheels' "
+        "odometry), poses that are not the wheels' (or pictures that the scene was built from) and an IMU "
+        "(pip install 'twin[ros]'). A film (.mp4, ...) is of the robot's front camera, rectified, "
         "driving ten metres or more on the built scene's place, mostly ahead, in light like that of one of its films."
     )
     parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` for the published one")
-    parser.add_argument("log", type=Path, help="a .csv, an .npz, the folder of a ROS 2 bag, or a film")
+    parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
+    parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
+    parser.add_argument("--topic", help="of these pictures; default: the one with most of them")
     parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: the scene's")
     parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")

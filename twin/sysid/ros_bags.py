@@ -1,33 +1,147 @@
-"""Drive logs from bags, as tables: a row per joint state, with the newest values of the other topics."""
+"""Drive logs from bags, as tables: a row per joint state, with the newest values of the other topics.
 
+Where a bag has no joint states, the wheel speeds are those of the wheels' odometry, by the inverse of Clearpath's
+kinematics. Poses that come from the wheels would hide their slip; in their place are taken those of the bag's own
+pictures, if a scene was built from it: of the robot at rest below the reconstructed cameras.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from twin.capture.bag import VALUES, choose_topics, open_bag
+from twin import runtime
+from twin.assets.ground import Ground
+from twin.capture.bag import (
+    ODOMETRY,
+    TYPES,
+    VALUES,
+    bag_files,
+    choose_topics,
+    is_bag,
+    is_from_wheels,
+    messages_by_topic,
+    open_bag,
+    topic_names,
+)
+from twin.capture.bag_film import read_contents
+from twin.capture.frames import source_names
+from twin.config import SceneConfig
 from twin.errors import InputError
+from twin.files import digest_file
+from twin.geometry.cameras import Cameras
+from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
+from twin.scene import SceneDir, require_stage
+from twin.sysid.camera_extrinsics import base_below_camera
 from twin.types import Array
 
 
-def read_bag(path: Path) -> dict[str, Array]:
+@dataclass(frozen=True)
+class FilmedPoses:
+    """Poses of a robot by the pictures that it took."""
+
+    times: NDArray[np.int64]
+    """Stamps of the pictures [ns], increasing, shape (n,)."""
+    poses: Array
+    """x, y [m], yaw [rad] of the base in the scene, shape (n, 3)."""
+
+
+def filmed_poses(scene: SceneDir, config: SceneConfig, bag: Path) -> FilmedPoses | None:
+    """The robot's poses by the reconstruction of a bag's pictures; None unless the scene was built from that bag.
+
+    Raises InputError: the bag is unreadable.
+    """
+    names = source_names([source.path for source in config.source])
+    built = all(scene.stage(stage).is_dir() for stage in ("metric", "mesh"))
+    for name, source in zip(names, config.source, strict=True):
+        path = scene.root / source.path
+        if not (built and is_bag(path) and path.exists() and _are_same(path, bag)):
+            continue
+        cameras = Cameras.load(require_stage(scene, "metric"))
+        ground = Ground.load(require_stage(scene, "mesh"))
+        rows = [i for i, one in enumerate(cameras.sources) if one == name]
+        first = int(read_contents(bag, source.topic).stamps[0])
+        times = first + np.round(cameras.times[rows] * 1e9).astype(np.int64)
+        poses = [base_below_camera(config.robot, cameras.camera_to_world[i], ground.at) for i in rows]
+        order = np.argsort(times)
+        return FilmedPoses(times[order], np.array(poses).reshape(-1, 3)[order])
+    return None
+
+
+def _are_same(one: Path, other: Path) -> bool:
+    """True if two bags have the same files."""
+    first, second = bag_files(one), bag_files(other)
+    sizes = [[file.stat().st_size for file in files] for files in (first, second)]
+    return sizes[0] == sizes[1] and list(map(digest_file, first)) == list(map(digest_file, second))
+
+
+def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
     """The columns that `twin.sysid.logs` describes.
 
-    Raises InputError: rosbags is not installed, the bag is unreadable, or a kind of message is missing.
+    Args:
+        path: See `twin.capture.bag`.
+        filmed: Poses in place of those that come from the wheels.
+
+    Raises:
+        InputError: rosbags is not installed, the bag is unreadable, a kind of message is missing, or the poses come
+            from the wheels.
     """
     with open_bag(path, "record it anew or give a .csv") as bag:
-        chosen = choose_topics(bag.connections, path)
+        kinds, values = _kinds(bag.connections, path, filmed)
+        chosen = choose_topics(bag.connections, path, [kind for kind in kinds if kind not in values])
+        functions = {kind: VALUES[kind] for kind in chosen}
+        if "wheels" in values:
+            chosen["wheels"], functions["wheels"] = values["wheels"], _wheels_of_odometry
         rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
-        kinds = {connection.id: kind for kind, connection in chosen.items()}
+        by_id = {connection.id: kind for kind, connection in chosen.items()}
         # The beginning is subtracted as an integer: as a float it would be rounded to 0.2 µs.
         for connection, recorded, message in bag.messages(list(chosen.values())):
-            kind = kinds[connection.id]
-            values = VALUES[kind](message)
-            if values is not None:
-                rows[kind].append(((recorded - bag.begin) * 1e-9, *values))
-    empty = [kind for kind, values in rows.items() if not values]
+            kind = by_id[connection.id]
+            numbers = functions[kind](message)
+            if numbers is not None:
+                rows[kind].append(((recorded - bag.begin) * 1e-9, *numbers))
+        if "poses" not in kinds and filmed is not None:
+            since = (filmed.times - bag.begin) * 1e-9
+            rows["poses"] = [(float(t), *pose) for t, pose in zip(since, filmed.poses.tolist(), strict=True)]
+    empty = [kind for kind, found in rows.items() if not found]
     if empty:
         raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected some; record those topics")
-    return _columns({kind: np.array(values) for kind, values in rows.items()})
+    return _columns({kind: np.array(found) for kind, found in rows.items()})
+
+
+def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tuple[list[str], dict[str, Any]]:
+    """The kinds of topics to read, and the connection of the wheels' odometry if it stands in for joint states."""
+    kinds, values = list(TYPES), {}
+    independent = [name for name in messages_by_topic(connections, TYPES["poses"]) if not is_from_wheels(name)]
+    if not independent:
+        if filmed is None:
+            raise InputError(
+                f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) that come from elsewhere than the wheels "
+                f"among {topic_names(connections)}; record LiDAR, RTK or a total station, or build the scene from this "
+                "bag's pictures"
+            )
+        kinds.remove("poses")
+        runtime.log_line(f"{path}: poses are those of its pictures in the built scene, {len(filmed.times)} of them")
+    if not messages_by_topic(connections, TYPES["wheels"]):
+        from_wheels = messages_by_topic(connections, (ODOMETRY,))
+        names = [name for name in from_wheels if is_from_wheels(name)]
+        if names:
+            topic = max(names, key=lambda name: from_wheels[name])
+            values["wheels"] = next(one for one in connections if one.topic == topic and one.msgcount)
+            runtime.log_line(
+                f"{path}: no joint states; wheel speeds are those of {topic}, by Clearpath's multiplier "
+                f"{HuskyParams.separation_multiplier:g}"
+            )
+    return kinds, values
+
+
+def _wheels_of_odometry(message: Any) -> tuple[float, float]:
+    """Wheel speeds left and right [rad/s] of the wheels' odometry."""
+    v, yaw_rate = message.twist.twist.linear.x, message.twist.twist.angular.z
+    half = yaw_rate * TRACK * HuskyParams.separation_multiplier / 2.0
+    return (v - half) / WHEEL_RADIUS, (v + half) / WHEEL_RADIUS
 
 
 _NAMES = {
