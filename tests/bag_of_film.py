@@ -1,5 +1,7 @@
 """Writes a robot's bag of given pictures along given poses: calibration, odometry, fixes and the camera's seat."""
 
+from pathlib import Path
+
 import numpy as np
 from picture_bag import CAMERA_INFO, IMAGE, MESSAGES, START, TYPES, Recorded, image, odometry, write
 from scipy.spatial.transform import Rotation
@@ -82,4 +84,63 @@ def drive(base_to_world: np.ndarray, times: np.ndarray, stretch: float = 1.0) ->
     return out
 
 
-__all__ = ["CAMERA_INFO", "IMAGE", "START", "camera_info", "drive", "fix", "pictures", "seat", "transform", "write"]
+def write_ros1(path: Path, frames: list[np.ndarray], times: np.ndarray) -> Path:
+    """A .bag file of ROS 1 with frames (h, w, 3) at times [s], their camera_info and the camera on the robot."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    types = store.types
+    height, width = frames[0].shape[:2]
+
+    def header(stamp: int, frame: str = FRAME):
+        return types["std_msgs/msg/Header"](0, types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame)
+
+    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    k, p = np.zeros(9), np.zeros(12)
+    k[[0, 4, 2, 5, 8]] = 0.9 * width, 0.9 * width, width / 2 - 0.5, height / 2 - 0.5, 1.0
+    point, turn = types["geometry_msgs/msg/Vector3"](0.3, 0.0, 0.5), Rotation.from_matrix(CAMERA_AHEAD).as_quat()
+    mount = types["geometry_msgs/msg/TransformStamped"](
+        header(START, "base_link"),
+        FRAME,
+        types["geometry_msgs/msg/Transform"](point, types["geometry_msgs/msg/Quaternion"](*turn.tolist())),
+    )
+    info = types["sensor_msgs/msg/CameraInfo"](
+        *(header(START), height, width, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), p, 0, 0, roi)
+    )
+    with Writer(path) as writer:
+
+        def connection(topic: str, kind: str):
+            return writer.add_connection(topic, kind, typestore=store)
+
+        def put(to, stamp: int, message) -> None:
+            writer.write(to, stamp, store.serialize_ros1(message, to.msgtype))
+
+        put(connection("/tf_static", "tf2_msgs/msg/TFMessage"), START, types["tf2_msgs/msg/TFMessage"]([mount]))
+        put(connection("/camera/camera_info", "sensor_msgs/msg/CameraInfo"), START, info)
+        images = connection("/camera/image_raw", "sensor_msgs/msg/Image")
+        for frame, time in zip(frames, times, strict=True):
+            stamp = START + round(float(time) * 1e9)
+            rows = np.ascontiguousarray(frame[..., ::-1])
+            put(
+                images,
+                stamp,
+                types["sensor_msgs/msg/Image"](header(stamp), height, width, "bgr8", 0, 3 * width, rows.ravel()),
+            )
+    return path
+
+
+__all__ = [
+    "CAMERA_INFO",
+    "IMAGE",
+    "START",
+    "camera_info",
+    "drive",
+    "fix",
+    "pictures",
+    "seat",
+    "transform",
+    "write",
+    "write_ros1",
+]

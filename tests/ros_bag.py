@@ -19,7 +19,7 @@ _TOPICS = {
 
 
 def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = ()) -> Path:
-    """A table of `twin.sysid.logs` as a bag; the poses of the wheels' odometry stand still, so that using them shows."""
+    """A table of `twin.sysid.logs` as a bag; the wheels' poses stand still, so that using them shows."""
     store = get_typestore(Stores.LATEST)
     t = store.types
     zero = np.zeros(9)

@@ -7,7 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_of_film import CAMERA_INFO, FRAME, IMAGE, START, camera_info, drive, pictures, seat, transform, write
+from bag_of_film import (
+    CAMERA_INFO,
+    FRAME,
+    IMAGE,
+    START,
+    camera_info,
+    drive,
+    pictures,
+    seat,
+    transform,
+    write,
+    write_ros1,
+)
 from filmed_wall import HEIGHT, WIDTH, captured, refused, views
 from picture_bag import MESSAGES, TYPES, Recorded
 from scipy.spatial.transform import Rotation
@@ -96,6 +108,17 @@ def test_a_bayer_film(tmp_path: Path) -> None:
     contents = read_contents(write(tmp_path / "bag", messages))
     assert contents.encoding == "bayer_rggb8" and contents.lens is None and "no sensor_msgs" in contents.lens_note
     assert len(list(contents.film().decode(FilmStatistics()))) == 3
+
+
+def test_a_bag_of_ros_1(tmp_path: Path) -> None:
+    frames = views(SHIFTS)
+    path = write_ros1(tmp_path / "drive.bag", frames, TIMES)
+    capture, metrics, out = captured(tmp_path, [SourceConfig(path="drive.bag")], frames=10)
+    assert capture.sources[0].calibrated and metrics["sources"]["drive"]["decoded"] == 30
+    name = capture.names[3]
+    np.testing.assert_array_equal(read_image(out / "images" / f"{name}.png"), frames[int(name[-6:])])
+    seat_of = read_contents(path).seat
+    assert seat_of is not None and (seat_of.offset[0], seat_of.pitch) == pytest.approx((0.3, 0.0), abs=1e-9)
 
 
 # ---- calibration
