@@ -1,12 +1,13 @@
 """Benchmark of bags as films: a scene built from bags that were made of its films, beside the scene itself.
 
-    python benchmarks/bags.py SCENE --work FOLDER [--films sun] [--quick] [--json FILE]
+    python benchmarks/bags.py SCENE --work FOLDER [--films sun] [--quick] [--again] [--until metric] [--json FILE]
 
 SCENE is a generated place (`twin reality film`). For each film, FOLDER/bags gets a ROS 2 bag with the film's pictures
 (raw, so that both builds read the same pixels), their camera_info, and, from the true poses, what a robot records
 beside them: odometry that is 2 % long and turns by a degree per metre, fixes that wander by a metre, and /tf_static.
 Both scenes are built with the camera's height as scale; then the bags' scene is scaled by odometry and by GPS. Prints
-the figures of both builds, and each scale's error.
+the figures of both builds, and each scale's error. With --again the films are built twice, which shows how far a
+build differs from itself.
 """
 
 import argparse
@@ -43,7 +44,6 @@ _WANDER = 1.0  # [m] of the fixes
 _AHEAD, _BASE = 0.36, 0.13  # [m] lens ahead of the base, base above the ground
 _EARTH = 6_378_137.0  # [m]
 _QUICK = ("nerf.steps=400", "nerf.rays=2048", "nerf.max_width=240", "nerf.bake_steps=60", "nerf.max_bricks=2500")
-_UNTIL = "mjcf"
 FIGURES = (
     ("capture", "frames"),
     ("cameras", "registered"),
@@ -155,10 +155,17 @@ def _transform(types: Any, header: Any, child: str, pose: np.ndarray) -> Any:
 
 def figures(root: Path, report: dict[str, Any]) -> dict[str, Any]:
     """The compared figures of a build."""
-    report = {**report, "truth": compare(SceneDir(root))["figures"]}
+    scene = SceneDir(root)
+    cameras = Cameras.load(scene.stage("metric"))
+    errors: dict[str, Any] = camera_errors(cameras.camera_to_world, matched_poses(Truth.load(scene.truth), cameras))
+    if "mjcf" in report:
+        errors = compare(scene)["figures"]
+    report = {**report, "truth": errors}
     out: dict[str, Any] = {}
     for section, name in FIGURES:
-        value = report[section][name]
+        value = report.get(section, {}).get(name)
+        if value is None:
+            continue
         for key, one in value.items() if isinstance(value, dict) else [("", value)]:
             out[f"{section}.{name}" + (f".{key}" if key else "")] = one
     return out
@@ -169,6 +176,8 @@ def main() -> int:
     parser.add_argument("scene", type=Path, help="a folder written by `twin reality film`")
     parser.add_argument("--work", type=Path, required=True, help="folder for bags and both scenes")
     parser.add_argument("--films", nargs="+", metavar="NAME", help="default: all")
+    parser.add_argument("--again", action="store_true", help="build the films twice")
+    parser.add_argument("--until", choices=("metric", "mjcf"), default="mjcf", help="last stage (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help="a small field, for the tiny place")
     add_record_options(parser)
     options = parser.parse_args()
@@ -176,7 +185,7 @@ def main() -> int:
     table = tomllib.loads((options.scene / "scene.toml").read_text())
     names = options.films or list(truth.films)
     sources = {Path(one["path"]).stem: one for one in table["source"] if Path(one["path"]).stem in names}
-    scenes = {kind: options.work / kind for kind in ("films", "bags")}
+    scenes = {kind: options.work / kind for kind in ("films", *(["again"] if options.again else []), "bags")}
     settings = [f'name = "{options.scene.name}"', "[metric]", f"camera_height = {truth.camera_height}"]
     for kind, root in scenes.items():
         (root / "input").mkdir(parents=True, exist_ok=True)
@@ -184,7 +193,7 @@ def main() -> int:
         lines = list(settings)
         for k, (name, one) in enumerate(sources.items()):
             film = options.scene / one["path"]
-            if kind == "films":
+            if kind != "bags":
                 shutil.copyfile(film, root / "input" / film.name)
                 camera = one["camera"]
                 lines += ["[[source]]", f'path = "input/{film.name}"', f"lighting = {toml_string(one['lighting'])}"]
@@ -200,12 +209,13 @@ def main() -> int:
     remove(shown)
     new_scene(shown, [scenes["bags"] / "input" / name for name in sources])
     overrides = _QUICK if options.quick else ()
-    results = {kind: figures(root, build(root, until=_UNTIL, overrides=overrides)) for kind, root in scenes.items()}
+    results = {
+        kind: figures(root, build(root, until=options.until, overrides=overrides)) for kind, root in scenes.items()
+    }
     same = _same_pictures(scenes)
-    print(f"{'':34} {'films':>12} {'bags':>12} {'difference':>12}")
-    for name, value in results["films"].items():
-        other = results["bags"][name]
-        print(f"{name:34} {value:12.5g} {other:12.5g} {other - value:+12.2g}")
+    print(f"{'':34}" + "".join(f" {kind:>12}" for kind in results))
+    for name in results["films"]:
+        print(f"{name:34}" + "".join(f" {one[name]:12.5g}" for one in results.values()))
     print(f"{same:.1%} of the kept frames are the same files")
     scales = {}
     for name in ("odometry", "gps"):

@@ -148,7 +148,7 @@ def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: Cam
 def _fix_way(bag: BagContents) -> float:
     """Greatest distance of a bag's fixes from the first one while it films [m]."""
     during = (bag.fix_times >= bag.stamps[0]) & (bag.fix_times <= bag.stamps[-1])
-    fixes = bag.fixes[during & np.isfinite(bag.fixes).all(1)]
+    fixes = np.nan_to_num(bag.fixes[during & np.isfinite(bag.fixes[:, :2]).all(1)])
     if len(fixes) < 3:
         return 0.0
     return float(np.linalg.norm(local_east_north_up(fixes)[:, :2], axis=1).max())
@@ -187,7 +187,7 @@ def _taken(bag: BagContents) -> str:
         lines.append(f"  other pictures: {others}; choose by --topic, or topic = in scene.toml")
     if "fixes" in bag.topics:
         lines.append(
-            f"  GPS: {bag.topics['fixes']}, {np.isfinite(bag.fixes).all(1).sum()} fixes, {_fix_way(bag):.1f} m"
+            f"  GPS: {bag.topics['fixes']}, {np.isfinite(bag.fixes[:, :2]).all(1).sum()} fixes, {_fix_way(bag):.1f} m"
         )
     if "odometry" in bag.topics:
         lines.append(f"  odometry: {bag.topics['odometry']}, {_odometry_way(bag):.1f} m")

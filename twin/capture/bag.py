@@ -42,6 +42,8 @@ TYPES = {
 """Message types of each kind of topic."""
 FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 """Words in names of topics whose odometry comes from the wheels."""
+MIN_POSES = 10
+"""Topics with fewer poses are taken only where there are no others; such are those of an operator's clicks."""
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")  # words in names of other images' topics
 _CLOCK = 1_000_000_000  # [ns] by which the headers' clock may differ from the bag's
 _MAX_METADATA = 16 << 20  # [bytes]
@@ -49,8 +51,8 @@ _MAX_CHUNK = 1 << 30  # [bytes] of an MCAP chunk, unpacked
 
 
 def is_bag(path: Path) -> bool:
-    """True for the folder of a ROS 2 bag and for a file named like a bag's."""
-    return (path.suffix.lower() in BAG_SUFFIXES and not path.is_dir()) or is_file(path / METADATA)
+    """True for the folder of a ROS 2 bag, and for an existing file named like a bag's."""
+    return (path.suffix.lower() in BAG_SUFFIXES and is_file(path)) or is_file(path / METADATA)
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -191,7 +193,7 @@ def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYP
         if kind == "commands":  # prefer the controller's input to the multiplexer's
             found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
         elif kind == "poses":
-            found.sort(key=lambda c: (is_from_wheels(c.topic), -c.msgcount))
+            found.sort(key=lambda c: (c.msgcount < MIN_POSES, is_from_wheels(c.topic), -c.msgcount))
         else:
             found.sort(key=lambda c: -c.msgcount)
         if found:

@@ -5,6 +5,7 @@ position by satellites. The *seat* is the camera's pose on the robot by `/tf_sta
 headers to `base_link`. Positions by odometry are those of the lens, in the frame of the odometry.
 """
 
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -116,6 +117,14 @@ class BagContents:
         return Film(self.path, FilmTiming(times, 0.0, self.recorded), partial(_decode, self))
 
 
+class _Rows:
+    """Numbers of a topic's messages, as compact as they are many."""
+
+    def __init__(self) -> None:
+        self.times = array("q")  # of header and recording [ns], per message
+        self.values = array("d")
+
+
 def read_contents(path: Path, topic: str = "") -> BagContents:
     """Reads all of a bag that is no picture, and the pictures' stamps.
 
@@ -129,7 +138,7 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
     """
     with open_bag(path) as bag:
         topics = _topics(bag.connections, path, topic)
-        rows: dict[str, list[tuple[Any, ...]]] = {kind: [] for kind in topics}
+        rows = {kind: _Rows() for kind in topics}
         first: dict[str, Any] = {}
         transforms: dict[str, tuple[str, Array]] = {}
         kinds = {name: kind for kind, name in topics.items()}
@@ -139,21 +148,26 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
             if kind == "transforms":
                 _add_transforms(transforms, message)
             elif kind != "camera":
-                rows[kind].append((header_time(message), recorded, *_values(kind, message)))
+                rows[kind].times.extend((header_time(message), recorded))
+                rows[kind].values.extend(_values(kind, message))
         recorded = messages_by_topic(bag.connections, (RAW, COMPRESSED))[topics["pictures"]]
         others = tuple(name for name in picture_topics(bag.connections) if name != topics["pictures"])
-    if not rows["pictures"]:
+    if not rows["pictures"].times:
         raise InputError(f"{path}: no message on {topics['pictures']}; record it")
     where = f"{path}: {topics['pictures']}"
-    times = {kind: _times(rows[kind], topics[kind], path) for kind in rows}
+    times = {
+        kind: message_times(np.array(one.times, np.int64).reshape(-1, 2), topics[kind], path)
+        for kind, one in rows.items()
+        if one.times
+    }
     position, stamps = _ordered(times["pictures"], where)
     picture = picture_of(first["pictures"])
     height, width = _decoded(picture, where).shape[:2]
     frame = str(first["pictures"].header.frame_id)
     lens, note = _lens(first.get("camera"), topics, frame, (width, height), path)
     camera_to_base = _pose_in_base(transforms, frame)
-    fix_times, fixes = _table(rows.get("fixes", []), times.get("fixes"), 3)
-    pose_times, poses = _table(rows.get("odometry", []), times.get("odometry"), 7)
+    fix_times, fixes = _table(rows.get("fixes"), times.get("fixes"), 3)
+    pose_times, poses = _table(rows.get("odometry"), times.get("odometry"), 7)
     arm = np.zeros(3) if camera_to_base is None else camera_to_base[:3, 3]
     encoding = getattr(picture, "encoding", None) or str(getattr(first["pictures"], "format", "")) or "compressed"
     return BagContents(
@@ -190,10 +204,6 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
     return ()
 
 
-def _times(rows: list[tuple[Any, ...]], topic: str, path: Path) -> NDArray[np.int64]:
-    return message_times(np.array([row[:2] for row in rows], np.int64), topic, path)
-
-
 def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Positions and stamps of the pictures whose stamp is after all earlier ones. Raises InputError: many are not."""
     latest = np.maximum.accumulate(times)
@@ -208,12 +218,12 @@ def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], N
     return position, times[position]
 
 
-def _table(rows: list[tuple[Any, ...]], times: NDArray[np.int64] | None, width: int) -> tuple[NDArray[np.int64], Array]:
-    """Times in order and the values of a topic's messages."""
-    if times is None or not rows:
+def _table(rows: _Rows | None, times: NDArray[np.int64] | None, width: int) -> tuple[NDArray[np.int64], Array]:
+    """Times in order and the values of a topic's messages, shape (n, width)."""
+    if rows is None or times is None:
         return np.zeros(0, np.int64), np.zeros((0, width))
     times, index = np.unique(times, return_index=True)
-    return times, np.array([rows[i][2:] for i in index], np.float64)
+    return times, np.array(rows.values, np.float64).reshape(-1, width)[index]
 
 
 def _interpolated(times: Array, first: int, knots: NDArray[np.int64], values: Array, max_gap: float) -> Array:

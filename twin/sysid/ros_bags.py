@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from twin import runtime
 from twin.assets.ground import Ground
 from twin.capture.bag import (
+    MIN_POSES,
     ODOMETRY,
     TYPES,
     VALUES,
@@ -114,8 +115,8 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
 def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tuple[list[str], dict[str, Any]]:
     """The kinds of topics to read, and the connection of the wheels' odometry if it stands in for joint states."""
     kinds, values = list(TYPES), {}
-    independent = [name for name in messages_by_topic(connections, TYPES["poses"]) if not is_from_wheels(name)]
-    if not independent:
+    counts = messages_by_topic(connections, TYPES["poses"])
+    if not any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
         if filmed is None:
             raise InputError(
                 f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) that come from elsewhere than the wheels "
