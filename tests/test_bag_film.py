@@ -328,6 +328,9 @@ def test_damaged_files_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
     refused(
         tmp_path, SourceConfig(path=bag.name, topic="/none"), r"no pictures on topic /none; there are .* /camera/image"
     )
+    (tmp_path / "bare").mkdir()
+    (tmp_path / "bare/drive_0.mcap").write_bytes(good)
+    refused(tmp_path, SourceConfig(path="bare"), r"a bag without metadata\.yaml; give its file, such as drive_0\.mcap")
     (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: 3")
     refused(tmp_path, SourceConfig(path=bag.name), "not a readable bag")
     remove(bag)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
-from twin.capture.bag import bag_files, is_bag
+from twin.capture.bag import BAG_SUFFIXES, bag_files, is_bag
 from twin.capture.bag_film import BagContents, read_contents
 from twin.capture.camera_models import Lens
 from twin.capture.capture_data import NO_GPS, Capture, FrameWriter, KeptFrames, SourceTask
@@ -94,6 +94,8 @@ def detect_kind(path: Path) -> str:
         return "transforms"
     if image_files(path):
         return "images"
+    if bags := sorted(file.name for suffix in BAG_SUFFIXES for file in path.glob(f"*{suffix}")):
+        raise InputError(f"{path}: a bag without metadata.yaml; give its file, such as {bags[0]}")
     raise InputError(
         f"{path}: holds no images, no COLMAP model and no transforms.json; give a film, a bag or an image folder"
     )
