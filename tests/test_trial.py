@@ -175,7 +175,7 @@ def test_missing_and_foreign_files_are_refused_in_one_line(place, tmp_path):
     with pytest.raises(InputError, match="no such bag"):
         read_trial(tmp_path / "none")
     (tmp_path / "bad.mcap").write_bytes(b"rubbish" * 100)
-    with pytest.raises(InputError, match="not a readable ROS 2 bag"):
+    with pytest.raises(InputError, match="not a readable bag"):
         read_trial(tmp_path / "bad.mcap")
 
 

@@ -187,10 +187,13 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
         settings[name] = table[section][key] if key else table[section]
     # Settings that were added later and have no effect are left out, so that older results stay valid.
     for one in (settings.get("capture", {}), *settings.get("source", ())):
-        if "keep" in one and not one["keep"]:
-            del one["keep"]
+        for key in ("keep", "topic"):
+            if key in one and not one[key]:
+                del one[key]
     if settings.get("metric", {}).get("camera_height_tolerance") == MetricConfig.camera_height_tolerance:
         del settings["metric"]["camera_height_tolerance"]
+    if not settings.get("metric", {}).get("odometry", True):
+        del settings["metric"]["odometry"], settings["metric"]["odometry_tolerance"]
     if settings.get("route") == dataclasses.asdict(RouteConfig()):
         del settings["route"]
     if not settings.get("nerf", {}).get("refine_cameras", True):

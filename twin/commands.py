@@ -145,10 +145,16 @@ def _describe(error: OSError) -> str:
 
 
 def _new(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Start a scene folder from films."
+    parser.description = (
+        "Start a scene folder from films or robots' bags (ROS 2, or .bag of ROS 1; pip install 'twin[ros]'). A bag "
+        "also brings the camera's calibration, GPS and odometry for the scale, and the camera's pose on the robot."
+    )
     parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
-    parser.add_argument("films", type=Path, nargs="+", metavar="VIDEO", help="films or image folders, one per lighting")
+    parser.add_argument(
+        "films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting"
+    )
     parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
+    parser.add_argument("--topic", help="of the pictures in a bag; default: the one with most of them")
 
 
 def _build(parser: argparse.ArgumentParser) -> None:
@@ -157,7 +163,7 @@ def _build(parser: argparse.ArgumentParser) -> None:
 a scene.toml of your own road:
 
   [[source]]                      # one per film; several lightings make one twin
-  path = "input/morning.mp4"      # video, photo folder, COLMAP model or transforms.json
+  path = "input/morning.mp4"      # video, bag, photo folder, COLMAP model or transforms.json
   lighting = "morning"
   # mask = "input/robot.png"      # 0 = ignore (an image, or a folder named like the frames)
   # camera = { model = "PINHOLE", params = [fx, fy, cx, cy], width = 1280, height = 720 }
@@ -203,13 +209,16 @@ def _align(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
         "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
-        "acceleration_x, acceleration_y [m/s²] and group. Or the folder of a ROS 2 bag with cmd_vel, joint states, a "
-        "pose and an IMU (pip install 'twin[ros]'). A film (.mp4, ...) is one by the robot's front camera, "
-        "rectified: the robot drives ten metres or more in the built scene's place, mostly straight ahead, in light "
-        "like that of one of the scene's films."
+        "acceleration_x, acceleration_y [m/s²] and group. Or a ROS bag with cmd_vel, joint states (or the wheels' "
+        "odometry), poses that are not the wheels' (or pictures that the scene was built from) and an IMU "
+        "(pip install 'twin[ros]'). A film (.mp4, ...) is one by the robot's front camera, rectified: the robot drives "
+        "ten metres or more in the built scene's place, mostly straight ahead, in light like that of one of the "
+        "scene's films."
     )
     parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` for the published one")
-    parser.add_argument("log", type=Path, help="a .csv, an .npz, the folder of a ROS 2 bag, or a film")
+    parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
+    parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
+    parser.add_argument("--topic", help="of these pictures; default: the one with most of them")
     parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: the scene's")
     parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")

@@ -18,7 +18,7 @@ RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 RANDOMIZED = "+randomised"
 """Suffix of randomized conditions in tables, see `Condition`; not allowed at the end of a lighting's name."""
 
-KINDS = ("auto", "video", "images", "colmap", "transforms")
+KINDS = ("auto", "video", "bag", "images", "colmap", "transforms")
 MAPPERS = ("auto", "global", "incremental")
 UPS = ("ground", "cameras", "poses")
 CAMERA_MODELS = {
@@ -85,20 +85,23 @@ class CalibrationConfig:
 
 @dataclass(frozen=True)
 class SourceConfig:
-    """One film, photo folder or posed image set under one lighting."""
+    """One film, bag, photo folder or posed image set under one lighting."""
 
     path: str = ""
-    """Video file, image folder, COLMAP model folder or transforms.json, relative to the scene folder."""
+    """Video file, robot's bag, image folder, COLMAP model folder or transforms.json, relative to the scene folder."""
     lighting: str = ""
     """Name of the lighting, not one of `RESERVED_LIGHTINGS`; by default the file's stem."""
     kind: str = "auto"
-    """auto, video, images, colmap or transforms."""
+    """auto, video, bag, images, colmap or transforms."""
+    topic: str = ""
+    """The pictures' topic in a bag; by default the one with most pictures."""
     images: str = ""
     """Image folder of a COLMAP model or transforms.json, if not beside it."""
     mask: str = ""
     """One static mask image, or a folder of masks named like the frames; 0 = ignore."""
     camera: CalibrationConfig | None = None
-    """Known intrinsics, held fixed. Calibrate if possible: forward motion biases self-calibration."""
+    """Known intrinsics, held fixed; by default those of a bag's camera_info. Calibrate if possible: forward motion
+    biases self-calibration."""
     camera_height: Annotated[float, Range(0)] = 0.0
     """Height of this source's lens above the ground [m], if sources differ; 0 = `metric.camera_height`."""
     keep: tuple[tuple[float, ...], ...] = ()
@@ -183,7 +186,11 @@ class MetricConfig:
     distance: DistanceConfig | None = None
     marker: MarkerConfig | None = None
     gps: bool = False
-    """EXIF GPS positions of the images."""
+    """GPS positions: EXIF of the images, or NavSatFix of bags."""
+    odometry: bool = False
+    """Distances by the odometry of bags."""
+    odometry_tolerance: Annotated[float, Range(0.0001, 0.5)] = 0.03
+    """Standard deviation of the relative error of these distances: a few percent for wheels, less for LiDAR or RTK."""
     poses_are_metric: bool = False
     """The given poses (COLMAP model or transforms.json) are in metres."""
     up: str = "ground"

@@ -33,6 +33,8 @@ GEAR_RATIO = 79.0  # motor turns per wheel turn
 
 CAMERA_SIZE = (160, 90)
 """Width, height of a policy's images from the front camera [px]."""
+CAMERA_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Axes right, down and forward (columns) of a camera that looks straight ahead, in the base."""
 REAR_HEAVY = (-0.085, -0.00065, 0.062)
 """The published center of mass of the chassis, with x and y exchanged [m]."""
 

@@ -34,6 +34,7 @@ _SCALE_SOURCES = {
     "distance": "a distance measured between two marked points",
     "marker": "a printed marker of known size",
     "gps": "the GPS positions of the images",
+    "odometry": "the robot’s odometry",
     "poses": "the given metric poses",
     "poses_are_metric": "the given metric poses",
 }

@@ -10,7 +10,7 @@ window *follows* the previous one if it begins when that one ends. A pose is *fr
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
   [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
   [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
-- a ROS 2 bag, as such a table (`twin.sysid.ros_bags`);
+- a robot's bag, as such a table (`twin.sysid.ros_bags`);
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
 from twin import runtime
+from twin.capture.bag import is_bag
 from twin.errors import InputError
 from twin.files import exists, load_arrays, read_text, wrap_read_errors
 from twin.robot import TRACK, WHEEL_RADIUS
@@ -203,8 +204,8 @@ class Windows:
 def read_log(path: Path) -> Windows:
     """Reads a log. Raises InputError: an unreadable file, missing columns, or impossible times or values."""
     if not exists(path):
-        raise InputError(f"{path}: no such log; expected a .csv, an .npz or the folder of a ROS 2 bag")
-    if path.is_dir() or path.suffix in (".db3", ".mcap", ".bag"):
+        raise InputError(f"{path}: no such log; expected a .csv, an .npz or a bag")
+    if path.is_dir() or is_bag(path):
         from twin.sysid.ros_bags import read_bag
 
         return cut_windows(read_bag(path), str(path))
@@ -215,7 +216,7 @@ def read_log(path: Path) -> Windows:
         if columns.get("icp_x", np.zeros(0)).ndim == 2:
             return _published_windows(columns, str(path))
         return cut_windows(columns, str(path))
-    raise InputError(f"{path}: expected a log in .csv, .npz or a ROS 2 bag; convert it to one of those")
+    raise InputError(f"{path}: expected a log in .csv, .npz or a bag; convert it to one of those")
 
 
 def _read_csv(path: Path) -> dict[str, Array]:
