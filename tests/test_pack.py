@@ -61,7 +61,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 def episode(scene: Path) -> list[np.ndarray]:
     """States and pixels of a drive with obstacles, under a mixture with a lighting of a photo."""
-    env = twin.load(scene, "ahead", seed=3, lighting="day:dusk:0.5", obstacles=1)
+    env = twin.load(scene, "ahead", seed=3, lighting="day:dusk:0.5")
     step, out = env.reset(), []
     for action in ([1.0, 0.1], [0.8, -0.4], [0.8, 0.3], [1.0, 0.0]):
         out += [step.observation["pixels"], env.physics.data.qpos.copy(), env.physics.data.qvel.copy()]
@@ -300,7 +300,7 @@ HOSTILE = {
     "code": (add("build/5_mjcf/evil.py"), "has no place in a scene"),
     "hidden": (add("lightings/.bashrc"), "has no place in a scene"),
     "link": (add("build/5_mjcf/assets/a.obj", b"/etc/passwd", stat.S_IFLNK | 0o777), "is a link"),
-    "bomb": (add("build/5_mjcf/assets/a.obj", bytes(60 << 20)), "unpacks to"),
+    "bomb": (add("build/5_mjcf/assets/a.obj", bytes(16 << 20)), "unpacks to"),
     "huge": (add("build/5_mjcf/assets/a.obj", bytes=10**13), "expected at most"),
     "negative": (add("build/5_mjcf/assets/a.obj", bytes=-1), "expected at most"),
     "other size": (add("build/5_mjcf/assets/a.obj", bytes=5), "its list says otherwise"),
@@ -360,7 +360,7 @@ def test_an_sb3_zip_is_packed_and_unpacked_by_trust_alone(root, tmp_path, monkey
 
 
 def test_a_function_has_no_place_in_a_pack(root, tmp_path):
-    with pytest.raises(InputError, match=r"no policy|no place"):
+    with pytest.raises(InputError, match="policy operator:neg"):
         pack(root, tmp_path / "x.twin", ["operator:neg"])
 
 
@@ -371,7 +371,7 @@ def test_a_function_has_no_place_in_a_pack(root, tmp_path):
         ("near", lambda a: a + 1000),
         ("near", lambda a: np.concatenate([a[:1], a[:-1]])),
         ("near_leap", lambda a: a[:-4]),
-        ("network.head.1", lambda a: a[:8, :8]),
+        ("network.head.1", lambda a: a[:, :4]),
         ("network.head.0", lambda a: a[:4]),
         ("network.backdrop.1", lambda a: a[:, :2]),
         ("step", lambda a: a[:3]),

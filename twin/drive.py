@@ -3,7 +3,7 @@
     python -m twin.drive demo
     python -m twin.drive scenes/demo --policy first --lighting night --view
 
-The policy that came with a pack drives, or the only run of a scene, on the task that it was trained for; without one, the
+The policy that came with a pack drives, or the only run of a scene, on the task of its training; without one, the
 scripted driver. `twin.film` has more options.
 """
 

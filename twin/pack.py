@@ -41,6 +41,7 @@ LEVELS = 256
 """Values of a byte: as built."""
 _ZERO = 128  # byte about which features are rounded; it is the value 0 of detail
 _FINER = 4  # levels of the density per level of a feature: it decides where surfaces are
+_VERTEX_STEP = 2  # steps of the hash grid's vertices, whose range is half as wide, per step of a feature
 _PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "baked.safetensors")}
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
@@ -209,7 +210,8 @@ def packed_field(layout: BrickLayout, arrays: dict[str, NDArray], levels: int = 
         features = np.concatenate(
             [rounded(features[..., :1], max(1.0, step / _FINER)), rounded(features[..., 1:], step)], -1
         )
-        detail = {name: rounded(arrays[name], step) for name in ("detail.texels", "detail.vertices") if name in arrays}
+        coarser = {"detail.texels": step, "detail.vertices": _VERTEX_STEP * step}
+        detail = {name: rounded(arrays[name], by) for name, by in coarser.items() if name in arrays}
         arrays = arrays | detail
     read = samples_read(layout, arrays).ravel()
     last = np.maximum.accumulate(np.where(read, np.arange(len(read)), 0))
