@@ -244,6 +244,57 @@ def _film(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
+def _drive(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Show the Husky driving: the policy of a pack, or the only run of a scene, on its task; without one, the "
+        "scripted driver. A film is written, or the page of twin view opened."
+    )
+    parser.add_argument("scene", type=Path, help="folder of a built scene, a pack, or the name of one: demo")
+    parser.add_argument("--view", action="store_true", help="in the browser; there press Drive")
+    parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function")
+    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
+    parser.add_argument("--task", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5 (default: drawn by the seed)")
+    parser.add_argument("--seed", type=int, default=0, help="of the episode")
+    parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free one; 0: any")
+    parser.add_argument("--out", type=Path, help="the mp4; default: in SCENE/films, of a pack in the working folder")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _pack(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Pack a built scene into one file with what driving in it needs, for another machine."
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="the pack; default: NAME.twin in this folder")
+    parser.add_argument(
+        "--policy",
+        action="append",
+        default=[],
+        help="a run, a checkpoint or an ONNX file to take along; may be repeated",
+    )
+    parser.add_argument("--licence", default="", metavar="TEXT", help="terms for its receivers, such as 'CC BY 4.0'")
+    parser.add_argument("--with-positions", action="store_true", help="take the films' GPS positions along")
+    parser.add_argument(
+        "--levels",
+        type=int,
+        default=256,
+        help="values to which the field's features are rounded: fewer make the pack smaller, and another field; 256: "
+        "as built, bit for bit",
+    )
+    parser.add_argument("--trust", action="store_true", help="take a policy along that may run code")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _unpack(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Unpack a pack into a scene folder, in which all verbs work that need no films. Its paths, sizes and digests "
+        "are checked, and nothing in it runs."
+    )
+    parser.add_argument("pack", type=Path, help="the file")
+    parser.add_argument("folder", type=Path, help="folder to make")
+    parser.add_argument("--trust", action="store_true", help="take policies that may run code when they are loaded")
+    parser.add_argument("--quiet", action="store_true", help="no summary")
+
+
 def _view(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Show a built scene in the browser: look around under any lighting, drive the Husky by keys or a policy, put "
@@ -480,9 +531,12 @@ VERBS = {
     "build": Verb("turn a scene folder into a drivable twin, with a report and a review film", _build, "twin.build"),
     "relight": Verb("add a lighting to a built scene, from one photo", _relight, "twin.relight"),
     "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),
+    "drive": Verb("show the Husky driving in a scene or a pack", _drive, "twin.drive"),
     "view": Verb("look at a built scene and drive in it, in the browser", _view, "twin.view.__main__"),
     "film": Verb("film a drive in a built scene", _film, "twin.film"),
     "export": Verb("write the place for other programs: USD, glTF, splats, cameras", _export, "twin.export.__main__"),
+    "pack": Verb("pack a built scene into one file, with policies, for another machine", _pack, "twin.pack"),
+    "unpack": Verb("unpack such a file into a scene folder", _unpack, "twin.unpack"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
     "validate": Verb("measure how often policies succeed, lighting by lighting", _validate, "twin.validate"),
     "trial": Verb("judge a trial on the road from the robot's recording", _trial, "twin.trial"),

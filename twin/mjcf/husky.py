@@ -8,6 +8,7 @@ to `twin/assets/husky/husky.xml`; to attach it to another scene:
     spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,81 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     spec.option.viscosity = params.ground_viscosity
     # The default of 1e-8 takes twice the Newton iterations for the same motion.
     spec.option.tolerance = 1e-5
+
+
+@dataclass(frozen=True)
+class WrongOption:
+    """An option with which the robot's tires do not skid as real ones."""
+
+    option: str
+    found: str
+    expected: str
+    cost: str
+    """Effect on a turn on the spot, as `benchmarks/husky_options.py` measures it; or what it does, if nothing turns."""
+
+    def __str__(self) -> str:
+        return f"{self.option} is {self.found}; expected {self.expected}: {self.cost}"
+
+
+def check(model: mujoco.MjModel) -> list[WrongOption]:
+    """The options of a model with a Husky in it that are wrong for skidding; empty if all are right.
+
+    MuJoCo keeps the options of the scene that a robot is attached to, and lets its ground override the tires' contacts.
+
+    Raises ValueError if the model has no Husky.
+    """
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    tires = [i for i, name in enumerate(names) if name.endswith(tuple(f"{wheel}_tyre" for wheel in WHEELS))]
+    if len(tires) < len(WHEELS):
+        raise ValueError("no Husky in the model: expected geoms named front_left_tyre and so on, after any prefix")
+    opt, out = model.opt, []
+
+    def expect(right: bool, option: str, found: Any, expected: str, cost: str) -> None:
+        if not right:
+            out.append(WrongOption(option, str(found), expected, cost))
+
+    def name_of(value: Any) -> str:
+        return value.name.split("_", 1)[-1].lower()
+
+    cone, integrator = mujoco.mjtCone(opt.cone), mujoco.mjtIntegrator(opt.integrator)
+    implicit = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_IMPLICIT
+    expect(cone == mujoco.mjtCone.mjCONE_ELLIPTIC, "cone", name_of(cone), "elliptic", COSTS["cone"])
+    expect(opt.impratio >= 5.0, "impratio", f"{opt.impratio:g}", "10", COSTS["impratio"])
+    expect(integrator in implicit, "integrator", name_of(integrator), "implicitfast", COSTS["integrator"])
+    expect(opt.timestep <= 0.005, "timestep", f"{1e3 * opt.timestep:g} ms", "2 ms, at most 5", COSTS["timestep"])
+    expect(opt.iterations >= 3, "iterations", opt.iterations, "3 or more", COSTS["iterations"])
+    expect(opt.tolerance <= 1e-3, "tolerance", f"{opt.tolerance:g}", "1e-5", COSTS["tolerance"])
+    override = bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+    expect(not override, "flag override", "enabled", "disabled", COSTS["contact"])
+    for bit, flag in (
+        (mujoco.mjtDisableBit.mjDSBL_EQUALITY, "equality"),
+        (mujoco.mjtDisableBit.mjDSBL_CONTACT, "contact"),
+        (mujoco.mjtDisableBit.mjDSBL_ACTUATION, "actuation"),
+        (mujoco.mjtDisableBit.mjDSBL_GRAVITY, "gravity"),
+    ):
+        expect(not opt.disableflags & bit, f"flag {flag}", "disabled", "enabled", "the robot cannot drive without it")
+    tire_priority = int(model.geom_priority[tires].min())
+    bodies = set(model.body_rootid[model.geom_bodyid[tires]])
+    for i in range(model.ngeom):
+        solid = model.geom_contype[i] or model.geom_conaffinity[i]
+        if solid and model.body_rootid[model.geom_bodyid[i]] not in bodies and model.geom_priority[i] >= tire_priority:
+            what, most = f"priority of geom {names[i] or i}", f"below the tires' {tire_priority}"
+            expect(False, what, int(model.geom_priority[i]), most, COSTS["contact"])
+    if set(tires) & {*model.pair_geom1, *model.pair_geom2}:
+        expect(False, "contact pair", "given for a tire", "none", COSTS["contact"])
+    return out
+
+
+COSTS = {
+    "cone": "a pyramidal cone turns with 23 % too little torque, and creeps down a slope at 9 cm/s",
+    "impratio": "at 1, a parked robot creeps down a slope ten times faster, at 7 mm/s",
+    "integrator": "with Euler and RK4 the wheels hop (3 m/s² at the camera), with three times the torque",
+    "timestep": "at 10 ms the wheels hop (10 m/s²), with three times the torque, and the robot turns 26 % slower",
+    "iterations": "with 1, a parked robot creeps down a slope at 15 cm/s",
+    "tolerance": "at 1e-2, a parked robot creeps down a slope at 9 mm/s",
+    "contact": "with MuJoCo's default contacts the wheels hop (14 m/s²), and the robot turns 28 % slower",
+}
+"""Cost of a wrong option by its name, from `benchmarks/husky_options.py`."""
 
 
 def add_husky(
