@@ -25,7 +25,7 @@ from twin.env.weather import Weather
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.husky import ROBOT_COLLISION_GROUP, camera_mount_geoms
-from twin.mjcf.world import World
+from twin.mjcf.world import GROUND_GROUP, World
 from twin.nerf.rendering import FAR, Rendering
 from twin.runtime import available_cores, log_line
 from twin.types import Array, Array32, Image
@@ -41,7 +41,8 @@ _SCENE_SETTINGS: dict[str, Any] = {  # collision parts are not drawn
     "use_shadows": True,
     "enable_backface_culling": False,
 }
-_SPLAT_SETTINGS = _SCENE_SETTINGS | {"enabled_geom_groups": [1, OBSTACLE_GROUP]}  # ground and mesh are not drawn
+_SPLAT_SETTINGS = _SCENE_SETTINGS | {"enabled_geom_groups": [GROUND_GROUP, 1, OBSTACLE_GROUP]}  # no visual mesh
+_GROUND_BELOW_SPLATS = 0.15  # [m] by which the ground is drawn lower, to show only where there are no splats
 
 
 def camera_intrinsics(model: mujoco.MjModel, camera: int, size: tuple[int, int]) -> Array:
@@ -117,7 +118,8 @@ class SceneRenderer:
     """Renders envs as MuJoCo shows them to their front cameras; has the interface of `Compositor`.
 
     It draws obstacles and the robot under the model's own lights, and as the place either the visual mesh in its filmed
-    colors with the ground, or Gaussian splats, which hide what lies behind them and are hidden by what is before them.
+    colors with the ground, or Gaussian splats, which hide what lies behind them and are hidden by what is before them;
+    the ground is then seen through their gaps.
     """
 
     def __init__(
@@ -130,6 +132,8 @@ class SceneRenderer:
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
         model = copy.copy(model)
         model.geom_group[camera_mount_geoms(model, self._camera)] = ROBOT_COLLISION_GROUP  # not drawn
+        if splats is not None:
+            model.geom_pos[model.geom("ground").id, 2] -= _GROUND_BELOW_SPLATS
         # One after the other, as Warp compiles kernels at their first use.
         threads = min(max_envs, available_cores())
         settings = _SCENE_SETTINGS if splats is None else _SPLAT_SETTINGS | splats.render_settings()

@@ -212,7 +212,7 @@ class _Baker:
 
     def colors(self, points: Array, normals: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 where no view shows one."""
-        given = [wp.array(x.astype(np.float32), dtype=wp.vec3, device="cpu") for x in (points, normals)]
+        given: list[Any] = [wp.array(x.astype(np.float32), dtype=wp.vec3, device="cpu") for x in (points, normals)]
         out = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
         total = wp.zeros(len(points), dtype=float, device="cpu")
         settings = [_TEXEL_TOLERANCE, _SHARPNESS]
