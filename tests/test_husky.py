@@ -215,15 +215,12 @@ def test_the_scene_of_the_folder_is_the_robot_on_a_plane():
 
 
 RIGHT = husky_options.RIGHT
+QUICK = (RIGHT, "`cone` pyramidal (MuJoCo's default)", "`timestep` 5 ms", "`solver` PGS")
 
 
-@pytest.mark.parametrize("name", [
-    RIGHT,
-    "`cone` pyramidal (MuJoCo's default)",
-    "`timestep` 5 ms",
-    "`solver` PGS",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in list(husky_options.CASES)[2:]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in husky_options.CASES]
+)
 def test_check_finds_the_options_that_cost_something_and_no_others(name):
     road = reconstructed(np.random.default_rng(0))
     right, found = (husky_options.measure(husky_options.CASES[key], road) for key in (RIGHT, name))
