@@ -2,9 +2,9 @@
 
     python benchmarks/husky_options.py [--json FILE]
 
-Turns on the spot at a commanded 1 rad/s on a plane and on a flat road as the mesh stage reconstructs it: yaw rate and motor
-torque over those with the right options on the plane, power of the motors over the contacts' dissipation (1 if energy is
-conserved), and the vertical acceleration at the camera (jolt). Parked on a slope: creep. Takes a minute.
+Turns on the spot at a commanded 1 rad/s on a plane and on a flat road as the mesh stage reconstructs it: yaw rate and
+motor torque over those with the right options on the plane, power of the motors over the contacts' dissipation (1 if
+energy is conserved), and the vertical acceleration at the camera (jolt). Parked on a slope: creep. Takes a minute.
 """
 
 import argparse
@@ -54,21 +54,21 @@ def pairs(spec: mujoco.MjSpec) -> None:
 
 
 RIGHT = "as `set_options` sets them"
-I, S = mujoco.mjtIntegrator, mujoco.mjtSolver
+Integrator, Solver = mujoco.mjtIntegrator, mujoco.mjtSolver
 CASES: dict[str, Edit | None] = {
     RIGHT: None,
     "`cone` pyramidal (MuJoCo's default)": option(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL),
     "`impratio` 1 (MuJoCo's default)": option(impratio=1.0),
     "`impratio` 100": option(impratio=100.0),
-    "`integrator` Euler (MuJoCo's default)": option(integrator=I.mjINT_EULER),
-    "`integrator` RK4": option(integrator=I.mjINT_RK4),
-    "`integrator` implicit": option(integrator=I.mjINT_IMPLICIT),
+    "`integrator` Euler (MuJoCo's default)": option(integrator=Integrator.mjINT_EULER),
+    "`integrator` RK4": option(integrator=Integrator.mjINT_RK4),
+    "`integrator` implicit": option(integrator=Integrator.mjINT_IMPLICIT),
     "`timestep` 5 ms": option(timestep=0.005),
     "`timestep` 4 ms": option(timestep=0.004),
     "`timestep` 10 ms": option(timestep=0.01),
-    "`solver` PGS": option(solver=S.mjSOL_PGS),
-    "`solver` CG": option(solver=S.mjSOL_CG),
-    "`solver` PGS, 10 `iterations`": option(solver=S.mjSOL_PGS, iterations=10),
+    "`solver` PGS": option(solver=Solver.mjSOL_PGS),
+    "`solver` CG": option(solver=Solver.mjSOL_CG),
+    "`solver` PGS, 10 `iterations`": option(solver=Solver.mjSOL_PGS, iterations=10),
     "`iterations` 1": option(iterations=1),
     "`iterations` 3": option(iterations=3),
     "`iterations` 10": option(iterations=10),
@@ -79,7 +79,7 @@ CASES: dict[str, Edit | None] = {
     "flag `override` enabled": option(enableflags=mujoco.mjtEnableBit.mjENBL_OVERRIDE),
     "contact `pair` of each tire, otherwise MuJoCo's default": pairs,
     "cone, impratio, integrator as MuJoCo's default": option(
-        cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=1.0, integrator=I.mjINT_EULER, tolerance=1e-8
+        cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=1.0, integrator=Integrator.mjINT_EULER, tolerance=1e-8
     ),
 }
 

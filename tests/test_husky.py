@@ -1,13 +1,25 @@
 """The Husky's model: constants, names, sensors, camera, standalone file. Its motion: `test_acceptance.py`."""
 
+import husky_options
 import mujoco
 import numpy as np
 import pytest
 from acceptance.drives import drive, on_plane, state_at_rest
+from acceptance.grounds import reconstructed
 from acceptance.rows import MASS
 
 from twin.env.physics import HuskyPhysics
-from twin.mjcf.husky import HUSKY_XML, add_husky, center_of_mass, coulomb_track_ratio, set_options, standalone_xml
+from twin.mjcf.husky import (
+    HUSKY_XML,
+    SCENE,
+    SCENE_XML,
+    add_husky,
+    center_of_mass,
+    check,
+    coulomb_track_ratio,
+    set_options,
+    standalone_xml,
+)
 from twin.robot import GEAR_RATIO, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams, PixelCamera
 
 
@@ -189,3 +201,41 @@ def test_shipped_file_attaches_and_drives_like_the_model():
     np.testing.assert_allclose(there.qpos[:3] - [0, 0, 0.5], here.qpos[:3], atol=1e-4)
     np.testing.assert_allclose(there.qvel, here.qvel, atol=1e-3)
     assert here.qvel[5] > 0.9  # it did turn
+
+
+def test_the_scene_of_the_folder_is_the_robot_on_a_plane():
+    assert SCENE_XML.read_text(encoding="utf-8") == SCENE
+    model = mujoco.MjModel.from_xml_path(str(SCENE_XML))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 500)
+    data.ctrl[:] = -3.0, 3.0
+    mujoco.mj_step(model, data, 1000)
+    assert data.qvel[5] == pytest.approx(3.0 * 2 * WHEEL_RADIUS / (1.812 * TRACK), rel=0.02)
+    assert not any(warning.number for warning in data.warning) and not check(model)
+
+
+RIGHT = husky_options.RIGHT
+QUICK = (RIGHT, "`cone` pyramidal (MuJoCo's default)", "`timestep` 5 ms", "`solver` PGS")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in husky_options.CASES]
+)
+def test_check_finds_the_options_that_cost_something_and_no_others(name):
+    road = reconstructed(np.random.default_rng(0))
+    right, found = (husky_options.measure(husky_options.CASES[key], road) for key in (RIGHT, name))
+    assert bool(found.faults) == found.differs(right)
+
+
+def test_check_names_what_is_wrong_in_a_scene_of_defaults():
+    floor = "<geom name='floor' type='plane' size='9 9 1'/>"
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{floor}</worldbody></mujoco>")
+    with pytest.raises(ValueError, match="no Husky in the model"):
+        check(spec.compile())
+    spec.attach(mujoco.MjSpec.from_file(str(HUSKY_XML)), prefix="a/", frame=spec.worldbody.add_frame())
+    assert [one.option for one in check(spec.compile())] == ["cone", "impratio", "integrator"]
+    set_options(spec)
+    assert not check(spec.compile())
+    spec.geom("floor").priority = 1
+    assert [one.option for one in check(spec.compile())] == ["priority of geom floor"]
+    assert "the wheels hop" in str(check(spec.compile())[0])

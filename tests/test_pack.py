@@ -300,7 +300,7 @@ HOSTILE = {
     "code": (add("build/5_mjcf/evil.py"), "has no place in a scene"),
     "hidden": (add("lightings/.bashrc"), "has no place in a scene"),
     "link": (add("build/5_mjcf/assets/a.obj", b"/etc/passwd", stat.S_IFLNK | 0o777), "is a link"),
-    "bomb": (add("build/5_mjcf/assets/a.obj", bytes(16 << 20)), "unpacks to"),
+    "bomb": (add("build/5_mjcf/assets/a.obj", bytes(90 << 20)), "unpacks to"),
     "huge": (add("build/5_mjcf/assets/a.obj", bytes=10**13), "expected at most"),
     "negative": (add("build/5_mjcf/assets/a.obj", bytes=-1), "expected at most"),
     "other size": (add("build/5_mjcf/assets/a.obj", bytes=5), "its list says otherwise"),

@@ -174,7 +174,7 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
     results = {}
     for stage in unpack.STAGES_PACKED:
         folder = require_stage(scene, stage)
-        names = _PACKED.get(stage, _MESH)
+        names: tuple[str, ...] = _PACKED.get(stage, _MESH)
         if stage == "mjcf":
             names = tuple(p.relative_to(folder).as_posix() for p in sorted(folder.rglob("*")) if p.is_file())
         kept = {name: read_bytes(folder / name) for name in names if name != "stamp.json" and (folder / name).is_file()}
@@ -187,7 +187,8 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
             )
             if levels < LEVELS:
                 results[stage] = digest_json([stamp.result, levels])
-        sizes, digests = ({name: of(content) for name, content in kept.items()} for of in (len, unpack.digest))
+        sizes = {name: len(content) for name, content in kept.items()}
+        digests = {name: unpack.digest(content) for name, content in kept.items()}
         stamp = replace(stamp, result=results[stage], depends={}, metrics={}, files=sizes, sha256=digests)
         kept["stamp.json"] = stamp.content()
         files |= {f"build/{STAGES[stage]}/{name}": content for name, content in kept.items()}

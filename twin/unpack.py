@@ -47,7 +47,7 @@ STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
 
 _MAX_FILES = 20_000
 _MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] of a file and of all, unpacked
-_MAX_RATIO, _FREE = 100, 16 << 20  # total size over the pack's, from a total of `_FREE` bytes on
+_MAX_RATIO, _FREE = 30, 16 << 20  # total size over the pack's, from a total of `_FREE` bytes on
 _MAX_MANIFEST = 16 << 20  # [bytes]
 _CHUNK = 4 << 20  # [bytes]
 _N = r"\w[\w.+-]{0,99}"  # a name in a path; a leading dot, and so "..", has no place

@@ -1,11 +1,13 @@
 """MuJoCo model of the Clearpath Husky A200, its visual geoms, and its quasi-static skid steering.
 
-Constants and frames: `twin.robot`. Names in the model: `add_husky`. `python -m twin.mjcf.husky` writes the robot alone
-to `twin/assets/husky/husky.xml`; to attach it to another scene:
+Constants and frames: `twin.robot`. Names in the model: `add_husky`. `python -m twin.mjcf.husky` writes
+`twin/assets/husky/`: the robot alone in `husky.xml`, and on a plane in `scene.xml`. To attach it to another scene, and
+to find out which of that scene's options are wrong:
 
     husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tires need these
     robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
     spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
+    print(*husky.check(spec.compile()), sep="\\n")
 """
 
 from dataclasses import dataclass
@@ -38,6 +40,8 @@ from twin.types import Array
 TIMESTEP = 0.002  # [s]
 HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
 """The published robot alone, without a floor."""
+SCENE_XML = HUSKY_XML.with_name("scene.xml")
+"""The same on a plane, to be opened in a viewer."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
 _WHEEL_INERTIA = (0.02467, 0.04411, 0.02467)  # [kg m²], the axle is y
@@ -563,7 +567,7 @@ def standalone_xml() -> str:
 
 
 _XML_HEADER = """<!--
-  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures and licence: NOTICE.md.
+  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures: README.md; licence: LICENSE.
 
   body, free joint  base_link
   joints            front_left_wheel, front_right_wheel, rear_left_wheel, rear_right_wheel
@@ -579,6 +583,33 @@ _XML_HEADER = """<!--
 """
 
 
+SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not edit. It turns with ctrl -3 and 3. -->
+<mujoco model="husky scene">
+  <include file="husky.xml"/>
+
+  <statistic center="0 0 0.3" extent="1.5"/>
+
+  <visual>
+    <headlight diffuse="0.6 0.6 0.6" ambient="0.3 0.3 0.3" specular="0 0 0"/>
+    <global azimuth="-140" elevation="-20" offwidth="1280" offheight="720"/>
+  </visual>
+
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.55 0.68 0.85" rgb2="0.9 0.92 0.94" width="64" height="384"/>
+    <texture type="2d" name="floor" builtin="checker" rgb1="0.36 0.38 0.4" rgb2="0.3 0.32 0.34" width="256"
+      height="256"/>
+    <material name="floor" texture="floor" texuniform="true" texrepeat="1 1" reflectance="0.05"/>
+  </asset>
+
+  <worldbody>
+    <light pos="0 0 4" dir="0.2 0.3 -1" directional="true"/>
+    <geom name="floor" type="plane" size="20 20 0.1" material="floor"/>
+  </worldbody>
+</mujoco>
+"""
+
+
 if __name__ == "__main__":
     HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
-    print(f"wrote {HUSKY_XML}")
+    SCENE_XML.write_text(SCENE, encoding="utf-8")
+    print(f"wrote {HUSKY_XML} and {SCENE_XML}")
