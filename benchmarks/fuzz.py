@@ -261,7 +261,7 @@ def main() -> int:
     )
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    sys.path[:0] = [str(_HERE), str(_ROOT / "tests"), str(_ROOT)]
+    sys.path[:0] = [str(_HERE), str(_ROOT / "tests"), str(_ROOT), str(_ROOT / "ros2" / "twin_policy")]
     if options.child:
         _run_child(options.child, options.seed, options.limit)
         return 0

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from twin.robot import WHEELS
+from twin.robot import TRACK, WHEEL_RADIUS, WHEELS
 
 _TOPICS = {
     "commands": ("/cmd_vel", "geometry_msgs/msg/TwistStamped"),
@@ -19,7 +19,7 @@ _TOPICS = {
 
 
 def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = ()) -> Path:
-    """A table of `twin.sysid.logs` as a bag; the wheels' own odometry stands still, so that using it shows."""
+    """A table of `twin.sysid.logs` as a bag; the wheels' poses stand still, so that using them shows."""
     store = get_typestore(Stores.LATEST)
     t = store.types
     zero = np.zeros(9)
@@ -30,9 +30,9 @@ def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = 
     def turn(yaw: float):
         return t["geometry_msgs/msg/Quaternion"](0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
 
-    def odometry(header, x: float, y: float, yaw: float):
+    def odometry(header, x: float, y: float, yaw: float, v: float = 0.0, yaw_rate: float = 0.0):
         pose = t["geometry_msgs/msg/Pose"](t["geometry_msgs/msg/Point"](x, y, 0.0), turn(yaw))
-        twist = t["geometry_msgs/msg/Twist"](vector(), vector())
+        twist = t["geometry_msgs/msg/Twist"](vector(v), vector(z=yaw_rate))
         return t["nav_msgs/msg/Odometry"](
             header,
             "base_link",
@@ -57,7 +57,10 @@ def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = 
                     header, t["geometry_msgs/msg/Twist"](vector(row["cmd_v"]), vector(z=row["cmd_yaw_rate"]))
                 ),
                 "poses": odometry(header, row["x"], row["y"], row["yaw"]),
-                "wheel odometry": odometry(header, 0.0, 0.0, 0.0),
+                "wheel odometry": odometry(
+                    *(header, 0.0, 0.0, 0.0, (sides[1] + sides[0]) * WHEEL_RADIUS / 2),
+                    (sides[1] - sides[0]) * WHEEL_RADIUS / (TRACK * 1.875),
+                ),
                 "imu": t["sensor_msgs/msg/Imu"](
                     header,
                     turn(0.0),

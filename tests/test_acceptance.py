@@ -14,7 +14,7 @@ _TABLE = {f"{letter}{n + 1}" for letter, count in zip("ABCDE", (2, 8, 3, 6, 4), 
 
 
 @pytest.mark.parametrize("key", MEASURES)
-def test_row(key):
+def test_each_quantity_of_the_husky_is_within_its_bounds(key):
     rows = MEASURES[key](Subject())
     assert {row.id for row in rows} == set(key.split())
     assert not [row for row in rows if not row.passed]
@@ -25,7 +25,7 @@ def test_no_row_is_left_out():
 
 
 @pytest.mark.parametrize("control", CONTROLS, ids=lambda control: control.name)
-def test_negative_control(control):
+def test_each_wrong_robot_fails_its_rows(control):
     for key in control.fails:
         assert not all(row.passed for row in MEASURES[key](control.subject)), key
 
@@ -57,7 +57,7 @@ def test_ground_and_controller_of_the_given_robot_are_used():
     assert fastest == pytest.approx(0.4, rel=0.02)
 
 
-def test_nan_fails():
+def test_nan_is_outside_every_bound():
     assert not Row("X", "", float("nan"), -1e9, 1e9).passed
     assert Row("X", "", 1.0, 1.0, 1.0).passed
 

@@ -20,7 +20,7 @@ from twin.sysid.identification import Identification, identify, robot_toml
 from twin.sysid.kinematics import IcrModel, Prediction
 
 
-def test_arc_in_closed_form():
+def test_constant_wheel_speeds_drive_a_circle():
     """Constant wheel speeds make a circle: radius and angle are known."""
     left, right = 2.0, 5.0
     wheels = np.broadcast_to([left, right], (1, logs.SAMPLES, 2)).copy()
@@ -35,7 +35,7 @@ def test_arc_in_closed_form():
     assert yaw == pytest.approx(angle)
 
 
-def test_icr_of_icr_motion_is_found():
+def test_the_icr_model_is_recovered_from_its_own_motion():
     rng = np.random.default_rng(0)
     truth = IcrModel(0.93, 0.97, 0.55, -0.62, -0.08)
     wheels = np.repeat(rng.uniform(-6, 6, (60, 1, 2)), logs.SAMPLES, 1)
@@ -98,7 +98,7 @@ def test_the_drivetrain_is_the_controller_run_every_step():
     np.testing.assert_allclose(targets[:, : logs.SAMPLES * 5], np.stack(expected, 1), rtol=0, atol=1e-9)
 
 
-def test_a_ramp_goes_on_from_window_to_window():
+def test_acceleration_ramps_continue_from_window_to_window():
     """Wheels that lag behind a ramp do not show how far it has come when a window begins; the windows before do."""
     drive = drivetrain.Drivetrain(1.0, 1.0, 9.0, 9.0, 0.2, 1.0, 9.0, 0.3)
     time = np.arange(3 * logs.SAMPLES) * logs.PERIOD
@@ -115,7 +115,7 @@ def test_a_ramp_goes_on_from_window_to_window():
 
 
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])
-def test_late_poses_are_earlier_ones(late):
+def test_a_pose_delay_shows_earlier_poses(late):
     """A robot that speeds up along a straight line, and one that goes on around a circle."""
     time = (
         np.arange(rollout.LEAD_SAMPLES + logs.SAMPLES + drivetrain.EXTRA_SAMPLES) - rollout.LEAD_SAMPLES
@@ -243,7 +243,7 @@ def test_components_that_were_not_fitted_are_named():
     assert robot["center_of_mass"]["standard_error"] == [0.003, None, None]
 
 
-def test_a_log_that_identifies_nothing():
+def test_a_log_that_identifies_nothing_keeps_previous_fields():
     result = aligned()
     assert "fitted: nothing" in summary(result)
     text = robot_toml(result, {"friction": 0.3}, "log")
@@ -291,13 +291,13 @@ def test_an_unwritable_folder_is_refused_before_the_fit(out, drive, tmp_path, mo
         (["husky", "x.csv", "--out", "out"], "no such log"),
     ],
 )
-def test_bad_arguments(arguments, message, capsys, tmp_path, monkeypatch):
+def test_bad_arguments_exit_with_status_2(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
     assert message in capsys.readouterr().err
 
 
-def test_effort_of_motors():
+def test_motor_effort_is_relative_to_a_straight_drive():
     """Made-up currents: the right side, outer in a left turn, takes three times a straight drive's, the left half."""
     speeds = np.concatenate([np.full((50, 2), 0.5), np.full((50, 2), [0.4, 0.6])])
     amps = np.concatenate([np.full((50, 2), 2.0), np.full((50, 2), [1.0, 6.0])])

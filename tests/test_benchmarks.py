@@ -61,7 +61,7 @@ def test_a_missing_gpu_is_reported(scripts, monkeypatch, tmp_path):
     assert [name for name in env.TARGETS if name.startswith("gpu.")] == ["gpu.steps_per_s"]
 
 
-def test_visual_vs_collision_drives_the_scene_s_own_robot(scripts, monkeypatch, tmp_path):
+def test_visual_vs_collision_drives_the_robot_of_the_scene(scripts, monkeypatch, tmp_path):
     import overlay
 
     class Called(Exception):
@@ -90,7 +90,7 @@ def test_peak_memory_is_that_of_this_process(scripts):
 
 @pytest.mark.realdata
 @pytest.mark.slow
-def test_training_within_a_budget(real_data, tmp_path):
+def test_training_stops_within_its_time_budget(real_data, tmp_path):
     file = tmp_path / "figures.json"
     command = [sys.executable, BENCHMARKS / "field.py", "--quick", "--only", "fox", "gpu", "--data", real_data]
     done = subprocess.run([*map(str, command), "--json", str(file)], capture_output=True, text=True)

@@ -108,7 +108,7 @@ def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):
     assert _rerun(pipeline, "capture.fps=2.5") == ["capture"]
 
 
-def test_changed_input_version_damage_and_force(pipeline, monkeypatch):
+def test_a_change_of_input_version_or_files_reruns_what_depends_on_it(pipeline, monkeypatch):
     _rerun(pipeline)
     (pipeline.root / "input/a.txt").write_text("another film")
     assert _rerun(pipeline) == ["capture", "cameras", "field"]
@@ -150,7 +150,7 @@ def test_images_listed_in_transforms_json_are_inputs_in_any_folder(tmp_path):
     assert set(verb.input_digests(SceneDir(root), config)) == {"input/transforms.json"}
 
 
-def test_until_and_report(pipeline):
+def test_until_stops_after_its_stage_and_the_report_is_written(pipeline):
     report = verb.build(pipeline.root, until="cameras")
     assert pipeline.ran == ["capture", "cameras"] and list(report["stages"]) == ["capture", "cameras"]
     written = json.loads(pipeline.scene.report_json.read_text())

@@ -133,7 +133,7 @@ def scene(tmp_path: Path) -> SceneDir:
     return scene
 
 
-def test_the_page_says_what_happened(scene: SceneDir) -> None:
+def test_the_page_shows_the_results_of_every_stage(scene: SceneDir) -> None:
     write_page(scene, REPORT)
     text = read(scene.report_html.read_text(encoding="utf-8")).text
     assert "The Husky followed the 59.8 m route from start to end and touched nothing but the ground." in text
@@ -206,7 +206,7 @@ def test_nothing_is_fetched_from_elsewhere(scene: SceneDir) -> None:
     assert "video" in parser.tags
 
 
-def test_without_a_film_none_is_offered(scene: SceneDir) -> None:
+def test_a_page_without_a_video_has_no_player(scene: SceneDir) -> None:
     assert "video" not in read(page(scene, REPORT)).tags
 
 
@@ -223,7 +223,7 @@ def test_without_a_film_none_is_offered(scene: SceneDir) -> None:
         ),
     ],
 )
-def test_the_headline(follower: dict[str, Any], sentence: str, mood: str) -> None:
+def test_the_headline_states_the_outcome_of_the_drive(follower: dict[str, Any], sentence: str, mood: str) -> None:
     verdict = follower_verdict(changed("review.follower", follower))
     assert verdict.text.endswith(sentence)
     assert verdict.mood == mood
@@ -303,7 +303,7 @@ def test_nothing_wrong_gives_no_caution() -> None:
 
 @pytest.mark.usefixtures("no_charts")
 @pytest.mark.parametrize(("section", "path", "value", "what"), CAUTIONS)
-def test_what_is_wrong_is_said_with_a_cure_below_and_above(
+def test_every_defect_gives_a_caution_with_a_cure_in_section_and_summary(
     scene: SceneDir, section: str, path: str, value: Any, what: str
 ) -> None:
     report = changed(path, value)
@@ -321,7 +321,7 @@ def test_what_is_wrong_is_said_with_a_cure_below_and_above(
     assert len(printed) == 1 and caution.what in printed[0] and caution.cure in printed[0]
 
 
-def test_every_kind_of_caution_is_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.MonkeyPatch) -> None:
     """A caution that the code can give and the list above lacks would not be tested."""
     given: set[int] = set()
     limits: set[str] = set()
@@ -354,7 +354,7 @@ def test_every_kind_of_caution_is_among_them(monkeypatch: pytest.MonkeyPatch) ->
         if "Caution(" in path.read_text(encoding="utf-8").replace("class Caution", "")
     }
     # The pages of a validation and of a forecast have their own.
-    assert elsewhere == {"build_sections", "validation_report", "forecast_report"}
+    assert elsewhere == {"build_sections", "validation_report", "forecast_text"}
 
 
 @pytest.mark.usefixtures("no_charts")
@@ -368,7 +368,7 @@ def test_every_kind_of_caution_is_among_them(monkeypatch: pytest.MonkeyPatch) ->
     ),
     missing=st.sets(st.sampled_from(list(REPORT)), max_size=3),
 )
-def test_no_summary_is_greener_than_its_sections(
+def test_no_summary_has_a_better_mood_than_its_sections(
     wrong: list[tuple[str, str, Any, str]], numbers: dict[str, Any], missing: set[str]
 ) -> None:
     report = {key: value for key, value in REPORT.items() if key not in missing or key in ("stages", "seconds")}
@@ -399,7 +399,7 @@ def test_a_failed_drive_says_what_to_try() -> None:
     assert "part_0001" in cautions[1].what
 
 
-def test_truth_is_told_where_it_is_known(scene: SceneDir) -> None:
+def test_errors_against_ground_truth_are_shown_where_it_is_known(scene: SceneDir) -> None:
     assert "generated places only" in truth_section(REPORT).not_applicable
     known = changed("truth", {"ate_m": 0.042, "ground_median_m": 0.09, "corridor_intrusions": 2, "scale_error": None})
     section = truth_section(known)
@@ -456,7 +456,7 @@ def next_commands(scene: SceneDir, report: dict[str, Any]) -> list[str]:
     return [line for _, commands in report_page._next_steps(scene, report) for line in commands]
 
 
-def test_small_words() -> None:
+def test_numbers_durations_and_names_are_formatted_as_stated() -> None:
     assert number(None) == number(True) == number("x") == NOT_MEASURED
     assert number(2, "{:.1f} m") == "2.0 m"
     assert duration(8.24) == "8.2 s" and duration(59.96) == "1 min 00 s" and duration(None) == NOT_MEASURED

@@ -38,7 +38,7 @@ def test_augmentation_is_unbiased_and_repeats_with_the_seed():
     assert (means[:, 0] - means[:, 2]).std() > 3.0  # and so does tint
 
 
-def test_rectangles_of_one_colour_cover_some():
+def test_rectangles_of_one_color_cover_some_stacks():
     """Noise has no color twice, so repeated colors are rectangles."""
     picture = np.random.default_rng(3).integers(60, 190, (3, 45, 80), np.uint8)
     before = np.repeat(np.tile(picture, (4, 1, 1))[None], 200, 0)

@@ -98,7 +98,7 @@ def test_missing_file_suggests_the_verb_new(tmp_path):
         load_config(tmp_path / "scene.toml")
 
 
-def test_segments_of_films(tmp_path):
+def test_segments_of_films_are_read(tmp_path):
     config = load_config(_write(tmp_path, _MINIMAL + "keep = [[0, 3], [4.5, 6]]\n"), ("capture.keep=[[1, 2]]",))
     assert config.source[0].keep == ((0.0, 3.0), (4.5, 6.0)) and config.capture.keep == ((1.0, 2.0),)
 
@@ -117,7 +117,7 @@ def test_choices_match_the_libraries():
         assert len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList) == count
 
 
-def test_overrides(tmp_path):
+def test_overrides_replace_settings_of_the_file(tmp_path):
     path = _write(tmp_path, _MINIMAL)
     config = load_config(path, ("nerf.steps=7", "metric.up=cameras", "seed=3"))
     assert (config.nerf.steps, config.metric.up, config.seed) == (7, "cameras", 3)

@@ -19,7 +19,7 @@ def fresh(monkeypatch):
 @pytest.mark.parametrize(
     ("said", "wanted"), [("max 100000", 8), ("250000 100000", 2), ("10000 100000", 1), ("what", 8), (None, 8)]
 )
-def test_quota_of_a_container(tmp_path, monkeypatch, said, wanted):
+def test_available_cores_obey_the_quota_of_a_container(tmp_path, monkeypatch, said, wanted):
     file = tmp_path / "cpu.max"
     if said:
         file.write_text(said + "\n")
@@ -27,6 +27,6 @@ def test_quota_of_a_container(tmp_path, monkeypatch, said, wanted):
     assert runtime.available_cores() == wanted
 
 
-def test_limit_of_a_process():
+def test_available_cores_obey_the_limit_of_a_process():
     runtime.limit_cores(3)
     assert runtime.available_cores() == min(3, runtime._quota() or 3)

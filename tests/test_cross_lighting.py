@@ -27,7 +27,7 @@ class Stubborn(CheckeredField):
         return Rendering(seen.rgb, seen.depth + 0.25 * (lighting != self.lightings[0]), seen.opacity)
 
 
-def test_colour_follows_the_light_where_only_brightness_differs(tmp_path: Path) -> None:
+def test_color_follows_the_lighting_where_only_brightness_differs(tmp_path: Path) -> None:
     field = CheckeredField({"day": 1.0, "night": 0.3})
     found = cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field), max_poses=10)
     assert found is not None and found["poses"] == 10
@@ -60,7 +60,7 @@ def test_one_lighting_gives_no_result(tmp_path: Path) -> None:
     assert cross_lighting(field, make_cameras(tmp_path / "build" / "2_metric", field)) is None
 
 
-def test_masked_pixels_have_no_colour() -> None:
+def test_masked_pixels_have_no_color() -> None:
     image = np.zeros((2, 2, 3))
     image[0, 0] = 1.0
     assert np.array_equal(mean_color(image, image[..., 0] == 0), np.zeros(3))

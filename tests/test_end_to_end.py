@@ -63,14 +63,14 @@ def test_the_twin_agrees_with_the_truth(built):
     assert truth["ground_median_m"] < 0.08
 
 
-def test_the_pictures_beat_a_flat_colour(built):
+def test_the_pictures_beat_a_flat_color(built):
     """A field that learned nothing scores about what the mean colour does; this one must know the place."""
     root, _ = built
     field = json.loads((root / "build/report.json").read_text())["field"]
     assert all(value > 17 for value in field["psnr"].values()), field["psnr"]
 
 
-def test_films_and_page(built):
+def test_the_video_plays_and_the_page_is_self_contained(built):
     root, _ = built
     page = (root / "build/report.html").read_text()
     assert "data:image/" in page and "http://" not in page.replace("http://www.w3.org", "")
@@ -100,7 +100,7 @@ def test_a_second_build_has_nothing_to_do(built):
     assert all(stage["skipped"] for stage in report["stages"].values())
 
 
-def test_opening_the_twin(built):
+def test_the_twin_opens_with_its_field_world_and_cameras(built):
     root, _ = built
     scene = twin.load_scene(root)
     assert set(scene.field().lightings) == {"sun", "overcast"}

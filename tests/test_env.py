@@ -323,7 +323,7 @@ def test_the_environment_needs_no_torch():
 
 
 @pytest.mark.slow
-def test_twenty_thousand_steps(scene):
+def test_twenty_thousand_steps_leak_no_memory_and_give_no_nan(scene):
     """No NaN, no memory growth; `benchmarks/env.py --only soak` takes five times as many, with pictures."""
     envs = LocalVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1])
     rng = np.random.default_rng(0)

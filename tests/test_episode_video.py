@@ -44,7 +44,7 @@ def straight(k: int = 101) -> RecordedDrive:
     return drive_along(x, 0.2 * np.sin(x), np.zeros(k))
 
 
-def test_the_numbers_of_a_quarter_circle_to_the_right() -> None:
+def test_metrics_of_a_quarter_circle_to_the_right_are_exact() -> None:
     angle = np.linspace(0.0, np.pi / 2, 401)
     metrics = drive_metrics(drive_along(10 * np.sin(angle), -10 * (1 - np.cos(angle)), -angle))
     assert metrics["turn_deg"] == pytest.approx(-90.0)

@@ -1,125 +1,182 @@
-"""Export: splats lie on the surfaces of the views and render like them in MuJoCo; colors of the mesh."""
+"""The verb: files and folders for other programs, read back by their own readers; bad arguments get one line."""
 
-import mujoco
+import io
+import json
+from pathlib import Path
+
 import numpy as np
+import pycolmap
 import pytest
+import trimesh
+from test_gaussians import floor_views
+from tiny_twin import tiny_twin
 
-from twin import export
-from twin.assets.views import Views
-from twin.export import Gaussians, gaussians_of_views, select_sharpest
-from twin.geometry.cameras import opencv_to_mujoco
+from twin.assets.gaussians import read_ply
+from twin.capture.formats import read_model, read_transforms
+from twin.export import gltf
+from twin.export.__main__ import main
+from twin.geometry.cameras import Cameras, SparsePoints, project
+from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
+from twin.scene import write_stamp
 
-SIZE = (60, 40)
-FOCAL = 40.0
-
-
-def _views(eyes) -> Views:
-    """Views of the floor z = 0 in quarters of four colors, from above at a slant."""
-    poses = np.array([look_at(np.array(eye), np.array([0.0, 0.1, 0.0])) for eye in eyes])
-    k = np.tile([FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2], (len(poses), 1))
-    v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
-    rays = np.stack([(u - k[0, 2]) / FOCAL, (v - k[0, 3]) / FOCAL, np.ones_like(u)], -1)
-    depth, rgb = [], []
-    for pose in poses:
-        world = rays @ pose[:3, :3].T
-        z = -pose[2, 3] / world[..., 2]
-        points = pose[:3, 3] + world * z[..., None]
-        depth.append(z)
-        rgb.append(_colour(points))
-    depth = np.array(depth, np.float32)
-    return Views(poses, k, np.array(rgb), depth, np.ones_like(depth), np.ones_like(depth))
+SIZE = (96, 64)
 
 
-def _colour(points) -> np.ndarray:
-    x, y = points[..., 0] > 0, points[..., 1] > 0
-    return np.stack([np.where(x, 220, 40), np.where(y, 200, 60), np.where(x ^ y, 180, 90)], -1).astype(np.uint8)
-
-
-EYES = [(0.0, -0.8, 2.0), (0.6, -0.5, 1.5)]
-
-
-def test_gaussians_are_flat_disks_on_the_surface() -> None:
-    splats = gaussians_of_views(_views(EYES), 100.0)
-    assert np.abs(splats.positions[:, 2]).max() < 1e-4
-    w, x, y, z = splats.rotations.T
-    normal = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
-    assert np.abs(np.abs(normal[:, 2]) - 1).max() < 1e-3
-    assert (splats.scales[:, 2] < splats.scales[:, 1]).all() and (splats.scales[:, 1] <= splats.scales[:, 0]).all()
-    away = np.abs(splats.positions[:, :2]).min(1) > 0.1  # from where colours change
-    assert np.abs(splats.rgb - _colour(splats.positions) / 255.0)[away].max() < 1e-3
-
-
-def test_the_sharpest_point_of_a_cell_is_kept() -> None:
-    points = np.array([[0.001, 0, 0], [0.002, 0, 0], [0.004, 0.001, 0], [0.5, 0, 0]])
-    assert select_sharpest(points, np.array([0.009, 0.005, 0.03, 0.03])).tolist() == [1, 3]
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """A tiny twin filmed by six cameras under two lightings; the first frame is held out, two have masks."""
+    root = tiny_twin(tmp_path_factory.mktemp("export") / "scene")
+    build = root / "build"
+    names = [f"{lighting}/{k:06d}" for lighting in ("day", "night") for k in range(3)]
+    eyes = np.array([[k * 1.5, 0.1 * k, 1.5] for k in range(3)] * 2)
     rng = np.random.default_rng(0)
-    points, width = rng.uniform(0, 0.3, (3000, 3)), rng.uniform(0.005, 0.08, 3000)
-    kept = select_sharpest(points, width)
-    level = np.maximum(np.ceil(np.log2(width / 0.01)), 0)
-    for n in range(4):
-        cells = np.floor((points[kept] - points.min(0)) / (0.01 * 2**n)).astype(int)[level[kept] <= n]
-        mine = cells[level[kept][level[kept] <= n] == n]
-        assert all((cells == cell).all(1).sum() == 1 for cell in mine)
-
-
-def test_splats_look_like_the_views_in_mujocos_renderer() -> None:
-    import mujoco_warp as mjw
-
-    views = _views(EYES)
-    splats = _read(gaussians_of_views(views, 100.0).to_ply())
-    spec = mujoco.MjSpec()
-    pose = opencv_to_mujoco(views.camera_to_world[0])
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
-    fovy = 2 * np.degrees(np.arctan(SIZE[1] / 2 / FOCAL))
-    spec.worldbody.add_camera(name="eye", pos=pose[:3, 3], quat=quaternion, fovy=fovy)
-    spec.worldbody.add_body(pos=[0, 0, -30]).add_geom(size=[0.1, 0.1, 0.1])
-    spec.stat.extent = 10.0
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    device_model, device_data = mjw.put_model(model), mjw.put_data(model, data)
-    context = mjw.create_render_context(
-        model,
-        cam_res=SIZE,
-        render_rgb=True,
-        splat_position=splats.positions,
-        splat_rotation=splats.rotations,
-        splat_scale=splats.scales,
-        splat_rgba=np.concatenate([splats.rgb, splats.opacity[:, None]], 1).astype(np.float32),
+    for i, name in enumerate(names):
+        image = build / "2_cameras" / "images" / f"{name}.png"
+        image.parent.mkdir(parents=True, exist_ok=True)
+        write_image(image, rng.integers(0, 255, (SIZE[1], SIZE[0], 3)).astype(np.uint8))
+        if i in (1, 4):
+            mask = build / "1_capture" / "masks" / f"{name}.png"
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            write_image(mask, np.full((SIZE[1], SIZE[0]), 255 * (i == 1), np.uint8))
+    cameras = Cameras(
+        names=tuple(names),
+        camera_to_world=np.array([look_at(eye, eye + np.array([3.0, 0.4, -0.8])) for eye in eyes]),
+        intrinsics=np.array([[60.0, 61.0, 47.0, 33.0]] * 3 + [[70.0, 70.5, 48.5, 31.0]] * 3),
+        sizes=np.tile(SIZE, (6, 1)),
+        lightings=("day",) * 3 + ("night",) * 3,
+        sources=("day",) * 3 + ("night",) * 3,
+        times=np.arange(6.0),
+        held_out=np.arange(6) == 0,
+        images=build / "2_cameras" / "images",
+        masks=build / "1_capture" / "masks",
     )
-    mjw.refit_bvh(device_model, device_data, context)
-    mjw.render(device_model, device_data, context)
-    packed = context.rgb_data.numpy()[0].reshape(SIZE[::-1])
-    shown = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], -1).astype(float)
-    error = np.abs(shown - views.rgb[0])[4:-4, 4:-4].mean()
-    assert error < 12.0, error
+    xyz = rng.uniform([3, -1, 0], [6, 1, 1], (40, 3))
+    point, frame = np.divmod(np.arange(240), 6)
+    rgb = rng.integers(0, 255, (40, 3)).astype(np.uint8)
+    cameras.save(build / "2_metric")
+    SparsePoints(xyz, rgb, rng.uniform(0, 1, 40), point, frame).save(build / "2_metric")
+    write_stamp(build / "2_metric", "metric")
+    return root
 
 
-def _read(ply: bytes) -> Gaussians:
-    """The file as a viewer reads it."""
-    head, _, body = ply.partition(b"end_header\n")
-    names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property")]
-    d = np.frombuffer(body, [(name, "<f4") for name in names])
-    assert f"element vertex {len(d)}".encode() in head
+@pytest.fixture(scope="module")
+def out(scene, tmp_path_factory) -> Path:
+    """Everything that the verb writes."""
+    out = tmp_path_factory.mktemp("out")
+    options = {"usd": "p.usdz", "glb": "p.glb", "ply": "p.ply", "nerfstudio": "ns", "colmap": "cm"}
+    given = [text for name, value in options.items() for text in (f"--{name}", str(out / value))]
+    assert main([str(scene), *given, "--lighting", "night", "--quiet"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == sorted(options.values())
+    return out
 
-    def columns(*wanted):
-        return np.stack([d[name] for name in wanted], -1)
 
-    return Gaussians(
-        columns("x", "y", "z"),
-        columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        np.exp(columns("scale_0", "scale_1", "scale_2")),
-        columns("f_dc_0", "f_dc_1", "f_dc_2") * 0.28209479177387814 + 0.5,
-        1.0 / (1.0 + np.exp(-d["opacity"])),
+def _cameras(scene) -> Cameras:
+    return Cameras.load(scene / "build" / "2_metric")
+
+
+def test_colmap_reads_the_same_poses(scene, out) -> None:
+    cameras, points = _cameras(scene), SparsePoints.load(scene / "build" / "2_metric")
+    model = pycolmap.Reconstruction(str(out / "cm" / "sparse" / "0"))
+    assert model.num_reg_images() == 6 and len(model.cameras) == 2
+    for image in model.images.values():
+        i = cameras.names.index(image.name.removesuffix(".png"))
+        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        assert np.abs(np.linalg.inv(pose) - cameras.camera_to_world[i]).max() < 1e-12
+        assert np.allclose(model.cameras[image.camera_id].params, cameras.intrinsics[i], atol=0)
+        assert (read_image(out / "cm" / "images" / image.name) == read_image(cameras.image_path(i))).all()
+        # COLMAP projects its points to where we do.
+        for seen in image.points2D:
+            xyz = model.points3D[seen.point3D_id].xyz
+            ours, _ = project(xyz, cameras.camera_to_world[i], cameras.intrinsics[i])
+            assert np.abs(image.project_point(xyz) - ours).max() < 1e-9 and np.abs(seen.xy - ours).max() < 1e-9
+    for key, point in model.points3D.items():
+        assert np.allclose(point.xyz, points.xyz[key - 1], atol=0) and (point.color == points.rgb[key - 1]).all()
+    assert model.compute_mean_reprojection_error() < 1.1
+    assert {p.relative_to(out / "cm" / "masks").as_posix() for p in (out / "cm" / "masks").rglob("*.png")} == {
+        "day/000001.png.png",
+        "night/000001.png.png",
+    }
+    assert len(read_model(out / "cm" / "sparse" / "0")) == 6
+
+
+def test_nerfstudio_has_opengl_axes_and_meters(scene, out) -> None:
+    cameras = _cameras(scene)
+    table = json.loads((out / "ns" / "transforms.json").read_text())
+    assert table["applied_transform"] == np.eye(4)[:3].tolist() and table["camera_model"] == "OPENCV"
+    assert len(table["frames"]) == 6
+    for i, frame in enumerate(table["frames"]):
+        pose = np.array(frame["transform_matrix"])
+        right, up, back, eye = pose[:3].T
+        assert (eye == cameras.positions[i]).all()
+        assert np.allclose(right, cameras.camera_to_world[i, :3, 0]) and np.allclose(
+            -back, cameras.camera_to_world[i, :3, 2]
+        )
+        assert up[2] > 0.5  # a level camera's up points up
+        assert [frame[k] for k in ("fl_x", "fl_y", "cx", "cy")] == cameras.intrinsics[i].tolist()
+        assert (read_image(out / "ns" / frame["file_path"]) == read_image(cameras.image_path(i))).all()
+        white = i != 4
+        assert (read_image(out / "ns" / frame["mask_path"]) == 255 * white).all()
+    # All lists or none, as nerfstudio demands, of paths that frames have.
+    assert table["val_filenames"] == table["test_filenames"] == ["images/day/000000.png"]
+    assert set(table["train_filenames"]) == {f["file_path"] for f in table["frames"][1:]}
+    night = json.loads((out / "ns" / "transforms_night.json").read_text())
+    assert [f["lighting"] for f in night["frames"]] == ["night"] * 3
+    cloud = trimesh.load(out / "ns" / table["ply_file_path"])
+    points = SparsePoints.load(scene / "build" / "2_metric")
+    assert np.allclose(cloud.vertices, points.xyz, atol=1e-5) and (cloud.colors[:, :3] == points.rgb).all()
+    # Our own reader of such files finds the poses again.
+    again = read_transforms(out / "ns" / "transforms.json")
+    assert np.abs(again.camera_to_world - cameras.camera_to_world).max() < 1e-12
+
+
+def test_splats_and_mesh_have_the_lighting(out, scene) -> None:
+    splats = read_ply(out / "p.ply")
+    assert len(splats.rgb) > 1000 and np.abs(splats.positions).max() < 200.0
+    mesh = trimesh.load(io.BytesIO((out / "p.glb").read_bytes()), file_type="glb").to_geometry()
+    stored = np.load(scene / "build" / "4_mesh" / "visual.npz")
+    corners = stored["vertices"][stored["faces"]].reshape(-1, 3)
+    assert np.allclose(mesh.vertices, corners[:, [0, 2, 1]] * [1, 1, -1], atol=1e-6)  # y up
+    head = (out / "p.glb").read_bytes()[20:]
+    assert b"KHR_materials_unlit" in head and b"image/jpeg" in head and mesh.visual.uv is not None
+
+
+# ---- texture
+
+
+def test_a_baked_texture_shows_what_the_views_show() -> None:
+    views = floor_views([(0.0, -0.8, 2.0), (0.6, -0.5, 1.5), (-0.5, 0.4, 1.8)])
+    vertices = np.array(
+        [[-0.6, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.6, 0], [-0.6, 0.6, 0], [0, 0, -3], [1, 0, -3], [0, 1, -3.0]]
     )
+    faces = np.array([[0, 1, 2], [2, 3, 0], [4, 5, 6]])
+    texture, coordinates = gltf.bake(vertices, faces, views)
+    rng = np.random.default_rng(0)
+    for face in range(2):
+        share = rng.dirichlet([1, 1, 1], 300)
+        point, at = share @ vertices[faces[face]], share @ coordinates[face]
+        u, v = np.floor(at * texture.shape[1::-1]).astype(int).T
+        away = np.abs(point[:, :2]).min(1) > 0.12  # from where colors change
+        expected = np.stack([np.where(point[:, 0] > 0, 220, 40), np.where(point[:, 1] > 0, 200, 60)], 1)
+        assert np.abs(texture[v, u, :2].astype(int) - expected)[away].max() <= 2
+    # The face that no view sees has the mean color of the nearest one.
+    u, v = np.floor(coordinates[2].mean(0) * texture.shape[1::-1]).astype(int)
+    assert texture[v, u].min() > 30
+
+
+def test_tiles_do_not_overlap() -> None:
+    side = np.random.default_rng(0).integers(2, 60, 500)
+    side, x, y, width = gltf.pack_tiles(side)
+    used = np.zeros(((y + side).max(), width), int)
+    for n, left, top in zip(side, x, y, strict=True):
+        used[top : top + n, left : left + n] += 1
+    assert used.max() == 1 and used.sum() == (side**2).sum()
 
 
 def test_vertices_have_the_colors_of_the_views() -> None:
     vertices = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [0.3, 0.31, -0.5]])
-    colours = export.vertex_colors(_views(EYES), vertices)
-    assert np.abs(colours[:3].astype(int) - _colour(vertices[:3])).max() <= 1
+    colours = gltf.vertex_colors(floor_views(), vertices)
+    assert np.abs(colours[:3, :2].astype(int) - [[220, 200], [40, 200], [220, 60]]).max() <= 1
     assert (colours[3] == colours[0]).all()  # hidden below the floor: as the nearest seen
 
 
@@ -129,9 +186,28 @@ def test_vertices_have_the_colors_of_the_views() -> None:
         ([], "nothing to write"),
         (["--glb", "absent/a.glb"], "there is no folder absent"),
         (["--ply", "a.ply"], "no scene.toml"),
+        (["--usd", "a.obj"], "expected a file ending in .usdz"),
+        (["--usd", "folder"], "is a folder; give a file"),
+        (["--colmap", "folder"], "is there already"),
+        (["--nerfstudio", "file"], "is there already"),
     ],
 )
 def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, words) -> None:
     monkeypatch.chdir(tmp_path)
-    assert export.main(["nowhere", *arguments]) == 2
-    assert words in capsys.readouterr().err and not list(tmp_path.iterdir())
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    assert main(["nowhere", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_an_unknown_lighting_is_refused(scene, tmp_path, capsys) -> None:
+    assert main([str(scene), "--ply", str(tmp_path / "a.ply"), "--lighting", "noon"]) == 2
+    assert "noon" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_usd_without_its_package_is_told(scene, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+    assert main([str(scene), "--usd", str(tmp_path / "a.usdz")]) == 2
+    assert "pip install 'twin[usd]'" in capsys.readouterr().err

@@ -13,7 +13,8 @@ from scipy.special import expit
 
 from twin.env.options import CAUSES
 from twin.errors import InputError
-from twin.evaluation.forecasting import ALL_TASKS, OTHERS, SHUFFLED, TWIN, Estimate, Forecast, make_forecast
+from twin.evaluation.agreement import OTHERS, SHUFFLED, TWIN, Estimate
+from twin.evaluation.forecasting import ALL_TASKS, Forecast, make_forecast
 from twin.evaluation.jackknife import STATISTICS as WITH_INTERVAL
 from twin.evaluation.jackknife import jackknife_interval, pair_cells
 from twin.evaluation.statistics import MIN_POLICIES, mean_rate, mmrv, pearson, rate_difference, spearman
@@ -21,12 +22,12 @@ from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
 from twin.report import forecast_report
 from twin.report.figures import lighting_labels
-from twin.report.forecast_report import (
+from twin.report.forecast_report import forecast_page
+from twin.report.forecast_text import (
     CSV_COLUMNS,
     INTERVALS_NOTE,
     STATISTICS,
     candidates_csv,
-    forecast_page,
     format_estimate,
     limitations,
     next_trials,
@@ -119,7 +120,7 @@ class Text(HTMLParser):
         return re.sub(r"\s+", " ", " ".join(self.parts))
 
 
-def test_the_numbers_are_those_of_the_tables() -> None:
+def test_rates_are_those_of_the_tables() -> None:
     twin, real = cells()
     made = make_forecast("road", twin, real)
     found = {c.key: c for c in twin}
@@ -170,7 +171,7 @@ def test_policies_not_driven_are_predicted_from_the_others() -> None:
     assert group.mean_real.n == 9 and group.corrected_coverage.missing  # six others are too few for intervals
 
 
-def test_all_tasks_together() -> None:
+def test_a_group_of_all_tasks_combines_those_of_the_tasks() -> None:
     twin, real = cells(tasks=("straight", "right_turn"))
     made = make_forecast("road", twin, real)
     assert [g.task for g in made.groups] == ["straight", "right_turn", ALL_TASKS]
@@ -189,7 +190,7 @@ def test_the_candidates_are_ranked() -> None:
     assert all(c.real_ranks == () for c in made.candidates)
 
 
-def test_leaving_a_lighting_out() -> None:
+def test_every_real_lighting_is_left_out_once() -> None:
     twin, real = cells()
     made = make_forecast("road", twin, real)
     assert [(x.lighting, x.cells) for x in made.left_out] == [("dusk", 7), ("sun", 7)]
@@ -325,7 +326,7 @@ def tile_texts(figure) -> dict[tuple[str, str], str]:
     return {(rows[round(t.xy[1])], columns[round(t.xy[0])]): t.get_text() for t in axes.texts}
 
 
-def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
+def test_many_cells_are_heatmaps_above_a_collapsed_table() -> None:
     """The twin's by its own lightings: one that stands for many of the road is shown once."""
     few, many = (
         make_forecast("road", *cells(n=6, driven=6, tasks=tasks)) for tasks in (("straight",), ("a", "b", "c"))
@@ -358,7 +359,7 @@ def test_many_cells_are_shades_beside_each_other_and_rows_below() -> None:
     assert lighting_labels(["sun", "sun+randomised"]) == (["sun", "sun+randomised"], "")
 
 
-def test_ranks_that_are_hardly_possible_have_no_tile() -> None:
+def test_improbable_ranks_have_no_text_in_the_heatmap() -> None:
     made = make_forecast("road", cells(n=8)[0], [])  # episodes count singly where no days are compared
     ranks = np.array([c.twin_ranks for c in made.candidates])
     assert (ranks < 0.005).sum() > 0
@@ -366,7 +367,7 @@ def test_ranks_that_are_hardly_possible_have_no_tile() -> None:
     assert told == {(names[i], str(k + 1)): f"{100 * ranks[i, k]:.0f}" for i, k in np.argwhere(ranks > 0.005).tolist()}
 
 
-def test_one_policy_alone() -> None:
+def test_one_policy_alone_needs_no_ranking() -> None:
     made = make_forecast("road", [Cell("p", "straight", "sun", 10, 5)], [])
     assert "one policy; there is nothing to rank" in summary_text(made)
     assert Text(forecast_page(made)).text
@@ -396,7 +397,7 @@ def test_the_papers_table_has_training_twin_and_road_of_every_policy() -> None:
 # ---- files and the verb
 
 
-def test_saved_and_loaded(tmp_path: Path) -> None:
+def test_a_forecast_survives_saving(tmp_path: Path) -> None:
     for real in ([], cells()[1]):
         made = make_forecast("road", cells()[0], real)
         made.save(tmp_path)
@@ -409,13 +410,13 @@ def test_saved_and_loaded(tmp_path: Path) -> None:
         Forecast.load(tmp_path / "none")
 
 
-def test_the_same_seed_gives_the_same() -> None:
+def test_the_same_seed_gives_the_same_forecast() -> None:
     twin, real = cells(n=6, driven=6)
     assert make_forecast("road", twin, real) == make_forecast("road", twin, real)
     assert make_forecast("road", twin, real, seed=1) != make_forecast("road", twin, real)
 
 
-def test_the_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_writes_all_files_and_prints_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     twin, real = cells(n=8)
     root = scene(tmp_path / "road", twin)
     assert main([str(root), "--real", str(results(tmp_path / "results.csv", real))]) == 0
@@ -478,7 +479,7 @@ def test_names_from_files_are_text() -> None:
     assert "script" not in page.tags and evil in page.text
 
 
-def test_what_intervals_are_about_stands_beside_them() -> None:
+def test_every_interval_is_shown_with_what_it_is_about() -> None:
     twin, real = cells()
     made = make_forecast("road", twin, real)
     page = forecast_page(made)

@@ -49,7 +49,7 @@ def test_similarity_moves_poses_with_their_points():
     )
 
 
-def test_rotation_angle():
+def test_rotation_angle_is_accurate_near_zero():
     vectors = np.random.default_rng(3).normal(size=(20, 3))
     angles = rotation_angle(Rotation.from_rotvec(vectors).as_matrix())
     np.testing.assert_allclose(np.cos(angles), np.cos(np.linalg.norm(vectors, axis=1)), atol=1e-9)
@@ -68,7 +68,7 @@ def test_project_then_unproject_is_the_identity():
     np.testing.assert_allclose(z, depth, atol=1e-9)
 
 
-def test_look_at_and_mujoco_axes():
+def test_look_at_points_the_camera_in_opencv_and_mujoco_axes():
     pose = look_at(np.zeros(3), np.array([1.0, 0, 0]))
     np.testing.assert_allclose(pose[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12)
     mujoco = opencv_to_mujoco(pose)

@@ -1,17 +1,29 @@
 """The Husky's model: constants, names, sensors, camera, standalone file. Its motion: `test_acceptance.py`."""
 
+import husky_options
 import mujoco
 import numpy as np
 import pytest
 from acceptance.drives import drive, on_plane, state_at_rest
+from acceptance.grounds import reconstructed
 from acceptance.rows import MASS
 
 from twin.env.physics import HuskyPhysics
-from twin.mjcf.husky import HUSKY_XML, add_husky, center_of_mass, coulomb_track_ratio, set_options, standalone_xml
+from twin.mjcf.husky import (
+    HUSKY_XML,
+    SCENE,
+    SCENE_XML,
+    add_husky,
+    center_of_mass,
+    check,
+    coulomb_track_ratio,
+    set_options,
+    standalone_xml,
+)
 from twin.robot import GEAR_RATIO, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams, PixelCamera
 
 
-def test_names():
+def test_bodies_joints_and_sensors_have_the_documented_names():
     model = mujoco.MjModel.from_xml_path(str(HUSKY_XML))
     for name in ("front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"):
         assert model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_HINGE
@@ -21,7 +33,7 @@ def test_names():
     assert model.camera("front").bodyid[0] == model.body("base_link").id
 
 
-def test_centre_of_mass_and_balance():
+def test_the_robot_balances_at_its_center_of_mass():
     model = on_plane()
     assert model.body("base_link").mass[0] == pytest.approx(46.034)
     data = mujoco.MjData(model)
@@ -32,7 +44,7 @@ def test_centre_of_mass_and_balance():
     np.testing.assert_allclose(base.subtree_com - base.xpos, center_of_mass(HuskyParams()))
 
 
-def test_payload_moves_the_centre_of_mass():
+def test_payload_moves_the_center_of_mass():
     params = HuskyParams(payload_mass=10.0, payload_position=(0.2, 0.1, 0.4))
     expected = (MASS * center_of_mass(HuskyParams()) + 10.0 * np.array([0.2, 0.1, 0.4])) / (MASS + 10.0)
     np.testing.assert_allclose(center_of_mass(params), expected)
@@ -63,7 +75,7 @@ def test_visual_geoms_have_no_mass_and_no_contacts():
     assert not model.geom_contype[looks].any() and not model.geom_conaffinity[looks].any()
 
 
-def test_coulomb_reference():
+def test_the_coulomb_track_ratio_of_a_centered_mass_equals_its_closed_form():
     assert coulomb_track_ratio(np.zeros(2)) == pytest.approx(1 + (WHEELBASE / TRACK) ** 2, rel=1e-6)
     rear = coulomb_track_ratio(np.array([-0.07, 0.0]))
     assert rear == pytest.approx(coulomb_track_ratio(np.array([0.07, 0.0])), rel=1e-6)
@@ -91,7 +103,7 @@ def test_the_robot_turns_to_the_side_of_smaller_wheels():
     assert 1.6 < (right - left) / TRACK / run.yaw_rate < 2.3  # chi of a bend of 38 m
 
 
-def test_sensors_and_currents():
+def test_sensors_and_motor_currents_agree_with_the_motion():
     physics = HuskyPhysics(on_plane())
     for _ in range(5):
         physics.step()
@@ -147,7 +159,7 @@ def test_front_camera_has_the_given_intrinsics():
     np.testing.assert_allclose(np.array(edges) / view.frustum_near, expected, rtol=1e-5)
 
 
-def test_tyre_mesh_has_the_wheel_s_size():
+def test_tire_mesh_has_the_size_of_the_wheel():
     model = on_plane(HuskyParams(wheel_radius=(WHEEL_RADIUS, 0.16)))
     assert model.geom("front_left_tyre").size[1] * 2 == pytest.approx(WHEEL_WIDTH)
     for name, radius in (("husky_tyre_0", WHEEL_RADIUS), ("husky_tyre_1", 0.16)):
@@ -189,3 +201,41 @@ def test_shipped_file_attaches_and_drives_like_the_model():
     np.testing.assert_allclose(there.qpos[:3] - [0, 0, 0.5], here.qpos[:3], atol=1e-4)
     np.testing.assert_allclose(there.qvel, here.qvel, atol=1e-3)
     assert here.qvel[5] > 0.9  # it did turn
+
+
+def test_the_scene_of_the_folder_is_the_robot_on_a_plane():
+    assert SCENE_XML.read_text(encoding="utf-8") == SCENE
+    model = mujoco.MjModel.from_xml_path(str(SCENE_XML))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 500)
+    data.ctrl[:] = -3.0, 3.0
+    mujoco.mj_step(model, data, 1000)
+    assert data.qvel[5] == pytest.approx(3.0 * 2 * WHEEL_RADIUS / (1.812 * TRACK), rel=0.02)
+    assert not any(warning.number for warning in data.warning) and not check(model)
+
+
+RIGHT = husky_options.RIGHT
+QUICK = (RIGHT, "`cone` pyramidal (MuJoCo's default)", "`timestep` 5 ms", "`solver` PGS")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in husky_options.CASES]
+)
+def test_check_finds_the_options_that_cost_something_and_no_others(name):
+    road = reconstructed(np.random.default_rng(0))
+    right, found = (husky_options.measure(husky_options.CASES[key], road) for key in (RIGHT, name))
+    assert bool(found.faults) == found.differs(right)
+
+
+def test_check_names_what_is_wrong_in_a_scene_of_defaults():
+    floor = "<geom name='floor' type='plane' size='9 9 1'/>"
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{floor}</worldbody></mujoco>")
+    with pytest.raises(ValueError, match="no Husky in the model"):
+        check(spec.compile())
+    spec.attach(mujoco.MjSpec.from_file(str(HUSKY_XML)), prefix="a/", frame=spec.worldbody.add_frame())
+    assert [one.option for one in check(spec.compile())] == ["cone", "impratio", "integrator"]
+    set_options(spec)
+    assert not check(spec.compile())
+    spec.geom("floor").priority = 1
+    assert [one.option for one in check(spec.compile())] == ["priority of geom floor"]
+    assert "the wheels hop" in str(check(spec.compile())[0])

@@ -67,7 +67,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_bad_logs_get_one_line(kind, drive, tmp_path, capsys):
+def test_bad_logs_are_refused_in_one_line(kind, drive, tmp_path, capsys):
     change, message = BAD[kind]
     path = tmp_path / "log.npz"
     np.savez(path, **change(drive))
@@ -78,7 +78,7 @@ def test_bad_logs_get_one_line(kind, drive, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_too_few_turns(tmp_path):
+def test_a_log_with_too_few_turns_is_refused(tmp_path):
     table = columns(HuskyParams(), 130.0, seed=2, strong=False)
     with pytest.raises(InputError, match=r"0 windows turn left and 0 right .*drive more turns"):
         logs.check_log(logs.cut_windows(table, "log"), "log")
@@ -137,7 +137,7 @@ def test_windows_in_which_the_robot_stands_are_left_out(drive):
     assert len(logs.cut_windows(parked, "log")) >= len(whole) + 199
 
 
-def test_a_gap_costs_nothing(drive):
+def test_a_clock_set_after_the_first_row_loses_no_window(drive):
     """One row before the clock was set: two seconds of the log are lost to the grid at most, and no memory."""
     late = {name: np.concatenate([column[:1], column]) for name, column in drive.items()}
     late["time"][1:] += 1.7e9
@@ -161,7 +161,7 @@ def test_bag_is_the_same_log(drive, tmp_path):
         assert getattr(bag, name) == pytest.approx(getattr(table, name), abs=1e-6), name
 
 
-def test_a_bag_without_commands(drive, tmp_path):
+def test_a_bag_without_commands_is_refused(drive, tmp_path):
     pytest.importorskip("rosbags")
     from ros_bag import write_bag
 

@@ -192,7 +192,7 @@ def test_up_is_signed_by_the_cameras() -> None:
     assert up.direction[2] < -0.99
 
 
-def test_the_road_is_found_below_kerbs_and_above_mismatches() -> None:
+def test_the_road_is_found_below_curbs_and_above_mismatches() -> None:
     rng = np.random.default_rng(5)
     film = _path()
     centres = film[:, :3, 3]

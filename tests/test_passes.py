@@ -26,13 +26,13 @@ def _endings(kind: str, number: int = 0) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_routes_of_drawn_filmings_follow_the_film_without_jumps_and_folds(kind):
+def test_routes_of_random_films_follow_the_film_without_jumps_and_folds(kind):
     for number in range(3):
         row = measure(draw_filming(KINDS.index(kind) + len(KINDS) * number))
         assert row["off"] < 0.3 and row["step"] < 0.3 and row["turn"] < 120.0 and row["length"] > 0.9
 
 
-def test_how_a_pass_ends():
+def test_a_pass_ends_at_a_jump_turn_lap_or_the_film_s_end():
     assert _endings("once") == ["end"]
     assert _endings("stops") == ["end"]
     assert _endings("twice_with_cut") == ["jump", "end"]
@@ -70,7 +70,7 @@ def _lifted(xy):
     return np.concatenate([xy, np.full((len(xy), 1), 1.8)], 1)
 
 
-def test_standing_and_rocking_leave_no_trace():
+def test_standing_and_rocking_are_removed_from_the_path():
     rng = np.random.default_rng(2)
     path = np.stack([np.arange(0.0, 20.0, 0.5), np.zeros(40)], -1)
     standing = path[20] + 0.03 * rng.standard_normal((15, 2))

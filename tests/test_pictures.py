@@ -43,13 +43,13 @@ def test_every_color_encoding_is_the_same_picture(padding):
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_mosaics(pattern):
+def test_bayer_mosaics_are_decoded(pattern):
     picture = _raw(f"bayer_{pattern}8", _mosaic(pattern)).decode()
     assert np.abs(picture[4:-4, 4:-4].astype(int) - SMOOTH[4:-4, 4:-4]).mean() < 4.0  # swapped colors differ by 50
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422", "uyvy"), ("yuv422_yuy2", "yuyv")])
-def test_yuv(encoding, order):
+def test_yuv_pictures_are_decoded(encoding, order):
     yuv = cv2.cvtColor(SMOOTH, cv2.COLOR_RGB2YUV)
     height, width = yuv.shape[:2]
     limited = np.stack(  # BT.601, limited range: what cameras send
@@ -69,7 +69,7 @@ def test_yuv(encoding, order):
     assert np.abs(picture.astype(int) - SMOOTH).mean() < 3.0
 
 
-def test_files():
+def test_compressed_pictures_are_decoded():
     np.testing.assert_array_equal(CompressedPicture(image(SMOOTH, 0, encoding="png").message.data).decode(), SMOOTH)
     near = CompressedPicture(image(SMOOTH, 0, encoding="jpeg").message.data.tobytes()).decode()
     assert np.abs(near.astype(int) - SMOOTH).mean() < 3.0
@@ -90,7 +90,7 @@ def test_files():
         (CompressedPicture(b"\xff\xd8\xff rubbish"), r"11 bytes are neither"),
     ],
 )
-def test_bad_pictures_get_one_line(picture, message):
+def test_bad_pictures_are_refused_in_one_line(picture, message):
     with pytest.raises(PictureError, match=message) as error:
         picture.decode()
     assert "\n" not in str(error.value)
@@ -165,7 +165,7 @@ def test_whole_scales_are_plain_averages():
     np.testing.assert_allclose(small, mean, atol=0.51)
 
 
-def test_resizing_is_twins():
+def test_resizing_equals_that_of_twin():
     ours = Camera((640, 480), (500.0, 501.0, 322.0, 239.0)).resized((160, 90))
     theirs = PixelCamera((500.0, 501.0, 322.0, 239.0), (640, 480)).resized((160, 90))
     assert ours.intrinsics == theirs.intrinsics and ours.size == theirs.size
@@ -211,7 +211,7 @@ def test_rays_beyond_the_fold_of_a_distortion_are_not_seen():
         ),
     ],
 )
-def test_bad_cameras_get_one_line(make, message):
+def test_bad_cameras_are_refused_in_one_line(make, message):
     with pytest.raises(PictureError, match=message) as error:
         make()
     assert "\n" not in str(error.value)

@@ -176,7 +176,7 @@ def test_the_first_picture_fills_the_stack(policy):
     np.testing.assert_array_equal(pilot.stack, shown)
 
 
-def test_when_pictures_cease_the_robot_stops_in_time(policy):
+def test_the_robot_stops_in_time_when_pictures_cease(policy):
     pilot, clock = pilot_of(policy)
     drive(pilot, clock, 5)
     taken = clock.true - 30 * MS
@@ -192,7 +192,7 @@ def test_when_pictures_cease_the_robot_stops_in_time(policy):
     np.testing.assert_array_equal(pilot.stack, [picture(6).transpose(2, 0, 1)] * 4)  # as at the start of an episode
 
 
-def test_one_lost_picture_is_borne_and_counted(policy):
+def test_one_lost_picture_is_tolerated_and_counted(policy):
     pilot, clock = pilot_of(policy)
     drive(pilot, clock, 4)
     drive(pilot, clock, 4, first=5)
@@ -302,7 +302,7 @@ def test_slow_inference_stops_it(tmp_path):
     assert "newest picture is 0.31 s old" in loose.picture(picture(0), clock.now()).cause
 
 
-def test_the_deadman_switch(policy):
+def test_a_released_deadman_switch_stops_the_robot(policy):
     pilot, clock = pilot_of(policy, deadman=0.5)
     assert pilot.picture(picture(0), clock.now()).cause == DEADMAN
     pilot.press()
@@ -417,7 +417,7 @@ def faulty_drive(policy: OnnxPolicy, network: Network, clock: Clock, seed: int) 
     return commands, stops
 
 
-def test_a_thousand_faulty_drives(tmp_path):
+def test_a_thousand_faulty_drives_obey_the_safety_rules(tmp_path):
     policy, clock = small_policy(tmp_path), Clock()
     policy._session = network = Network(policy._session, clock)
     results = np.array([faulty_drive(policy, network, clock, seed) for seed in range(1000)])

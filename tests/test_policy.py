@@ -76,7 +76,7 @@ def test_the_onnx_file_is_the_same_policy(folder):
     assert alone.trained == whole.trained == {"step": 7}
 
 
-def test_what_actions_mean():
+def test_actions_become_the_commands_that_control_states():
     from twin.learn.policy import Policy
 
     steer = Policy("s", lambda x: np.zeros((len(x), 1)), Control(yaw_rate=0.8, speed=0.7))
@@ -212,7 +212,7 @@ def foreign(path: Path, kind=TensorProto.FLOAT, shape=("n", 12, 90, 160), action
 
 
 @pytest.mark.parametrize("kind", [TensorProto.FLOAT, TensorProto.UINT8])
-def test_onnx_files_of_others_drive(tmp_path, kind):
+def test_foreign_onnx_files_are_policies(tmp_path, kind):
     policy, stacks = load_policy(foreign(tmp_path / "theirs.onnx", kind)), pictures(2)
     assert policy.control.action == "twist" and policy.size == (160, 90) and policy.stack == 4
     expected = np.repeat(stacks.reshape(2, -1).mean(1)[:, None] / 255, 2, 1)
@@ -249,7 +249,7 @@ def test_an_onnx_file_with_a_damaged_note_is_refused(tmp_path):
     assert onnx.load(tmp_path / "a.onnx", load_external_data=False).metadata_props[0].key == "twin"
 
 
-def test_callables_drive(tmp_path, monkeypatch):
+def test_a_callable_is_a_policy(tmp_path, monkeypatch):
     code = "import numpy as np\nspeed = 1.0\ndef act(pixels):\n    return [pixels.mean() / 255]\n"
     (tmp_path / "my_driver.py").write_text(code)
     monkeypatch.chdir(tmp_path)
@@ -311,7 +311,7 @@ def test_a_callable_that_is_no_policy_is_refused_in_one_line(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("name", ["subprocess:run", "os:abort_", "..:..", "a b:c", ":x", "x:"])
-def test_names_of_no_policy_are_refused(name):
+def test_unknown_policy_names_are_refused(name):
     with pytest.raises(InputError):
         load_policy(name)
 

@@ -55,7 +55,7 @@ def test_baselines_use_other_trainings_alone() -> None:
     assert np.allclose(recalibrated(p, changed)[:2], recalibrated(p, data)[:2])
 
 
-def test_recalibration_takes_a_bias_back() -> None:
+def test_recalibration_removes_a_bias() -> None:
     rng = np.random.default_rng(0)
     true = rng.uniform(0.05, 0.95, (12, 40))
     real = (rng.random(true.shape) < true).astype(float)
@@ -78,7 +78,7 @@ def test_the_gain_is_the_difference_of_mean_scores() -> None:
     assert low < mean_bias(**pair.rates()) < high
 
 
-def test_the_twin_leaves_room_for_what_did_not_happen() -> None:
+def test_twin_probabilities_are_never_0_or_1() -> None:
     p = twin_probabilities(np.array([[5, 5, 5], [0, 0, 5]]), np.full((2, 3), 5))
     assert (p > 0).all() and (p < 1).all() and p[0].min() > 0.9 and p[1, 2] > 0.5 > p[1, 0]
 

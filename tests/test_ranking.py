@@ -23,7 +23,7 @@ def of(*counts: tuple[int, int], samples: int = 4000, seed: int = 0) -> np.ndarr
     return np.random.default_rng(seed).beta(won + 0.5, driven - won + 0.5, (samples, len(counts)))
 
 
-def test_two_policies_against_integration() -> None:
+def test_rank_probabilities_of_two_policies_equal_integration() -> None:
     chance = rank_probabilities(of((7, 10), (5, 10), samples=100_000))
     rate = (np.arange(200_000) + 0.5) / 200_000
     better = np.mean(stats.beta.pdf(rate, 7.5, 3.5) * stats.beta.cdf(rate, 5.5, 5.5))

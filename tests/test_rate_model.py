@@ -9,7 +9,7 @@ from twin.evaluation.rate_model import RateModel, padded_counts
 from twin.evaluation.statistics import wilson
 
 
-def test_single_trials_against_integration() -> None:
+def test_single_trials_equal_integration() -> None:
     """One policy of single trials: ρ plays no part, and the posterior of the rate can be integrated directly."""
     won, driven = 7, 10
     model = RateModel.fit([[1] * won + [0] * (driven - won)], [[1] * driven], shared_days=False)
@@ -64,7 +64,7 @@ def test_days_count_and_trials_of_one_day_hardly_do() -> None:
     assert width(4, 5) > 1.2 * (high - low)  # as if the 20 trials were independent
 
 
-def test_a_policy_is_drawn_towards_the_others_and_not_towards_one_half() -> None:
+def test_a_policy_is_shrunk_towards_the_others_and_not_towards_one_half() -> None:
     trials = np.full((6, 2), 5)
     good = RateModel.fit([[5, 5]] * 5 + [[5, 0]], trials).mean()
     bad = RateModel.fit([[0, 0]] * 5 + [[5, 0]], trials).mean()
@@ -72,7 +72,7 @@ def test_a_policy_is_drawn_towards_the_others_and_not_towards_one_half() -> None
     assert bad[0] < 0.15
 
 
-def test_a_covariate_draws_a_policy_towards_it() -> None:
+def test_a_covariate_pulls_a_rate_towards_itself() -> None:
     won, trials = np.array([[5, 5], [5, 5], [0, 0], [0, 0], [5, 0], [5, 0]]), np.full((6, 2), 5)
     x = np.array([3.0, 3.0, -3.0, -3.0, 3.0, -3.0])
     mean = RateModel.fit(won, trials, x).mean()
@@ -89,13 +89,13 @@ def test_samples_follow_the_posterior() -> None:
     assert np.allclose(((low <= samples) & (samples <= high)).mean(0), 0.9, atol=0.02)
 
 
-def test_cells_are_drawn_towards_their_policy() -> None:
+def test_cells_are_shrunk_towards_their_policy() -> None:
     means = RateModel.fit([[5, 0, 5, 5], [0, 0, 0, 5]], np.full((2, 4), 5), shared_days=False).cell_means()
     assert means[0, 1] < 0.5 < means[0, 0] and means[0, 1] > means[1, 0]
     assert means[1, 3] < means[0, 0]
 
 
-def test_padding_and_wrong_counts() -> None:
+def test_padding_changes_nothing_and_wrong_counts_are_refused() -> None:
     won, trials = padded_counts([[(3, 5), (5, 5)], [(2, 4)]])
     assert won.tolist() == [[3, 5], [2, 0]] and trials.tolist() == [[5, 5], [4, 0]]
     padded = RateModel.fit(np.pad(won, ((0, 0), (0, 3))), np.pad(trials, ((0, 0), (0, 3))))

@@ -100,7 +100,7 @@ def test_real_film_with_the_robot_masked(place):
     assert report["cameras"]["registered"] >= 0.9 * report["cameras"]["total"] >= 40
 
 
-def test_fox_is_no_drive(place):
+def test_the_fox_capture_has_no_route(place):
     """An object filmed around: field and mesh are made, and the stages about driving say that they do not apply."""
     text = (
         '[[source]]\npath = "input/transforms_orig_1080x1920.json"\nimages = "input/images"\nlighting = "indoor"\n'

@@ -61,7 +61,7 @@ def test_fit_finds_the_lighting_of_a_photo():
     assert psnr(there[1], there[0]) > 25.0
 
 
-def test_a_fit_tells_haze_from_light_and_clear_air_from_haze(monkeypatch):
+def test_the_fit_separates_fog_from_lighting(monkeypatch):
     rng, field = np.random.default_rng(2), small_field()
     pose, size, wide = pose_at(0.0), (64, 48), K / [20, 20, 5, 5]  # corners are thrice as far as their depth
     seen = field.render(Viewpoints.of(pose[None], wide, size), field.embedding("night"))
@@ -92,7 +92,7 @@ def test_halves_are_scored_by_the_fit_to_the_other_half():
     assert torn.psnr_clear_other_half == pytest.approx(psnr(day, night), abs=3.0)  # each half fits one of them
 
 
-def test_fog_by_closed_forms_and_in_mixtures():
+def test_fog_equals_its_closed_form_and_mixes():
     rgb, distance = np.full((1, 2, 3), 0.5, np.float32), np.array([[0.0, 1e6]], np.float32)
     np.testing.assert_array_equal(Fog().apply(rgb, distance), rgb)
     near, far = Fog(0.03, (1.0, 0.0, 0.5)).apply(rgb, distance)[0]

@@ -83,7 +83,7 @@ def test_stacks_are_those_added(longest, steps):
     assert count == min(steps, 40) * ENVS or (longest < 16 and count > min(steps, 40) * ENVS // 2)
 
 
-def test_samples_are_transitions_and_each_comes(tmp_path):
+def test_every_transition_is_sampled(tmp_path):
     buffer = FrameReplayBuffer(10 * ENVS, SPACE, ACTION, "cpu", ENVS, seed=5, state_size=STATES)
     worlds = NaiveEnvs(0, 4)
     for _ in range(33):
@@ -104,7 +104,7 @@ def test_samples_are_transitions_and_each_comes(tmp_path):
     assert len(drawn) == check(buffer, worlds)
 
 
-def test_shifted_samples_are_shifted_by_so_much_with_edges_repeated():
+def test_shifts_stay_within_their_limit_and_repeat_edges():
     buffer = FrameReplayBuffer(40, SPACE, ACTION, "cpu", ENVS, shift=2)
     stacks = np.random.default_rng(0).integers(0, 256, (60, 12, *SIZE), np.uint8)
     shifts = set()

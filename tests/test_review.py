@@ -140,7 +140,7 @@ def test_a_scene_without_a_route_is_filmed_and_says_so(scene: SceneDir, tmp_path
     assert {picture["section"] for picture in told["pictures"]} == {"capture", "field", "poster"}
 
 
-def test_a_route_that_was_not_wanted_is_told_apart(scene: SceneDir, tmp_path: Path) -> None:
+def test_a_route_switched_off_is_distinguished_from_none_found(scene: SceneDir, tmp_path: Path) -> None:
     field = CheckeredField({"day": 1.0})
     make_cameras(scene.stage("metric"), field)
     out = tmp_path / "out"
@@ -190,11 +190,11 @@ def test_the_nearest_frame_is_at_the_same_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, []), (1, [5]), (2, [0, 9]), (3, [0, 4, 9]), (99, list(range(10)))])
-def test_spread(count: int, expected: list[int]) -> None:
+def test_evenly_spaced_picks_the_middle_or_both_ends(count: int, expected: list[int]) -> None:
     assert evenly_spaced(range(10), count) == expected
 
 
-def test_every_lighting_has_its_stretch_of_the_drive() -> None:
+def test_every_lighting_has_its_segment_of_the_drive() -> None:
     lightings = ("day", "dusk", "night")
     assert lighting_at(lightings, 0.0) == ("day", "day")
     assert lighting_at(lightings, 0.5) == ("dusk", "dusk")
@@ -242,14 +242,14 @@ def test_fit_keeps_proportions() -> None:
     assert (out == 255).all(-1).sum() == 60 * 30
 
 
-def test_near_is_brighter_than_far_and_nothing_is_empty() -> None:
+def test_depth_colors_are_brighter_when_near_and_empty_without_depth() -> None:
     shades = depth_colors(np.array([[1.0, 5.0, 30.0, FAR]]), np.array([[1.0, 1.0, 1.0, 0.0]]))
     brightness = shades.astype(int).sum(-1)[0]
     assert brightness[0] > brightness[1] > brightness[2]
     assert tuple(shades[0, 3]) == (28, 34, 43)
 
 
-def test_the_plan_runs_from_left_to_right() -> None:
+def test_the_map_runs_from_left_to_right() -> None:
     path = np.stack([np.full(20, 3.0), np.linspace(0, -30, 20)], 1)  # southwards
     plan = MapView.draw((200, 80), path)
     start, end = path[[0, -1]] @ plan.to_pixel[:, :2].T + plan.to_pixel[:, 2]
@@ -269,7 +269,7 @@ def test_footprints_are_outlines_and_flat_parts_have_none() -> None:
     assert sorted(map(tuple, outlines[0])) == [(0, 0), (0, 1), (1, 0), (1, 1)]
 
 
-def test_a_bird_looks_along_the_route() -> None:
+def test_the_overview_camera_looks_along_the_route() -> None:
     route = np.stack([np.linspace(0, 40, 50), np.zeros(50), np.zeros(50)], 1)
     for s in (0.0, 20.0, 40.0):
         pose = overview_pose(route, s)
@@ -290,7 +290,7 @@ def test_a_row_of_pictures_has_one_height() -> None:
     assert row.shape == (40, 80 + 6 + 20, 3)
 
 
-def test_work_ahead_keeps_order_and_hands_on_errors() -> None:
+def test_prefetching_keeps_order_and_passes_errors_on() -> None:
     with Prefetcher(iter(range(20)), depth=3) as items:
         assert list(items) == list(range(20))
 
@@ -302,7 +302,7 @@ def test_work_ahead_keeps_order_and_hands_on_errors() -> None:
         list(items)
 
 
-def test_work_ahead_stops_when_nobody_reads() -> None:
+def test_prefetching_stops_when_nobody_reads() -> None:
     made = []
 
     def endless() -> Iterator[int]:

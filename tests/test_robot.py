@@ -37,7 +37,7 @@ def test_scene_toml_precedes_robot_toml_and_defaults(tmp_path):
     assert robot.friction == 0.4
 
 
-def test_lists_and_whole_numbers(tmp_path):
+def test_lists_and_whole_numbers_are_read_as_floats(tmp_path):
     robot = config_of(
         tmp_path,
         "center_of_mass = [-0.05, 0, 0.06]\ncamera_intrinsics = [600, 600, 320, 240]\ncamera_size = [640, 480]",

@@ -66,7 +66,7 @@ def test_front_camera_looks_ahead_and_upright(drive):
     assert abs(pixels[0, 0] - 80) < 1 and pixels[1, 0] < pixels[0, 0] and pixels[2, 1] > pixels[0, 1]
 
 
-def test_same_drive_twice(world, drive):
+def test_the_same_drive_repeats_exactly(world, drive):
     again = follow_route(world, HuskyPhysics(world.model(), world.robot))
     np.testing.assert_array_equal(again.qpos, drive.qpos)
 
@@ -102,7 +102,7 @@ def test_leaving_the_corridor_ends_the_drive(world):
     assert drive.outcome == "off_corridor" and drive.max_cross_track > 0.002
 
 
-def test_time_limit(world):
+def test_the_time_limit_ends_the_drive(world):
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot), timeout=1.0)
     assert drive.outcome == "timeout" and drive.times[-1] == pytest.approx(1.1, abs=0.11)
 
@@ -115,7 +115,7 @@ def test_pursuit_circle_passes_the_target():
     assert pursuit_curvature(turned, np.array([1.0 + 3.0, 2.0 + 3.0])) == pytest.approx(-1 / 3)
 
 
-def test_command_lapses():
+def test_a_command_expires():
     physics = on_a_plane()
     physics.command(1.0, 0.0)
     speeds = []
@@ -125,7 +125,7 @@ def test_command_lapses():
     assert max(speeds) > 0.5 and abs(speeds[-1]) < 0.02
 
 
-def test_speed_and_acceleration_limits():
+def test_speed_and_acceleration_stay_within_their_limits():
     physics = on_a_plane()
     for _ in range(5):
         physics.step()
@@ -178,13 +178,13 @@ def test_chase_camera_is_behind_and_sees_the_robot(drive):
         assert depth > 1.0 and 100 < pixel[0] < 220 and 90 < pixel[1] < 180
 
 
-def test_frame_indices():
+def test_frame_indices_include_the_last():
     assert frame_indices(10, 3) == [0, 3, 6, 9]
     assert frame_indices(11, 3) == [0, 3, 6, 9, 10]
 
 
 @pytest.mark.slow
-def test_pictures(world, drive):
+def test_pictures_show_robot_ground_and_parts(world, drive):
     """The renderer draws robot, ground and parts where they are. Slow: its kernels compile on first use."""
     camera, poses = SceneCamera(world, (160, 90)), chase_poses(drive.base_to_world)
     frames = [camera.render(drive.qpos[i], poses[i]) for i in frame_indices(len(drive.times), 40)]

@@ -79,7 +79,7 @@ def test_the_noise_of_ground_and_imu_is_estimated(truth):
     assert np.abs(smoothed - slopes).mean() < 0.7 * np.abs(readings - slopes).mean()
 
 
-def test_the_preceding_window():
+def test_preceding_wheel_speeds_are_those_of_the_window_before():
     wheels = np.arange(3 * logs.SAMPLES * 2, dtype=float).reshape(3, logs.SAMPLES, 2)
     before = replace(windows_of(wheels), follows=np.array([False, True, False])).preceding_wheels
     np.testing.assert_array_equal(before[1], np.concatenate([wheels[0], wheels[1, :1]]))

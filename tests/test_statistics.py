@@ -43,7 +43,7 @@ def slow_mmrv(twin: np.ndarray, real: np.ndarray) -> float:
     ("successes", "trials", "low", "high"),
     [(8, 10, 0.4902, 0.9433), (0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (81, 263, 0.2553, 0.3662)],
 )
-def test_wilson_known(successes: int, trials: int, low: float, high: float) -> None:
+def test_wilson_equals_published_values(successes: int, trials: int, low: float, high: float) -> None:
     # The last line is of Newcombe's paper on single proportions, Stat. in Medicine 17 (1998), table I.
     assert np.allclose(wilson(successes, trials, 0.95), (low, high), atol=6e-5)
 
@@ -63,7 +63,7 @@ def test_wilson_solves_the_score_equation() -> None:
             assert score == pytest.approx(stats.norm.ppf(0.5 + CONFIDENCE / 2))
 
 
-def test_newcombe_known() -> None:
+def test_newcombe_equals_published_values() -> None:
     # Newcombe, Stat. in Medicine 17 (1998) 873, table II, method 10: 56/70 − 48/80 and 9/10 − 3/10.
     for (a, n, b, m), ends in (((56, 70, 48, 80), (0.0524, 0.3339)), ((9, 10, 3, 10), (0.1705, 0.8090))):
         got = rate_difference(twin_successes=b, twin_trials=m, real_successes=a, real_trials=n, confidence=0.95)
@@ -96,7 +96,7 @@ def test_correlations_equal_scipy_with_ties() -> None:
             assert spearman(twin=twin, real=real) == pytest.approx(stats.spearmanr(twin, real).statistic)
 
 
-def test_closed_forms() -> None:
+def test_correlations_and_mmrv_equal_closed_forms() -> None:
     real = np.array([0.1, 0.4, 0.5, 0.9])
     assert pearson(twin=0.2 + 0.5 * real, real=real) == pytest.approx(1.0)
     assert spearman(twin=real**3, real=real) == pytest.approx(1.0)
@@ -107,7 +107,7 @@ def test_closed_forms() -> None:
     assert winner(twin=real**3, real=real)[0] == 1.0
 
 
-def test_mmrv_equals_the_slow_one() -> None:
+def test_mmrv_equals_a_slow_implementation() -> None:
     rng = np.random.default_rng(1)
     for _ in range(50):
         twin, real = tied(rng, 7), tied(rng, 7)
@@ -125,7 +125,7 @@ def test_the_order_of_arguments_matters_and_is_by_keyword() -> None:
             statistic(twin, real)  # type: ignore[misc]
 
 
-def test_ties() -> None:
+def test_ties_count_for_the_worse_policy_and_share_the_winner() -> None:
     twin, real = np.array([1.0, 1.0, 0.0]), np.array([0.2, 0.8, 0.0])
     # The worse of the tied pair is charged, the better is not.
     assert mmrv(twin=twin, real=real) == pytest.approx(0.6 / 3)

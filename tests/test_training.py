@@ -111,7 +111,7 @@ def test_another_config_is_refused(scene, tmp_path):
     assert json.loads((tmp_path / "state" / "state.json").read_text())["steps"] == 16
 
 
-def test_the_verb(scene, capsys):
+def test_the_verb_trains_and_refuses_a_changed_configuration(scene, capsys):
     common = [str(scene), "--task", "ahead", "--quiet", "--worlds", "2"]
     assert train.main([*common, "--run", "one", "--steps", "4", "--observe", "simulator"]) == 0
     assert (scene / "runs/one/success.png").exists()

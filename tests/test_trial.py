@@ -159,7 +159,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_bad_bags_get_one_line(place, tmp_path, kind, capsys):
+def test_bad_bags_are_refused_in_one_line(place, tmp_path, kind, capsys):
     scene, drives = place
     change, message = BAD[kind]
     bag = write(tmp_path / "bag", change([one for one in drives["ahead"] if one.topic]))
@@ -171,11 +171,11 @@ def test_bad_bags_get_one_line(place, tmp_path, kind, capsys):
     assert not (tmp_path / "real.csv").exists()
 
 
-def test_no_bag_and_rubbish_get_one_line(place, tmp_path):
+def test_missing_and_foreign_files_are_refused_in_one_line(place, tmp_path):
     with pytest.raises(InputError, match="no such bag"):
         read_trial(tmp_path / "none")
     (tmp_path / "bad.mcap").write_bytes(b"rubbish" * 100)
-    with pytest.raises(InputError, match="not a readable ROS 2 bag"):
+    with pytest.raises(InputError, match="not a readable bag"):
         read_trial(tmp_path / "bad.mcap")
 
 

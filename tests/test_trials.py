@@ -75,7 +75,7 @@ def test_an_invalid_row_is_named(tmp_path: Path, line: str, message: str) -> Non
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-def test_nothing_validated_says_what_to_run(tmp_path: Path) -> None:
+def test_without_validated_trials_the_error_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"twin\.validate"):
         read_trials(tmp_path / "episodes.csv")
 

@@ -242,7 +242,7 @@ def test_the_worst_lighting_is_evaluated_on_fresh_episodes(fresh, monkeypatch):
     assert {t.lighting for t in proof} == {worst["lighting"]} and len(proof) == 2
 
 
-def test_the_verb(fresh, capsys):
+def test_the_verb_validates_and_refuses_bad_arguments(fresh, capsys):
     common = [str(fresh), "--task", "ahead", "--lightings", "day", "--episodes", "2"]
     assert validate.main([*common, "--policy", "ahead", "left", "--quiet"]) == 0
     assert validate.main([*common, "--policy", "ahead", "left"]) == 0

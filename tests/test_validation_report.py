@@ -90,14 +90,14 @@ def page(folder: Path, said: dict, *curves: TrainingCurve) -> Text:
 # ---- which episodes are typical and worst
 
 
-def test_the_typical_episode_is_the_median_of_the_way():
+def test_the_typical_episode_has_the_median_progress():
     ways = [3.0, 0.5, 2.0, 4.0, 1.0]
     assert typical_episode([trial(seed=k, progress=way) for k, way in enumerate(ways)]).progress == np.median(ways)
     assert typical_episode([trial(seed=k, progress=way) for k, way in enumerate(ways[:4])]).progress == 3.0
     assert typical_episode([trial(seed=k) for k in range(5)]).seed == 2
 
 
-def test_the_worst_episode_failed_first_and_else_is_trusted_least():
+def test_the_worst_episode_failed_earliest_or_has_the_lowest_trust():
     won = [trial(seed=k, progress=0.1, trust=trust) for k, trust in enumerate((0.9, 0.7, None))]
     lost = [trial(seed=9, cause="stuck", progress=2.0, trust=1.0), trial(seed=8, cause="collision", progress=1.0)]
     assert worst_episode([*won, *lost]).seed == 8
@@ -187,7 +187,7 @@ def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
         assert (absent in text) == (absent == "The worst light that")
 
 
-def test_the_page_says_the_tables_numbers(tmp_path):
+def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
     trials = [trial("a", k, "goal" if k < 31 else "collision", trust=0.9 if k % 2 else 0.5) for k in range(40)]
     trials += [trial("b", k, "goal" if k < 12 else "timeout", light=light) for k in range(40) for light in ("day", "n")]
     trials += [trial("a", 7, "stuck", task="bend", light="any")]
@@ -318,15 +318,15 @@ def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count)
     assert len(points) == min(25, max(1, count // 5))
 
 
-def test_whose_robot_is_judged_is_said():
+def test_a_robot_without_identified_parameters_gives_a_caution():
     """Where episodes are drawn anew and nothing is known of the robot, it says what would tell."""
 
     def cautions(light: str, **more) -> str:
         return " ".join(c.what for c in limitations(told([trial(light=light)], **more)))
 
-    assert "another one drives every episode" in cautions("held-out+randomised", robot_known=[])
-    assert "another one" not in cautions("held-out+randomised", robot_known=["friction"])
-    assert "another one" not in cautions("held-out", robot_known=[])
+    assert "every episode has a robot with other random parameters" in cautions("held-out+randomised", robot_known=[])
+    assert "random parameters" not in cautions("held-out+randomised", robot_known=["friction"])
+    assert "random parameters" not in cautions("held-out", robot_known=[])
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
@@ -352,7 +352,7 @@ def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
     return {key: (t.get_text(), tuple(f)) for key, t, f in zip(at, axes.texts, faces, strict=True)}
 
 
-def test_many_lightings_are_tiles_with_the_mean_of_those_that_all_drove():
+def test_many_lightings_are_a_heatmap_with_the_mean_of_the_shared_ones():
     """`a` is better in every light; a mean over what each drove, or over episodes, would say otherwise."""
     assert MAX_PLOTTED_LIGHTINGS < 6
     won = {"a": [0, 25, 100, 100, 100, 100], "b": [None, None, 100, 75, 75, 75]}
@@ -381,7 +381,7 @@ def test_where_no_lighting_is_shared_there_is_no_mean():
     assert set(drawn) == {("ab"[k % 2], f"day_{k}") for k in range(6)}
 
 
-def test_who_beats_whom_is_shown_with_the_best_on_top():
+def test_paired_comparisons_are_a_heatmap_with_the_best_on_top():
     """`good` arrives in 20 episodes, `fair` in 2, `poor` in none: two more may be chance."""
     won = {"poor": 0, "good": 20, "fair": 2}
     trials = [trial(name, seed, "goal" if seed < n else "collision") for name, n in won.items() for seed in range(20)]
@@ -397,13 +397,13 @@ def test_who_beats_whom_is_shown_with_the_best_on_top():
     assert chance == color["poor  3", "2"] and chance[3] < color["good  1", "2"][3]
 
 
-def test_what_never_drove_the_same_is_not_compared():
+def test_policies_without_shared_episodes_are_not_compared():
     assert summarize([trial("a", 1), trial("b", 2), trial("c", 1, light="night")])["pairs"] == []
     (pair,) = summarize([trial("a", 1), trial("b", 1), trial("c", 2)])["pairs"]
     assert (pair["a"], pair["b"], pair["episodes"]) == ("a", "b", 1)
 
 
-def test_long_tables_are_folded_away_below_a_figure(tmp_path):
+def test_long_tables_are_collapsed_below_a_figure(tmp_path):
     policies, lights = [f"p{k}" for k in range(8)], [f"day_{k}" for k in range(5)]
     many = [(p, light, seed) for p in policies for light in lights for seed in range(3)]
     trials = [trial(p, seed, trust=0.9 if seed else 0.1, light=light) for p, light, seed in many]

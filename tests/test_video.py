@@ -30,7 +30,7 @@ def test_a_film_is_h264_yuv420p_and_keeps_its_pictures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("colour", [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (0, 0, 0), (40, 200, 120)])
-def test_flat_colours_come_back(tmp_path: Path, colour: tuple[int, int, int]) -> None:
+def test_flat_colors_survive_encoding(tmp_path: Path, colour: tuple[int, int, int]) -> None:
     frame = np.broadcast_to(np.array(colour, np.uint8), (32, 32, 3)).copy()
     with VideoWriter(tmp_path / "flat.mp4", (32, 32), fps=2, crf=5) as film:
         film.write(frame, count=2)
@@ -38,7 +38,7 @@ def test_flat_colours_come_back(tmp_path: Path, colour: tuple[int, int, int]) ->
     assert np.abs(read.reshape(-1, 3).astype(int) - colour).max() <= 4
 
 
-def test_the_index_is_in_front(tmp_path: Path) -> None:
+def test_the_index_precedes_the_frames(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     with VideoWriter(path, (32, 32), fps=5) as film:
         film.write(np.zeros((32, 32, 3), np.uint8), count=3)
@@ -73,5 +73,5 @@ def test_wrong_sizes_are_refused(tmp_path: Path) -> None:
             film.write(np.zeros((30, 32, 3), np.uint8))
 
 
-def test_even() -> None:
+def test_even_rounds_down_to_even_sides() -> None:
     assert [even(n) for n in (0, 2, 3, 719, 720)] == [2, 2, 2, 718, 720]

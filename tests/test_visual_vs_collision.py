@@ -68,7 +68,7 @@ def place(tmp_path_factory):
     return world, views, cameras, Ground.load(mesh), Parts.load(mesh / "parts.npz")
 
 
-def test_what_shows_the_solid_scene_has_no_gap(place):
+def test_equal_geometries_have_no_gap(place):
     world, views, cameras, ground, parts = place
     found = compare_geometry(views, world, cameras, ground, parts)
     assert found["pixels"] > 5000 and found["views"] == 3
@@ -78,7 +78,7 @@ def test_what_shows_the_solid_scene_has_no_gap(place):
     assert found["leak_share"] == 0.0 and found["ghost_share"] == 0.0
 
 
-def test_what_is_seen_above_the_corridor_is_a_leak(place):
+def test_visible_geometry_without_collision_is_a_leak(place):
     world, views, cameras, ground, parts = place
     points = views.points(views.collision_depth, world.intrinsics)
     s_near = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & views.is_ground
@@ -93,7 +93,7 @@ def test_what_is_seen_above_the_corridor_is_a_leak(place):
     assert max(found["along"]["leak_m"][:3]) > 0.3 and max(found["along"]["leak_m"][4:]) < 0.05
 
 
-def test_what_is_solid_but_seen_through_is_a_ghost_and_unfilmed_ones_are_told_apart(place):
+def test_invisible_collision_geometry_is_a_ghost_and_unfilmed_ones_count_separately(place):
     world, views, cameras, ground, parts = place
     points = views.points(views.collision_depth, world.intrinsics)
     hole = (np.abs(points[..., 0] - 2.5) < 0.4) & (np.abs(points[..., 1]) < 0.5) & views.is_ground
@@ -170,13 +170,13 @@ def test_a_part_that_is_not_seen_is_a_ghost_and_one_that_is_not_solid_a_leak(pla
     assert compare_geometry(far_off, world, cameras, ground, parts)["leak_share"] > 0.5
 
 
-def test_a_drive_is_looked_at_every_two_meters():
+def test_a_drive_has_a_view_every_two_meters():
     poses = np.tile(np.eye(4), (101, 1, 1))
     poses[:, 0, 3] = np.linspace(0.0, 10.0, 101)
     assert view_poses(poses)[:, 0, 3] == pytest.approx([0.0, 2.0, 4.0, 6.0, 8.0])
 
 
-def test_the_page_tells_it(place, tmp_path):
+def test_the_build_page_shows_the_comparison(place, tmp_path):
     world, views, cameras, ground, parts = place
     found = compare_geometry(views, world, cameras, ground, parts)
     report = {"scene": "tiny", "seen_touched": found, "review": {"follower": None}}

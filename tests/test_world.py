@@ -42,7 +42,7 @@ def ray_down(model, data, xy, groups=(1, 0, 0, 0, 0, 0)) -> float:
     return 20.0 - distance
 
 
-def test_metrics(exported):
+def test_metrics_are_those_of_the_scene(exported):
     _, metrics = exported
     assert metrics["parts"] == 2
     assert metrics["route_length_m"] == pytest.approx(arc_lengths(tiny_route())[-1])
@@ -66,7 +66,7 @@ def test_heights_are_right_to_a_millimeter(exported):
         assert ray_down(model, data, xy) == pytest.approx(ground.height[row, column], abs=1e-3)
 
 
-def test_coarse_height_field_keeps_nodes_and_colours_in_place(tmp_path):
+def test_coarse_height_field_keeps_nodes_and_colors_in_place(tmp_path):
     """Nodes of the coarse field are nodes of the fine one; the texture has a texel per fine cell of the rest."""
     ground = tiny_ground()
     rgb = np.random.default_rng(5).integers(0, 255, (*ground.height.shape, 3)).astype(np.uint8)
@@ -122,7 +122,7 @@ def test_parts_keep_their_places(exported):
     assert ray_down(model, data, (4.0, -3.0), groups=(0, 0, 0, 1, 0, 0)) == pytest.approx(1.2, abs=1e-4)
 
 
-def test_groups(exported):
+def test_geoms_are_in_their_documented_groups(exported):
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     group = {model.geom(i).name: model.geom_group[i] for i in range(model.ngeom)}
@@ -160,7 +160,7 @@ def test_world_save_and_load_round_trip(exported):
     np.testing.assert_allclose(world.intrinsics, [125.0, 127.5, 82.5, 42.5])
 
 
-def test_camera_is_the_first_training_frame_s(exported):
+def test_camera_is_that_of_the_first_training_frame(exported):
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     pixel = model.cam_sensorsize[0] / model.cam_resolution[0]
@@ -257,7 +257,7 @@ def test_a_start_inside_a_part_is_refused_on_soft_ground(tmp_path):
         on_a_slope(tmp_path, 2.0, SOFT, boxes=((0.4, 0.3, 0.2),))
 
 
-def test_a_start_too_steep_for_the_tyres_is_refused_for_that(tmp_path):
+def test_a_start_too_steep_for_the_tires_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"falls by 18\.0°, expected at most 14\.0° .*friction 0\.25.*"):
         on_a_slope(tmp_path, 18.0, SOFT)
 
@@ -295,7 +295,7 @@ def test_rest_pose_follows_the_slope():
     np.testing.assert_allclose(position, np.array([5.0, 5.0, 0.5]) + BASE_HEIGHT * up, atol=1e-9)
 
 
-def test_tiles_interpolate_corner_colours_exactly():
+def test_texels_interpolate_corner_colors_exactly():
     """Bilinear lookup in the texture, by hand, against the linear interpolation of the corners."""
     rng = np.random.default_rng(2)
     colors = rng.integers(60, 120, (7, 3, 3)).astype(np.uint8)  # no clamping of the fourth texel
@@ -337,7 +337,7 @@ def test_vertices_near_the_ground_are_covered():
     assert covered_by_ground(points, ground).tolist() == [True, False, True, False]
 
 
-def test_nearest_against_dense_samples():
+def test_nearest_on_route_equals_dense_samples():
     route = tiny_route()
     s_dense = np.linspace(0, arc_lengths(route)[-1], 20001)
     dense = point_at(route, s_dense)
@@ -359,7 +359,7 @@ def test_left_of_the_route_is_positive():
     assert nearest_on_route(loop, np.array([0.02, 0.2]), around=(0.0, 2.0))[0] == pytest.approx(0.02)
 
 
-def test_headings_and_turns():
+def test_headings_turns_and_corridor_edges_equal_closed_forms():
     route = tiny_route()
     assert heading_at(route, 0.0) == pytest.approx(0.0)
     assert heading_at(route, 100.0) == pytest.approx(-np.pi / 2, abs=0.05)

@@ -2,12 +2,17 @@
 
     python -m twin.align scenes/demo drive.csv
     python -m twin.align scenes/demo robot.mp4
+    python -m twin.align scenes/my_road drive.mcap [--camera]
     python -m twin.align husky drive.npz --out aligned
 
 From a log, system identification fits the controller's limits and latency, the servo's lag, tires, ground, center of
-mass and effective wheel radii to one half, and scores them on the other against a kinematic model fitted to the same
-half. Each value has a standard error; parameters that the log does not determine keep their values and are listed.
-Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json` and four figures.
+mass and effective wheel radii to half of the log. The other half scores them, against a kinematic model fitted to the
+first half, too. Each value has a standard error; parameters that the log does not determine keep their values and are
+listed. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json` and four
+figures.
+
+A robot's bag is a log; with --camera, its pictures are a film. If the scene was built from that bag, and its only poses
+are the wheels', the poses of the pictures are used.
 
 From a film that the robot's front camera records in the built place, the camera's extrinsics (height, yaw, pitch, roll)
 are fitted, and its focal length unless `[robot] camera_intrinsics` is given. They go to the same `robot.toml`;
@@ -24,13 +29,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from twin import commands, runtime
+from twin.capture.bag import is_bag
 from twin.config_file import ROBOT_TOML, load_config, merge_robot, parse_table, read_robot
 from twin.errors import InputError
-from twin.files import digest_file, read_toml, write_json, write_text
+from twin.files import digest_file, exists, read_toml, write_json, write_text
 from twin.robot import HuskyParams
 from twin.scene import SceneDir
 from twin.sysid.identification import Identification, format_error, identify, robot_toml, toml_text
-from twin.sysid.logs import check_log, read_log
+from twin.sysid.logs import Windows, check_log, cut_windows, read_log
 
 if TYPE_CHECKING:
     from twin.sysid.camera_extrinsics import CameraCalibration
@@ -61,7 +67,7 @@ def align_to_log(
     folder = out or folder
     if folder is None:
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")
-    windows = read_log(log)
+    windows = _windows(target, log)
     runtime.log_line(f"{log}: {len(windows)} windows, {int(windows.fitting.sum())} for fitting, the others for scoring")
     check_log(windows, str(log))
     pictures = folder / RESULT_FOLDER
@@ -78,8 +84,19 @@ def align_to_log(
     return result, folder
 
 
-def align_camera(target: str, film: Path) -> "tuple[CameraCalibration, Path]":
-    """Fits the camera of a built scene's robot to a film; writes the results and returns their folder.
+def _windows(target: str, log: Path) -> Windows:
+    """The windows of a log; those of a bag that the scene was built from may use the poses of its pictures."""
+    root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
+    if not (is_bag(log) and exists(log) and SceneDir(root).config_file.exists()):
+        return read_log(log)
+    from twin.sysid.ros_bags import filmed_poses, read_bag
+
+    scene = SceneDir(root)
+    return cut_windows(read_bag(log, filmed_poses(scene, load_config(scene.config_file), log)), str(log))
+
+
+def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalibration, Path]":
+    """Fits the camera of a built scene's robot to a film or a bag; writes the results and returns their folder.
 
     Raises:
         InputError: unknown scene or film, no writable folder, or an unusable film.
@@ -90,7 +107,7 @@ def align_camera(target: str, film: Path) -> "tuple[CameraCalibration, Path]":
     scene = SceneDir(root)
     if not scene.config_file.exists():
         raise InputError(f"{target}: a film needs a built scene to be localized in; give the scene's folder")
-    if not film.is_file():
+    if not film.is_file() and not is_bag(film):
         raise InputError(f"{film}: no such film")
     by_hand = _scene_robot_table(root)
     params = load_config(scene.config_file).robot
@@ -98,7 +115,7 @@ def align_camera(target: str, film: Path) -> "tuple[CameraCalibration, Path]":
     lens = parse_table(HuskyParams, given, str(scene.config_file))
     # Intrinsics in robot.toml may come from an earlier film, which this one replaces.
     params = replace(params, camera_intrinsics=lens.camera_intrinsics, camera_size=lens.camera_size)
-    result, frames = calibrate_camera(film, scene, params)
+    result, frames = calibrate_camera(film, scene, params, topic)
     kept = {name: value for name, value in read_robot(root / ROBOT_TOML).items() if name not in _INTRINSICS_FIELDS}
     text = toml_text(f"The camera was fitted to {film.name}: {result.summary}.", kept, result.identified)
     robot = merge_robot(tomllib.loads(text), by_hand, str(scene.config_file))
@@ -106,7 +123,7 @@ def align_camera(target: str, film: Path) -> "tuple[CameraCalibration, Path]":
     _check_writable(folder, "make it writable")
     write_camera_comparison(folder, result, frames, scene, parse_table(HuskyParams, robot, str(scene.config_file)))
     write_text(root / ROBOT_TOML, text)
-    figures = {"film": str(film), "film_sha256": digest_file(film)} | result.figures()
+    figures = {"film": str(film), "film_sha256": digest_file(film) if film.is_file() else None} | result.figures()
     write_json(folder / "camera.json", figures)
     return result, root
 
@@ -144,7 +161,7 @@ def _scene_robot_table(folder: Path) -> dict[str, Any]:
 def summary(result: Identification) -> str:
     """The printed summary."""
     scoring = ~result.windows.fitting
-    rows = [f"{'2 s ahead, on windows not fitted to':36} {'median':>16} {'90th percentile':>18}  wheels"]
+    rows = [f"{'errors after 2 s, held-out windows':36} {'median':>16} {'90th percentile':>18}  wheels"]
     for prediction in (result.nominal, result.baseline, result.level, result.fitted):
         s = prediction.score(scoring)
         wheels = f"{s.wheels_rad_s:.2f} rad/s" if prediction.wheels is not result.windows.wheels else "as measured"
@@ -170,10 +187,14 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
 
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    if options.log.suffix.lower() in _FILM_SUFFIXES:
+    if options.camera and not is_bag(options.log):
+        raise InputError(f"{options.log} is no bag; --camera is for bags, a film is taken for the camera anyway")
+    if options.topic and not options.camera:
+        raise InputError(f"--topic {options.topic}: is for --camera")
+    if options.camera or options.log.suffix.lower() in _FILM_SUFFIXES:
         if options.out or options.level:
-            raise InputError(f"{options.log} is a film; --out and --level are for logs")
-        camera, folder = align_camera(options.robot, options.log)
+            raise InputError(f"{options.log} is taken as a film; --out and --level are for logs")
+        camera, folder = align_camera(options.robot, options.log, options.topic or "")
         identified, lines = camera.identified, "\n".join([camera.summary, "fitted:", *_fitted(camera.identified)])
     else:
         result, folder = align_to_log(options.robot, options.log, options.out, not options.level)

@@ -45,8 +45,8 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 1, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.trainer", 4, ("nerf", "mjcf.route"), ("cameras", "metric")),
-    Stage("mesh", "twin.assets.mesh", 3, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
+    Stage("field", "twin.nerf.trainer", 5, ("nerf", "mjcf.route"), ("cameras", "metric")),
+    Stage("mesh", "twin.assets.mesh", 4, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",
@@ -59,8 +59,8 @@ PIPELINE = (
 
 _ON_DEVICE = ("field", "mesh")  # stages that take a device
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders of a scene that are never inputs
-# Durations [s] on the demo with 2 cores; only their ratios matter, since the pace of a build is measured. No time left
-# is shown before stages worth 30 s have run, since the first one is too short to estimate the pace.
+# Durations [s] on the demo with 2 cores; only their ratios matter, since the pace of a build is measured. The remaining
+# time is shown once stages worth 30 s have run; the first stage alone is too short to estimate the pace.
 _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
 _LEAST_TIMED = 30.0
 
@@ -133,8 +133,8 @@ def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     """SHA-256 of every file of the sources, by path relative to the scene.
 
-    Of a folder that contains the scene, and of a posed image set outside it, only the files that are read are hashed;
-    of other folders all files, without twin's own output.
+    All files of a folder are hashed, without twin's own output. If the folder contains the scene itself, or is a posed
+    image set outside it, only the files that the build reads are hashed.
 
     Raises:
         InputError: a source is missing, or neither a file nor a folder.
@@ -187,10 +187,13 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
         settings[name] = table[section][key] if key else table[section]
     # Settings that were added later and have no effect are left out, so that older results stay valid.
     for one in (settings.get("capture", {}), *settings.get("source", ())):
-        if "keep" in one and not one["keep"]:
-            del one["keep"]
+        for key in ("keep", "topic"):
+            if key in one and not one[key]:
+                del one[key]
     if settings.get("metric", {}).get("camera_height_tolerance") == MetricConfig.camera_height_tolerance:
         del settings["metric"]["camera_height_tolerance"]
+    if not settings.get("metric", {}).get("odometry", True):
+        del settings["metric"]["odometry"], settings["metric"]["odometry_tolerance"]
     if settings.get("route") == dataclasses.asdict(RouteConfig()):
         del settings["route"]
     if not settings.get("nerf", {}).get("refine_cameras", True):

@@ -53,7 +53,7 @@ class Verb:
     define: Callable[[argparse.ArgumentParser], None]
     """Adds the verb's description and options to a parser."""
     module: str
-    """Its function `command` does the work, given the parsed options."""
+    """Module whose function `command` does the work, given the parsed options."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -145,10 +145,16 @@ def _describe(error: OSError) -> str:
 
 
 def _new(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Start a scene folder from films."
+    parser.description = (
+        "Start a scene folder from films or robots' bags (ROS 2, or .bag of ROS 1; pip install 'twin[ros]'). A bag "
+        "also brings the camera's calibration, GPS and odometry for the scale, and the camera's pose on the robot."
+    )
     parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
-    parser.add_argument("films", type=Path, nargs="+", metavar="VIDEO", help="films or image folders, one per lighting")
+    parser.add_argument(
+        "films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting"
+    )
     parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
+    parser.add_argument("--topic", help="of the pictures in a bag; default: the one with most of them")
 
 
 def _build(parser: argparse.ArgumentParser) -> None:
@@ -157,7 +163,7 @@ def _build(parser: argparse.ArgumentParser) -> None:
 a scene.toml of your own road:
 
   [[source]]                      # one per film; several lightings make one twin
-  path = "input/morning.mp4"      # video, photo folder, COLMAP model or transforms.json
+  path = "input/morning.mp4"      # video, bag, photo folder, COLMAP model or transforms.json
   lighting = "morning"
   # mask = "input/robot.png"      # 0 = ignore (an image, or a folder named like the frames)
   # camera = { model = "PINHOLE", params = [fx, fy, cx, cy], width = 1280, height = 720 }
@@ -173,9 +179,11 @@ twin new SCENE VIDEO... writes such a folder.
 """
     parser.add_argument("scene", type=Path, help="folder with scene.toml and input/")
     parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"stop after: {', '.join(STAGES)}")
-    parser.add_argument("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="run it again")
     parser.add_argument(
-        "--quality", choices=tuple(QUALITIES), help="of the pictures; default: scene.toml's, or standard"
+        "--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again"
+    )
+    parser.add_argument(
+        "--quality", choices=tuple(QUALITIES), help="picture quality of the field; default: scene.toml's, or standard"
     )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
@@ -195,18 +203,22 @@ def _relight(parser: argparse.ArgumentParser) -> None:
 
 def _align(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Fit the Husky's parameters to a log of a real one driving, scored on windows not fitted to; or fit the pose "
-        "of its camera to a film by that camera."
+        "Fit the Husky's parameters to the log of a real Husky's drive, and score them on parts of the log that were "
+        "held out; or fit the pose of its camera to a film by that camera."
     )
     parser.epilog = (
         "A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
         "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
-        "acceleration_x, acceleration_y [m/s²] and group. Or the folder of a ROS 2 bag with cmd_vel, joint states, a "
-        "pose and an IMU (pip install 'twin[ros]'). A film (.mp4, ...) is of the robot's front camera, rectified, "
-        "driving ten metres or more on the built scene's place, mostly ahead, in light like that of one of its films."
+        "acceleration_x, acceleration_y [m/s²] and group. Or a ROS bag with cmd_vel, joint states (or the wheels' "
+        "odometry), poses that are not the wheels' (or pictures that the scene was built from) and an IMU "
+        "(pip install 'twin[ros]'). A film (.mp4, ...) is one by the robot's front camera, rectified: the robot drives "
+        "ten metres or more in the built scene's place, mostly straight ahead, in light like that of one of the "
+        "scene's films."
     )
     parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` for the published one")
-    parser.add_argument("log", type=Path, help="a .csv, an .npz, the folder of a ROS 2 bag, or a film")
+    parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
+    parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
+    parser.add_argument("--topic", help="of these pictures; default: the one with most of them")
     parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: the scene's")
     parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -226,10 +238,61 @@ def _film(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
     parser.add_argument("--obstacles", default="scene", help="number of random ones; scene: those of scene.toml")
-    parser.add_argument("--randomise", action="store_true", help="the seed also draws robot, weather and bystanders")
+    parser.add_argument("--randomise", action="store_true", help="randomize robot, weather and distractor objects")
     parser.add_argument("--seed", type=int, default=0, help="of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; default: a file in SCENE/films")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _drive(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Show the Husky driving: the policy of a pack, or the only run of a scene, on its task; without one, the "
+        "scripted driver. A film is written, or the page of twin view opened."
+    )
+    parser.add_argument("scene", type=Path, help="folder of a built scene, a pack, or the name of one: demo")
+    parser.add_argument("--view", action="store_true", help="in the browser; there press Drive")
+    parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function")
+    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
+    parser.add_argument("--task", help="straight, right_turn, route, or one of scene.toml")
+    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5 (default: drawn by the seed)")
+    parser.add_argument("--seed", type=int, default=0, help="of the episode")
+    parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free one; 0: any")
+    parser.add_argument("--out", type=Path, help="the mp4; default: in SCENE/films, of a pack in the working folder")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _pack(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Pack a built scene into one file with what driving in it needs, for another machine."
+    parser.add_argument("scene", type=Path, help="folder of a built scene")
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="the pack; default: NAME.twin in this folder")
+    parser.add_argument(
+        "--policy",
+        action="append",
+        default=[],
+        help="a run, a checkpoint or an ONNX file to take along; may be repeated",
+    )
+    parser.add_argument("--licence", default="", metavar="TEXT", help="terms for its receivers, such as 'CC BY 4.0'")
+    parser.add_argument("--with-positions", action="store_true", help="take the films' GPS positions along")
+    parser.add_argument(
+        "--levels",
+        type=int,
+        default=256,
+        help="values to which the field's features are rounded: fewer make the pack smaller, and another field; 256: "
+        "as built, bit for bit",
+    )
+    parser.add_argument("--trust", action="store_true", help="take a policy along that may run code")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def _unpack(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Unpack a pack into a scene folder, in which all verbs work that need no films. Its paths, sizes and digests "
+        "are checked, and nothing in it runs."
+    )
+    parser.add_argument("pack", type=Path, help="the file")
+    parser.add_argument("folder", type=Path, help="folder to make")
+    parser.add_argument("--trust", action="store_true", help="take policies that may run code when they are loaded")
+    parser.add_argument("--quiet", action="store_true", help="no summary")
 
 
 def _view(parser: argparse.ArgumentParser) -> None:
@@ -246,7 +309,7 @@ def _view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve on; other than this machine's loopback, the page's address has a token",
+        help="address to serve on; unless it is this machine's loopback, the page's URL contains a secret token",
     )
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one; 0: any")
     parser.add_argument("--path", type=Path, help="render this camera path instead of showing the page")
@@ -257,11 +320,29 @@ def _view(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Write a built place for other programs: its mesh as glTF, its field as Gaussian splats."
+    parser.description = (
+        "Write a built place for other programs: all of it as USD, its mesh as glTF, its field as Gaussian splats, its "
+        "frames and cameras for other trainers."
+    )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("--glb", type=Path, help="write the visual mesh with colors per vertex (binary glTF, y up)")
-    parser.add_argument("--ply", type=Path, help="write Gaussians as 3DGS viewers read them (z up)")
-    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
+    parser.add_argument(
+        "--usd",
+        type=Path,
+        metavar="FILE",
+        help="write splats in every lighting, collision shapes, the Husky, its camera and route as .usdz, .usd, .usdc "
+        "(pip install 'twin[usd]')",
+    )
+    parser.add_argument("--glb", type=Path, metavar="FILE", help="write the visual mesh, textured (binary glTF, y up)")
+    parser.add_argument("--ply", type=Path, metavar="FILE", help="write Gaussians as 3DGS viewers read them (z up)")
+    parser.add_argument(
+        "--nerfstudio", type=Path, metavar="DIR", help="write transforms.json, frames, masks and sparse points"
+    )
+    parser.add_argument("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
+    parser.add_argument(
+        "--lighting",
+        help="of --glb and --ply, and shown first by --usd: a name, or a mixture sun:night:0.5; default: first filmed "
+        "one",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
@@ -276,7 +357,9 @@ def _train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
     parser.add_argument("--steps", type=int, help="control steps of all worlds together (default: 12000; gpu: 120000)")
     parser.add_argument("--worlds", type=int, help="number of worlds driven at once (default: 8; gpu: 32)")
-    parser.add_argument("--processes", type=int, help="processes that step the worlds (default: as many as pay)")
+    parser.add_argument(
+        "--processes", type=int, help="processes that step the worlds (default: a core each, at most 8)"
+    )
     parser.add_argument("--updates", type=float, help="updates of the networks per step (default: 0.5)")
     parser.add_argument(
         "--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)"
@@ -292,7 +375,7 @@ def _train(parser: argparse.ArgumentParser) -> None:
         "--randomise",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="another robot in every episode and, where the lighting varies, weather and bystanders (the default)",
+        help="randomize the robot and, where the lighting varies, weather and distractor objects (the default)",
     )
     parser.add_argument(
         "--privileged",
@@ -337,8 +420,8 @@ def _trial(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", type=Path, help="the recording of one trial")
     parser.add_argument("--policy", required=True, help="the policy that drove: a run, a checkpoint or an ONNX file")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--lighting", required=True, metavar="NAME", help="of the day or light, as in real.csv")
-    parser.add_argument("--twin-lighting", metavar="NAME", help="the twin's to compare with; default: the same name")
+    parser.add_argument("--lighting", required=True, metavar="NAME", help="name of the day or light for real.csv")
+    parser.add_argument("--twin-lighting", metavar="NAME", help="the twin's lighting to compare with; default: NAME")
     parser.add_argument(
         "--cause",
         choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),
@@ -370,8 +453,8 @@ results.csv, one line per policy and lighting:
   first,morning,10,8
   first,dusk,10,6
 
-Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task. A lighting
-that the twin does not know by name is compared with one that it does, named in a column twin_lighting, such as
+Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task.
+If the twin has no lighting of that name, a column twin_lighting names the one to compare with, such as
 held-out+randomised.
 """
     parser.add_argument("scene", type=Path, help="folder of a scene with validated policies")
@@ -414,7 +497,10 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
     command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
     command.add_argument(
-        "--out", type=Path, required=True, help="results.csv; rows of trials go beside it; not for two commands at once"
+        "--out",
+        type=Path,
+        required=True,
+        help="results.csv, with a table of trials beside it; two commands cannot share it",
     )
     command.add_argument(
         "--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with"
@@ -445,9 +531,12 @@ VERBS = {
     "build": Verb("turn a scene folder into a drivable twin, with a report and a review film", _build, "twin.build"),
     "relight": Verb("add a lighting to a built scene, from one photo", _relight, "twin.relight"),
     "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),
+    "drive": Verb("show the Husky driving in a scene or a pack", _drive, "twin.drive"),
     "view": Verb("look at a built scene and drive in it, in the browser", _view, "twin.view.__main__"),
     "film": Verb("film a drive in a built scene", _film, "twin.film"),
-    "export": Verb("write the place for other programs: glTF mesh, Gaussian splats", _export, "twin.export"),
+    "export": Verb("write the place for other programs: USD, glTF, splats, cameras", _export, "twin.export.__main__"),
+    "pack": Verb("pack a built scene into one file, with policies, for another machine", _pack, "twin.pack"),
+    "unpack": Verb("unpack such a file into a scene folder", _unpack, "twin.unpack"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
     "validate": Verb("measure how often policies succeed, lighting by lighting", _validate, "twin.validate"),
     "trial": Verb("judge a trial on the road from the robot's recording", _trial, "twin.trial"),

@@ -1,7 +1,8 @@
 """Settings of `scene.toml`: one frozen dataclass per stage, with units, ranges and defaults; read by `config_file.py`.
 
 A *source* is one film (or photo folder, or posed image set) under one *lighting*. Several sources may share a lighting.
-Outside the ranges a stage fails for lack of memory, by its arithmetic, or never ends, often minutes into a build.
+With values outside their ranges a stage, often minutes into a build, runs out of memory, fails in its arithmetic or
+never ends.
 """
 
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 RANDOMIZED = "+randomised"
 """Suffix of randomized conditions in tables, see `Condition`; not allowed at the end of a lighting's name."""
 
-KINDS = ("auto", "video", "images", "colmap", "transforms")
+KINDS = ("auto", "video", "bag", "images", "colmap", "transforms")
 MAPPERS = ("auto", "global", "incremental")
 UPS = ("ground", "cameras", "poses")
 CAMERA_MODELS = {
@@ -84,20 +85,23 @@ class CalibrationConfig:
 
 @dataclass(frozen=True)
 class SourceConfig:
-    """One film, photo folder or posed image set under one lighting."""
+    """One film, bag, photo folder or posed image set under one lighting."""
 
     path: str = ""
-    """Video file, image folder, COLMAP model folder or transforms.json, relative to the scene folder."""
+    """Video file, robot's bag, image folder, COLMAP model folder or transforms.json, relative to the scene folder."""
     lighting: str = ""
     """Name of the lighting, not one of `RESERVED_LIGHTINGS`; by default the file's stem."""
     kind: str = "auto"
-    """auto, video, images, colmap or transforms."""
+    """auto, video, bag, images, colmap or transforms."""
+    topic: str = ""
+    """The pictures' topic in a bag; by default the one with most pictures."""
     images: str = ""
     """Image folder of a COLMAP model or transforms.json, if not beside it."""
     mask: str = ""
     """One static mask image, or a folder of masks named like the frames; 0 = ignore."""
     camera: CalibrationConfig | None = None
-    """Known intrinsics, held fixed. Calibrate if possible: forward motion biases self-calibration."""
+    """Known intrinsics, held fixed; by default those of a bag's camera_info. Calibrate if possible: forward motion
+    biases self-calibration."""
     camera_height: Annotated[float, Range(0)] = 0.0
     """Height of this source's lens above the ground [m], if sources differ; 0 = `metric.camera_height`."""
     keep: tuple[tuple[float, ...], ...] = ()
@@ -178,11 +182,15 @@ class MetricConfig:
     camera_height: Annotated[float, Range(0)] = 0.0
     """Lens above the ground [m], for a camera carried at constant height. 0 = not given."""
     camera_height_tolerance: Annotated[float, Range(0, 1)] = 0.01
-    """Standard deviation of the error with which it was measured [m]."""
+    """Standard deviation of the error of `camera_height` [m]."""
     distance: DistanceConfig | None = None
     marker: MarkerConfig | None = None
     gps: bool = False
-    """EXIF GPS positions of the images."""
+    """GPS positions: EXIF of the images, or NavSatFix of bags."""
+    odometry: bool = False
+    """Distances by the odometry of bags."""
+    odometry_tolerance: Annotated[float, Range(0.0001, 0.5)] = 0.03
+    """Standard deviation of the relative error of these distances: a few percent for wheels, less for LiDAR or RTK."""
     poses_are_metric: bool = False
     """The given poses (COLMAP model or transforms.json) are in metres."""
     up: str = "ground"
@@ -202,10 +210,11 @@ class NerfConfig:
     samples: Annotated[int, Range(1, 1024)] = 16
     """Samples per ray and step."""
     sightings: Annotated[float, Range(0, 0.7)] = 0.35
-    """Fraction of each step's rays with depth supervision; the others belong to triples and single pixels."""
+    """Fraction of each step's rays with depth supervision. The others are single pixels, and triples of neighboring
+    pixels."""
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
-    bake_steps: Annotated[int, Range(1)] = 300
+    bake_steps: Annotated[int, Range(1)] = 600
     """Fine-tuning steps of the baked field, which renders images."""
     detail_passes: Annotated[float, Range(0, 100)] = 2.0
     """How often each training pixel on a near surface is used to fit the detail that bricks lack; 0 = no detail."""
@@ -230,9 +239,9 @@ class NerfConfig:
 
 
 QUALITIES: dict[str, dict[str, int | float]] = {
-    "draft": {"steps": 1200, "bake_steps": 200, "detail_passes": 1.0},
+    "draft": {"steps": 1000, "bake_steps": 300, "detail_passes": 1.0},
     "standard": {},
-    "high": {"steps": 10000, "bake_steps": 1000, "detail_passes": 4.0, "max_width": 640},
+    "high": {"steps": 8000, "bake_steps": 3000, "detail_passes": 4.0, "max_width": 640},
 }
 """Settings of `NerfConfig` by quality, where they differ from the defaults."""
 
@@ -286,8 +295,9 @@ class MjcfConfig:
     half_width: Annotated[float, Range(0.1, 100)] = 1.0
     """Half width of the drivable corridor around the route [m]."""
     hfield_cell: Annotated[float, Range(0.01, 10)] = 0.3
-    """Cell of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge touches several
-    facets, so larger cells vibrate and cost less; the ground is smoothed to this scale (`mesh.ground_smoothing`)."""
+    """Cell of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge between cells
+    touches several facets, so smaller cells cause more vibration and cost more; the ground is smoothed to this scale
+    (`mesh.ground_smoothing`)."""
     corridor_margin: Annotated[float, Range(0, 100)] = 0.0
     """Extra clearance between the corridor and convex parts [m]."""
 

@@ -187,12 +187,16 @@ def _check(config: SceneConfig, folder: str) -> None:
     _check_obstacles(config.obstacle)
     _check_metric(config.metric)
     metric = config.metric
-    scales = (metric.camera_height > 0.0, metric.distance, metric.gps, metric.marker, metric.poses_are_metric)
+    scales = (
+        *(metric.camera_height > 0.0, metric.distance, metric.gps, metric.odometry, metric.marker),
+        metric.poses_are_metric,
+    )
     _require(
         any(scales) or any(source.camera_height > 0.0 for source in config.source),
         "[metric] gives no scale; give one or more of "
         "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
-        "gps = true (EXIF), marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true",
+        "gps = true (EXIF or a bag's fixes), odometry = true (a bag's), "
+        "marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true",
     )
 
 

@@ -205,6 +205,22 @@ def toml_string(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
+def toml_value(value: Any, digits: int | None = None) -> str:
+    """A value of TOML, tables inline, lists and tuples as arrays; numbers are exact, or have so many digits."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(toml_value(item, digits) for item in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{toml_string(key)} = {toml_value(item, digits)}" for key, item in value.items()) + "}"
+    if isinstance(value, str):
+        return toml_string(value)
+    if isinstance(value, int):
+        return str(value)
+    text = repr(float(value)) if digits is None else f"{value:.{digits}g}"
+    return text if any(c in text for c in ".einf") else text + ".0"
+
+
 def check_shapes(arrays: Mapping[str, tuple[NDArray, tuple[int, ...], str]]) -> None:
     """Raises ValueError if an array, given by name as (array, shape, dtype.kind), has another shape or kind."""
     for name, (array, shape, kind) in arrays.items():

@@ -21,6 +21,7 @@ from twin import commands, runtime
 from twin.env.suite import load
 from twin.errors import InputError
 from twin.loading import load_scene
+from twin.unpack import is_cached
 
 if TYPE_CHECKING:
     from twin.env.episode import Episode
@@ -40,11 +41,12 @@ def film(
     """Drives one episode and films it; returns the film's path and the episode.
 
     Args:
-        root: A built scene.
+        root: A built scene, or a pack.
         task: See `twin.load`.
         policy: A run's name, or see `twin.learn.policy.load_policy`; None: the scripted driver.
         seed: Seed of the episode.
-        out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder.
+        out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder, or for a pack
+            `<pack>_<task>_<lighting>_<seed>.mp4` in the working folder.
         trust: Allows a policy file to run code.
         options: See `twin.env.options.Options`; by default those of the policy.
 
@@ -64,7 +66,7 @@ def film(
     if policy:
         from twin.learn.policy import find_policy, load_policy
 
-        loaded = load_policy(find_policy(root, policy), trust)
+        loaded = load_policy(find_policy(scene.scene.root, policy), trust)
         driver, driver_name = PolicyDriver(loaded), loaded.name
         options = {**loaded.options(), **options}
     environment = load(scene, task, seed, **options)
@@ -77,7 +79,9 @@ def film(
 
     with runtime.bar("drive", max_steps, "step") as progress:
         episode = record_episode(environment, driver, watch)
-    path = out or root / "films" / film_name(task, episode.lighting, seed)
+    name = film_name(task, episode.lighting, seed)
+    in_cache = is_cached(scene.scene.root)
+    path = out or (Path(f"{root.stem}_{name}") if in_cache else scene.scene.root / "films" / name)
     path.parent.mkdir(parents=True, exist_ok=True)
     driven, geometry = environment.task, load_ground_and_parts(scene.scene)
     limits, title = (driven.segment.start, driven.segment.end), f"{task.replace('_', ' ')}: {driver_name}"
@@ -98,14 +102,25 @@ def command(given: argparse.Namespace) -> None:
             raise InputError(f"--obstacles {obstacles!r}: expected a number, or 'scene' for those of scene.toml")
         obstacles = int(obstacles)
     options = {"lighting_drift": given.drift, "randomise": given.randomise, "obstacles": obstacles}
-    if given.lighting:
-        from twin.config import Condition
-        from twin.env.domain_randomization import condition_options
-
-        options |= {name: value for name, value in condition_options(Condition.parse(given.lighting)).items() if value}
+    options |= film_options(given.lighting)
     path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
     if not given.quiet:
-        print(f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}")
+        print(summary(path, episode))
+
+
+def film_options(lighting: str | None) -> dict[str, Any]:
+    """Options of the environment for `--lighting`."""
+    if not lighting:
+        return {}
+    from twin.config import Condition
+    from twin.env.domain_randomization import condition_options
+
+    return {name: value for name, value in condition_options(Condition.parse(lighting)).items() if value}
+
+
+def summary(path: Path, episode: "Episode") -> str:
+    """One line: how the drive ended, and where its film is."""
+    return f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}"
 
 
 main = partial(commands.main, "film")

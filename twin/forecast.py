@@ -13,7 +13,8 @@ from pathlib import Path
 
 from twin import commands
 from twin.errors import InputError
-from twin.evaluation.forecasting import Estimate, Forecast
+from twin.evaluation.agreement import Estimate
+from twin.evaluation.forecasting import Forecast
 from twin.evaluation.trials import read_results, read_trials, tally
 from twin.files import write_text
 from twin.scene import SceneDir
@@ -32,7 +33,8 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     """
     from twin.evaluation.forecasting import make_forecast
     from twin.evaluation.training_curves import training_summaries
-    from twin.report.forecast_report import candidates_csv, write_forecast_page
+    from twin.report.forecast_report import write_forecast_page
+    from twin.report.forecast_text import candidates_csv
 
     scene = SceneDir(root)
     if not root.is_dir():
@@ -57,7 +59,7 @@ def command(options: argparse.Namespace) -> None:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     result = forecast(options.scene, options.real, options.seed)
     if not options.quiet:
-        from twin.report.forecast_report import summary_text
+        from twin.report.forecast_text import summary_text
 
         print(summary_text(result))
         print(f"look at {SceneDir(options.scene).forecast / 'forecast.html'}")

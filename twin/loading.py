@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from twin.errors import InputError
 from twin.files import read_json
 from twin.scene import SceneDir, require_stage
+from twin.unpack import open_scene
 
 if TYPE_CHECKING:
     from twin.geometry.cameras import Cameras
@@ -68,8 +69,19 @@ class Twin:
 
 
 def load_scene(path: str | Path) -> Twin:
-    """Opens a scene folder built by `twin.build`. Raises InputError if there is none."""
-    scene = SceneDir(Path(path))
+    """Opens a scene folder built by `twin.build`, or a pack of one (see `twin.unpack.open_scene`).
+
+    Raises InputError if there is none.
+    """
+    scene = SceneDir(open_scene(Path(path)))
     if not scene.config_file.exists():
-        raise InputError(f"no scene.toml in {path}; give the scene's folder, such as scenes/demo")
+        raise InputError(f"no scene.toml in {path}; give the scene's folder, such as scenes/demo, or a pack of one")
     return Twin(scene)
+
+
+def load_writable(path: Path) -> Twin:
+    """Opens a scene folder to which results are added. Raises InputError as `load_scene` does, and for a pack."""
+    twin = load_scene(path)
+    if twin.scene.root != path:
+        raise InputError(f"{path} is a pack; unpack it where results may go: twin unpack {path} FOLDER")
+    return twin

@@ -1,9 +1,11 @@
-"""Verb: creates a scene folder from films.
+"""Verb: creates a scene folder from films or a robot's bags.
 
     python -m twin.new scenes/my_road day.mp4 dusk.mp4 --camera-height 1.2
 
 writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
-`python -m twin.build scenes/my_road` builds it.
+`python -m twin.build scenes/my_road` builds it. Of a bag (`twin.capture.bag_film`) the pictures and their calibration
+are used; its GPS and odometry become sources of scale, and its `/tf_static` gives the camera's height and, in
+`robot.toml`, its seat on the robot.
 
 A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the deepest
 folder that contains all of its files; they are copied with their paths relative to the root.
@@ -16,17 +18,27 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from twin import commands
+import numpy as np
+
+from twin import commands, runtime
+from twin.capture.bag_film import BagContents, CameraSeat, read_contents
 from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap, read_transforms
 from twin.capture.frames import detect_kind
+from twin.capture.scale import local_east_north_up
 from twin.capture.video import probe
 from twin.config import RANDOMIZED, RESERVED_LIGHTINGS
-from twin.config_file import MAX_NAME
-from twin.errors import InputError
-from twin.files import digest_file, is_file, toml_string, write_text
+from twin.config_file import MAX_NAME, ROBOT_TOML, parse_table
+from twin.errors import InputError, join_names
+from twin.files import digest_file, exists, is_file, read_toml, toml_string, write_text
+from twin.robot import BASE_HEIGHT, HuskyParams
 from twin.scene import SceneDir
+from twin.sysid.identification import toml_text
 
 _POSED = ("colmap", "transforms")
+_MIN_FIX_WAY = 20.0  # [m] between the farthest fixes: below it they tell no scale
+_MIN_ODOMETRY_WAY = 15.0  # [m]
+_SEAT_TOLERANCE = 0.02  # [m] of a camera's height by /tf_static
+_SEAT_FIELDS = ("height", "offset", "yaw", "pitch", "roll")
 
 _HEAD = """\
 # Settings of this place. All others have defaults: see twin/config.py.
@@ -36,7 +48,7 @@ name = {name}
 _SOURCE = """
 [[source]]
 path = {path}
-lighting = {lighting}  # sources filmed under the same light may share a name
+{topic}lighting = {lighting}  # sources filmed under the same light may share a name
 # Mask image or folder of masks: pixels of value 0 are ignored, such as the robot's hood or a person ahead.
 # mask = "input/mask.png"
 # Calibrate the camera if possible: forward motion biases self-calibration. Lengths in pixels of the upright image.
@@ -51,7 +63,8 @@ fps = 2.0                      # frames kept per second of film, the sharpest of
 
 [metric]                       # sources of the metric scale; several are compared
 {camera_height}
-# gps = true                   # EXIF positions of the photos
+{gps}
+{odometry}
 # poses_are_metric = true      # the given poses are in metres
 # marker = {{ family = "DICT_APRILTAG_36h11", id = 0, size = 0.16 }}   # a printed marker; side of its square [m]
 # distance = {{ metres = 3.5, frame_a = "day/000012", a = [400, 500], b = [700, 500] }}   # two points on the road
@@ -62,13 +75,15 @@ half_width = 1.0               # half the width of the drivable corridor around 
 """
 
 
-def new_scene(root: Path, films: list[Path], camera_height: float | None = None) -> Path:
-    """Writes a scene folder: copies of the films under `input/`, then `scene.toml`, whose path is returned.
+def new_scene(root: Path, films: list[Path], camera_height: float | None = None, topic: str = "") -> Path:
+    """Writes a scene folder: copies of the films under `input/`, `robot.toml` if a bag has the camera's seat, then
+    `scene.toml`, whose path is returned. Logs what was taken from bags.
 
     Args:
         root: The scene folder; created if it does not exist.
-        films: Films, image folders or posed image sets; one source and one lighting each.
-        camera_height: Lens above the ground [m]; None: left for the user to fill in.
+        films: Films, bags, image folders or posed image sets; one source and one lighting each.
+        camera_height: Lens above the ground [m]; None: by a bag, or left for the user to fill in.
+        topic: Of the bags' pictures; empty: the one with most of them.
 
     Raises:
         InputError: an existing scene, an unreadable film, missing images of a posed image set, or an invalid height.
@@ -78,27 +93,113 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None)
         raise InputError(f"{scene.config_file}: a scene is here already; edit it, or choose another folder")
     if camera_height is not None and not 0.01 <= camera_height <= 100.0:
         raise InputError(f"--camera-height {camera_height:g}: expected metres above the ground, such as 1.2")
+    bags: dict[Path, BagContents] = {}
     for film in films:
         if not film.exists():
             raise InputError(f"{film}: no such film; give the path of a video file or an image folder")
         kind = detect_kind(film)
         if kind == "video":
             probe(film)
+        elif kind == "bag":
+            bags[film] = read_contents(film, topic)
         elif kind in _POSED:
             _image_set(film)
+    if topic and not bags:
+        raise InputError(f"--topic {topic}: none of the films is a bag; leave it out")
     inputs = root / "input"
     inputs.mkdir(parents=True, exist_ok=True)
     text = _HEAD.format(name=toml_string(root.resolve().name))
     for film in films:
         path = _import_film(film, inputs)
         lighting = _lighting(path, detect_kind(film))
-        text += _SOURCE.format(path=toml_string(("input" / path).as_posix()), lighting=toml_string(lighting))
-    if camera_height is None:
-        line = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another source below"
-    else:
-        line = f"camera_height = {camera_height:<14g} # lens above the ground [m], carried at a constant height"
-    write_text(scene.config_file, text + _REST.format(camera_height=line))
+        chosen = f"topic = {toml_string(bags[film].topics['pictures'])}\n" if film in bags else ""
+        path_text = toml_string(("input" / path).as_posix())
+        text += _SOURCE.format(path=path_text, topic=chosen, lighting=toml_string(lighting))
+    seat = next((bag.seat for bag in bags.values() if bag.seat), None)
+    seat_used = seat is not None and _write_seat(root / ROBOT_TOML, seat, next(b for b in bags.values() if b.seat))
+    scales = _scale_lines(list(bags.values()), camera_height, seat if seat_used else None)
+    write_text(scene.config_file, text + _REST.format(**scales))
+    for bag in bags.values():
+        runtime.log_line(_taken(bag))
     return scene.config_file
+
+
+def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: CameraSeat | None) -> dict[str, str]:
+    """Lines of [metric], active where the value is known."""
+    if camera_height is not None:
+        height = f"camera_height = {camera_height:<14g} # lens above the ground [m], carried at a constant height"
+    elif seat is not None:
+        height = (
+            f"camera_height = {seat.height:<14.4g} # lens above the ground [m], by /tf_static\n"
+            f"camera_height_tolerance = {_SEAT_TOLERANCE:<4g} # its standard deviation [m]; measure it for less"
+        )
+    else:
+        height = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another source below"
+    gps = "" if any(_fix_way(bag) >= _MIN_FIX_WAY for bag in bags) else "# "
+    odometry = "" if any(_odometry_way(bag) >= _MIN_ODOMETRY_WAY for bag in bags) else "# "
+    return {
+        "camera_height": height,
+        "gps": f"{gps + 'gps = true':<30} # positions: EXIF of photos, or a bag's fixes",
+        "odometry": f"{odometry + 'odometry = true':<30} # distances by a bag's odometry, good to 3 %"
+        " (odometry_tolerance)",
+    }
+
+
+def _fix_way(bag: BagContents) -> float:
+    """Greatest distance of a bag's fixes from the first one while it films [m]."""
+    during = (bag.fix_times >= bag.stamps[0]) & (bag.fix_times <= bag.stamps[-1])
+    fixes = np.nan_to_num(bag.fixes[during & np.isfinite(bag.fixes[:, :2]).all(1)])
+    if len(fixes) < 3:
+        return 0.0
+    return float(np.linalg.norm(local_east_north_up(fixes)[:, :2], axis=1).max())
+
+
+def _odometry_way(bag: BagContents) -> float:
+    """Length of a bag's path by odometry while it films [m]."""
+    during = (bag.odometry_times >= bag.stamps[0]) & (bag.odometry_times <= bag.stamps[-1])
+    some = bag.odometry[during & np.isfinite(bag.odometry).all(1)]
+    return float(np.linalg.norm(np.diff(some[:: max(1, len(some) // 1000)], axis=0), axis=1).sum())
+
+
+def _write_seat(path: Path, seat: CameraSeat, bag: BagContents) -> bool:
+    """Writes `robot.toml` with the camera's seat; False if it is none of a Husky's camera. Keeps an existing file."""
+    fields = {f"camera_{name}": getattr(seat, name) for name in _SEAT_FIELDS}
+    try:
+        parse_table(HuskyParams, {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}, str(path))
+    except InputError:
+        return False
+    if not exists(path):
+        comment = f"The camera's seat is that of {bag.topics['transforms']} in {bag.path.name}."
+        write_text(path, toml_text(comment, {}, {name: (value, None) for name, value in fields.items()}))
+    return True
+
+
+def _taken(bag: BagContents) -> str:
+    """Lines on what a bag gave."""
+    rate = (len(bag.stamps) - 1) / max(bag.duration, 1e-9)
+    lines = [
+        f"{bag.path.name}: {len(bag.stamps)} pictures of {bag.topics['pictures']}, {bag.size[0]}x{bag.size[1]} "
+        f"{bag.encoding}, {rate:.1f} a second over {bag.duration:.1f} s",
+        f"  calibration: {bag.lens_note}",
+    ]
+    if bag.other_pictures:
+        others = join_names(bag.other_pictures)
+        lines.append(f"  other pictures: {others}; choose by --topic, or topic = in scene.toml")
+    if "fixes" in bag.topics:
+        lines.append(
+            f"  GPS: {bag.topics['fixes']}, {np.isfinite(bag.fixes[:, :2]).all(1).sum()} fixes, {_fix_way(bag):.1f} m"
+        )
+    if "odometry" in bag.topics:
+        lines.append(f"  odometry: {bag.topics['odometry']}, {_odometry_way(bag):.1f} m")
+    if bag.seat:
+        ground = "" if bag.seat.ground_known else f" (base_link as high as a Husky's, {BASE_HEIGHT:.3f} m)"
+        lines.append(
+            f"  camera on the robot: {bag.seat.height:.3f} m above the ground{ground}, {bag.seat.offset[0]:.3f} m "
+            f"ahead, pitch {bag.seat.pitch:.1f}°, by {bag.topics['transforms']}"
+        )
+    elif "transforms" in bag.topics:
+        lines.append(f"  camera on the robot: its frame is not connected to base_link on {bag.topics['transforms']}")
+    return "\n".join(lines)
 
 
 def _import_film(film: Path, inputs: Path) -> Path:
@@ -194,9 +295,9 @@ def _lighting(path: Path, kind: str) -> str:
 
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    config = new_scene(options.scene, options.films, options.camera_height)
+    config = new_scene(options.scene, options.films, options.camera_height, options.topic or "")
     print(f"wrote {config}")
-    if options.camera_height is None:
+    if not any(read_toml(config)["metric"].values()):
         print("fill in [metric] there: without a scale nothing is metric")
     print(f"next: python -m twin.build {options.scene}")
 

@@ -93,8 +93,8 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     filmed = {name: render(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
-    # A start from the most similar frame instead of a lighting suits other views of the place better: by up to 1.7 dB
-    # on the demo, at worst by −0.2 dB.
+    # The fit starts from the most similar frame's embedding. Compared with a start from a lighting's, other views of
+    # the place gain up to 1.7 dB on the demo, and lose at most 0.2 dB.
     some = slice(None, None, max(1, height * width // _START_RAYS))
     starts = [*field.appearance.named().vectors, *field.appearance.named().frame_vectors]
     renders = [field.color(features[some], harmonics[some], one) for one in starts]

@@ -33,6 +33,8 @@ GEAR_RATIO = 79.0  # motor turns per wheel turn
 
 CAMERA_SIZE = (160, 90)
 """Width, height of a policy's images from the front camera [px]."""
+CAMERA_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Axes right, down and forward (columns) of a camera that looks straight ahead, in the base."""
 REAR_HEAVY = (-0.085, -0.00065, 0.062)
 """The published center of mass of the chassis, with x and y exchanged [m]."""
 
@@ -114,8 +116,8 @@ class HuskyParams:
     """Stiffness of tire friction relative to normal contact (MuJoCo's `impratio`). Below 1, tires creep as on soft
     ground: force grows with slip speed before they slide."""
     ground_viscosity: Annotated[float, Range(0, 1_000)] = 0.0
-    """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]; drag of about 2.4 N per tire,
-    Pa s and m/s."""
+    """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]. The drag of a tire is about
+    2.4 m × viscosity × speed."""
     wheel_shape: str = "ellipsoid"
     """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
 

@@ -30,11 +30,12 @@ from twin.files import (
     atomic_path,
     digest_file,
     digest_json,
+    json_bytes,
     read_json,
     regular_file,
     remove,
     wrap_read_errors,
-    write_json,
+    write_bytes,
 )
 
 STAGES: dict[str, str] = {
@@ -47,6 +48,9 @@ STAGES: dict[str, str] = {
     "review": "6_review",
 }
 """Stage name → folder under `build/`, in running order."""
+
+PACK_JSON = "pack.json"
+"""Marks a scene folder that was unpacked from a pack (`twin.unpack`), and has what driving needs alone."""
 
 
 @dataclass(frozen=True)
@@ -169,13 +173,16 @@ class Stamp:
     device: str
     packages: dict[str, str]
     sha256: dict[str, str] = field(default_factory=dict)
-    """Digest of every file; empty in older stamps, whose folders are compared with `result`."""
+    """Digest of every file. Older stamps have none; their folders are compared with `result` instead."""
     itself: str = ""
     """Digest of all fields above; empty in older stamps."""
 
     def save(self, folder: Path) -> None:
-        stamp = replace(self, itself=self._digest())
-        write_json(folder / "stamp.json", asdict(stamp))
+        write_bytes(folder / "stamp.json", self.content())
+
+    def content(self) -> bytes:
+        """The contents of the file."""
+        return json_bytes(asdict(replace(self, itself=self._digest())))
 
     @staticmethod
     def load(folder: Path) -> "Stamp | None":
@@ -245,6 +252,10 @@ def _verified_once(folder: Path, _stamped: tuple[int, int]) -> Stamp:
 def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
     folder = scene.stage(stage).resolve()
     path = folder / "stamp.json"
+    if not path.exists() and (scene.root / PACK_JSON).exists():
+        raise InputError(
+            f"{scene.root} was unpacked from a pack, which has no {STAGES[stage]}, nor films; ask its sender for those"
+        )
     if not path.exists():
         raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run python -m twin.build {scene.root}")
     facts = regular_file(path).stat()

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 from twin import commands, runtime
 from twin.errors import InputError
 from twin.evaluation.statistics import wilson
-from twin.loading import Twin, load_scene
+from twin.loading import Twin, load_writable
 from twin.runtime import exclusive_lock
-from twin.scene import SceneDir, require_stage, run_folder
+from twin.scene import require_stage, run_folder
 
 if TYPE_CHECKING:
     from twin.learn.train_config import TrainConfig
@@ -34,8 +34,8 @@ def command(given: argparse.Namespace) -> None:
     names = {field.name for field in dataclasses.fields(TrainConfig)}
     settings = {k: v for k, v in vars(given).items() if k in names and v is not None}
     config = TrainConfig(**{**PRESETS[given.preset], **settings})
-    folder = run_folder(SceneDir(given.scene), given.run)
-    twin = load_scene(given.scene)
+    twin = load_writable(given.scene)
+    folder = run_folder(twin.scene, given.run)
     require_stage(twin.scene, "mjcf")  # before the run's folder is created
     with exclusive_lock(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
         chosen = _train(twin, folder, config, given.processes)
@@ -45,7 +45,7 @@ def command(given: argparse.Namespace) -> None:
         low, high = wilson(won, trials)
         print(
             f"{folder}: the policy of step {chosen['step']}, which without exploring arrives in {won} of {trials} "
-            f"episodes like those of the training ({low:.2f} to {high:.2f}); success along it: {picture}"
+            f"episodes like those of the training ({low:.2f} to {high:.2f}); success during the training: {picture}"
         )
 
 

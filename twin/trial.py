@@ -3,8 +3,8 @@
     python -m twin.trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
 
 The bag has the front camera's pictures and camera_info, commands, and poses (RTK, LiDAR or filtered odometry). Pictures
-are located in the scene, which places the poses there; then the twin's own rules of success and failure apply. A
-collision shows in no pose: `--cause collision` says that the recording ends with one.
+are located in the scene, which places the poses there; then the twin's own rules of success and failure apply. Poses do
+not show a collision; `--cause collision` states that the recording ends with one.
 
 `<scene>/trials/<bag>/` gets `trial.mp4`, the robot's pictures beside the twin's, and `trial.json`: the outcome, how far
 the twin's robot ends from the real one under the same commands, how similar the pictures are, and whether the policy
@@ -44,7 +44,7 @@ from twin_policy import Camera, Limits, PictureError, Pilot, Rectifier
 SCENE_FRAME, FIT = "scene", "pictures"
 _LOCATED = 24  # pictures that are located in the scene
 _MOVING = 0.02  # [m/s], [rad/s]: the first faster command starts the trial
-_ANSWER = 300_000_000  # [ns] after a picture within which its command follows
+_ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
 _SAME = 1e-3  # [m/s], [rad/s] below which two commands are the same
 _START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] within which trials in the twin start
 
@@ -142,7 +142,7 @@ def _key(trial: Trial) -> tuple[str, str, str, int]:
 
 
 def _known_trials(table: Path, out: Path) -> list[Trial]:
-    """The trials recorded so far. Raises InputError: `out` has others, which writing it would lose."""
+    """The trials recorded so far. Raises InputError: `out` has other trials, which would be lost."""
     known = read_trials(table) if table.exists() else []
     explained = {cell.key: cell for cell in tally(known)}
     for key, (trials, _) in (read_counts(out) if out.exists() else {}).items():
@@ -221,7 +221,7 @@ def _with_cause(trial: JudgedTrial, cause: str | None, bag: Path) -> JudgedTrial
 
 
 class _PolicyOfPictures:
-    """A policy of `twin` as a pilot takes it."""
+    """A policy of `twin` with the interface that `twin_policy.pilot.Pilot` expects."""
 
     camera = None
 
@@ -250,7 +250,7 @@ def _pictures(
     def clock() -> int:
         return now
 
-    # Faults stopped the robot when it drove; here every picture counts.
+    # On the robot, faults in time stop it; here every picture is evaluated, so the limits are wide.
     loose = Limits(timeout=10.0, inference=10.0, ahead=10.0, clock_jump=10.0, rest=0.0)
     pilot = Pilot(_PolicyOfPictures(policy), loose, rectify.pinhole, clock, clock)  # type: ignore[arg-type]
     pilot.set_camera(recording.camera)

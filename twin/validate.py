@@ -26,7 +26,7 @@ from twin.evaluation.trials import EPISODE_COLUMNS, Trial, cells_csv, csv_text, 
 from twin.files import digest_file, digest_json, read_json, wrap_read_errors, write_bytes, write_json, write_text
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign
-from twin.loading import Twin, load_scene
+from twin.loading import Twin, load_writable
 from twin.report.validation_report import (
     TrainingCurve,
     failure_map,
@@ -133,7 +133,7 @@ def validate(
         InputError: unknown policy, scene, task or lighting; tables of another build, or of other policies with the same
             names; an episode that ends differently when it is filmed; another process that writes the same tables.
     """
-    twin = load_scene(root)
+    twin = load_writable(root)
     folder = twin.scene.validation
     policies = _named(root, sources, trust)
     lightings = tuple(dict.fromkeys(lightings))

@@ -60,11 +60,11 @@ def measures(subject: Subject) -> list[Row]:
 def track_ratios(subject: Subject) -> list[Row]:
     """B1: chi of a centered and of a rear-heavy robot."""
     rows = []
-    for label, center, bound in (("centred", HuskyParams.center_of_mass, 0.03), ("rear-heavy", REAR_HEAVY, 0.10)):
+    for label, center, bound in (("centered", HuskyParams.center_of_mass, 0.03), ("rear-heavy", REAR_HEAVY, 0.10)):
         changed = replace(subject.params, center_of_mass=center)
         expected = coulomb_track_ratio(center_of_mass(changed))
         for rate in _TURNS:
-            skip = 1.5 if label == "centred" else 3.0
+            skip = 1.5 if label == "centered" else 3.0
             turn = subject.turn(rate, skip=skip, center_of_mass=center)
             low, high = expected * (1 - bound), expected * (1 + bound)
             rows.append(Row("B1", f"chi at {rate:g} rad/s, {label} (Coulomb {expected:.3f})", turn.chi, low, high))

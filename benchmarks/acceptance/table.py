@@ -73,6 +73,6 @@ def _casters(spec: mujoco.MjSpec) -> None:
 CONTROLS = (
     Control("default contacts", Subject(edit=_default_contacts), ("B6 B7",)),
     Control("pyramidal cone", Subject(edit=_pyramidal_cone), ("B4 B5",)),
-    Control("mesh tyres", Subject(edit=_mesh_tyres), ("A1", "B6 B7")),
+    Control("mesh tires", Subject(edit=_mesh_tyres), ("A1", "B6 B7")),
     Control("frictionless casters", Subject(edit=_casters), ("A1", "B1", "B4 B5")),
 )

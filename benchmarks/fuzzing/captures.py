@@ -1,4 +1,4 @@
-"""Fuzz targets of captures: transforms.json, COLMAP models, images, EXIF, films."""
+"""Fuzz targets of captures: transforms.json, COLMAP models, images, EXIF, films, bags."""
 
 import struct
 import zlib
@@ -140,6 +140,28 @@ def exif(case: Case) -> None:
         data = data[:24] + corrupted(rng, data[24 : 24 + 400]) + data[424:]
     path.write_bytes(data)
     load_photo(path, None)
+
+
+def bag(case: Case) -> None:
+    from twin.capture.bag_film import read_contents
+    from twin.capture.video import FilmStatistics
+
+    rng, samples = case.rng, case.samples.bags
+    kind = rng.choice((".mcap", ".mcap", ".db3", ".bag", "metadata.yaml"))
+    path = case.folder / "drive"
+    if kind == "metadata.yaml":
+        path.mkdir()
+        text = samples[kind].decode()
+        (path / kind).write_bytes(mutated_text(rng, text))
+        (path / "mcap.mcap").write_bytes(samples[".mcap"])
+    else:
+        path = path.with_suffix(kind)
+        path.write_bytes(corrupted(rng, samples[kind]))
+    contents = read_contents(path, rng.choice(("", "", "/camera/image", "/none")))
+    contents.fixes_at(np.arange(3.0))
+    contents.odometry_at(np.arange(3.0))
+    for _ in contents.film().decode(FilmStatistics()):
+        pass
 
 
 def film(case: Case) -> None:

@@ -59,7 +59,7 @@ class Samples:
     def __init__(self, work: Path) -> None:
         self.folder = work / "stuff"
         self.folder.mkdir()
-        _ = self.twin, self.film  # made here, as the snapshots of cases must not see them appear
+        _ = self.twin, self.film, self.bags  # made here, as the snapshots of cases must not see them appear
 
     @cached_property
     def twin(self) -> Path:
@@ -88,6 +88,27 @@ class Samples:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
             container.mux(stream.encode(None))
         return path.read_bytes()
+
+    @cached_property
+    def bags(self) -> dict[str, bytes]:
+        """Bags of ten pictures with calibration, poses, fixes and transforms, by suffix, and metadata.yaml."""
+        from bag_of_film import camera_info, drive, pictures, seat, write, write_ros1
+
+        from twin.capture.camera_models import Lens
+
+        frames = [np.full((24, 32, 3), 30 * k, np.uint8) for k in range(6)]
+        times = np.arange(6) / 10.0
+        lens = Lens("OPENCV", (30.0, 30.0, 16.0, 12.0, 0.1, 0.0, 0.0, 0.0), 32, 24)
+        messages = [camera_info(lens), *seat(0.7, 0.3, 0.1), *drive(np.tile(np.eye(4), (6, 1, 1)), times)]
+        messages += [*pictures(frames[:4], times[:4]), *pictures(frames, times, "png")]
+        mcap = write(self.folder / "mcap", messages)
+        sqlite = write(self.folder / "sqlite", messages, mcap=False)
+        return {
+            ".mcap": next(mcap.glob("*.mcap")).read_bytes(),
+            ".db3": next(sqlite.glob("*.db3")).read_bytes(),
+            ".bag": write_ros1(self.folder / "ros1.bag", frames, times).read_bytes(),
+            "metadata.yaml": (mcap / "metadata.yaml").read_bytes(),
+        }
 
     @cached_property
     def images(self) -> dict[str, bytes]:

@@ -13,6 +13,7 @@ TARGETS = (
     Target("image", 8, captures.image),
     Target("exif", 4, captures.exif),
     Target("film", 4, captures.film),
+    Target("bag", 5, captures.bag),
     Target("results", 4, tables.results),
     Target("episodes", 4, tables.episodes),
     Target("training", 3, tables.training),

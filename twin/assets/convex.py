@@ -30,6 +30,8 @@ from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
 
 _MAX_COACD_FACES = 400  # meshes for CoACD are decimated to this, since its time grows fast; checks use all faces
+# Results are checked, so a coarser search than CoACD's defaults suffices.
+_SEARCH = {"resolution": 100, "mcts_nodes": 5, "mcts_iterations": 10, "mcts_max_depth": 2}
 _TIME_LIMIT = 120.0  # [s] per piece, far more than any needs: a busy machine shall not change the result
 _PROCESSES = 2
 _MAX_HULL_VERTICES = 32
@@ -234,7 +236,7 @@ def _run_coacd(
 ) -> tuple[list[list[ConvexPart] | None], int]:
     """CoACD's parts of each piece (None if it failed), and the number of cached results."""
     cache.mkdir(parents=True, exist_ok=True)
-    setting = {"bound": bound, "seed": seed, "faces": _MAX_COACD_FACES, "coacd": metadata.version("coacd")}
+    setting = {**_SEARCH, "bound": bound, "seed": seed, "faces": _MAX_COACD_FACES, "coacd": metadata.version("coacd")}
     jobs = []
     for piece in pieces:
         shape = hashlib.sha256(piece.vertices.tobytes() + piece.faces.tobytes()).hexdigest()
@@ -311,12 +313,8 @@ def _decompose_files(paths: list[Path]) -> None:
             coacd.Mesh(vertices, faces),
             threshold=float(data["bound"]),
             real_metric=True,
-            # Pieces are closed and results are checked, so a coarse search, 10 times as fast, suffices.
-            preprocess_mode="off",
-            resolution=200,
-            mcts_nodes=5,
-            mcts_iterations=10,
-            mcts_max_depth=2,
+            preprocess_mode="off",  # pieces are closed
+            **_SEARCH,
             max_ch_vertex=_MAX_HULL_VERTICES,
             decimate=True,
             seed=int(data["seed"]),

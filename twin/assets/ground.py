@@ -98,7 +98,7 @@ def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: in
 
 DATA_KINDS = ("field", "points", "path")
 _MIN_UPRIGHT = 0.94  # z of a normal (20° from vertical); steeper surfaces are no ground
-_GATE, _GATE_PER_METER = 0.25, 0.05  # [m] from the level of the path, and per meter of distance from it
+_GATE, _GATE_PER_METER = 0.25, 0.05  # [m] largest height difference to the path, plus so much per meter of distance
 _SIGMA_FIELD = 0.03  # [m] σ of a cell's median rendered height near the lens
 _SIGMA_POINTS = 0.04  # [m] σ of a cell's median sparse point
 _SIGMA_PATH = 0.012  # [m] σ of the path of a rigidly mounted camera
@@ -156,7 +156,7 @@ def _field_data(views: Views) -> tuple[HeightData, Array, NDArray[np.uint8]]:
         depth = views.depth[i]
         keep = (depth > 0) & (depth < _MAX_DEPTH) & (views.upward[i] > _MIN_UPRIGHT)
         points.append(views.points(i)[keep])
-        # A depth error of 2 % is an error of slant times as much in height.
+        # A depth error of 2 % causes a height error of 2 % · depth · slant.
         sigmas.append(np.hypot(_SIGMA_FIELD, 0.02 * depth[keep] * views.slant[i][keep]))
         colors.append(views.rgb[i][keep])
     xyz = np.concatenate(points)
@@ -234,7 +234,7 @@ _SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed as noise
 _EXTRAPOLATION_LENGTH = 8.0  # [m] over which slopes continue without data
 _REWEIGHTINGS = 6
 _COLOR_WIDTHS = (0.1, 0.4, 1.6, 6.4)  # [m] σ of means of colors
-_COLOR_WEIGHT = 0.1  # share of cells with a color from which a mean counts in full
+_COLOR_WEIGHT = 0.1  # least share of cells with a color for a mean to count in full
 _MIN_DATA = 50  # with fewer data the ground is flat
 
 

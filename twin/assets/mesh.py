@@ -106,7 +106,7 @@ def build_assets(
 
 
 def _camera_height(config: SceneConfig) -> float:
-    """The camera height that set the scale [m] if all sources share one, else 0 (estimated per source)."""
+    """The given height of the camera [m]; 0 if there is none or sources differ, so that it is estimated per source."""
     heights = {source.camera_height or config.metric.camera_height for source in config.source}
     return heights.pop() if len(heights) == 1 else 0.0
 
@@ -127,7 +127,7 @@ def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dic
     above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
     vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band)
-    # No view sees the back of the band, which is no surface.
+    # The far side of the band of distances is no surface; no view sees it.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
     vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)

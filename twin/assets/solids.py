@@ -32,8 +32,8 @@ _HIDDEN_DEPTH = 0.3  # [m] behind a surface where hidden space is solid
 _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
 _SMOOTHING = 0.7  # voxels
 _EROSION = 0.06  # [m] inward offset of surfaces, since edges blur outwards and hulls only grow
-_CERTAIN_DEPTH = 0.02  # [m] behind a seen surface, beyond which voxels stay solid despite the erosion
-_CORRIDOR_SLACK = 0.02  # [m] extra distance of parts, for rounding in later stages
+_CERTAIN_DEPTH = 0.02  # [m] voxels deeper than this behind a seen surface are never eroded
+_CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against rounding in later stages
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def clip_part(part: ConvexPart, normal: Array, offset: float) -> ConvexPart | No
 
 
 def _sagitta(reach: float) -> float:
-    """Largest error [m] of a distance to the points of the route, `SPACING` apart, instead of to its line."""
+    """Largest error [m] of measuring distances from the route's points, `SPACING` apart, instead of from its line."""
     return SPACING**2 / (8 * reach)
 
 

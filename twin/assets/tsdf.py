@@ -2,8 +2,9 @@
 
 *Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
 view votes `near` if its surface passes within the band, `free` if it sees further (Curless & Levoy 1996, eqs. 3 and 4,
-with votes for free space), so the views through a floater outvote the few that show it. The radiance field bridges
-depth edges with a ramp, which is seen edge-on: its votes have little weight, and views from elsewhere outvote it, too.
+with votes for free space), so the views through a floater outvote the few that show it. At a depth edge the radiance
+field has a false, slanted surface from the near to the far side. The view sees it edge-on, so its votes have little
+weight, and views from elsewhere outvote it.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -24,7 +25,7 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array
 from twin.warp_runtime import wp
 
-FREE_SPACE_REACH = 2.5  # times the depth range of surface votes: the depth range of free votes
+FREE_SPACE_REACH = 2.5  # free votes reach this many times as far as surface votes
 _HALF_WEIGHT_DEPTH = 5.0  # [m] depth at which a vote has half weight, since pixels and errors grow with depth
 _CLEARANCE = 0.1  # of the depth: beyond `far`, a voxel is free only if the surface is this much further
 _SAME_SURFACE_RATIO = 1.1  # largest depth ratio of neighboring pixels on one surface
@@ -235,7 +236,7 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
         through = (near > 0) & (free > _FREE_MAJORITY * (near + free))
         outvoted += int((through & (value < band)).sum())
         value = np.where(through, np.fmax(value, 0.5 * voxel), value)
-        # Free space without near votes bounds surfaces, too.
+        # Where all votes are for free space, the voxel is outside every surface.
         value = np.where((near == 0) & (free > 0), band, value)
         distance[tuple(part.T)] = value
         hidden[tuple(part.T)] = (near == 0) & (free == 0)

@@ -43,7 +43,7 @@ class Views:
     rgb: NDArray[np.uint8]
     """Shape (n, h, w, 3)."""
     depth: NDArray[np.float32]
-    """z-depth [m], shape (n, h, w); 0 where unreliable, larger than of any surface for the background."""
+    """z-depth [m], shape (n, h, w); 0 where unreliable, and larger than any surface's for the background."""
     slant: NDArray[np.float32]
     """Shape (n, h, w), in [0.12, √(1 + r²)]."""
     upward: NDArray[np.float32]
@@ -108,7 +108,7 @@ def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
         across = np.moveaxis(inverse, axis, -1)
         step = np.diff(across)
         first, second = step[..., :-1], step[..., 1:]
-        # Between its neighbors, far from both, and off the line between them.
+        # Pixels whose inverse depth is between their neighbors', far from both, and off the line between them.
         steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING_PIXEL_STEP * across[..., 1:-1]
         bent = np.abs(first - second) > 0.3 * np.abs(first + second)
         np.moveaxis(bad, axis, -1)[..., 1:-1] |= steep & bent & (first * second > 0)

@@ -39,6 +39,7 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "gps": ((3,), "f"),
     "camera_to_world": ((4, 4), "f"),
     "intrinsics": ((4,), "f"),
+    "odometry": ((3,), "f"),
 }
 """Stored arrays of `Capture`: shape per frame and `dtype.kind`."""
 
@@ -52,7 +53,7 @@ class SourceInfo:
 
     name: str  # unique folder name of the source
     lighting: str
-    kind: str  # video, images, colmap or transforms
+    kind: str  # video, bag, images, colmap or transforms
     width: int  # size of the kept frames [px]
     height: int
     camera_model: str  # COLMAP model name of the known or assumed camera
@@ -77,6 +78,9 @@ class Capture:
     """Poses given with the input (OpenCV axes), shape (n, 4, 4); None unless all sources have them."""
     intrinsics: Array | None = None
     """fx, fy, cx, cy [px] per frame of posed input at the kept size, shape (n, 4); `SourceInfo` has the distortion."""
+    odometry: Array | None = None
+    """Positions of the lens by a bag's odometry [m], in a frame per source, shape (n, 3), NaN where unknown; None
+    without a bag that has any."""
 
     def save(self, folder: Path) -> None:
         """Writes `capture.json` and `capture.npz`."""
@@ -192,6 +196,7 @@ class KeptFrames:
     metrics: dict[str, Any]
     poses: list[Array]  # camera_to_world (4, 4) per frame; empty for a source without poses
     intrinsics: list[Array]  # fx, fy, cx, cy [px] at the kept size per pose
+    odometry: list[tuple[float, float, float]] | None = None  # of a bag
 
 
 class FrameWriter:

@@ -1,8 +1,9 @@
 """Stage `capture`: converts films and image sets to kept frames of one size with masks, times and a held-out split.
 
-A *source* is one input under one lighting; its *kind* is video, images, colmap or transforms. A *kept* frame is upright
-and scaled to `capture.max_size`, and still has the lens's distortion. Its name is `<source>/<index>`, where the index
-is its position in the film or in the natural order of the image set: it does not depend on which other frames are kept.
+A *source* is one input under one lighting; its *kind* is video, bag, images, colmap or transforms. A *kept* frame is
+upright and scaled to `capture.max_size`, and still has the lens's distortion. Its name is `<source>/<index>`, where the
+index is its position in the film or in the natural order of the image set: it does not depend on which other frames are
+kept.
 *Held-out* frames are never trained on.
 """
 
@@ -13,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
+from twin.capture.bag import BAG_SUFFIXES, bag_files, is_bag
+from twin.capture.bag_film import BagContents, read_contents
+from twin.capture.camera_models import Lens
 from twin.capture.capture_data import NO_GPS, Capture, FrameWriter, KeptFrames, SourceTask
 from twin.capture.formats import (
     find_model,
@@ -23,7 +27,7 @@ from twin.capture.formats import (
     read_transforms,
 )
 from twin.capture.photos import read_photos
-from twin.capture.video import FilmStatistics, damage_note, read_film
+from twin.capture.video import FilmStatistics, damage_note, read_film, video_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
 from twin.config_file import MAX_NAME, check_lighting
 from twin.errors import InputError
@@ -78,8 +82,11 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 
 def detect_kind(path: Path) -> str:
-    """The kind of a source by its files: video, images, colmap or transforms. Raises InputError for none of them."""
-    if not is_folder(path, "check path = in scene.toml (it is relative to the scene folder)"):
+    """The kind of a source by its files, one of `twin.config.KINDS`. Raises InputError for none of them."""
+    folder = is_folder(path, "check path = in scene.toml (it is relative to the scene folder)")
+    if is_bag(path):
+        return "bag"
+    if not folder:
         return "transforms" if path.suffix.lower() == ".json" else "video"
     if find_model(path):
         return "colmap"
@@ -87,7 +94,11 @@ def detect_kind(path: Path) -> str:
         return "transforms"
     if image_files(path):
         return "images"
-    raise InputError(f"{path}: holds no images, no COLMAP model and no transforms.json; give a film or an image folder")
+    if bags := sorted(file.name for suffix in BAG_SUFFIXES for file in path.glob(f"*{suffix}")):
+        raise InputError(f"{path}: a bag without metadata.yaml; give its file, such as {bags[0]}")
+    raise InputError(
+        f"{path}: holds no images, no COLMAP model and no transforms.json; give a film, a bag or an image folder"
+    )
 
 
 def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path]:
@@ -99,6 +110,8 @@ def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path
     if kind == "transforms":
         table = path / "transforms.json" if path.is_dir() else path
         return [table, *listed_files(table, images)]
+    if kind == "bag":
+        return bag_files(path)
     if kind == "colmap" and path.is_dir() and (model := find_model(path)) is not None:
         files = [file for file in model.iterdir() if is_file(file)]
         try:
@@ -144,6 +157,8 @@ def _read_source(
 ) -> KeptFrames:
     path = root / source.path
     kind = detect_kind(path) if source.kind == "auto" else source.kind
+    if source.topic and kind != "bag":
+        raise InputError(f"{path}: topic = {source.topic!r}, but this is no bag ({kind}); remove the topic")
     masks = root / source.mask if source.mask else None
     cure = "give as mask an image or a folder of images, 0 = ignore"
     if masks and is_folder(masks, cure) and not any(masks.iterdir()):
@@ -153,13 +168,17 @@ def _read_source(
     if images:
         require_folder(images, "check images = in scene.toml, a folder")
     if kind == "video":
-        return _read_video(task)
+        return _read_video(task, None)
+    if kind == "bag":
+        return _read_video(task, read_contents(path, source.topic))
     if kind == "images":
         return read_photos(task, read_image_folder(path))
     return read_photos(task, read_colmap(path, images) if kind == "colmap" else read_transforms(path, images))
 
 
-def _read_video(task: SourceTask) -> KeptFrames:
+def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
+    """Reads a video file, or the film in a bag with its calibration and positions."""
+    film = video_film(task.path) if bag is None else bag.film()
     index: list[int] = []
     times: list[float] = []
     count, unmasked, size = FilmStatistics(), 0, (0, 0)
@@ -168,7 +187,7 @@ def _read_video(task: SourceTask) -> KeptFrames:
         return task.mask((f"{frame:06d}",), width, height)
 
     with runtime.bar(f"reading {task.name}", 0, "frame") as bar:
-        for frame in read_film(task.path, task.config, count, mask_of, task.segments):
+        for frame in read_film(film, task.config, count, mask_of, task.segments):
             size = (frame.image.shape[1], frame.image.shape[0])
             task.writer.put(frame.index, frame.image, frame.mask)
             unmasked += frame.mask is None
@@ -179,10 +198,10 @@ def _read_video(task: SourceTask) -> KeptFrames:
     if note := damage_note(task.path, count):
         runtime.log_line(f"  {note}")
     task.check_masked(unmasked, len(index))
-    lens = task.given_lens(count.size)
+    lens = task.given_lens(count.size) or _lens_of_bag(bag, count.size)
     info = task.info(size, lens.scaled(*size) if lens else None, lens is not None)
     metrics = {
-        "kind": "video",
+        "kind": task.kind,
         "lighting": task.lighting,
         "decoded": count.decoded,
         "promised": count.declared,
@@ -195,7 +214,21 @@ def _read_video(task: SourceTask) -> KeptFrames:
         "height": size[1],
         "median_sharpness": round(float(np.median(count.sharpness)), 4),
     }
-    return KeptFrames(info, index, times, [NO_GPS] * len(index), metrics, [], [])
+    if bag is None:
+        return KeptFrames(info, index, times, [NO_GPS] * len(index), metrics, [], [])
+    fixes, odometry = bag.fixes_at(np.array(times)), bag.odometry_at(np.array(times))
+    metrics |= {
+        "topics": bag.topics,
+        "calibration": "scene.toml" if task.source.camera else bag.lens_note,
+        "with_odometry": int(np.isfinite(odometry).all(1).sum()),
+    }
+    runtime.log_line(f"  {task.name}: {bag.topics['pictures']}; {metrics['calibration']}")
+    return KeptFrames(info, index, times, list(map(tuple, fixes)), metrics, [], [], list(map(tuple, odometry)))
+
+
+def _lens_of_bag(bag: BagContents | None, size: tuple[int, int]) -> Lens | None:
+    """A bag's calibration at the size of its pictures [px]."""
+    return bag.lens.scaled(*size) if bag is not None and bag.lens is not None else None
 
 
 def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:
@@ -206,6 +239,7 @@ def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:
             f"  the poses given are not used: {bare} brings none, so all cameras are reconstructed together"
         )
     counts = [len(one.index) for one in kept]
+    odometry = [row for one in kept for row in one.odometry or [NO_GPS] * len(one.index)]
     return Capture(
         sources=tuple(one.info for one in kept),
         names=tuple(f"{one.info.name}/{i:06d}" for one in kept for i in one.index),
@@ -215,6 +249,7 @@ def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:
         gps=np.array([g for one in kept for g in one.gps], np.float64).reshape(-1, 3),
         camera_to_world=None if without else np.stack([pose for one in kept for pose in one.poses]),
         intrinsics=None if without else np.stack([k for one in kept for k in one.intrinsics]),
+        odometry=np.array(odometry, np.float64).reshape(-1, 3) if np.isfinite(odometry).any() else None,
     )
 
 

@@ -19,6 +19,7 @@ from twin.capture.scale import (
     scale_from_gps,
     scale_from_height,
     scale_from_marker,
+    scale_from_odometry,
     select_scale_sources,
 )
 from twin.config import SceneConfig
@@ -62,11 +63,18 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
                 "metric.distance: no ground was reconstructed to lay the points on; give frame_b, a2 and b2"
             )
         scales["distance"] = scale_from_distance(cameras, up.direction, level, config.metric.distance)
+    row = {name: i for i, name in enumerate(capture.names)}
+    rows = [row[name] for name in cameras.names]
     if "gps" in sources:
-        row = {name: i for i, name in enumerate(capture.names)}
-        gps = capture.gps[[row[name] for name in cameras.names]]
+        gps = capture.gps[rows]
         rng = np.random.default_rng(config.seed)
         scales["gps"], east = scale_from_gps(cameras.positions, up.direction, gps, rng)
+    if "odometry" in sources:
+        if capture.odometry is None:
+            raise InputError(
+                "metric.odometry: no source is a bag with odometry; give metric.camera_height or another scale"
+            )
+        scales["odometry"] = scale_from_odometry(cameras, capture.odometry[rows], config.metric.odometry_tolerance)
     if "marker" in sources:
         assert config.metric.marker is not None
         scales["marker"] = scale_from_marker(cameras, config.metric.marker)

@@ -1,4 +1,4 @@
-"""Metric scale of a reconstruction from the camera height, a known distance, GPS or a printed marker."""
+"""Metric scale of a reconstruction from the camera height, a known distance, GPS, odometry or a printed marker."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,11 +18,15 @@ from twin.types import Array
 
 _SCALE_OPTIONS = (
     "metric.camera_height = 0.5 (lens above the ground [m]), [metric.distance] (two marked image points and the metres "
-    "between them), metric.gps = true (EXIF positions), [metric.marker] (a printed ArUco or AprilTag marker), or "
-    "metric.poses_are_metric = true"
+    "between them), metric.gps = true (positions in EXIF or a bag), metric.odometry = true (a bag's), [metric.marker] "
+    "(a printed ArUco or AprilTag marker), or metric.poses_are_metric = true"
 )
 _PIXEL_ERROR = 1.0  # [px] of a point marked by hand
 _GPS_TRIALS = 400
+_STRETCH = 2.0  # [m] of odometry that is compared with the path of the cameras: its heading hardly drifts within it
+_STRAIGHT = 0.7  # a stretch whose ends are nearer than this fraction of its length is not compared
+_MIN_STRETCHES = 5
+_MAX_STRETCH_SPREAD = 0.3  # relative
 _MIN_SIDE = 10  # road points on either side of the path for a comparison of the two
 _MIN_ANGLE = np.radians(2.0)  # [rad] between the rays of two frames to a marker
 
@@ -37,7 +41,7 @@ class Scale:
 
 
 def select_scale_sources(metric: MetricConfig, source_heights: dict[str, float]) -> list[str]:
-    """The scale sources that are configured: camera_height, distance, gps, marker, poses_are_metric.
+    """The scale sources that are configured: camera_height, distance, gps, odometry, marker, poses_are_metric.
 
     `source_heights` holds the sources' own camera heights [m], 0 for none. Raises InputError if none is configured, or
     for a negative height.
@@ -51,6 +55,7 @@ def select_scale_sources(metric: MetricConfig, source_heights: dict[str, float])
         "camera_height": any(height > 0 for height in heights),
         "distance": metric.distance is not None,
         "gps": metric.gps,
+        "odometry": metric.odometry,
         "marker": metric.marker is not None,
         "poses_are_metric": metric.poses_are_metric,
     }
@@ -311,6 +316,69 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
         "gps_residual_median_m": float(np.median(residual)),
     }
     return Scale(float(abs(fit)), sigma, notes), east
+
+
+def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> Scale:
+    """Scale from positions of the cameras by odometry [m], in a frame per source, shape (n, 3), NaN where unknown.
+
+    Odometry drifts in heading, that of a skid-steered robot's wheels most, but its lengths are good to a few percent.
+    So the distances between the ends of stretches of `_STRETCH` are compared, whose directions do not matter. Their
+    common error is `tolerance`, a relative standard deviation; how well the stretches agree adds to it.
+
+    Raises InputError: too few stretches, or stretches that contradict each other.
+    """
+    ratios, lengths = [], []
+    sources = np.array(cameras.sources)
+    for name in dict.fromkeys(cameras.sources):
+        rows = np.flatnonzero(sources == name)
+        for first, last in _stretches(odometry[rows]):
+            moved = float(np.linalg.norm(odometry[rows[last]] - odometry[rows[first]]))
+            filmed = float(np.linalg.norm(cameras.positions[rows[last]] - cameras.positions[rows[first]]))
+            if filmed > 0.0:
+                ratios.append(moved / filmed)
+                lengths.append(moved)
+    if len(ratios) < _MIN_STRETCHES:
+        known = int(np.isfinite(odometry).all(1).sum())
+        raise InputError(
+            f"metric.odometry: {known} of {len(odometry)} registered frames have odometry, over {len(ratios)} "
+            f"stretches of {_STRETCH:g} m (need {_MIN_STRETCHES}); record odometry while filming, or give the scale "
+            "another way"
+        )
+    logs, weights = np.log(ratios), np.array(lengths)
+    middle = float(np.median(logs))
+    spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+    if spread > _MAX_STRETCH_SPREAD:
+        raise InputError(
+            f"metric.odometry: stretches differ from the film's by factors that vary by {spread:.0%} (expected at most "
+            f"{_MAX_STRETCH_SPREAD:.0%}); check the stamps of pictures and odometry, or give the scale another way"
+        )
+    inliers = np.abs(logs - middle) <= max(3.0 * spread, 1e-3)
+    value = float(np.exp(np.average(logs[inliers], weights=weights[inliers])))
+    # Slip and errors of the reconstruction are shared by neighboring stretches: about three count as one.
+    repeat = spread / np.sqrt(max(inliers.sum() / 3.0, 1.0))
+    notes = {
+        "odometry_stretches": len(ratios),
+        "odometry_inliers": int(inliers.sum()),
+        "odometry_length_m": float(weights[inliers].sum()),
+        "odometry_spread_relative": spread,
+    }
+    return Scale(value, float(np.hypot(tolerance, repeat)), notes)
+
+
+def _stretches(positions: Array) -> list[tuple[int, int]]:
+    """First and last index of consecutive stretches of `_STRETCH` or more between known positions (n, 3) in order."""
+    out, first, way = [], 0, 0.0
+    for last in range(1, len(positions)):
+        step = float(np.linalg.norm(positions[last] - positions[last - 1]))
+        if not np.isfinite(step):
+            first, way = last, 0.0
+            continue
+        way += step
+        if way >= _STRETCH:
+            if np.linalg.norm(positions[last] - positions[first]) >= _STRAIGHT * way:
+                out.append((first, last))
+            first, way = last, 0.0
+    return out
 
 
 def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:

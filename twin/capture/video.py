@@ -1,14 +1,16 @@
-"""Video files: decoding, rotation (display matrix) and frame selection, in one pass with little memory.
+"""Films: decoding of video files, rotation (display matrix) and frame selection, in one pass with little memory.
 
-A *slot* is one of n equal time spans of a film; the sharpest frame of each slot is its *candidate*. A candidate that
-hardly moved since the last kept frame is a *duplicate* and is dropped. A frame's *index* is its position in the film,
-counted from 0 in order of presentation; its *time* [s] is measured from the first frame. If only *segments* of the film
-are kept, the slots divide these segments as if the rest were cut out; indices and times remain those of the whole film.
+A *film* is a video file, or the pictures of a bag (`bag_film.py`). A *slot* is one of n equal time spans of it; the
+sharpest frame of each slot is its *candidate*. A candidate that hardly moved since the last kept frame is a *duplicate*
+and is dropped. A frame's *index* is its position in the film, counted from 0 in order of presentation; its *time* [s]
+is measured from the first frame. If only *segments* of the film are kept, the slots divide these segments as if the
+rest were cut out; indices and times remain those of the whole film.
 """
 
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import av
@@ -209,6 +211,21 @@ class FilmStatistics:
 
 
 @dataclass(frozen=True)
+class Film:
+    """A film to be read."""
+
+    path: Path
+    timing: FilmTiming
+    decode: Callable[[FilmStatistics], Iterator[tuple[float | None, av.VideoFrame]]]
+    """Yields the undamaged frames in order, each after its time stamp [s] or None; counts the damaged ones."""
+
+
+def video_film(path: Path) -> Film:
+    """The film in a video file. Raises InputError: see `probe`."""
+    return Film(path, probe(path), partial(decode, path))
+
+
+@dataclass(frozen=True)
 class FilmFrame:
     """A kept frame, upright and scaled to the kept size."""
 
@@ -228,7 +245,7 @@ class _Candidate:
 
 
 def read_film(
-    path: Path,
+    film: Film,
     config: CaptureConfig,
     count: FilmStatistics,
     mask_of: Callable[[int, int, int], Image | None],
@@ -242,7 +259,7 @@ def read_film(
     Raises InputError: unreadable, fewer than two frames, or only blank frames.
     """
     last_small: Image | None = None
-    for candidate in _sharpest_per_slot(path, config, count, segments):
+    for candidate in _sharpest_per_slot(film, config, count, segments):
         image = upright(candidate.frame)
         count.size = (image.shape[1], image.shape[0])
         size = fitted_size(*count.size, config.max_size)
@@ -263,20 +280,21 @@ def read_film(
         yield FilmFrame(candidate.index, candidate.time, image, mask)
     if count.decoded < 2:
         raise InputError(
-            f"{path}: {count.decoded} of {count.declared} frames could be decoded (need 2); "
+            f"{film.path}: {count.decoded} of {count.declared} frames could be decoded (need 2); "
             "copy it again from the camera or re-encode it"
         )
     if last_small is None:
         raise InputError(
-            f"{path}: all {count.blank} frames are blank (one color); film with enough light and without a lens cap"
+            f"{film.path}: all {count.blank} frames are blank (one color); film with enough light and without a lens "
+            "cap"
         )
 
 
 def _sharpest_per_slot(
-    path: Path, config: CaptureConfig, count: FilmStatistics, segments: tuple[tuple[float, ...], ...]
+    film: Film, config: CaptureConfig, count: FilmStatistics, segments: tuple[tuple[float, ...], ...]
 ) -> Iterator[_Candidate]:
-    timing = probe(path)
-    kept_timing, position = _joined_segments(timing, segments, path)
+    timing = film.timing
+    kept_timing, position = _joined_segments(timing, segments, film.path)
     last = int(np.flatnonzero(position >= 0)[-1])
     slots = config.frames or max(2, round(kept_timing.duration * config.fps))
     slots = min(slots, config.max_frames, len(kept_timing.times))
@@ -285,7 +303,7 @@ def _sharpest_per_slot(
     best: _Candidate | None = None
     index = -1
     size: tuple[int, int] | None = None
-    for stamp, frame in decode(path, count):
+    for stamp, frame in film.decode(count):
         index = frame_index(None if stamp is None else stamp - timing.start, timing, index)
         if segments and index > last:
             break
@@ -294,7 +312,7 @@ def _sharpest_per_slot(
         count.decoded += 1
         if size is not None and size != (frame.width, frame.height):
             raise InputError(
-                f"{path}: the picture changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} "
+                f"{film.path}: the picture changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} "
                 f"at frame {index}; cut the film there into two sources"
             )
         size = (frame.width, frame.height)

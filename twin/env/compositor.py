@@ -33,7 +33,7 @@ from twin.warp_runtime import wp
 # ---- objects
 
 _NEAR_PLANE = 0.02  # [m] z-depth before which nothing is drawn
-_SMALL_MASK = 800  # [px] masks up to here are supersampled throughout: a first cast would cost more than it saves
+_SMALL_MASK = 800  # [px] smaller masks are supersampled everywhere: finding the edges costs more than it saves
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of the samples at edges
 
 

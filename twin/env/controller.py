@@ -21,7 +21,7 @@ Int32Array = NDArray[np.int32]
 CONTROL_PERIOD = 0.1
 """Usual time between two commands [s]."""
 COMMAND_TIMEOUT = min(timing.timeout for timing in CONTROLLERS.values())
-"""Longest time between two commands that no controller takes for a stop [s]."""
+"""Longest time between two commands [s]: the shortest time-out of all controllers."""
 
 _TIME_TOLERANCE = 1e-9  # [s] below which two times are equal
 
@@ -53,12 +53,6 @@ def wheel_speeds(command: Array, params: HuskyParams) -> Array:
     return limit_sides(sides, params.max_wheel_speed) / WHEEL_RADIUS
 
 
-def wheel_speeds_to_twist(speeds: Array, params: HuskyParams) -> Array:
-    """Inverse of `wheel_speeds` within its limits: the controller's v [m/s], ω [rad/s], shape (2,)."""
-    left, right = np.asarray(speeds) * WHEEL_RADIUS
-    return np.array([(left + right) / 2, (right - left) / (params.separation_multiplier * TRACK)])
-
-
 class Controller:
     """Controller of one robot. Times are in seconds on a clock that starts with `reset`."""
 
@@ -74,7 +68,7 @@ class Controller:
 
     @property
     def phase(self) -> float:
-        """Time of the first update [s]; others follow periodically. A command given at 0 arrives just then."""
+        """Time of the first update [s]; others follow periodically. A command given at time 0 arrives at an update."""
         period = self.params.timing.period
         phase = self.params.command_latency % period
         return 0.0 if phase > period - _TIME_TOLERANCE else phase
@@ -136,7 +130,7 @@ class VectorController:
         self._params, self.timestep, self._check_steps = params, timestep, check_steps
         self._steps, self._period = round(period / timestep), period
         self._steps_per_update = round(params.timing.period / timestep)
-        # A segment ends with a contact check; each update, and the end of the control step, may shorten one.
+        # A segment ends at a contact check, at a controller update, or at the end of the control step.
         self.max_segments = self._steps // check_steps + round(period / params.timing.period) + 3
         self._latency, self._steps_to_update = np.zeros(count), np.zeros(count, int)
         self.time = np.zeros(count)

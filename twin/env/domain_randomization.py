@@ -29,9 +29,10 @@ KNOWN_WEATHER_FRACTION = 0.6
 
 Measured by `benchmarks/day.py` with the twelve finished policies that are forecast on the known-truth world, on ten of
 its days (the five stated weathers and days 1 to 5, not 6 to 15): a forecast for these is not independent of it. The
-change of steering between the twin under a photo's appearance and fog and the pictures of that day is 0.8 (0.6 to 0.96)
-times that under the full randomization. With this fraction it is 1.1 (0.8 to 1.4) times in the part that is constant
-over a day, and 1.2 (1.0 to 1.4) times in the part that varies along the route."""
+benchmark measures how much the policies' steering changes from the twin, under a photo's appearance and fog, to the
+pictures of that day. That change is 0.8 (0.6 to 0.96) times the change that the full randomization causes. Relative to
+the change caused with this fraction, it is 1.1 (0.8 to 1.4) times in the part that is constant over a day, and 1.2 (1.0
+to 1.4) times in the part that varies along the route."""
 
 _PAYLOAD_SIDE = 0.3  # [m] of the cube whose inertia the payload gets
 _TIRE_SUFFIX = "_tyre"
@@ -166,8 +167,9 @@ class RandomizationSample:
 
 
 EVALUATION_RANGES = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75), hold_known=True)
-"""Ranges for evaluating policies: the scene's robot as far as measured, and never the film's sun. Training samples sun
-and shadows from zero up, to ease learning; in a forecast, such mild days would overestimate success on the road."""
+"""Ranges for evaluating policies: measured parameters of the scene's robot are held, and the sun always differs from
+the film's. Training samples sun and shadows from zero up, to ease learning; in a forecast, such mild days would
+overestimate success on the road."""
 
 
 def measured_parameters(robot: HuskyParams) -> list[str]:

@@ -7,7 +7,8 @@
     "training"           sampled from the training set
     "held-out"           sampled from the held-out set
 
-With drift, an episode begins in one lighting and, if it lasts that long, ends in another one sampled in the same way.
+With drift, an episode begins in one lighting, which changes over the drift's duration into another one, sampled in the
+same way.
 """
 
 from collections.abc import Sequence
@@ -121,7 +122,7 @@ class LightingSets:
         prior = self._filmed.prior
         # The anchor itself is the fallback where samples are rare, such as at the edge of the filmed lightings.
         for embedding in chain((prior.propose(rng) for _ in range(_MAX_TRIES)), [self.anchors.embeddings[anchor]]):
-            # Few are near the anchor, while most are plausible: so the former is tested first.
+            # Most proposals are plausible, but few are near the anchor, so nearness is tested first.
             if self.set_and_anchor(embedding) == (which, anchor) and not prior.violations(embedding):
                 return embedding
         raise InputError(

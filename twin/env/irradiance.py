@@ -5,9 +5,9 @@ of a given normal: an object's own color times the irradiance is its color in th
 horizontal surface is the *ground irradiance*: the color of the reconstructed ground nearby over an assumed albedo.
 
 The irradiance of other normals is fitted to *probes*, surface points of the field. Each upright probe is compared with
-itself under the mean of the filmed lightings, which cancels its albedo; that mean is taken as a uniform sky over dim
-ground. For each direction of `SIDE_DIRECTIONS` one part is proportional to the ground irradiance, as the light of a
-lamp or sun is, and one part is constant, as the light of the sky is.
+itself under the mean of the filmed lightings, which cancels its albedo; that mean is assumed to be the light of a
+uniform sky over dim ground. The light from each direction of `SIDE_DIRECTIONS` has two parts: one proportional to the
+ground irradiance, like that of a lamp or the sun, and a constant one, like that of the sky.
 
 The composited features of the probes are stored, so that any embedding gives their colors in a millisecond.
 """
@@ -32,8 +32,8 @@ from twin.types import Array
 
 GROUND_ALBEDO = 0.37
 """Assumed reflectance of the ground along the route, in film colors: worn asphalt reflects about 11 %, which the tone
-curve of a film (exponent 1 / 2.2) shows as 0.37. It was lowered from 0.38 (12 %) so that obstacles at night pass the
-threshold of `benchmarks/overlay.py` (6 dB better than unshaded); that benchmark is not independent of it."""
+curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %) obstacles at night missed the threshold of
+`benchmarks/overlay.py` (6 dB better than unshaded), so that benchmark is no independent test of it."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 """Horizontal directions that light is resolved into, shape (4, 3)."""
@@ -48,7 +48,7 @@ _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
 _KERNEL_STD = 1.5  # [m] of the ground probes' weights around a position
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
 _UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky, 1 facing up
-_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # share of one direction; cotangent of its elevation
+_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
 _MAX_BRIGHTNESS = 1.5  # times the ground's brightest: brighter surfaces emit light
 _NEIGHBORS = 8  # ground probes around an upright one
@@ -65,9 +65,9 @@ class Irradiance:
     up: Array
     """Ground irradiance at them, shape (k, 3)."""
     constant: Array
-    """Constant part of the light on normals that do not face up, and from each of `SIDE_DIRECTIONS`, (5, 3)."""
+    """Constant part of the light: on normals that do not face up (row 0), and from `SIDE_DIRECTIONS`, shape (5, 3)."""
     proportional: Array
-    """The same per unit of ground irradiance, shape (5, 3)."""
+    """Part of the light proportional to the ground irradiance, as a factor of it; rows as in `constant`, (5, 3)."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
     """Ground irradiance at recent positions; most objects stand still."""
 
@@ -135,7 +135,7 @@ class IrradianceEstimator:
         if len(self._ground.positions) < _MIN_PROBES:
             raise InputError(
                 "no ground is seen along the route, so the irradiance cannot be estimated; was the field built with "
-                "this scene? Compositor(..., shaded=False) works without"
+                "this scene? Compositor(..., shaded=False) needs no irradiance"
             )
         self._xy = self._ground.positions[:, :2]
         self._neighbors = _nearest_indices(self._xy, self._upright.positions[:, :2])
@@ -370,7 +370,7 @@ def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Arr
     hidden = np.zeros(len(points))
     for low, high in boxes:
         center, half = 0.5 * (low + high)[:2], 0.5 * _FILL * (high - low)[:2]
-        # Sky, weighted with the cosine: an endless wall hides half of it, a box a part by its width and height.
+        # Sky, weighted with the cosine: an endless wall hides half of it; a box hides less, by its width and height.
         gap = np.linalg.norm(np.maximum(np.abs(local - center) - half, 0.0), axis=1)
         wide = np.arctan2(float(half.mean()), gap) / np.pi
         gap2 = gap**2 + 1e-6

@@ -6,6 +6,7 @@ visual geometry; the *chase camera* follows the robot from behind and above.
 """
 
 import copy
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,6 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.assets.gaussians import Gaussians
 from twin.config import ObstacleConfig
 from twin.env.camera_noise import CameraNoise
 from twin.env.obstacle_models import OBSTACLE_GROUP
@@ -23,9 +25,9 @@ from twin.env.weather import Weather
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.husky import ROBOT_COLLISION_GROUP, camera_mount_geoms
-from twin.mjcf.world import World
+from twin.mjcf.world import GROUND_GROUP, World
 from twin.nerf.rendering import FAR, Rendering
-from twin.runtime import available_cores
+from twin.runtime import available_cores, log_line
 from twin.types import Array, Array32, Image
 from twin.warp_runtime import wp
 
@@ -39,6 +41,8 @@ _SCENE_SETTINGS: dict[str, Any] = {  # collision parts are not drawn
     "use_shadows": True,
     "enable_backface_culling": False,
 }
+_SPLAT_SETTINGS = _SCENE_SETTINGS | {"enabled_geom_groups": [GROUND_GROUP, 1, OBSTACLE_GROUP]}  # no visual mesh
+_GROUND_BELOW_SPLATS = 0.15  # [m] by which the ground is drawn lower, to show only where there are no splats
 
 
 def camera_intrinsics(model: mujoco.MjModel, camera: int, size: tuple[int, int]) -> Array:
@@ -113,10 +117,14 @@ def mujoco_rays(rays: Array) -> Array32:
 class SceneRenderer:
     """Renders envs as MuJoCo shows them to their front cameras; has the interface of `Compositor`.
 
-    It draws the visual mesh in its filmed colors, the ground, obstacles and the robot, under the model's own lights.
+    It draws obstacles and the robot under the model's own lights, and as the place either the visual mesh in its filmed
+    colors with the ground, or Gaussian splats, which hide what lies behind them and are hidden by what is before them;
+    the ground is then seen through their gaps.
     """
 
-    def __init__(self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int, splats: Gaussians | None = None
+    ) -> None:
         """`model` has the visuals that `episode_spec` keeps; other arguments as of `Compositor`."""
         self.size = size
         self._camera = model.camera(FRONT_CAMERA).id
@@ -124,10 +132,20 @@ class SceneRenderer:
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
         model = copy.copy(model)
         model.geom_group[camera_mount_geoms(model, self._camera)] = ROBOT_COLLISION_GROUP  # not drawn
+        if splats is not None:
+            model.geom_pos[model.geom("ground").id, 2] -= _GROUND_BELOW_SPLATS
         # One after the other, as Warp compiles kernels at their first use.
         threads = min(max_envs, available_cores())
-        self._workers = [_SceneWorker(model, size, self._rays) for _ in range(threads)]
+        settings = _SCENE_SETTINGS if splats is None else _SPLAT_SETTINGS | splats.render_settings()
+        self._workers = [_SceneWorker(model, size, self._rays, settings) for _ in range(threads)]
         self._pool = ThreadPoolExecutor(threads)
+        if splats is not None:
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            start = time.perf_counter()
+            self._workers[0].render(data, camera_pose(data, self._camera))
+            seconds = time.perf_counter() - start
+            log_line(f"{len(splats.rgb)} splats on the CPU: {seconds:.2f} s for a picture of {size[0]}×{size[1]}")
 
     def render(
         self,
@@ -159,7 +177,7 @@ class SceneRenderer:
 class _SceneWorker:
     """Renders the scene for one thread."""
 
-    def __init__(self, model: mujoco.MjModel, size: tuple[int, int], rays: Array) -> None:
+    def __init__(self, model: mujoco.MjModel, size: tuple[int, int], rays: Array, settings: dict[str, Any]) -> None:
         self._model, self._data = model, mujoco.MjData(model)
         self._size, self._camera = size, model.camera(FRONT_CAMERA).id
         mujoco.mj_forward(model, self._data)
@@ -168,7 +186,7 @@ class _SceneWorker:
             self._data,
             cam_res=size,
             cam_active=[FRONT_CAMERA],
-            **_SCENE_SETTINGS,
+            **settings,
         )
         self._caster.set_rays(mujoco_rays(rays))
         self.render(self._data, camera_pose(self._data, self._camera))  # compiles

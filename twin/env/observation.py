@@ -16,7 +16,7 @@ from twin.env.camera_noise import CameraNoise
 from twin.env.compositor import Compositor
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.mujoco_renderer import FRONT_CAMERA, SceneRenderer, camera_intrinsics
-from twin.env.options import SIMULATOR, Options
+from twin.env.options import Options
 from twin.env.task import CAMERA, LIGHTING, WEATHER, DrivePhysics, DriveTask
 from twin.env.trust import SKY_OPACITY, Trust
 from twin.env.weather import Weather
@@ -27,9 +27,6 @@ from twin.warp_runtime import wp
 
 if TYPE_CHECKING:
     import torch
-
-
-_SIMULATOR_LIGHTING = EpisodeLighting(SIMULATOR, np.zeros(0, np.float32))
 
 
 class PixelObserver:
@@ -46,7 +43,7 @@ class PixelObserver:
         """
         Args:
             renderer: Renders the envs.
-            field: Contains the lightings; None: MuJoCo renders the mesh under its own lights.
+            field: Contains the lightings; None: MuJoCo renders the mesh, or splats, under its own lights.
             trust: From the filmed frames.
             options: Of the envs.
             envs: Physics and task of every env.
@@ -67,7 +64,7 @@ class PixelObserver:
         o = self.options
         for i in which:
             task = self.envs[i][1]
-            self.lightings[i] = _SIMULATOR_LIGHTING
+            self.lightings[i] = EpisodeLighting(o.observe, np.zeros(0, np.float32))
             if self._sets:
                 self.lightings[i] = sample_lighting(
                     o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHTING)
@@ -89,7 +86,7 @@ class PixelObserver:
         """Sets up the weather of env i's episode under its lighting."""
         o, task = self.options, self.envs[i][1]
         fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
-        # A photo without fog determines the weather, too.
+        # The weather is also known if a photo shows that there is no fog.
         if fog is not None and o.randomise and o.randomise.hold_known:
             task.set_weather(task.sample.for_known_weather())
         has_weather = fog is not None or o.randomise
@@ -146,8 +143,8 @@ def _push_frames(
 ):
     """Adds frames to the stacks of some envs, or fills the stacks with them.
 
-    `below` sums up, over the lower halves (from pixel `lower` on), opacity and the number of pixels with less than
-    `sky`.
+    `below` accumulates, over the lower half of each frame (pixels from `lower` on), the opacity and the number of
+    pixels whose opacity is less than `sky`.
     """
     k, pixel = wp.tid()
     env, depth = which[k], stacks.shape[1]

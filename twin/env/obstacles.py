@@ -145,7 +145,7 @@ def random_obstacles(
     if room <= 0.0 or count > room:
         raise InputError(f"{count} obstacles on a route of {length:.1f} m; expected at most {max(0, int(room))}")
     spacing = min(_SPACING, 0.8 * room / max(count, 1))
-    # Uniform over all arrangements that keep the spacing: sort, then add it.
+    # Sorted uniform samples plus multiples of the spacing are uniform over all arrangements that keep it.
     free = np.sort(rng.uniform(0.0, room - spacing * (count - 1), count)) if count else np.zeros(0)
     out = []
     for k, station in enumerate(_FREE_ENDS[0] + free + spacing * np.arange(count)):

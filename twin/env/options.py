@@ -7,6 +7,7 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
 """Causes of an episode's end, in the order of tables. `RewardAndTermination` decides which one takes precedence."""
 
 TWIST, STEERING = "twist", "steering"
-NERF, SIMULATOR = "nerf", "simulator"
+NERF, SIMULATOR, SPLATS = "nerf", "simulator", "splats"
 CPU, CUDA = "cpu", "cuda"
 
 
@@ -77,13 +78,16 @@ class Options:
     start_along: float = 0.0
     """Half of the episodes start further along, uniform up to this fraction of the route segment."""
     observe: str = NERF
-    """nerf: images of the field; simulator: MuJoCo's images of the extracted mesh, under MuJoCo's lights."""
+    """nerf: images of the field; simulator: MuJoCo's images of the extracted mesh, under MuJoCo's lights; splats: of a
+    file's Gaussian splats, with obstacles and robot under MuJoCo's lights."""
+    splats: str | Path | None = None
+    """A 3DGS .ply in the scene's frame (meters, z up), for `observe="splats"`; its lighting is the only one."""
     lighting: str | Sequence[str] = TRAINING
     """See `episode_lighting.py`."""
     lighting_drift: bool = False
     """The lighting changes during an episode."""
     obstacles: str | int | Sequence[ObstacleConfig] = "scene"
-    """`scene`: those of scene.toml; a number: as many static ones, sampled for every episode; or these."""
+    """`scene`: those of scene.toml; a number: that many static ones, sampled per episode; a list: exactly these."""
     camera: CameraOptions | None = None
     """Camera noise: vibration, exposure, blur. None: no noise."""
     randomise: Ranges | None = None
@@ -97,7 +101,7 @@ class Options:
 _MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES = 1e6, 4096, 64, 1000
 
 Check = tuple[Callable[[Any], bool], str]
-"""Whether a value is valid, and the expectation that an error states."""
+"""A test of whether a value is valid, and the expectation that an error states."""
 
 
 def _is_number(value: Any) -> bool:
@@ -154,7 +158,8 @@ _CHECKS: dict[str, Check] = {
     "start_offset": _NONNEGATIVE,
     "start_heading": _NONNEGATIVE,
     "start_along": (lambda x: _is_number(x) and 0.0 <= x < 1.0, "0 or more, and less than 1"),
-    "observe": _one_of(NERF, SIMULATOR),
+    "observe": _one_of(NERF, SIMULATOR, SPLATS),
+    "splats": (lambda value: value is None or (isinstance(value, str | Path) and str(value) != ""), "a path, or None"),
     "lighting": (
         lambda value: (
             isinstance(value, str)
@@ -194,6 +199,11 @@ def parse_options(given: dict[str, Any]) -> Options:
     options = _from_keywords(Options, given, "option")
     for name in _CHECKS:
         check_option(name, getattr(options, name), _CHECKS[name])
+    if (options.observe == SPLATS) != (options.splats is not None):
+        raise InputError(
+            f"observe = {options.observe!r}, splats = {short_repr(options.splats)}; expected both observe='splats' and "
+            "splats='road.ply', or neither"
+        )
     if options.device == CUDA and not wp.is_cuda_available():
         raise InputError(f"device = {CUDA!r}: no CUDA device is visible to warp; use device={CPU!r}")
     return options

@@ -129,7 +129,7 @@ class HuskyPhysics:
             touched |= self._contacts()
             if self.params.camera_latency:
                 self._snapshots.append(self._snapshot())
-        # mj_step leaves poses and contacts of the last substep's start; update them to its end.
+        # After mj_step, poses and contacts are those at the start of the last substep; compute those at its end.
         mujoco.mj_forward(self.model, self.data)
         self._finish_step(touched | self._contacts())
 

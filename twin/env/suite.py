@@ -18,6 +18,7 @@ import numpy as np
 from dm_env import specs
 from scipy.spatial import cKDTree
 
+from twin.assets.gaussians import read_ply
 from twin.config import HELD_OUT, TRAINING, Condition
 from twin.config_file import load_config
 from twin.env import episode_lighting
@@ -119,7 +120,9 @@ class EnvFactory:
         half_width = self.options.half_width or self.world.half_width
         spec = episode_spec(self.world, self.segment.start, self.segment.end, half_width, visuals=True)
         add_obstacles(spec, self.obstacles.pool, self.world)
-        return PixelObserver(SceneRenderer(spec.compile(), size, count), None, self.trust, self.options, envs)
+        splats = read_ply(Path(self.options.splats)) if self.options.splats else None
+        renderer = SceneRenderer(spec.compile(), size, count, splats)
+        return PixelObserver(renderer, None, self.trust, self.options, envs)
 
 
 def fingerprint(twin: Twin, task: str, condition: Condition) -> str:

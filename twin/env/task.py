@@ -102,7 +102,7 @@ class RewardAndTermination:
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
-        # An episode ends beyond the corridor, at the latest one control step later.
+        # An episode ends at most one control step after the robot left the corridor, which bounds the distance.
         cross_track = max(self.half_width, options.start_offset) + speed * options.control_timestep
         high = np.array([speed, yaw_rate, cross_track, *[np.pi] * 4], np.float32)
         self.state_bounds = np.stack([-high, high])

@@ -247,7 +247,7 @@ class GpuSimulation:
         time = self._controllers.time[which] - self._params.camera_latency
         row = np.arange(len(which))
         past = times <= time + TIME_TOLERANCE
-        past[np.argmin(times, 0), row] = True  # not before the episode's start
+        past[np.argmin(times, 0), row] = True  # the oldest snapshot, if all are newer than the image
         first = np.argmax(np.where(past, times, -np.inf), 0)
         coming = np.where(past, np.inf, times)
         last = np.argmin(coming, 0)

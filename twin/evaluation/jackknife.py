@@ -12,15 +12,15 @@ design is crossed, so the variance is that of two-way clustering (Cameron, Gelba
 
     V = V_training + V_day − V_both / 2
 
-V_both leaves out one training on one day, and is contained in both others. Subtracting all of it, as for a linear
-statistic of many units, made intervals too narrow where ranks jump, subtracting nothing made them too wide
-(`benchmarks/intervals.py`). The interval is the estimate ± Student's t times √V on a scale on which the statistic is
-less skewed, with Satterthwaite's degrees of freedom, at least half of those of the trainings (few days made intervals
-too wide). It is not widened to contain anything. It is refused for fewer units than it holds for, and if leaving units
-out changes nothing, since then there is no variance to go by.
+V_both is the variance from leaving out one training on one day; V_training and V_day each contain it. For a linear
+statistic of many units all of it is subtracted. Here that made intervals too narrow where ranks jump, and subtracting
+nothing made them too wide (`benchmarks/intervals.py`). The interval is the estimate ± Student's t times √V on a scale
+on which the statistic is less skewed, with Satterthwaite's degrees of freedom, at least half of those of the trainings
+(few days made intervals too wide). There is no interval for fewer units than its coverage was tested with, nor if
+leaving units out changes nothing, since the variance cannot be estimated then.
 
-A bootstrap was worse: resampled policies come twice, which raises correlations, and cells resampled at shrunken rates
-agree less than observed ones; its intervals held 0.5 to 0.8 of the time.
+A bootstrap was worse (coverage 0.5 to 0.8): it samples some policies twice, which raises correlations, and twin and
+real rates that are sampled again agree less than the observed ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,6 @@ from twin.evaluation.statistics import (
     mmrv_batched,
     pearson_batched,
     spearman_batched,
-    winner_batched,
 )
 from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
@@ -43,7 +42,7 @@ from twin.types import Array, Indices
 MIN_TRAININGS, MIN_DAYS, MIN_PLACES = 8, 4, 5
 """Number of units below which a correlation or MMRV has no interval."""
 MIN_PEARSON_TRAININGS = 12
-"""The same for Pearson's correlation, which a single policy can carry."""
+"""The same for Pearson's correlation, which can depend on a single policy."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
 """The same for a mean difference."""
 
@@ -182,11 +181,6 @@ def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedC
     return np.mean([one[0] for one in each], 0), np.mean([one[1] for one in each], 0)
 
 
-def mean_regret(data: PairedCells) -> Array:
-    """Regret of the twin's best policy, mean over tasks, shape (...)."""
-    return mean_over_tasks(winner_batched, data)[1]
-
-
 # ---- intervals
 
 
@@ -271,7 +265,7 @@ def _ends(
     if np.ndim(variance) == 0 and np.isnan(variance):
         raise UndefinedStatistic(
             "no interval: without some of the trainings or days all rates are the same, or the "
-            "value does not change, so that they do not tell how much it varies"
+            "value does not change, so that its variance cannot be estimated"
         )
     half = student.ppf(0.5 + confidence / 2, freedom) * np.sqrt(variance)
     center = statistic.scale(value)

@@ -7,8 +7,8 @@ A predictor gives a probability p of success for each cell (policy, day) of the 
 
 Both are 0 at best and *proper*: no other p than one's true belief has a better expectation (Gneiting and Raftery, J.
 Am. Stat. Assoc. 102, 2007). The scores of the twin mean little alone; they are compared with baselines that do not look
-at the twin, or not at the day. A baseline that is fitted to real trials, and the twin's recalibration, use those of
-other trainings than the one that is predicted.
+at the twin, or not at the day. Baselines that are fitted to real trials, and the twin's recalibration, use only trials
+of other trainings than the one that they predict.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,10 +26,10 @@ CALIBRATION_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 SCORE_DIFFERENCE = Statistic(
     mean_bias, lambda x: x, lambda x: x, -np.inf, np.inf, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS
 )
-"""Mean over policies of the difference of two scores; `jackknife_interval` takes it with `score_pair`."""
+"""Mean over policies of the difference of two scores, as a `Statistic` for `jackknife_interval` on a `score_pair`."""
 
 _LEAST = 0.005  # probability that any predictor leaves to either outcome
-_RIDGE = 0.1  # of a recalibration: weight of a prior that leaves probabilities as they are
+_RIDGE = 0.1  # weight of a recalibration's prior, which prefers to leave probabilities unchanged
 _NEWTON_STEPS = 30
 
 
@@ -103,8 +103,8 @@ def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callabl
 def other_trainings(data: PairedCells, groups: Indices) -> Array:
     """Baseline: success rate on the road of the same group in other trainings, for each policy, shape (n,).
 
-    Shrunk towards the rate of all other trainings by one trial's weight. `groups` names the group of each policy, such
-    as its setup; all equal gives the mean of the other policies.
+    The rate of all other trainings is a prior with the weight of one trial. `groups` names the group of each policy,
+    such as its setup; all equal gives the mean of the other policies.
     """
     real = data.rates()["real"]
     out = np.full(data.policies, 0.5)

@@ -1,9 +1,9 @@
 """Bayesian ranking of policies: probabilities of ranks, and how many further trials would settle the ranking.
 
 Samples of the policies' true rates come from the posterior of `twin.evaluation.rate_model`, which shrinks a rate
-towards the other policies and counts the trials of a day as far as they say more than one. A rank's probability is the
-fraction of samples in which a policy has it. All this holds for the world in which the trials were driven: a ranking in
-the twin is no evidence of one on the road.
+towards the other policies and treats trials of one day as correlated. A rank's probability is the fraction of samples
+in which a policy has it. All this holds for the world in which the trials were driven: a ranking in the twin is no
+evidence of one on the road.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import numpy as np
 from twin.evaluation.statistics import CONFIDENCE
 from twin.types import Array
 
-SETTLED_PROBABILITY = 0.95  # from which on a ranking counts as settled
+SETTLED_PROBABILITY = 0.95  # least confidence of a settled ranking
 MARGIN = 0.05  # policies whose true scores differ by less count as equally good
 MAX_TRIALS = 1000  # most further trials per policy that are considered
 

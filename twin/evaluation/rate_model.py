@@ -9,18 +9,19 @@ policy i succeeds yᵢⱼ times:
     logit μᵢ = logit μ + β xᵢ                                        xᵢ: a covariate such as the twin's rate, or none
 
 A Beta distribution of mean p and intra-class correlation ρ is Beta(p/ρ − p, (1 − p)/ρ − (1 − p)); ρ = 1 makes all
-trials of a day agree, ρ = 0 makes them independent. τ has a uniform prior and μ Jeffreys'. ρ has Beta(5, 1), since on
-most days of a road all trials end alike (706 of 720 cells in docs/benchmarks.md) and few days cannot tell that from
-policies that differ: with a uniform prior, which the twin's rates have (`road=False`), intervals from four such days
-held 0.79 of the time. All are integrated over a grid, so that intervals need no sampling and no seed. A policy's rate
-is thus shrunk towards the other policies, as far as these are alike, and not towards one half; policies share ρ, so
-that two days say something where eight policies drove on them. Beta-binomial: Skellam, J. R. Stat. Soc. B 10 (1948);
-hierarchical: Gelman et al., Bayesian Data Analysis, section 5.3.
+trials of a day agree, ρ = 0 makes them independent. τ has a uniform prior and μ Jeffreys'. For the road ρ has
+Beta(5, 1), since on most days all trials of a policy end alike (706 of 720 cells in docs/benchmarks.md), and few days
+do not suffice to estimate ρ: with a uniform prior, intervals from four such days held 0.79 of the time. For the twin's
+rates (`road=False`) ρ has a uniform prior. All are integrated over a grid, so that intervals need no sampling and no
+seed. A policy's rate is thus shrunk towards the other policies, as far as these are alike, and not towards one half;
+policies share ρ, so that even two days suffice to estimate it if eight policies drove on them. The beta-binomial
+distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical models see Gelman et al., Bayesian Data
+Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them, so their cells are not
 independent: the product of their likelihoods is a *composite* likelihood. It is raised to the power (2k − 1) / (2k + 1)
-for k days (Ribatet, Cooley and Davison, Statistica Sinica 22, 2012, on scaling such likelihoods); without, intervals
-from two days held 0.72 to 0.92 of the time.
+for k days (Ribatet, Cooley and Davison, Statistica Sinica 22, 2012, on scaling such likelihoods); without this power,
+intervals from two days held 0.72 to 0.92 of the time.
 
 The estimand is the rate over the *population* of days of the kind that were driven (`interval`), or of policies and
 days (`mean_interval`), not over these days; `cell_means` is about these. Coverage: `benchmarks/intervals.py`.

@@ -30,7 +30,7 @@ MIN_TRIALS = 5
 """Number of trials per cell below which no correlation is given."""
 
 _MIN_POINTS = 3  # of a correlation
-_DECIMALS = 12  # scores that agree to so many decimals are tied: sums differ in the last bits with their order
+_DECIMALS = 12  # scores equal to this many decimals are tied, since the order of a sum changes its last bits
 _MIN_VARIANCE = 1e-12  # scores of less variance count as equal
 
 
@@ -132,9 +132,9 @@ def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
 
     The violation of a pair of policies that twin and road order differently is the difference of their real scores:
     |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]; MMRV is the mean over i of the largest over j. It is not symmetric in its
-    arguments, and published code names them in both orders. Policies tied in the twin, but not on the road, count as a
-    violation of the worse of the two; code published with the paper compares by > and charges the better. Raises
-    UndefinedStatistic: fewer than two policies.
+    arguments, and published code names them in both orders. If two policies are tied in the twin, but not on the road,
+    the violation counts for the worse of the two; in the paper's published code, which compares by >, for the better.
+    Raises UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
     return float(mmrv_batched(twin=twin, real=real))

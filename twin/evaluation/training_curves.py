@@ -101,7 +101,7 @@ def binned_rates(steps: Indices, success: Indices, bins: int = _MAX_BINS) -> lis
 
 
 def plot_success_curve(axes: Axes, steps: Indices, success: Indices, color: str) -> None:
-    """Plots the success rate of at least one episode over steps, with its interval; see `binned_rates`."""
+    """Plots the success rate over steps, with its interval, from one episode or more; see `binned_rates`."""
     step, won, count, low, high = np.array(binned_rates(steps, success), float).T
     axes.fill_between(step, low, high, color=color, alpha=0.2, linewidth=0, label="90 % interval")
     axes.plot(step, won / count, ".-", color=color, label=f"{len(steps)} episodes, {int(count[0])} a point")
@@ -114,7 +114,7 @@ def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
     axes.plot([one["step"] for one in tried], shares, "o", color="#d95f02", fillstyle="none", label=label)
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])
-    label = f"the chosen one, {chosen['trials']} more"
+    label = f"the chosen policy in {chosen['trials']} new episodes"
     bars = [[max(0.0, rate - low)], [max(0.0, high - rate)]]  # rounding may put an end on the wrong side
     axes.errorbar(chosen["step"], rate, bars, fmt="o", color="#d95f02", capsize=3, label=label)
 

@@ -2,7 +2,7 @@
 
 The recorded poses, sampled once per control step, go through the environment's `RewardAndTermination`. *Replay*: the
 recorded commands drive the twin's robot from the same start. *Views*: the field rendered from the poses at which the
-robot's pictures were taken. What poses cannot show, such as a collision, the operator says.
+robot's pictures were taken. The operator states what poses cannot show, such as a collision.
 """
 
 from dataclasses import dataclass
@@ -96,11 +96,11 @@ class TrialViews:
 
     lighting: str
     twin: list[Image]
-    """RGB uint8 (h, w, 3), as many as pictures."""
+    """The rendered views, RGB uint8 (h, w, 3), one per picture."""
     psnr: Array
     """[dB], shape (n,)."""
     matched_psnr: Array
-    """The same with each color's mean and spread matched, which leaves shape and shadows [dB], shape (n,)."""
+    """PSNR after matching each color's mean and deviation, so that only shapes and shadows differ [dB], shape (n,)."""
     trust: Array
     """See `twin.env.trust`, shape (n,)."""
 

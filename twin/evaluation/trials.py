@@ -33,7 +33,8 @@ ROBOT_COLUMNS = ("robot", "camera", "outside_training")
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *ROBOT_COLUMNS)
 """Further columns that `results.csv` may have."""
 RECENT_EPISODES = 20
-"""Number of latest complete episodes in a training's success rate, of about 40 in a training on a CPU."""
+"""Number of newest episodes, started at the segment's beginning, that a training's success rate is counted over; a
+training on a CPU has about 40."""
 
 _MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # trials or steps in a cell; a seed
 _VALIDATE_COMMAND = "python -m twin.validate"

@@ -123,7 +123,8 @@ def _between_jumps(cameras: Cameras, index: NDArray[np.int64]) -> list[tuple[NDA
     """The frames of a source between its jumps, each with how the piece ends."""
     inliers = index[path_inliers(cameras.positions[index])]
     jumps = path_jumps(cameras.positions[inliers, :2], cameras.times[inliers])
-    # An outlier at the edge of a piece has no neighbors on both sides to be found by, so pieces are made without it.
+    # Outliers are removed before the division, since one at the end of a piece could not be recognized: it has
+    # neighbors on one side only.
     pieces = np.split(inliers, jumps + 1) if len(jumps) else [index]
     return [(piece, "jump" if k < len(jumps) else "end") for k, piece in enumerate(pieces)]
 
@@ -160,7 +161,7 @@ def _retraces(path: Array) -> list[tuple[int, int, str]]:
     begin, run = 0, list[tuple[int, int, str]]()
     for i in range(len(path)):
         earlier = np.array([j for j in near[i] if begin <= j < i], int)
-        # Beside the point, neither ahead nor behind.
+        # Keep points of the path beside point i, neither ahead of it nor behind.
         earlier = earlier[np.abs((path[earlier] - path[i]) @ direction[i]) <= _ALONGSIDE]
         cosine = direction[earlier] @ direction[i]
         back = earlier[cosine < -_PARALLEL]
@@ -182,7 +183,7 @@ def _retraces(path: Array) -> list[tuple[int, int, str]]:
 
 
 def _frame_stations(xy: Array, path: Array) -> Array:
-    """Station [m] of frames (n, 2) along their own path; it never falls, also where the path meets itself."""
+    """Station [m] of frames (n, 2) along their own path; it never decreases, even where the path crosses itself."""
     total = path_length(path)
     kept = _moving(xy)
     raw = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy[kept], axis=0), axis=1))])
@@ -190,7 +191,7 @@ def _frame_stations(xy: Array, path: Array) -> Array:
 
 
 def _looks_back(camera_to_world: Array, path: Array) -> bool:
-    """Whether cameras (n, 4, 4) look against the direction in which they moved."""
+    """True if cameras (n, 4, 4) look against the direction in which they moved."""
     direction = path_directions(path)
     _, nearest = cKDTree(path).query(camera_to_world[:, :2, 3])
     return float(np.mean((camera_to_world[:, :2, 2] * direction[nearest]).sum(1))) < -0.5
@@ -222,8 +223,8 @@ def path_inliers(positions: Array) -> NDArray[np.bool_]:
 def remove_stationary(xy: Array) -> Array:
     """Removes stops and rocking from a path in order of time, (n, 2) → (k, 2).
 
-    The point kept after each kept point is the first one past the path's last exit from a disc of radius
-    `_STATIONARY_RADIUS` around it. Returns after the path was `_DEPARTURE_RADIUS` away are another pass and are kept.
+    After each kept point, the points within `_STATIONARY_RADIUS` of it are skipped, up to the path's last exit from
+    that disc. A return after the path was `_DEPARTURE_RADIUS` away is another pass and is kept.
     """
     return xy[_moving(xy)]
 
@@ -321,7 +322,8 @@ def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
         worst = int(np.argmax(score))
         if score[worst] <= 1.0:
             return out
-        # An outlier also spoils its neighbors' predictions: the frame is removed without which the others agree best.
+        # An outlier also spoils its neighbors' predictions, so of the worst frame and its neighbors the one is removed
+        # without which the others agree best.
         candidates = [k for k in range(max(worst - 2, 0), min(worst + 3, len(kept))) if score[k] > 0.5]
         out[kept[min(candidates, key=lambda k: _score_without(camera_to_world[kept], k, max_offset, max_turn))]] = True
         if out.sum() > _MAX_OUTLIER_FRACTION * n:

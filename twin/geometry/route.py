@@ -1,8 +1,8 @@
 """The route: the line that the robot drives, chosen from the filmed passes.
 
-By default it is the longest pass, continued where another pass of the same lighting takes up its line; `[route]` in
-scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along it. The *corridor* is
-the area within a half width of the route; it is free, since the camera passed through it.
+By default it is the longest pass, continued by another pass of the same lighting that runs on from its end; `[route]`
+in scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along it. The *corridor*
+is the area within a half width of the route; it is free, since the camera passed through it.
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from twin.types import Array
 
 _MIN_LENGTH = 2.0  # [m]
 _AS_LONG = 0.98  # the first line this close to the longest is chosen, so that noise does not decide
-_ASIDE = 0.6  # [m] lateral offset at which one pass continues another; half of it is off both
-_BEYOND = 3.0  # [m] of new way that a continuation must bring
-_AGREE = np.cos(np.deg2rad(40.0))  # of headings where passes are joined
+_ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
+_BEYOND = 3.0  # [m] least length that a continuation adds
+_AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined passes
 _BLEND = 3.0  # [m] before and after a join over which the line goes from one pass to the other
 _MAX_FOLD = np.cos(np.deg2rad(120.0))  # of the change of heading over `_FOLD_CHORD`
 _FOLD_CHORD = 2.0  # [m]
-_OFF_FILM = 1.0  # [m] that a line through way points may leave the filmed paths
+_OFF_FILM = 1.0  # [m] largest distance of a line through way points from the filmed paths
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
 
 
 def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tuple[str, ...]]:
-    """The first line within 2 % of the longest, each pass continued by others of its lighting, and its passes."""
+    """The longest line of a pass continued by others of its lighting, and the names of its passes."""
     lines = []
     for start in passes:
         line, names = start.path, [start.name]
@@ -109,13 +109,13 @@ def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tupl
     if not lines:
         return np.zeros((0, 2)), ()
     longest = max(path_length(line) for line, _ in lines)
-    # Of lines that are as long, one pass is better than a joined one.
+    # Among lines about as long as the longest, the one of fewest passes is chosen.
     fitting = [one for one in lines if path_length(one[0]) >= _AS_LONG * longest]
     return min(fitting, key=lambda one: len(one[1]))
 
 
 def _continued(line: Array, path: Array, max_gap: float) -> Array | None:
-    """A line that goes on along a path which runs over or starts ahead of its end; None if the path does neither."""
+    """A line extended by a path; None unless the path passes the line's end or starts ahead of it."""
     if len(line) < 3 or len(path) < 3:
         return None
     end, ahead = line[-1], path_directions(line)[-1]
@@ -132,13 +132,13 @@ def _continued(line: Array, path: Array, max_gap: float) -> Array | None:
 
 
 def _new_length(line: Array, joined: Array) -> float:
-    """Length [m] of a continued line beside which the line itself has not run, as in a second lap."""
+    """Length [m] that `joined` adds to a line; parts beside the line, such as a second lap, do not count."""
     distance, _ = cKDTree(line).query(joined)
     return float((distance > _ASIDE).sum()) * SPACING
 
 
 def _joined(line: Array, one: FilmedPass, max_gap: float) -> Array:
-    """A line that goes on along a pass, as the user wants it."""
+    """A line extended by a pass that the user chose."""
     distance = np.linalg.norm(one.path - line[-1], axis=1)
     k = int(np.argmin(distance))
     if distance[k] > max_gap:
@@ -150,7 +150,7 @@ def _joined(line: Array, one: FilmedPass, max_gap: float) -> Array:
 
 
 def _blended(line: Array, rest: Array) -> Array:
-    """A line and its continuation; side by side they are joined gradually, across a gap by a straight piece."""
+    """A line joined to its continuation: gradually if they run side by side, by a straight piece across a gap."""
     offset = rest[0] - line[-1]
     if np.linalg.norm(offset) > _ASIDE:
         return resample(np.concatenate([line, rest]), curved=False)
@@ -176,7 +176,7 @@ def _through_points(points: tuple[tuple[float, ...], ...], passes: list[FilmedPa
 
 
 def _check_no_fold(line: Array) -> None:
-    """Raises InputError: the line turns back on the spot, which no robot drives in one go."""
+    """Raises InputError: the line turns back on the spot, which the robot cannot drive."""
     directions, reach = path_directions(line), round(_FOLD_CHORD / SPACING)
     cosine = (directions[reach:] * directions[:-reach]).sum(1)
     if len(cosine) and cosine.min() < _MAX_FOLD:

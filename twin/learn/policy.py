@@ -75,7 +75,7 @@ class Policy:
 
     name: str
     act: ActFunction
-    """Unchecked."""
+    """The network; its output is not checked, unlike that of `actions`."""
     control: Control
     size: tuple[int, int] = (160, 90)
     """Width, height of the pictures [px]."""

@@ -30,7 +30,7 @@ from twin.loading import load_scene
 from twin.runtime import die_with_parent, ignore_terminal_signals, signals_held, signals_kept
 
 CHUNK = 16
-"""Most episodes of a chunk, which one process drives."""
+"""Largest number of episodes in a chunk; one process drives a chunk."""
 
 _ENVS = 8  # episodes driven at once
 _SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")

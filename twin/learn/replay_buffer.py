@@ -1,9 +1,10 @@
 """A replay buffer of single pictures instead of stacks, and color augmentation of its samples.
 
 Each environment's pictures are written once, in order, to a ring in a file. A *transition* refers to its newest picture
-and stores its *age*, the steps since its episode began. Its stack is that picture and those before it, back to the
-episode's first, which is repeated; the next stack ends with the next picture of the ring. After an episode's last
-picture follows the next episode's first. This takes an eighth of the memory of two stacks of four.
+and stores its *age*, the steps since its episode began. The stack before the transition consists of that picture and
+those before it, with the episode's first repeated if there are too few; the stack after it ends with the next picture
+of the ring. An episode's last picture is followed by the next episode's first. A buffer that stores both stacks, of
+four pictures each, would take eight times the memory.
 """
 
 from pathlib import Path
@@ -72,7 +73,7 @@ def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np
 
 # ---- the buffer
 
-_SHORT = 8  # mean steps of an episode; if they are shorter, fewer transitions than the buffer's size are complete
+_SHORT = 8  # steps; the ring has room for all transitions if episodes are at least this long on average, else for fewer
 _ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after")
 
 
@@ -115,7 +116,7 @@ class FrameReplayBuffer(ReplayBuffer):
             buffer_size: Transitions of all environments together.
             observation_space: uint8 (3 · stack, height, width).
             file: For the pictures; None: in memory. An existing file is kept, see `set_state`.
-            slack: Most transitions of all environments together between two saves.
+            slack: Largest number of transitions, of all environments together, added between two saves.
             shift: Largest random shift of samples each way [px], edges repeated (DrQ, Kostrikov et al. 2020).
             color_strength: Strength of `augment_colors`, for half of the stacks before transitions.
             state_size: Size of the `state` in an `info`.

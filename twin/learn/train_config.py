@@ -79,7 +79,8 @@ class TrainConfig:
     steering: float = 0.5
     """Fraction of the step reward lost at full steering."""
     entropy: float = -0.5
-    """Target entropy per number of an action [nat]; -0.5 is a standard deviation of 0.15 of the largest, -1 of 0.09."""
+    """Target entropy per number of an action [nat]; -0.5 corresponds to a standard deviation of 0.15, -1 to 0.09, for
+    numbers in [-1, 1]."""
     start_along: float = 0.9
     """Every second episode starts within this fraction of the segment, beside the route and at an angle, so that a
     policy practices returning to the middle."""
@@ -98,7 +99,7 @@ class TrainConfig:
     starts: int = 1_000
     """Steps of random actions before learning begins."""
     updates: float = 0.5
-    """Per step."""
+    """Updates per step."""
     gamma: float = 0.97
     """Discount per step; a reward 33 steps (3 s) away counts a third."""
     learning_rate: float = 5e-4
@@ -155,8 +156,8 @@ class TrainConfig:
 
     def options(self) -> dict[str, Any]:
         """Options of the environment."""
-        # The goal is worth as much as surviving for ever: a policy that earned less would linger before it. The loss
-        # off the route keeps policies away from the kerb, where a single disturbance ends an episode.
+        # The goal is worth as much as surviving for ever: a policy that earned less would linger before it. The reward
+        # lost off the route keeps policies away from the kerb, where a single disturbance ends an episode.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY

@@ -59,14 +59,15 @@ TRAINING_EPISODE_COLUMNS = (
 )
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
 FRESH_EPISODES = 20
-"""Fresh episodes of the selected policy."""
+"""Number of fresh episodes from which the selected policy's success rate is reported."""
 
 Watch = Callable[[int, Sequence[bool]], None]
 """Receives the steps done, and the success of the last `RECENT_EPISODES` that started at the segment's beginning."""
 
 _FINAL_RATE = 0.1  # of the learning rate, at the end
 _CANDIDATES = 4  # policies that the best one is selected from
-# Seeds derive from the run's seed, one of these and, in training, the number of resumptions: none repeats.
+# A seed derives from the run's seed, one of these numbers and, in training, the number of resumptions, so that no
+# random stream is used twice.
 _TRAINING_STREAM, _SELECTION_STREAM = 6, 7
 
 
@@ -78,7 +79,7 @@ class PreprocessedVecEnv(VecEnvWrapper):
         super().__init__(envs, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
         self._pool, self._thread = pool, ThreadPoolExecutor(1)
         self.meanwhile: Callable[[], None] = lambda: None
-        """Called while the environments step; neither depends on the other."""
+        """Called while the environments step, which must not depend on it: the updates of the networks."""
 
     def reset(self) -> NDArray:
         return preprocess(np.asarray(self.venv.reset()), self._pool)
@@ -258,7 +259,7 @@ class _RunRecorder(BaseCallback):
         return self._wall + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        # Not earlier: only a configuration with which the environments start is valid.
+        # Written only now, because a configuration with which no environment starts is not valid.
         write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self.model.num_timesteps
         self._first_updates = self.model._n_updates

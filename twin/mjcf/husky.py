@@ -1,13 +1,16 @@
 """MuJoCo model of the Clearpath Husky A200, its visual geoms, and its quasi-static skid steering.
 
-Constants and frames: `twin.robot`. Names in the model: `add_husky`. `python -m twin.mjcf.husky` writes the robot alone
-to `twin/assets/husky/husky.xml`; to attach it to another scene:
+Constants and frames: `twin.robot`. Names in the model: `add_husky`. `python -m twin.mjcf.husky` writes
+`twin/assets/husky/`: the robot alone in `husky.xml`, and on a plane in `scene.xml`. To attach it to another scene, and
+to find out which of that scene's options are wrong:
 
     husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tires need these
     robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
     spec.attach(robot, prefix="husky/", frame=spec.worldbody.add_frame(pos=on_the_ground))
+    print(*husky.check(spec.compile()), sep="\\n")
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,8 @@ from twin.types import Array
 TIMESTEP = 0.002  # [s]
 HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
 """The published robot alone, without a floor."""
+SCENE_XML = HUSKY_XML.with_name("scene.xml")
+"""The same on a plane, to be opened in a viewer."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
 _WHEEL_INERTIA = (0.02467, 0.04411, 0.02467)  # [kg m²], the axle is y
@@ -68,6 +73,81 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     spec.option.viscosity = params.ground_viscosity
     # The default of 1e-8 takes twice the Newton iterations for the same motion.
     spec.option.tolerance = 1e-5
+
+
+@dataclass(frozen=True)
+class WrongOption:
+    """An option with which the robot's tires do not skid as real ones."""
+
+    option: str
+    found: str
+    expected: str
+    cost: str
+    """Effect on a turn on the spot, as `benchmarks/husky_options.py` measures it; or what it does, if nothing turns."""
+
+    def __str__(self) -> str:
+        return f"{self.option} is {self.found}; expected {self.expected}: {self.cost}"
+
+
+def check(model: mujoco.MjModel) -> list[WrongOption]:
+    """The options of a model with a Husky in it that are wrong for skidding; empty if all are right.
+
+    MuJoCo keeps the options of the scene that a robot is attached to, and lets its ground override the tires' contacts.
+
+    Raises ValueError if the model has no Husky.
+    """
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    tires = [i for i, name in enumerate(names) if name.endswith(tuple(f"{wheel}_tyre" for wheel in WHEELS))]
+    if len(tires) < len(WHEELS):
+        raise ValueError("no Husky in the model: expected geoms named front_left_tyre and so on, after any prefix")
+    opt, out = model.opt, []
+
+    def expect(right: bool, option: str, found: Any, expected: str, cost: str) -> None:
+        if not right:
+            out.append(WrongOption(option, str(found), expected, cost))
+
+    def name_of(value: Any) -> str:
+        return value.name.split("_", 1)[-1].lower()
+
+    cone, integrator = mujoco.mjtCone(opt.cone), mujoco.mjtIntegrator(opt.integrator)
+    implicit = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_IMPLICIT
+    expect(cone == mujoco.mjtCone.mjCONE_ELLIPTIC, "cone", name_of(cone), "elliptic", COSTS["cone"])
+    expect(opt.impratio >= 5.0, "impratio", f"{opt.impratio:g}", "10", COSTS["impratio"])
+    expect(integrator in implicit, "integrator", name_of(integrator), "implicitfast", COSTS["integrator"])
+    expect(opt.timestep <= 0.005, "timestep", f"{1e3 * opt.timestep:g} ms", "2 ms, at most 5", COSTS["timestep"])
+    expect(opt.iterations >= 3, "iterations", opt.iterations, "3 or more", COSTS["iterations"])
+    expect(opt.tolerance <= 1e-3, "tolerance", f"{opt.tolerance:g}", "1e-5", COSTS["tolerance"])
+    override = bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+    expect(not override, "flag override", "enabled", "disabled", COSTS["contact"])
+    for bit, flag in (
+        (mujoco.mjtDisableBit.mjDSBL_EQUALITY, "equality"),
+        (mujoco.mjtDisableBit.mjDSBL_CONTACT, "contact"),
+        (mujoco.mjtDisableBit.mjDSBL_ACTUATION, "actuation"),
+        (mujoco.mjtDisableBit.mjDSBL_GRAVITY, "gravity"),
+    ):
+        expect(not opt.disableflags & bit, f"flag {flag}", "disabled", "enabled", "the robot cannot drive without it")
+    tire_priority = int(model.geom_priority[tires].min())
+    bodies = set(model.body_rootid[model.geom_bodyid[tires]])
+    for i in range(model.ngeom):
+        solid = model.geom_contype[i] or model.geom_conaffinity[i]
+        if solid and model.body_rootid[model.geom_bodyid[i]] not in bodies and model.geom_priority[i] >= tire_priority:
+            what, most = f"priority of geom {names[i] or i}", f"below the tires' {tire_priority}"
+            expect(False, what, int(model.geom_priority[i]), most, COSTS["contact"])
+    if set(tires) & {*model.pair_geom1, *model.pair_geom2}:
+        expect(False, "contact pair", "given for a tire", "none", COSTS["contact"])
+    return out
+
+
+COSTS = {
+    "cone": "a pyramidal cone turns with 23 % too little torque, and creeps down a slope at 9 cm/s",
+    "impratio": "at 1, a parked robot creeps down a slope ten times faster, at 7 mm/s",
+    "integrator": "with Euler and RK4 the wheels hop (3 m/s² at the camera), with three times the torque",
+    "timestep": "at 10 ms the wheels hop (10 m/s²), with three times the torque, and the robot turns 26 % slower",
+    "iterations": "with 1, a parked robot creeps down a slope at 15 cm/s",
+    "tolerance": "at 1e-2, a parked robot creeps down a slope at 9 mm/s",
+    "contact": "with MuJoCo's default contacts the wheels hop (14 m/s²), and the robot turns 28 % slower",
+}
+"""Cost of a wrong option by its name, from `benchmarks/husky_options.py`."""
 
 
 def add_husky(
@@ -155,7 +235,8 @@ def _chassis_inertia(params: HuskyParams) -> tuple[float, Array, Array]:
 def disable_fluid_drag(body: mujoco.MjsBody, name: str) -> None:
     """Exempts a body from the drag of `ground_viscosity`.
 
-    MuJoCo's fluid acts on a whole body, or only on its geoms with `fluid_ellipsoid` if there are any: here a tiny one.
+    MuJoCo's fluid acts on a whole body unless it has geoms with `fluid_ellipsoid`; then it acts on these alone. So a
+    tiny one is added.
     """
     body.add_geom(
         name=f"{name}_dry",
@@ -486,7 +567,7 @@ def standalone_xml() -> str:
 
 
 _XML_HEADER = """<!--
-  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures and licence: NOTICE.md.
+  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures: README.md; licence: LICENSE.
 
   body, free joint  base_link
   joints            front_left_wheel, front_right_wheel, rear_left_wheel, rear_right_wheel
@@ -502,6 +583,33 @@ _XML_HEADER = """<!--
 """
 
 
+SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not edit. It turns with ctrl -3 and 3. -->
+<mujoco model="husky scene">
+  <include file="husky.xml"/>
+
+  <statistic center="0 0 0.3" extent="1.5"/>
+
+  <visual>
+    <headlight diffuse="0.6 0.6 0.6" ambient="0.3 0.3 0.3" specular="0 0 0"/>
+    <global azimuth="-140" elevation="-20" offwidth="1280" offheight="720"/>
+  </visual>
+
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.55 0.68 0.85" rgb2="0.9 0.92 0.94" width="64" height="384"/>
+    <texture type="2d" name="floor" builtin="checker" rgb1="0.36 0.38 0.4" rgb2="0.3 0.32 0.34" width="256"
+      height="256"/>
+    <material name="floor" texture="floor" texuniform="true" texrepeat="1 1" reflectance="0.05"/>
+  </asset>
+
+  <worldbody>
+    <light pos="0 0 4" dir="0.2 0.3 -1" directional="true"/>
+    <geom name="floor" type="plane" size="20 20 0.1" material="floor"/>
+  </worldbody>
+</mujoco>
+"""
+
+
 if __name__ == "__main__":
     HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
-    print(f"wrote {HUSKY_XML}")
+    SCENE_XML.write_text(SCENE, encoding="utf-8")
+    print(f"wrote {HUSKY_XML} and {SCENE_XML}")

@@ -143,7 +143,7 @@ def nearest_on_route(
     """
     knots, xy = arc_lengths(route), np.asarray(xy)
     low, high = (knots[0], knots[-1]) if around is None else around
-    # The run of segments that overlap each range, padded to the longest run.
+    # Indices of the segments that overlap each range, padded to the largest number of them.
     first = np.broadcast_to(np.searchsorted(knots[1:], low), xy.shape[:-1])
     last = np.broadcast_to(np.searchsorted(knots[:-1], high, "right"), xy.shape[:-1])
     run = first[..., None] + np.arange(np.max(last - first, initial=1))

@@ -128,6 +128,49 @@ def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str,
     return out
 
 
+def samples_read(layout: BrickLayout, arrays: dict[str, NDArray]) -> NDArray[np.bool_]:
+    """True for the samples (s, 729) of occupied blocks; the march reads no others, see `skip_distances`."""
+    near, far = brick_indices(layout, arrays["near"], arrays["far"])
+    skips = [_stored_skips(near, arrays["near_leap"])[1], _stored_skips(far, arrays["far_leap"])[1]]
+    occupied = np.concatenate(skips).reshape(-1, *[BLOCKS] * 3) == 0
+    read = np.zeros((len(occupied), *[CORNERS] * 3), bool)
+    for corner in itertools.product(range(CELLS // BLOCKS + 1), repeat=3):
+        read[:, *(slice(c, c + CELLS - 1, CELLS // BLOCKS) for c in corner)] |= occupied
+    return read.reshape(len(read), -1)
+
+
+def _check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> None:
+    """Raises ValueError for arrays with which a kernel would read outside of them."""
+    near, far = arrays["near"], arrays["far"]
+    slots, hidden = len(near) + len(far), arrays["network.head.1"].shape[0]
+    background, inputs = arrays["network.backdrop.0"].shape[1], CHANNELS - 1 + HARMONICS + dim
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {
+        "near": ((len(near), 3), "i"),
+        "far": ((len(far), 3), "i"),
+        "features": ((slots, CORNERS**3, CHANNELS), "u"),
+        "low": ((CHANNELS,), "f"),
+        "step": ((CHANNELS,), "f"),
+        "near_leap": (tuple(BLOCKS * n for n in layout.near_shape), "u"),
+        "far_leap": (tuple(BLOCKS * n for n in layout.far_shape), "u"),
+        "network.head.0": ((inputs, hidden), "f"),
+        "network.head.0.bias": ((hidden,), "f"),
+        "network.head.1": ((hidden, hidden), "f"),
+        "network.head.1.bias": ((hidden,), "f"),
+        "network.head.2": ((hidden, 3), "f"),
+        "network.head.2.bias": ((3,), "f"),
+        "network.backdrop.0": ((HARMONICS, background), "f"),
+        "network.backdrop.0.bias": ((background,), "f"),
+        "network.backdrop.1": ((background, CHANNELS - 1), "f"),
+    }
+    check_shapes({name: (arrays[name], *expected) for name, expected in shapes.items()})
+    if hidden % 8 or not hidden:
+        raise ValueError(f"head of {hidden} units; expected a multiple of 8")
+    for name, index, shape in (("near", near, layout.near_shape), ("far", far, layout.far_shape)):
+        inside = not len(index) or (index.min() >= 0 and (index < np.array(shape)).all())
+        if not inside or len(np.unique(np.ravel_multi_index(tuple(index.T), shape))) < len(index):
+            raise ValueError(f"{name}: a brick outside the grid of {shape} bricks, or one twice")
+
+
 # ---- detail
 
 
@@ -497,6 +540,7 @@ class BakedField:
             dim = vectors.shape[1]
             shapes = {"lightings.vectors": (vectors, (len(names), dim), "f")}
             check_shapes(shapes | {"lightings.frames": (frame_vectors, (len(frames), dim), "f")})
+            _check_arrays(bricks, arrays, dim)
             return BakedField(bricks, Lightings(names, vectors, frames, frame_vectors), arrays, device, about)
 
 

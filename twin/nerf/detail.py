@@ -155,7 +155,8 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
             )
             hit = hits.numpy()
             rows = slice(pixels.start[i], pixels.start[i + 1])
-            usable = np.where(hit[:, 3] > 0.0, hit[:, 3] < _TEXEL * 2**kernels.LEVELS, hit[:, 3] > -2.0 * _CELL)
+            coarsest = np.where(hit[:, 3] > 0.0, _TEXEL * 2 ** (kernels.LEVELS - 1), _CELL)
+            usable = np.abs(hit[:, 3]) < kernels.MAX_FOOTPRINT * coarsest
             usable &= (hit[:, 3] != 0.0) & pixels.unmasked[rows]
             usable &= shown.opacity.ravel() > _MIN_OPACITY
             if share < 1.0:

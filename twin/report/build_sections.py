@@ -34,6 +34,7 @@ _SCALE_SOURCES = {
     "distance": "a distance measured between two marked points",
     "marker": "a printed marker of known size",
     "gps": "the GPS positions of the images",
+    "odometry": "the robot’s odometry",
     "poses": "the given metric poses",
     "poses_are_metric": "the given metric poses",
 }
@@ -239,10 +240,9 @@ def field_section(report: dict[str, Any]) -> Section:
     for name, value in small.items():
         text = number(value, "{:.1f} dB PSNR") + (f", {lower[name]:.1f} dB in the lower half" if name in lower else "")
         facts.append(Fact(f"{name}, at 160×90", text, "as policies see it"))
-    unfitted = numbers(field.get("psnr_unfitted"))
-    for name, value in numbers(field.get("psnr_trained")).items():
-        change = number(unfitted.get(name, value) - value, "{:+.1f} dB")
-        facts.append(Fact(f"{name}, baked", change, "effect of baking and detail, on the same frames, unfitted"))
+    for name, value in numbers(field.get("baking_gain")).items():
+        meaning = "effect of baking and detail on the PSNR of the same frames, unfitted"
+        facts.append(Fact(f"{name}, baked", number(value, "{:+.1f} dB"), meaning))
     swapped, more = cross_lighting_facts(report)
     done = (
         "A NeRF models the appearance of every point from every direction, in each lighting. It is evaluated on "

@@ -385,7 +385,7 @@ Rate = tuple[str, float, float, float]
 
 @styled
 def rate_chart(policies: Sequence[str], rates: Mapping[str, Sequence[Rate]], label: str) -> Figure:
-    """Rates with intervals: one row per policy, one color and marker per series of `rates`; shape as a table."""
+    """Rates with intervals: one row per policy, one color and marker per series of `rates`."""
     figure, axes = new_figure(0.9 + max(0.34, _RATE_HEIGHT * len(rates)) * len(policies))
     for k, (name, mine) in enumerate(rates.items()):
         y = [policies.index(policy) + (k - (len(rates) - 1) / 2) * _RATE_SPACING for policy, *_ in mine]

@@ -1,10 +1,5 @@
-"""The forecast in words and figures: `forecast.html`, the printed summary, and `forecast.csv`.
+"""The forecast's page: `forecast.html` with its figures; its words come from `twin.report.forecast_text`."""
 
-They answer how well the twin predicts the road, which policy is best, and how certain that is; the numbers come from
-`twin.evaluation.forecasting`.
-"""
-
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,22 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.errors import join_names
-from twin.evaluation.forecasting import (
-    ALL_TASKS,
-    OTHERS,
-    SHUFFLED,
-    Agreement,
-    Candidate,
-    CellPair,
-    Estimate,
-    Forecast,
-    TrialAllocation,
-)
-from twin.evaluation.jackknife import MIN_DAYS, MIN_TRAININGS, training_of
-from twin.evaluation.ranking import MAX_TRIALS
+from twin.evaluation.agreement import Agreement, CellPair, Estimate
+from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
-from twin.evaluation.trials import csv_text
 from twin.files import write_text
 from twin.report.figures import (
     CARD,
@@ -49,359 +31,19 @@ from twin.report.figures import (
     styled,
     svg,
 )
-from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Verdict, command, render
-
-GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
-"""Rank correlations above which twin and road rank policies alike, or roughly alike."""
-SMALL_REGRET = 0.05
-_SMALL_GAP = 0.1  # difference in the twin from which on an order that may be believed counts as good
-
-STATISTICS = (
-    ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
-    ("pearson", "Pearson", "linear correlation of the rates: 1 on a straight line"),
-    ("mmrv", "MMRV", "mean maximum rank violation, in real success: 0 is best"),
-    ("winner_agreement", "winner agrees", "1 if the twin’s best policy is also the best on the road, else 0"),
-    ("winner_regret", "regret", "real success lost by choosing the twin’s best policy"),
-    ("bias", "road minus twin", "mean over the cells; below 0 the twin is too optimistic"),
-    (
-        "coverage",
-        "cells agree",
-        "share of the cells where twin and road differ by no more than chance; high for any guess if most cells are "
-        "all successes or all failures",
-    ),
-    (
-        "corrected_coverage",
-        "predictions hold",
-        "share of policies within the interval predicted from the other trainings; 90% are expected",
-    ),
-    ("twin_error", "twin is off by", "mean over the policies of the absolute difference of the rates"),
-    ("mean_real", "mean on the road", "of policies such as these, driven or not (prediction-powered estimate)"),
+from twin.report.forecast_text import (
+    INTERVALS_NOTE,
+    PERCENT_STATISTICS,
+    STATISTICS,
+    allocation_text,
+    format_estimate,
+    format_probability,
+    limitations,
+    next_trials,
+    percentage_points,
+    verdicts,
 )
-"""Field of `Agreement`, its short name, and its meaning."""
-PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage", "twin_error", "mean_real")
-"""Statistics shown in percent."""
-
-INTERVALS_NOTE = (
-    "Intervals (90%) are about repetitions with other trainings and other days, of which these are a sample: days and "
-    "trainings are left out in turn, not trials. More days and more trainings make them narrower; more checkpoints of "
-    "one training, or more trials on the same day, hardly do. Where there are too few for an interval that holds, none "
-    "is given."
-)
-"""Note wherever intervals of the agreement of twin and road are shown; coverage: `benchmarks/intervals.py`."""
-
-CSV_COLUMNS = (
-    *("task", "policy", "twin", "twin_low", "twin_high", "twin_trials", "rank", "rank_low", "rank_high"),
-    *("best_in_twin", "real", "real_low", "real_high", "real_trials", "best_on_road"),
-    *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
-)
-
-_RELIABLE = 0.95  # share of pairs in the road's order from which on the twin's order may be believed
-_ENOUGH_PAIRS = 10
-_POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
-_TRIALS_NEEDED = (
-    f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
-    "include good and bad ones, chosen before their real results are known."
-)
-
-# ---- numbers
-
-
-def format_estimate(estimate: Estimate, percent: bool = False, missing: str = "–", digits: int = 2) -> str:
-    """Formats an estimate as "0.93 (0.81 to 0.97)", or returns `missing`."""
-    if estimate.value is None:
-        return missing
-    value, *ends = (
-        _format_value(x, percent, digits) for x in (estimate.value, estimate.low, estimate.high) if x is not None
-    )
-    return f"{value} ({' to '.join(ends)})" if len(ends) == 2 else value
-
-
-def _format_value(value: float, percent: bool, digits: int) -> str:
-    text = f"{100 * value:.0f}%" if percent else f"{value:.{digits}f}"
-    return text.replace("-", "−" if text.strip("-0.%") else "")
-
-
-def percentage_points(share: float) -> str:
-    return f"{abs(100 * share):.1f} percentage points"
-
-
-def format_probability(probability: float) -> str:
-    """Formats an estimated probability in percent; never as 0% or 100%."""
-    if probability > 0.995:
-        return ">99%"
-    return "<1%" if probability < 0.005 else f"{probability:.0%}"
-
-
-# ---- verdicts
-
-
-def verdicts(forecast: Forecast) -> list[Verdict]:
-    """The headlines."""
-    leaders = [_leader(forecast, task) for task in forecast.tasks]
-    if not forecast.groups:
-        return [Verdict("Nothing is known yet about the road: no real trials were given.", "mixed"), *leaders]
-    group = forecast.groups[-1]  # of all tasks, or of the only one
-    if group.missing:
-        first = f"Too few real trials to measure how well the twin predicts the road: {group.missing[0]}."
-        return [Verdict(first, "bad"), *leaders]
-    return [believable(group), _agreement(group), *_regret(group), _bias(group), *_skill(group)]
-
-
-def believable(group: Agreement) -> Verdict:
-    """One sentence: which differences in the twin the road has confirmed, and which not."""
-    pairs = [(it.low, it.pairs, it.right) for it in group.ordered]
-    many, days = _count(group.trainings, "training"), _count(group.days, "day")
-    where = f"measured on {days} and {many}"
-    if not pairs:
-        return Verdict(
-            f"The road does not tell these policies apart, so no order of the twin was confirmed ({where}).", "bad"
-        )
-    for start, _, _ in pairs:
-        beyond = [(n, right) for low, n, right in pairs if low >= start]
-        n, right = sum(n for n, _ in beyond), sum(right for _, right in beyond)
-        if n >= _ENOUGH_PAIRS and right >= _RELIABLE * n:
-            closer = [(m, r) for low, m, r in pairs if low < start]
-            m, r = sum(m for m, _ in closer), sum(r for _, r in closer)
-            gap = f"that differ by {100 * start:.0f} percentage points or more" if start else "that differ at all"
-            rest = f", while closer ones were right in {r:g} of {m}" if m else ""
-            text = (
-                f"What may be believed: the order of two policies {gap} in the twin, which the road had in {right:g} "
-                f"of {n} pairs{rest} ({where})."
-            )
-            enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
-            return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
-    n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
-    text = f"No order of two policies in the twin may be believed yet: the road had it in {right:g} of {n} pairs"
-    return Verdict(f"{text} ({where}).", "bad")
-
-
-def _count(n: int, what: str) -> str:
-    return f"{n} {what}{'' if n == 1 else 's'}"
-
-
-def _agreement(group: Agreement) -> Verdict:
-    rank = group.spearman
-    if rank.value is None:
-        return Verdict(f"The rankings cannot be compared: {rank.missing}.", "bad")
-    how, mood = "does not rank", "bad"
-    if rank.value >= FAIR_CORRELATION:
-        how, mood = ("ranks", "good") if rank.value >= GOOD_CORRELATION else ("roughly ranks", "mixed")
-    what, where = "policies", f"on {group.task}"
-    if group.task == ALL_TASKS:
-        what, where = "pairs of policy and task", "on all tasks together"
-    text = f"The twin {how} these {group.policies} {what} as the road does: Spearman {format_estimate(rank)} {where}."
-    if rank.no_interval:
-        text = f"{text.removesuffix('.')}; {rank.no_interval}."
-    # Without a narrow interval a high value is no good news.
-    return Verdict(text, "mixed" if mood == "good" and (rank.low or 0.0) < FAIR_CORRELATION else mood)
-
-
-def _regret(group: Agreement) -> list[Verdict]:
-    regret = group.winner_regret
-    if regret.value is None:
-        return []
-    lost = "nothing" if regret.value < 5e-4 else percentage_points(regret.value)
-    text = f"In these trials, choosing the twin’s best policy would have cost {lost} of real success."
-    return [Verdict(text, "good" if regret.value <= SMALL_REGRET else "bad")]
-
-
-def _bias(group: Agreement) -> Verdict:
-    bias, off = group.bias, group.twin_error
-    if bias.value is None or off.value is None:
-        return Verdict("The bias of the twin’s rates is not known.", "bad")
-    single = f"a single policy’s rate is off by {percentage_points(off.value)} on average"
-    much = "high" if bias.value < 0 else "low"
-    if bias.low is None or bias.high is None:
-        mean = f"The twin’s rates are {percentage_points(bias.value)} too {much} on average"
-        return Verdict(f"{mean} ({bias.no_interval}); {single}.", "mixed")
-    if bias.low <= 0.0 <= bias.high:
-        return Verdict(f"No bias of the twin is certain ({format_estimate(bias, True)}); {single}.", "good")
-    return Verdict(f"The twin’s rates are {percentage_points(bias.value)} too {much} on average; {single}.", "mixed")
-
-
-def _skill(group: Agreement) -> list[Verdict]:
-    """Whether the twin predicts single days and policies better than a guess without it."""
-    gains = {it.predictor: it.gain for it in group.scores}
-    gain = gains.get(OTHERS)
-    if gain is None or gain.value is None:
-        return []
-    if gain.low is None or gain.high is None:
-        better = "better" if gain.value > 0 else "worse"
-        text = (
-            f"In these trials the twin predicts days {better} than the mean of the other policies; {gain.no_interval}."
-        )
-        return [Verdict(text, "mixed")]
-    if gain.low > 0:
-        text = "The twin predicts a policy’s days better than the mean of the other policies does"
-        shuffled = gains.get(SHUFFLED)
-        if shuffled is not None and shuffled.low is not None:
-            more = "and tells days apart" if shuffled.low > 0 else "but whether it tells days apart is open"
-            text = f"{text}, {more}"
-        return [Verdict(f"{text} (log scores).", "good")]
-    worse = gain.high < 0
-    text = "worse than" if worse else "not certainly better than"
-    return [
-        Verdict(f"The twin predicts a policy’s days {text} the mean of the other policies does (log scores).", "bad")
-    ]
-
-
-def _leader(forecast: Forecast, task: str) -> Verdict:
-    first = forecast.candidates_of(task)[0]
-    chance = f"best there with {format_probability(first.twin_ranks[0])} probability"
-    sure = chance if len(first.twin_ranks) > 1 else "the only policy"
-    return Verdict(f"In the twin, on {task}, “{first.policy}” leads: {format_estimate(first.twin, True)}, {sure}.")
-
-
-# ---- limitations and next trials
-
-
-def limitations(forecast: Forecast) -> list[Caution]:
-    """Limits of the forecast, with cures."""
-    out = [
-        Caution(f"{group.task}: no correlation is given because there are {what}.", _TRIALS_NEEDED)
-        for group in forecast.groups
-        for what in group.missing
-    ]
-    if not forecast.real_trials:
-        what = "Whether the road ranks these policies as the twin does, and how far its rates are off, is not known."
-        out.append(Caution(what, _TRIALS_NEEDED))
-    on_road = {p.policy for p in forecast.pairs}
-    days = {p.lighting for p in forecast.pairs}
-    runs = {training_of(name) for name in on_road}
-    if on_road:
-        what = (
-            f"What is known of the road rests on {_count(len(days), 'day')} and {_count(len(runs), 'training')}, "
-            f"not on {_count(forecast.real_trials, 'trial')}."
-        )
-        cure = "drive on further days, and train again with another --seed."
-        out.append(Caution(what, cure))
-    for group in forecast.groups:
-        if group.spearman.no_interval:
-            what = f"{group.task}: correlations have no interval ({group.spearman.no_interval})."
-            out.append(Caution(what, "the same: further days, further trainings."))
-    lightings = join_names(sorted({name for c in forecast.candidates for name in c.lightings}))
-    cure = (
-        "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
-        "with twin.relight."
-    )
-    out.append(Caution(f"Success was not measured in light unlike {lightings}.", cure))
-    for task in forecast.tasks:
-        mine = forecast.candidates_of(task)
-        sets = [frozenset(c.lightings) for c in mine]
-        usual = max(sets, key=sets.count)
-        if uneven := [c.policy for c, under in zip(mine, sets, strict=True) if under != usual]:
-            what = f"On {task} not all policies were validated under the same lightings ({join_names(uneven)} differ)."
-            cure = "validate all of them under the same ones; otherwise the ranking mixes policy and light."
-            out.append(Caution(what, cure))
-        driven = {
-            c.policy: {p.lighting for p in forecast.pairs if (p.policy, p.task) == (c.policy, task)} for c in mine
-        }
-        if len({frozenset(under) for under in driven.values() if under}) > 1:
-            what = f"On {task} not all policies were driven on the road under the same lightings."
-            cure = "drive all of them under the same ones; otherwise the rates mix policy and light."
-            out.append(Caution(what, cure))
-    what = (
-        "The twin lacks other traffic, wet ground, weather except for haze, sun and shadows, and all other changes "
-        "since the films."
-    )
-    return [*out, Caution(what, "only real trials measure it; spread them over several days.")]
-
-
-def next_trials(forecast: Forecast) -> list[str]:
-    """The most useful next trials on the road, per task."""
-    out = []
-    for task in forecast.tasks:
-        mine = forecast.candidates_of(task)
-        driven = [c for c in mine if c.driven]
-        enough = min(MIN_POLICIES, len(mine))
-        if len(driven) < enough:
-            some = [mine[round(k)] for k in np.linspace(0, len(mine) - 1, enough)]
-            names = join_names([c.policy for c in some if not c.driven], MIN_POLICIES)
-            out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each light: good and bad ones.")
-            continue
-        best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
-        if len(best) > 1:
-            odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], 6)
-            out.append(f"{task}: drive again those that may be the best of the driven, with this probability: {odds}.")
-        elif best:
-            out.append(f"{task}: drive {best[0].policy} on further days, in light that it has not met; it leads.")
-        if unseen := [c.policy for c in mine if not c.driven]:
-            out.append(f"{task}: drive what has not been driven, best in the twin first: {join_names(unseen, 6)}.")
-    return out
-
-
-def allocation_text(allocation: TrialAllocation) -> str:
-    """How many more real trials settle the best policy and the order."""
-    if allocation.policies < 2:
-        return f"{allocation.task}: one policy; there is nothing to rank."
-
-    def needed(trials: int | None, purpose: str, now: float | None) -> str:
-        many = f"more than {MAX_TRIALS}" if trials is None else f"{trials} more" if trials else "no more"
-        each = "" if trials == 0 else " each"
-        known = allocation.basis != "twin" and now is not None
-        sure = f", now {format_probability(now)} sure" if known and now is not None else ""
-        return f"{many} real trials{each} to {purpose}{sure}"
-
-    so_far = "" if allocation.basis == "road" else "no real trials yet; if the road were like the twin: "
-    winner = needed(allocation.more_for_winner, "find the best one", allocation.winner_now)
-    order = needed(allocation.more_for_order, "order all of them", allocation.order_now)
-    return f"{allocation.task}, {allocation.policies} policies: {so_far}{winner}; {order}."
-
-
-# ---- printed summary and table
-
-
-def summary_text(forecast: Forecast) -> str:
-    lines = []
-    for task in forecast.tasks:
-        mine = forecast.candidates_of(task)
-        width = max(len("policy"), *(len(c.policy) for c in mine))
-        row = f"  {{:<{width}}}  {{:<20}}  {{:<10}}  {{:<20}}  {{}}".format
-        lines += [f"{task}: success, with 90% intervals; ranks in the twin, 1 is best"]
-        lines += [row("policy", "twin", "rank", "road", "predicted for the road")]
-        for c in mine:
-            ranks = f"{c.twin_rank.low:.0f} to {c.twin_rank.high:.0f}"
-            road, predicted = format_estimate(c.real, True, "not driven"), format_estimate(c.corrected, True)
-            lines.append(row(c.policy, format_estimate(c.twin, True), ranks, road, predicted).rstrip())
-        lines.append("")
-    groups = [group for group in forecast.groups if not group.missing]
-    if groups:
-        lines.append(f"  {'':<18}" + "".join(f"{g.task + f' (n = {g.policies})':<26}" for g in groups).rstrip())
-        for name, title, _ in STATISTICS:
-            values = [format_estimate(getattr(group, name), name in PERCENT_STATISTICS) for group in groups]
-            lines.append(f"  {title:<18}{''.join(f'{value:<26}' for value in values)}".rstrip())
-        lines += ["", *_score_lines(groups[-1]), "", *textwrap.wrap(INTERVALS_NOTE, 110), ""]
-    lines += [f"{group.task}: no correlation: {'; '.join(group.missing)}" for group in forecast.groups if group.missing]
-    lines += [allocation_text(allocation) for allocation in forecast.plans]
-    lines += [verdict.text for verdict in verdicts(forecast)]
-    if not forecast.groups:
-        lines.append(limitations(forecast)[0].what)
-    return "\n".join(lines)
-
-
-def _score_lines(group: Agreement) -> list[str]:
-    """Scores of the predictors of a group's cells."""
-    width = max(len(it.predictor) for it in group.scores)
-    row = f"  {{:<{width}}}  {{:<7}}  {{:<7}}  {{}}".format
-    lines = [row(f"{group.task}: scores, 0 is best", "Brier", "log", "the twin's log score is better by")]
-    for it in group.scores:
-        numbers = (format_estimate(e, digits=3) for e in (it.brier, it.log, it.gain))
-        lines.append(row(it.predictor, *numbers).rstrip())
-    return lines
-
-
-def candidates_csv(forecast: Forecast) -> str:
-    """`forecast.csv`: one row per candidate; empty cells where there is no number."""
-    rows = []
-    for c in forecast.candidates:
-        numbers = [
-            *(c.twin.value, c.twin.low, c.twin.high, c.twin.n, c.twin_rank.value, c.twin_rank.low, c.twin_rank.high),
-            *(c.twin_ranks[0], c.real.value, c.real.low, c.real.high, c.real.n, *(c.real_ranks[:1] or [None])),
-            *(c.corrected.value, c.corrected.low, c.corrected.high, c.trained.value, c.trained.low, c.trained.high),
-        ]
-        rows.append((c.task, c.policy, *("" if x is None else f"{x:.4f}".rstrip("0").rstrip(".") for x in numbers)))
-    return csv_text(CSV_COLUMNS, rows)
-
+from twin.report.html import MAX_TABLE_ROWS, Chart, command, render
 
 # ---- figures
 
@@ -412,7 +54,7 @@ _SQUARE_SIZE = 4.6  # [in]
 
 @styled
 def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "success in the twin") -> Figure:
-    """Real rate over another one of every driven candidate, colored by task; on the diagonal they are equal.
+    """Real rate of every driven candidate over its rate in `field`, colored by task; on the diagonal they are equal.
 
     `field` of the candidate is "twin" or "corrected" (predicted from the other candidates); `label` names it.
     """

@@ -1,8 +1,8 @@
 """Content shared by the reports, number formatting, and the Jinja environment of their pages.
 
 A report consists of sections with verdicts, facts and cautions; numbers that a stage did not report are "not measured".
-Summaries contain headlines and cautions of sections only, so no summary is better than what it summarizes. The pages
-are `templates/*.html`; every text in them is escaped unless it is `Markup`.
+Summaries repeat the headlines and cautions of sections, so that a summary never sounds better than its sections. The
+pages are `templates/*.html`; every text in them is escaped unless it is `Markup`.
 """
 
 import base64
@@ -26,7 +26,7 @@ MOOD_WORDS = {"good": "good", "mixed": "caution", "bad": "bad", "plain": ""}
 
 @dataclass(frozen=True)
 class Verdict:
-    """A sentence for newcomers with a mood."""
+    """A finding in one sentence for newcomers, with its mood: good news or bad."""
 
     text: str
     mood: str = "plain"
@@ -156,7 +156,7 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
 MAX_TABLE_ROWS = 24
 """Longer tables are collapsed, below a figure of the same data."""
 
-_STRIP_ASPECT = 2.4  # width over height from which on a picture spans the page
+_STRIP_ASPECT = 2.4  # pictures of a larger width / height span the page
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The summary of a validation, and `validation.html`: how often policies reach the goal, and why they fail.
 
-`results` is the content of `summary.json`: `summarize` and what `twin.validate` adds. Paired episodes share lighting
-and seed; the exact McNemar test compares the numbers of episodes in which only one of two policies succeeded. Videos
-are stored beside the page, their posters inside it.
+`results` is the content of `summary.json`: the result of `summarize`, and entries that `twin.validate` adds. Paired
+episodes share lighting and seed; the exact McNemar test compares the numbers of episodes in which only one of two
+policies succeeded. Videos are stored beside the page, their posters inside it.
 """
 
 from collections import Counter
@@ -20,7 +20,7 @@ from scipy.stats import binomtest
 
 from twin.config import ANY, HELD_OUT, TRAINING, Condition
 from twin.errors import join_names
-from twin.evaluation.forecasting import Estimate
+from twin.evaluation.agreement import Estimate
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS, rate_summary
 from twin.evaluation.training_curves import plot_success_curve
 from twin.evaluation.trials import RECENT_EPISODES, Trial, csv_text, tally
@@ -43,7 +43,7 @@ from twin.report.figures import (
     styled,
     svg,
 )
-from twin.report.forecast_report import format_estimate
+from twin.report.forecast_text import format_estimate
 from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Picture, Verdict, command, data_url, render
 from twin.scene import SceneDir
 
@@ -225,8 +225,8 @@ def limitations(results: dict[str, Any]) -> list[Caution]:
     drawn = dict.fromkeys(c["lighting"] for c in cells if Condition.parse(c["lighting"]).randomised)
     if drawn and not results.get("robot_known"):
         what = (
-            f"The result may differ for your robot: under {join_names(drawn)} another one drives every episode, "
-            "because none of its parameters are identified."
+            f"The result may differ for your robot: under {join_names(drawn)} every episode has a robot with other "
+            "random parameters, because none of yours are identified."
         )
         cure = "log five minutes of driving, run python -m twin.align, build again and validate again."
         out.append(Caution(what, cure))
@@ -271,7 +271,7 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
 # ---- figures
 
 MAX_PLOTTED_LIGHTINGS = 4
-"""Up to this many lightings rates are plotted with intervals, else as a heatmap."""
+"""Largest number of lightings whose rates are plotted with intervals; more are shown as a heatmap."""
 
 _BIN = 2.0  # [m] bin of the route in the failure histogram
 _FAILURE_LOOKS = {  # cause → color and hatching

@@ -297,7 +297,7 @@ def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image
     bar = ramp.shape[1]
     left = (width - bar) // 2
     out[8:18, left : left + bar] = ramp[:1]
-    free = left  # left end of the next label at least
+    free = left  # the next label must start right of this
     last = width - text_width(labels[-1][1], _TEXT) - 2 * _GAP  # left end of the last label
     for k, (share, text) in enumerate(labels):
         at, half = left + round(share * (bar - 1)), text_width(text, _TEXT) // 2

@@ -1,11 +1,11 @@
 """Compares the visual geometry (radiance field) with the collision geometry along a drive of the robot's camera.
 
 *Gap*: z-depth of the collision geometry less that of the field along a pixel's ray. Visual-only ("leak" in the report's
-keys) is visible without collision geometry, collision-only ("ghost") is the opposite. Their size is a height difference
-on the ground, since a centimeter of height is decimeters along a low ray, and elsewhere the distance to the nearest
-surface of the other geometry. Frames are matched within a film, so the field's depth is determined only where one film
-shows a place from two directions. Elsewhere (mainly just ahead of a drive's first frame) it may differ from build to
-build; collision-only there is reported separately as `unfilmed_ghost_m`.
+keys) is visible without collision geometry, collision-only ("ghost") is the opposite. Their size is, on the ground, the
+height difference (along a low ray, a centimeter of height would be decimeters), and elsewhere the distance to the
+nearest surface of the other geometry. Frames are matched within a film, so the field's depth is determined only where
+one film shows a place from two directions. Elsewhere (mainly just ahead of a drive's first frame) it may differ from
+build to build; collision-only there is reported separately as `unfilmed_ghost_m`.
 """
 
 from collections.abc import Callable
@@ -122,7 +122,7 @@ def compare_geometry(
         visible obstacles, further than `LARGE_ERROR` from collision geometry), `ghost_share` (of hit parts, as far from
         visible geometry), `corridor_leak_m`, `corridor_ghost_m` (maxima), `unfilmed_ghost_m` (maximum where no film
         shows the corridor from two directions), and `along`, the maxima per meter of the route. Every collision-only
-        point of the corridor is in one of the two.
+        point of the corridor counts for either `corridor_ghost_m` or `unfilmed_ghost_m`.
     """
     visual = views.points(views.visual_depth, world.intrinsics)
     collision = views.points(views.collision_depth, world.intrinsics)

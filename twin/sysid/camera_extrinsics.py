@@ -20,16 +20,18 @@ from scipy.spatial.transform import Rotation
 
 from twin import runtime
 from twin.assets.ground import Ground
-from twin.capture.camera_models import Lens, same_aspect
+from twin.capture.bag import is_bag
+from twin.capture.bag_film import read_contents
+from twin.capture.camera_models import Lens, same_aspect, undistorted
 from twin.capture.localize import FilmRegistration, register_film
-from twin.capture.video import FilmStatistics, read_film
+from twin.capture.video import FilmStatistics, read_film, video_film
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, opencv_to_mujoco
 from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
 from twin.mjcf.scene_xml import rest_pose
-from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
+from twin.robot import BASE_HEIGHT, CAMERA_AHEAD, HuskyParams, PixelCamera
 from twin.scene import SceneDir, require_stage
 from twin.types import Array, Image
 
@@ -38,12 +40,10 @@ from twin.types import Array, Image
 
 _MIN_FRAMES, _MIN_WAY = 16, 6.0  # frames, [m]
 _PARTS = 8  # consecutive parts of the film for the jackknife
-_NOISE, _OUTLYING = 0.01, 0.03  # [m] a sum of sideways steps: standard deviation, threshold of the robust loss
+_NOISE, _OUTLYING = 0.01, 0.03  # [m] standard deviation of a sum of sideways steps; threshold of the robust loss
 _PIVOT = 0.1  # [m] prior standard deviation of the turning point's forward offset from the base's origin
 _ROUNDS = 3  # alternations of base poses and extrinsics
 _FAR_OFF, _JUMP = 8.0, 3.0  # outliers: multiples of the median deviation, and of the median step
-_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Axes right, down and forward (columns) of a camera that looks straight ahead, in the base."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def base_heading(camera_to_world: Array, yaw: float) -> Array:
 
 def _headings(poses: Array, pitch_roll: Array) -> Array:
     """Headings [rad] (n,) of bases from camera poses (n, 4, 4) with zero yaw and given pitch and roll [rad] (2,)."""
-    base = poses[:, :3, :3] @ _AHEAD.T @ Rotation.from_euler("YX", pitch_roll).as_matrix().T
+    base = poses[:, :3, :3] @ CAMERA_AHEAD.T @ Rotation.from_euler("YX", pitch_roll).as_matrix().T
     return np.arctan2(base[:, 1, 0], base[:, 0, 0])
 
 
@@ -149,7 +149,8 @@ def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
     def sideways(unknown: Array) -> Array:
         """Sideways drift [m] of the point that the robot turns about, `pivot` [m] ahead of the base's origin.
 
-        Sums of steps up to each frame of a segment, minus the segment's mean; then the prior of `pivot`.
+        Per segment, the sum of sideways steps up to each frame, minus its mean over the segment; the last value is the
+        residual of the prior of `pivot`.
         """
         yaw, pivot = unknown
         heads = headings - yaw
@@ -173,7 +174,7 @@ def _relative_to_base(
     angles, heights, bases = np.zeros((len(poses), 3)), np.zeros(len(poses)), np.zeros((len(poses), 2))
     for i, (pose, heading) in enumerate(zip(poses, headings, strict=True)):
         base, rotation = _base_pose(pose[:2, 3], heading, ground_at, lens)
-        angles[i] = Rotation.from_matrix(rotation.T @ pose[:3, :3] @ _AHEAD.T).as_euler("ZYX")
+        angles[i] = Rotation.from_matrix(rotation.T @ pose[:3, :3] @ CAMERA_AHEAD.T).as_euler("ZYX")
         heights[i], bases[i] = (rotation.T @ (pose[:3, 3] - base))[2], base[:2]
     return angles, heights, bases
 
@@ -208,7 +209,7 @@ class CameraCalibration:
     extrinsics: CameraExtrinsics
     standard_errors: CameraExtrinsics
     focal_given: bool
-    """False: the focal length is estimated."""
+    """False: the focal length is estimated, or a bag's."""
 
     @property
     def summary(self) -> str:
@@ -225,7 +226,8 @@ class CameraCalibration:
         }
         if not self.focal_given:
             lens, error = self.registration.lens, self.registration.focal_error
-            out["camera_intrinsics"] = tuple(map(float, lens.intrinsics)), (error, error, None, None)
+            errors = (error, error, None, None) if error else None  # none of a bag's calibration
+            out["camera_intrinsics"] = tuple(map(float, lens.intrinsics)), errors
             out["camera_size"] = (lens.width, lens.height), None
         return out
 
@@ -241,24 +243,34 @@ class CameraCalibration:
         }
 
 
-def calibrate_camera(film: Path, scene: SceneDir, params: HuskyParams) -> tuple[CameraCalibration, list[Image]]:
+def calibrate_camera(
+    film: Path, scene: SceneDir, params: HuskyParams, topic: str = ""
+) -> tuple[CameraCalibration, list[Image]]:
     """Estimates the camera's extrinsics, and its focal length unless given; also returns the film's frames.
 
     Args:
-        film: Undistorted film of the front camera, while the robot drives through the scene, mostly straight ahead.
+        film: Undistorted film of the front camera, while the robot drives through the scene, mostly straight ahead; or
+            a bag with its pictures, from which its calibration takes the distortion.
         params: The robot, with given intrinsics or none.
+        topic: Of the bag's pictures; empty: the one with most of them.
 
     Raises:
         InputError: the scene is not built, or the film does not determine the extrinsics.
     """
     ground = _ground(scene)
+    bag = read_contents(film, topic) if is_bag(film) else None
+    source = video_film(film) if bag is None else bag.film()
+    calibrated = bag.lens if bag else None
     with runtime.bar("reading the film", 0, "frame") as bar:
         frames = []
-        for frame in read_film(film, _CHOICE, FilmStatistics(), lambda *_: None):
-            frames.append(frame.image)
+        for frame in read_film(source, _CHOICE, FilmStatistics(), lambda *_: None):
+            image, pinhole = frame.image, None
+            if calibrated is not None:
+                image, pinhole = undistorted(image, calibrated.scaled(image.shape[1], image.shape[0]))
+            frames.append(image)
             bar.update()
     size = frames[0].shape[1], frames[0].shape[0]
-    registration = register_film(frames, _given_lens(params, size), scene)
+    registration = register_film(frames, pinhole or _given_lens(params, size), scene)
     worst = _WORST_ERROR * max(size) / 1280
     if registration.error > worst:
         raise InputError(
@@ -272,7 +284,8 @@ def calibrate_camera(film: Path, scene: SceneDir, params: HuskyParams) -> tuple[
             f"{errors.roll:.2f}° and its height by {errors.height:.3f} m, expected at most {_WORST_TURN:g}° and "
             f"{_WORST_HEIGHT:g} m; film a longer drive on the filmed path"
         )
-    return CameraCalibration(registration, len(frames), extrinsics, errors, bool(params.camera_intrinsics)), frames
+    given = bool(params.camera_intrinsics) and pinhole is None
+    return CameraCalibration(registration, len(frames), extrinsics, errors, given), frames
 
 
 def write_camera_comparison(

@@ -1,10 +1,11 @@
 """Drivetrain model: wheel speeds that result from commands, by the robot's controller and servos, fitted to a log.
 
 The model applies the limits of `twin.env.controller` to many windows at once, every 0.01 s instead of every 0.1 s, so
-that it is smooth in its parameters. (On average the controller's wait for its next period and its step ahead cancel.)
-*Mean* and *half* speed are the mean of the two sides and half their difference [rad/s at the wheels]. Wheel commands
-may be in units of another robot (DRIVE's assume wheels of 0.3 m under a Husky), so they have a gain for the mean and
-one for the half speed. For commands v and ω the first is 1, the second the controller's separation multiplier.
+that it is smooth in its parameters. (A real controller waits for its next period, and then changes speed for a whole
+period at once; on average these two effects cancel.) *Mean* and *half* speed are the mean of the two sides and half
+their difference [rad/s at the wheels]. Wheel commands may be in units of another robot (DRIVE's assume wheels of 0.3 m
+under a Husky), so they have a gain for the mean and one for the half speed. For commands v and ω the first is 1, the
+second the controller's separation multiplier.
 """
 
 from dataclasses import dataclass, replace
@@ -72,8 +73,9 @@ class Drivetrain:
 def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array, Array]:
     """Servo targets and the resulting wheel speeds, starting from each window's first wheel speeds.
 
-    A window that follows others starts with their delayed commands and the state of their acceleration ramps, which
-    lagging wheels do not show. In other windows the wheels keep their speed until the first command arrives.
+    A window that follows others starts with their delayed commands and with the state of their acceleration ramps,
+    which cannot be read from the wheels, as these lag behind. In other windows the wheels keep their speed until the
+    first command arrives.
 
     Returns:
         Targets and lagged wheel speeds, left and right [rad/s], each of shape (n, (k + EXTRA_SAMPLES) · 5, 2),

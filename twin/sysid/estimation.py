@@ -32,7 +32,7 @@ Kinds = tuple[int, ...]
 
 DEGREES_OF_FREEDOM = 3.0  # fitted to a log (DRIVE's) it came to 2.6 to 3.2
 
-_MIN_SCALE = 1e-3  # in units of the residuals: no log resolves millimetres, milliradians, or as much per second
+_MIN_SCALE = 1e-3  # [m], [rad], [m/s], [rad/s]; logs are not more accurate
 _ROUNDS, _SETTLED = 10, 0.05  # most alternations of scales and model; relative change at which scales have converged
 _ITERATIONS, _CLOSE = 500, 1e-4  # the same for expectation maximization
 
@@ -67,7 +67,7 @@ def fit_with_scales(
     """Fits a model and the scales of its residuals in alternation until the scales have converged.
 
     Args:
-        residuals: Returns a model's, shape (n, instants, c).
+        residuals: Returns the residuals of a model, shape (n, instants, c).
         solve: Returns the best model, from an initial one and the scales (c,).
     """
     scale = residual_scale(residuals(start), kinds)
@@ -117,7 +117,7 @@ def _per_window(factor: Array, like: Array) -> Array:
 _MAX_ERROR_SHARE = 0.5  # largest standard error of an identified parameter, in prior standard deviations
 _MIN_CURVATURE = 0.1  # of the curvature of the squares, see `_inverse_curvature`
 _STEP = 0.05  # of finite differences, in prior standard deviations
-_NATS = 0.02  # of likelihood; a search ends when a step gains less: a fifth of a standard error in one direction
+_NATS = 0.02  # a search ends when a step gains less log-likelihood, as 0.2 standard errors off the maximum do
 _EVALUATIONS = 50  # most evaluations per round of the search, without those of the Jacobians
 
 
@@ -162,7 +162,7 @@ def maximize_posterior(
     """The most probable value of every parameter, identified or not.
 
     Args:
-        residuals: Returns those of every window for values by name, shape (n, instants, c).
+        residuals: Returns the residuals of every window for values by name, shape (n, instants, c).
         reach: Scale of the first step in prior standard deviations; smaller near the solution. A step is at most
             √(reach · distance to the bound).
     """
@@ -324,7 +324,7 @@ def _inverse_curvature(information: Array, score: Array) -> Array:
     """Inverse of the curvature of the objective, shape (p, p).
 
     log(1 + s) has less curvature than the squares that replace it in a step, by twice the squared score of a window.
-    Where noise dominates the difference, `_MIN_CURVATURE` of the squares' remains.
+    Where noise would make the difference too small, `_MIN_CURVATURE` times the curvature of the squares is used.
     """
     root = np.linalg.inv(np.linalg.cholesky(information))
     less, axes = np.linalg.eigh(2 * root @ score.T @ score @ root.T)

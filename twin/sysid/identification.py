@@ -1,7 +1,7 @@
 """System identification of a robot from a log, and the text of `robot.toml`.
 
-`robot.toml` has a line with value and standard error for each identified field, after its previous fields; the others
-have their published values or those of `scene.toml`. `align.json` has all numbers.
+`robot.toml` keeps its previous fields and gets a line with value and standard error for each identified field. All
+other fields have their published values or those of `scene.toml`. `align.json` has all numbers.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.files import toml_string
+from twin.files import toml_value
 from twin.robot import HuskyParams
 from twin.sysid import rollout, tires
 from twin.sysid.drivetrain import Drivetrain, fit_drivetrain
@@ -39,6 +39,7 @@ _GROUND_FIELDS = {  # field of HuskyParams → parameters of `tires`
     "wheel_radius": ("radius_left", "radius_right"),
     "servo_gain": ("log10_servo_gain",),
 }
+_DIGITS = 6  # of numbers in robot.toml
 _NO_TWIST = "the log's commands are wheel speeds, which bypass the controller's own multiplier; needs v and ω"
 
 
@@ -207,23 +208,12 @@ def toml_text(comment: str, previous: dict[str, Any], identified: dict[str, tupl
     lines = ["# " + "".join(c if c.isprintable() else "?" for c in comment)]
     if not identified:
         lines.append("# But nothing in it could be identified; the fields below are those of the previous file.")
-    lines += [f"{name} = {_toml(value)}" for name, value in previous.items() if name not in identified]
+    lines += [f"{name} = {toml_value(value, _DIGITS)}" for name, value in previous.items() if name not in identified]
     for name, (value, error) in identified.items():
-        lines.append(f"{name} = {_toml(value)}" + ("" if error is None else f"  # ± {format_error(error)}"))
+        lines.append(
+            f"{name} = {toml_value(value, _DIGITS)}" + ("" if error is None else f"  # ± {format_error(error)}")
+        )
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    if isinstance(value, str):
-        return toml_string(value)
-    if isinstance(value, int):
-        return str(value)
-    text = f"{value:.6g}"
-    return text if any(c in text for c in ".einf") else text + ".0"
 
 
 def format_error(error: float | tuple[float | None, ...]) -> str:

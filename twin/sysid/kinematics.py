@@ -64,7 +64,7 @@ def integrate(motion: Array) -> Array:
 def predict(model: IcrModel, windows: Windows) -> Array:
     """Poses since the measurement of each window's first one, shape (n, k + MAX_POSE_AGE + 1, 3).
 
-    They follow from measured wheel speeds, the last of which are held.
+    They follow from the measured wheel speeds; beyond a window's end its last ones continue.
     """
     before = windows.preceding_wheels[:, -1 - MAX_POSE_AGE : -1]
     after = np.repeat(windows.wheels[:, -1:], MAX_POSE_AGE, 1)

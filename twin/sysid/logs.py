@@ -10,7 +10,7 @@ window *follows* the previous one if it begins when that one ends. A pose is *fr
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
   [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
   [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
-- a ROS 2 bag, as such a table (`twin.sysid.ros_bags`);
+- a robot's bag, as such a table (`twin.sysid.ros_bags`);
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
 from twin import runtime
+from twin.capture.bag import is_bag
 from twin.errors import InputError
 from twin.files import exists, load_arrays, read_text, wrap_read_errors
 from twin.robot import TRACK, WHEEL_RADIUS
@@ -44,7 +45,7 @@ ACCELERATION = ("acceleration_x", "acceleration_y")
 
 _MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are left out
 _MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
-_FAST = 1.75  # samples; for sensors of a shorter period, times of appearance are more accurate than counts of poses
+_FAST = 1.75  # samples; if a sensor's period is shorter, times of appearance are used, see `measurement_times`
 _JITTER = 4  # samples between measurement and appearance of a pose, at most, apart from the common delay
 _UNSTEADY = 0.1  # fraction of windows that contradict the period, above which the sensor counts as aperiodic
 _DROPOUT = 30  # samples without a fresh pose; windows with more are left out if the wheels turn
@@ -100,7 +101,7 @@ def _steady(appeared: Array, period: float) -> Array:
         return np.zeros(1)
     number = np.arange(1.0, len(appeared) + 1)
     lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
-    number += np.minimum.accumulate(lost[::-1])[::-1]  # a pose that later ones catch up with is late, not lost
+    number += np.minimum.accumulate(lost[::-1])[::-1]  # if later poses are on time again, the pose was late, not lost
     start = float(np.median(appeared - period * number))
     if start > period / 2:  # the robot rested, or the first poses were lost
         first = start - period * np.ceil(start / period)
@@ -111,7 +112,9 @@ def _steady(appeared: Array, period: float) -> Array:
 
 
 def _as_appeared(appeared: Array, period: float) -> Array:
-    """The same by times of appearance; `period` is the interval for a single fresh pose."""
+    """Measurement times as in `_steady`, taken from the times of appearance; `period` is used if only one pose is
+    fresh.
+    """
     apart = float(np.median(np.diff(appeared))) if len(appeared) > 1 else period
     return np.append(max(min(float(appeared[0]) - apart, 0.0), -MAX_POSE_AGE), appeared)
 
@@ -201,8 +204,8 @@ class Windows:
 def read_log(path: Path) -> Windows:
     """Reads a log. Raises InputError: an unreadable file, missing columns, or impossible times or values."""
     if not exists(path):
-        raise InputError(f"{path}: no such log; expected a .csv, an .npz or the folder of a ROS 2 bag")
-    if path.is_dir() or path.suffix in (".db3", ".mcap", ".bag"):
+        raise InputError(f"{path}: no such log; expected a .csv, an .npz or a bag")
+    if path.is_dir() or is_bag(path):
         from twin.sysid.ros_bags import read_bag
 
         return cut_windows(read_bag(path), str(path))
@@ -213,7 +216,7 @@ def read_log(path: Path) -> Windows:
         if columns.get("icp_x", np.zeros(0)).ndim == 2:
             return _published_windows(columns, str(path))
         return cut_windows(columns, str(path))
-    raise InputError(f"{path}: expected a log in .csv, .npz or a ROS 2 bag; convert it to one of those")
+    raise InputError(f"{path}: expected a log in .csv, .npz or a bag; convert it to one of those")
 
 
 def _read_csv(path: Path) -> dict[str, Array]:

@@ -72,7 +72,7 @@ def _plot_turning(windows: Windows, fitted: Prediction) -> plt.Figure:
 def _plot_wheels(windows: Windows, fitted: Prediction) -> plt.Figure:
     score = np.flatnonzero(~windows.fitting)
     change = np.ptp(windows.wheels[score], axis=1).sum(1)
-    # Of the windows with large changes of speed, some spread over the log.
+    # Some windows with large changes of speed, spread over the log.
     changing = score[change >= np.quantile(change, 0.7)]
     chosen = changing[np.linspace(0, len(changing) - 1, min(_SHOWN, len(changing))).astype(int)]
     figure, axes = plt.subplots(1, len(chosen), figsize=(12, 3.8), layout="constrained", sharey=True, squeeze=False)

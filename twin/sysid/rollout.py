@@ -45,7 +45,7 @@ class SlopeModel:
 
 
 _PRIOR, _PRIOR_STD = SlopeModel(0.25, 5.0, 0.25), 1.0  # median (gentle: 1.5°), standard deviation of the logarithms
-_RANGE = 1e-3, 1e3  # of each; bounds the fit to readings without noise
+_RANGE = 1e-3, 1e3  # of each statistic; keeps the fit finite if the readings have no noise
 
 
 def slope_gravity(windows: Windows, model: IcrModel) -> Array:

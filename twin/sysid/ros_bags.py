@@ -1,121 +1,150 @@
-"""ROS 2 bags read as tables, with `rosbags` (the extra `ros`; no ROS installation is needed).
+"""Drive logs from bags, as tables: a row per joint state, with the newest values of the other topics.
 
-Topics are selected by message type: geometry_msgs/Twist or TwistStamped for commands; sensor_msgs/JointState, with
-joints named like a Husky's wheels, for wheel speeds; nav_msgs/Odometry, geometry_msgs/PoseStamped or
-PoseWithCovarianceStamped for poses, preferably without a word of `_FROM_WHEELS` in the topic's name; sensor_msgs/Imu
-for accelerations. The table has a row per joint state, with the newest values of the other topics.
+Where a bag has no joint states, the wheel speeds are those of the wheels' odometry, by the inverse of Clearpath's
+kinematics. Poses that come from the wheels would hide their slip; in their place are taken those of the bag's own
+pictures, if a scene was built from it: of the robot at rest below the reconstructed cameras.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from twin import runtime
+from twin.assets.ground import Ground
+from twin.capture.bag import (
+    MIN_POSES,
+    ODOMETRY,
+    TYPES,
+    VALUES,
+    bag_files,
+    choose_topics,
+    is_bag,
+    is_from_wheels,
+    messages_by_topic,
+    open_bag,
+    topic_names,
+)
+from twin.capture.bag_film import read_contents
+from twin.capture.frames import source_names
+from twin.config import SceneConfig
 from twin.errors import InputError
-from twin.robot import WHEELS
+from twin.files import digest_file
+from twin.geometry.cameras import Cameras
+from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
+from twin.scene import SceneDir, require_stage
+from twin.sysid.camera_extrinsics import base_below_camera
 from twin.types import Array
 
-TYPES = {
-    "commands": ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"),
-    "wheels": ("sensor_msgs/msg/JointState",),
-    "poses": (
-        "nav_msgs/msg/Odometry",
-        "geometry_msgs/msg/PoseStamped",
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-    ),
-    "imu": ("sensor_msgs/msg/Imu",),
-}
-"""Message types of each kind of topic."""
-_FROM_WHEELS = ("platform", "wheel", "velocity_controller")
+
+@dataclass(frozen=True)
+class FilmedPoses:
+    """Poses of a robot by the pictures that it took."""
+
+    times: NDArray[np.int64]
+    """Stamps of the pictures [ns], increasing, shape (n,)."""
+    poses: Array
+    """x, y [m], yaw [rad] of the base in the scene, shape (n, 3)."""
 
 
-@contextmanager
-def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Any]:
-    """A reader of rosbags.
+def filmed_poses(scene: SceneDir, config: SceneConfig, bag: Path) -> FilmedPoses | None:
+    """The robot's poses by the reconstruction of a bag's pictures; None unless the scene was built from that bag.
 
-    Raises InputError, also for what goes wrong in the block: rosbags is not installed, or the bag is unreadable.
+    Raises InputError: the bag is unreadable.
     """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise InputError(f"{path}: reading a ROS 2 bag needs rosbags; pip install 'twin[ros]'") from None
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            yield reader
-    except InputError:
-        raise
-    except Exception as error:  # of the reader: not a bag, a damaged one, unknown messages
-        raise InputError(f"{path}: not a readable ROS 2 bag: {error}; {cure}") from None
+    names = source_names([source.path for source in config.source])
+    built = all(scene.stage(stage).is_dir() for stage in ("metric", "mesh"))
+    for name, source in zip(names, config.source, strict=True):
+        path = scene.root / source.path
+        if not (built and is_bag(path) and path.exists() and _are_same(path, bag)):
+            continue
+        cameras = Cameras.load(require_stage(scene, "metric"))
+        ground = Ground.load(require_stage(scene, "mesh"))
+        rows = [i for i, one in enumerate(cameras.sources) if one == name]
+        first = int(read_contents(bag, source.topic).stamps[0])
+        times = first + np.round(cameras.times[rows] * 1e9).astype(np.int64)
+        poses = [base_below_camera(config.robot, cameras.camera_to_world[i], ground.at) for i in rows]
+        order = np.argsort(times)
+        return FilmedPoses(times[order], np.array(poses).reshape(-1, 3)[order])
+    return None
 
 
-def read_bag(path: Path) -> dict[str, Array]:
+def _are_same(one: Path, other: Path) -> bool:
+    """True if two bags have the same files."""
+    first, second = bag_files(one), bag_files(other)
+    sizes = [[file.stat().st_size for file in files] for files in (first, second)]
+    return sizes[0] == sizes[1] and list(map(digest_file, first)) == list(map(digest_file, second))
+
+
+def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
     """The columns that `twin.sysid.logs` describes.
 
-    Raises InputError: rosbags is not installed, the bag is unreadable, or a kind of message is missing.
+    Args:
+        path: See `twin.capture.bag`.
+        filmed: Poses in place of those that come from the wheels.
+
+    Raises:
+        InputError: rosbags is not installed, the bag is unreadable, a kind of message is missing, or the poses come
+            from the wheels.
     """
-    with open_bag(path, "record it anew or give a .csv") as reader:
-        chosen = choose_topics(reader.connections, path)
+    with open_bag(path, "record it anew or give a .csv") as bag:
+        kinds, values = _kinds(bag.connections, path, filmed)
+        chosen = choose_topics(bag.connections, path, [kind for kind in kinds if kind not in values])
+        functions = {kind: VALUES[kind] for kind in chosen}
+        if "wheels" in values:
+            chosen["wheels"], functions["wheels"] = values["wheels"], _wheels_of_odometry
         rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
-        kinds = {connection.id: kind for kind, connection in chosen.items()}
-        begin = reader.start_time  # [ns], subtracted as an integer: as a float it would be rounded to 0.2 µs
-        for connection, stamp, raw in reader.messages(connections=list(chosen.values())):
-            kind = kinds[connection.id]
-            values = VALUES[kind](reader.deserialize(raw, connection.msgtype))
-            if values is not None:
-                rows[kind].append(((stamp - begin) * 1e-9, *values))
-    empty = [kind for kind, values in rows.items() if not values]
+        by_id = {connection.id: kind for kind, connection in chosen.items()}
+        # The beginning is subtracted as an integer: as a float it would be rounded to 0.2 µs.
+        for connection, recorded, message in bag.messages(list(chosen.values())):
+            kind = by_id[connection.id]
+            numbers = functions[kind](message)
+            if numbers is not None:
+                rows[kind].append(((recorded - bag.begin) * 1e-9, *numbers))
+        if "poses" not in kinds and filmed is not None:
+            since = (filmed.times - bag.begin) * 1e-9
+            rows["poses"] = [(float(t), *pose) for t, pose in zip(since, filmed.poses.tolist(), strict=True)]
+    empty = [kind for kind, found in rows.items() if not found]
     if empty:
         raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected some; record those topics")
-    return _columns({kind: np.array(values) for kind, values in rows.items()})
+    return _columns({kind: np.array(found) for kind, found in rows.items()})
 
 
-def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
-    """The connection of each kind, a key of `TYPES`. Raises InputError: a kind other than imu has none."""
-    chosen = {}
-    for kind in kinds:
-        types = TYPES[kind]
-        found = [c for c in connections if c.msgtype in types and c.msgcount]
-        if kind == "commands":  # prefer the controller's input to the multiplexer's
-            found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
-        elif kind == "poses":
-            found.sort(key=lambda c: (any(word in c.topic for word in _FROM_WHEELS), -c.msgcount))
-        else:
-            found.sort(key=lambda c: -c.msgcount)
-        if found:
-            chosen[kind] = found[0]
-        elif kind != "imu":
-            topics = ", ".join(sorted({c.topic for c in connections})) or "none"
-            raise InputError(f"{path}: no topic with {kind} ({' or '.join(types)}) among {topics}; record it")
-    return chosen
+def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tuple[list[str], dict[str, Any]]:
+    """The kinds of topics to read, and the connection of the wheels' odometry if it stands in for joint states."""
+    kinds, values = list(TYPES), {}
+    counts = messages_by_topic(connections, TYPES["poses"])
+    if not any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
+        if filmed is None:
+            raise InputError(
+                f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) that come from elsewhere than the wheels "
+                f"among {topic_names(connections)}; record LiDAR, RTK or a total station, or build the scene from this "
+                "bag's pictures"
+            )
+        kinds.remove("poses")
+        runtime.log_line(f"{path}: poses are those of its pictures in the built scene, {len(filmed.times)} of them")
+    if not messages_by_topic(connections, TYPES["wheels"]):
+        from_wheels = messages_by_topic(connections, (ODOMETRY,))
+        names = [name for name in from_wheels if is_from_wheels(name)]
+        if names:
+            topic = max(names, key=lambda name: from_wheels[name])
+            values["wheels"] = next(one for one in connections if one.topic == topic and one.msgcount)
+            runtime.log_line(
+                f"{path}: no joint states; wheel speeds are those of {topic}, by Clearpath's multiplier "
+                f"{HuskyParams.separation_multiplier:g}"
+            )
+    return kinds, values
 
 
-def _twist(message: Any) -> tuple[float, ...]:
-    twist = getattr(message, "twist", message)
-    return twist.linear.x, twist.angular.z
+def _wheels_of_odometry(message: Any) -> tuple[float, float]:
+    """Wheel speeds left and right [rad/s] of the wheels' odometry."""
+    v, yaw_rate = message.twist.twist.linear.x, message.twist.twist.angular.z
+    half = yaw_rate * TRACK * HuskyParams.separation_multiplier / 2.0
+    return (v - half) / WHEEL_RADIUS, (v + half) / WHEEL_RADIUS
 
 
-def _wheels(message: Any) -> tuple[float, ...] | None:
-    speeds = dict(zip(message.name, message.velocity, strict=False))
-    sides = [[v for name, v in speeds.items() for w in WHEELS[i::2] if name.startswith(w)] for i in (0, 1)]
-    return tuple(float(np.mean(side)) for side in sides) if all(sides) else None
-
-
-def _pose(message: Any) -> tuple[float, ...]:
-    pose = message.pose
-    pose = getattr(pose, "pose", pose)
-    p, q = pose.position, pose.orientation
-    return p.x, p.y, float(np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
-
-
-def _imu(message: Any) -> tuple[float, ...]:
-    return message.linear_acceleration.x, message.linear_acceleration.y
-
-
-VALUES: dict[str, Callable[[Any], Any]] = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
-"""Functions from a message of each kind to its numbers: v, ω; wheel speeds; x, y, yaw; accelerations."""
 _NAMES = {
     "commands": ("cmd_v", "cmd_yaw_rate"),
     "wheels": ("left_wheel_vel", "right_wheel_vel"),

@@ -39,9 +39,9 @@ from twin.types import Array
 #     + ramps continued between windows (`drivetrain`)  0.12 m, 4.5°: lagging wheels do not show them
 #     + residual scales from the log (`estimation`)     0.11 m, 4.6°: fixed ones weighted yaw too much
 #
-# The last row is the shipped model (`docs/benchmarks.md`). Before rolling resistance, drag on all bodies or on the
-# chassis alone had a 5 % higher loss. A part of the weight that slides, instead of drag, had 1 %: better straight on,
-# worse in turns.
+# The last row is the shipped model (`docs/benchmarks.md`). Alternatives to drag, tried before rolling resistance:
+# drag on all bodies, or on the chassis alone, had a 5 % higher loss; a sliding support that carries part of the weight
+# had 1 % (better straight on, worse in turns).
 #
 # In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire that rolls at v
 # and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip across. So grip grows with the slip ratio u / v,
@@ -54,8 +54,8 @@ _NEAR = 0.25  # `reach` of the search that starts near the solution
 _TURNS, _BENDS = "hard turns at several speeds", "gentle bends as well as hard turns"
 _BRAKING = "hard braking, or slopes"
 # Prior mean and standard deviation, lowest and highest value, unit, cure. Prior means are those of soft ground and of
-# the published robot without load, whose published centers of mass differ by as much as the prior of their x. Creep is
-# the inverse of slip stiffness, as slip is proportional to it.
+# the published robot without load; its publications give centers of mass that differ by one standard deviation of the
+# prior of x. Creep is the inverse of slip stiffness, as slip is proportional to it.
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "friction": (0.3, 0.2, 0.05, 1.5, "", _TURNS),
     "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _TURNS),

@@ -1,8 +1,8 @@
-"""A trial on the road, read from the robot's ROS 2 bag: pictures, calibration, poses and commands.
+"""A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
-Times are nanoseconds on the clock of the messages' headers; where headers have another clock than the bag, or none,
-they are those of recording. Poses are planar, in the frame of their topic (odometry, RTK); `fit_frame` finds that frame
-in the scene from pictures that were located there. Pictures stay in the bag until they are wanted.
+Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
+`fit_frame` finds that frame in the scene from pictures that were located there. Pictures stay in the bag until they are
+wanted.
 """
 
 from collections.abc import Iterator
@@ -13,17 +13,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import runtime
+from twin.capture.bag import (
+    CAMERA_INFO,
+    FIX,
+    TYPES,
+    VALUES,
+    choose_camera_info,
+    choose_pictures,
+    choose_topics,
+    fix_of,
+    header_time,
+    message_times,
+    open_bag,
+    picture_of,
+    topic_names,
+)
 from twin.capture.scale import local_east_north_up
 from twin.errors import InputError
-from twin.sysid.ros_bags import TYPES, VALUES, choose_topics, open_bag
 from twin.types import Array
-from twin_policy import Camera, CompressedPicture, PictureError, RawPicture
+from twin_policy import Camera, PictureError
 
-_PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_INFO, _FIX = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/NavSatFix"
-_NO_PICTURES = ("depth", "confidence", "disparity", "mask", "infra")  # words in names of other images' topics
-_CLOCK = 1_000_000_000  # [ns] by which the headers' clock may differ from the bag's
 _STEP = 0.3  # [m] of motion from which a fix's heading is taken
 
 
@@ -60,20 +69,12 @@ class TrialRecording:
         """Yields stamp and picture (something with `decode()`) of the pictures with these stamps, in order."""
         wanted = set(stamps.tolist())
         shift = dict(zip(self.arrival.tolist(), self.shutter.tolist(), strict=True))
-        with open_bag(self.path) as reader:
-            mine = [one for one in reader.connections if one.topic == self.topics["pictures"]]
-            for connection, recorded, raw in reader.messages(connections=mine):
+        with open_bag(self.path) as bag:
+            for _, recorded, message in bag.messages(bag.on(self.topics["pictures"])):
                 stamp = shift.get(recorded)
                 if stamp is not None and stamp in wanted:
                     wanted.discard(stamp)
-                    yield stamp, picture_of(reader.deserialize(raw, connection.msgtype))
-
-
-def picture_of(message: Any) -> RawPicture | CompressedPicture:
-    """The picture in an Image or CompressedImage."""
-    if hasattr(message, "format"):
-        return CompressedPicture(message.data)
-    return RawPicture(message.encoding, message.width, message.height, message.step, message.data)
+                    yield stamp, picture_of(message)
 
 
 def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecording:
@@ -88,19 +89,16 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
     """
     if not path.exists():
         raise InputError(f"{path}: no such bag; expected the folder of a ROS 2 bag, or its .mcap or .db3 file")
-    with open_bag(path) as reader:
-        chosen = _choose(reader.connections, path, given or {})
+    with open_bag(path) as bag:
+        chosen = _choose(bag.connections, path, given or {})
         times: dict[str, list[tuple[int, int]]] = {kind: [] for kind in chosen}
         values: dict[str, list[Any]] = {kind: [] for kind in chosen}
         kinds = {connection.id: kind for kind, connection in chosen.items()}
-        for connection, recorded, raw in reader.messages(connections=list(chosen.values())):
+        for connection, recorded, message in bag.messages(list(chosen.values())):
             kind = kinds[connection.id]
-            message = reader.deserialize(raw, connection.msgtype)
             if kind == "camera" and values[kind]:
                 continue
-            stamp = getattr(getattr(message, "header", None), "stamp", None)
-            header = stamp.sec * 10**9 + stamp.nanosec if stamp is not None else 0
-            times[kind].append((header, recorded))
+            times[kind].append((header_time(message), recorded))
             values[kind].append(_value(kind, message))
     topics = {kind: connection.topic for kind, connection in chosen.items()}
     for kind, topic in topics.items():
@@ -110,7 +108,7 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
         camera = Camera.from_info(values["camera"][0], "rect" in topics["pictures"])
     except PictureError as error:
         raise InputError(f"{path}: {topics['camera']}: {error}") from None
-    stamps = {kind: _clock(np.array(times[kind], np.int64), topics[kind], path) for kind in times}
+    stamps = {kind: message_times(np.array(times[kind], np.int64), topics[kind], path) for kind in times}
     arrival = np.array(times["pictures"], np.int64)[:, 1]
     if len(np.unique(arrival)) < len(arrival):
         raise InputError(f"{path}: pictures on {topics['pictures']} were recorded at the same time; record one topic")
@@ -133,40 +131,24 @@ def _choose(connections: Any, path: Path, given: dict[str, str]) -> dict[str, An
     for kind, topic in given.items():
         found = [one for one in filled if one.topic == topic]
         if not found:
-            raise InputError(f"{path}: no topic {topic} ({kind}); there are {_names(connections)}")
+            raise InputError(f"{path}: no topic {topic} ({kind}); there are {topic_names(connections)}")
         chosen[kind] = found[0]
     if "pictures" not in chosen:
-        found = [one for one in filled if one.msgtype in _PICTURES and not _is_other_image(one.topic)]
-        if not found:
-            raise InputError(f"{path}: no topic with pictures among {_names(connections)}; record the front camera")
-        chosen["pictures"] = max(found, key=lambda one: (one.msgcount, one.topic))
+        topic = choose_pictures(filled, path)
+        chosen["pictures"] = next(one for one in filled if one.topic == topic)
     if "camera" not in chosen:
-        found = [one for one in filled if one.msgtype == _INFO]
-        if not found:
+        info = choose_camera_info(filled, chosen["pictures"].topic)
+        if info is None:
             raise InputError(
-                f"{path}: no topic of {_INFO} among {_names(connections)}; record the camera's camera_info"
+                f"{path}: no topic of {CAMERA_INFO} among {topic_names(connections)}; record the camera's camera_info"
             )
-        chosen["camera"] = max(found, key=lambda one: _common(one.topic, chosen["pictures"].topic))
+        chosen["camera"] = next(one for one in filled if one.topic == info)
     if "poses" not in chosen and not any(one.msgtype in TYPES["poses"] for one in filled):
-        fixes = [one for one in filled if one.msgtype == _FIX]
+        fixes = [one for one in filled if one.msgtype == FIX]
         if fixes:
             chosen["poses"] = max(fixes, key=lambda one: one.msgcount)
     missing = [kind for kind in ("poses", "commands") if kind not in chosen]
     return chosen | choose_topics(connections, path, missing)
-
-
-def _is_other_image(topic: str) -> bool:
-    return any(word in topic for word in _NO_PICTURES)
-
-
-def _names(connections: Any) -> str:
-    return ", ".join(sorted({one.topic for one in connections})) or "none"
-
-
-def _common(one: str, other: str) -> int:
-    """Number of leading parts that two topics share."""
-    pairs = list(zip(one.split("/"), other.split("/"), strict=False))
-    return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def _value(kind: str, message: Any) -> Any:
@@ -175,24 +157,12 @@ def _value(kind: str, message: Any) -> Any:
     if kind == "camera":
         return message
     if kind == "poses" and hasattr(message, "latitude"):
-        good = message.status.status >= 0
-        return (message.latitude, message.longitude, message.altitude) if good else (np.nan,) * 3
+        return fix_of(message)
     if kind == "poses":
         pose = getattr(message.pose, "pose", message.pose)
         q = pose.orientation
         return (*(VALUES["poses"](message) or ()), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
     return VALUES[kind](message)
-
-
-def _clock(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[np.int64]:
-    """Times of a topic's messages [ns] from headers and recording, (n, 2)."""
-    header, recorded = times.T
-    if not header.any():
-        return recorded.copy()
-    if abs(int(np.median(recorded - header))) > _CLOCK:
-        runtime.log_line(f"{path}: headers on {topic} have another clock; the times of recording are used")
-        return recorded.copy()
-    return header.copy()
 
 
 def _poses(times: NDArray[np.int64], rows: list[Any], where: str) -> tuple[NDArray[np.int64], Array, Array]:
@@ -236,7 +206,7 @@ class FrameFit:
     residual: float = 0.0
     """Root mean square distance between the poses and the located pictures [m]."""
     scale: float = 1.0
-    """Metres of the scene per metre of the poses, of the same pictures; not applied."""
+    """Metres of the scene per metre of the poses, by the same pictures; reported only, not applied to poses."""
     located: int = 0
     """Pictures used."""
 

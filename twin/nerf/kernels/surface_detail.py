@@ -27,10 +27,11 @@ TEXELS = sum((TILE >> level) ** 2 for level in range(LEVELS))
 NO_GROUND = 1.0e6
 """Height of nodes where the ground is unknown [m]."""
 
+MAX_FOOTPRINT = 1.5
+"""Of a level [texels]."""
 _UNKNOWN = 1.0e3  # height above which an interpolated one contains a node without ground [m]
 _MIN_DESCENT = 0.01  # descent per meter along the ray of rays that can meet the ground
 _TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m] between the ground and a surface that counts as ground
-_MAX_FOOTPRINT = 1.5  # of a level [texels]
 _MAX_STRETCH = 4.0  # of a pixel on the ground, beyond which its length does not count
 _PRIME_Y = wp.uint32(2654435761)
 _PRIME_Z = wp.uint32(805459861)
@@ -124,7 +125,7 @@ def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32,
 @wp.func
 def level_weight(footprint: wp.float32, texel: wp.float32) -> wp.float32:
     """1 if a level of such texels is fine enough to show and coarse enough not to alias, else 0."""
-    return wp.where(footprint < _MAX_FOOTPRINT * texel, 1.0, 0.0)
+    return wp.where(footprint < MAX_FOOTPRINT * texel, 1.0, 0.0)
 
 
 @wp.func
@@ -433,7 +434,7 @@ def add_detail(
         pixel = first + run * RUN + j
         if pixel < last:
             z = depth[camera, pixel]
-            if z > 0.0 and z * per_pixel < _MAX_FOOTPRINT * grid.coarsest:
+            if z > 0.0 and z * per_pixel < MAX_FOOTPRINT * grid.coarsest:
                 u = (float(pixel % image.width) + 0.5 - k[2]) * per_pixel
                 v = (float(pixel // image.width) + 0.5 - k[3]) / k[1]
                 hit = surface_hit(grid, position, rotation * wp.vec3f(u, v, 1.0), z, per_pixel)

@@ -1,0 +1,251 @@
+"""Benchmark of bags as films: a scene built from bags that were made of its films, beside the scene itself.
+
+    python benchmarks/bags.py SCENE --work FOLDER [--films sun] [--quick] [--again] [--until metric] [--json FILE]
+
+SCENE is a generated place (`twin reality film`). For each film, FOLDER/bags gets a ROS 2 bag with the film's pictures
+(raw, so that both builds read the same pixels), their camera_info, and, from the true poses, what a robot records
+beside them: odometry that is 2 % long and turns by a degree per metre, fixes that wander by a metre, and /tf_static.
+Both scenes are built with the camera's height as scale; then the bags' scene is scaled by odometry and by GPS. Prints
+the figures of both builds, and each scale's error. With --again the films are built twice, which shows how far a
+build differs from itself.
+"""
+
+import argparse
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from record import add_record_options, save
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
+
+from twin.build import build
+from twin.capture.video import FilmStatistics, decode, upright
+from twin.errors import InputError
+from twin.files import digest_file, remove, toml_string, write_text
+from twin.geometry.cameras import Cameras
+from twin.geometry.poses import inverse_pose
+from twin.new import new_scene
+from twin.reality.comparison import camera_errors, compare, matched_poses
+from twin.reality.robot_bag import BagMessages
+from twin.reality.truth import Truth
+from twin.robot import CAMERA_AHEAD
+from twin.scene import SceneDir
+
+_START = 1_700_000_000 * 10**9  # [ns]
+_RATE = 20.0  # [Hz] of odometry
+_FIX_RATE = 5.0  # [Hz]
+_LONG, _TURN = 1.02, np.radians(1.0)  # odometry: factor of lengths, drift [rad/m]
+_WANDER = 1.0  # [m] of the fixes
+_AHEAD, _BASE = 0.36, 0.13  # [m] lens ahead of the base, base above the ground
+_EARTH = 6_378_137.0  # [m]
+_QUICK = ("nerf.steps=400", "nerf.rays=2048", "nerf.max_width=240", "nerf.bake_steps=60", "nerf.max_bricks=2500")
+FIGURES = (
+    ("capture", "frames"),
+    ("cameras", "registered"),
+    ("cameras", "points"),
+    ("cameras", "reprojection_error_px"),
+    ("metric", "camera_height_median_m"),
+    ("metric", "path_length_m"),
+    ("metric", "scale_uncertainty"),
+    ("field", "psnr"),
+    ("mesh", "parts"),
+    ("mjcf", "route_length_m"),
+    ("truth", "ate_m"),
+    ("truth", "scale_error"),
+    ("truth", "ground_median_m"),
+)
+
+
+def write_bag(path: Path, film: Path, truth: Truth, name: str, seed: int) -> None:
+    """Writes the bag of one film; its pictures are as the film's decoder gives them."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    messages, rng = BagMessages(), np.random.default_rng(seed)
+    types, poses = messages.types, truth.films[name].camera_to_world
+    times = truth.films[name].times
+    height = truth.camera_height
+    # The camera looks ahead and down as the mean film does.
+    pitch = float(np.mean(np.arcsin(-poses[:, 2, 2])))
+    seat = np.eye(4)
+    seat[:3, :3] = Rotation.from_euler("Y", pitch).as_matrix() @ CAMERA_AHEAD
+    seat[:3, 3] = (_AHEAD, 0.0, height - _BASE)
+    records: list[tuple[int, str, str, Any]] = []
+
+    def add(time: float, topic: str, kind: str, message: Any) -> None:
+        records.append((_START + round(time * 1e9), topic, kind, message))
+
+    def header(time: float, frame: str) -> Any:
+        return messages.header(_START + round(time * 1e9), frame)
+
+    grid = np.arange(times[0], times[-1], 1.0 / _RATE)
+    base = truth.poses(name, grid) @ inverse_pose(seat)
+    odometry = _drifted(base)
+    for time, pose in zip(grid - times[0], odometry, strict=True):
+        add(time, "/platform/odom", "nav_msgs/msg/Odometry", messages.odometry(pose, _START + round(time * 1e9)))
+    wander = np.cumsum(rng.normal(0.0, 1.0, (len(grid), 2)), axis=0)
+    wander *= _WANDER / max(float(wander.std(axis=0).max()), 1e-9)
+    for k in range(0, len(grid), round(_RATE / _FIX_RATE)):
+        east, north = base[k, :2, 3] + wander[k]
+        status = types["sensor_msgs/msg/NavSatStatus"](0, 1)
+        latitude = 49.0 + float(np.degrees(north / _EARTH))
+        longitude = 8.0 + float(np.degrees(east / _EARTH / np.cos(np.radians(49.0))))
+        fix = types["sensor_msgs/msg/NavSatFix"](
+            header(grid[k] - times[0], "gps"), status, latitude, longitude, 100.0, np.zeros(9), 2
+        )
+        add(grid[k] - times[0], "/fix", "sensor_msgs/msg/NavSatFix", fix)
+    frames = [("base_link", "base_footprint", _at(0.0, 0.0, -_BASE)), ("base_link", "camera", seat)]
+    transforms = [_transform(types, header(0.0, parent), child, pose) for parent, child, pose in frames]
+    add(0.0, "/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"](transforms))
+    topics: dict[str, Any] = {}
+    remove(path)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+
+        def write(stamp: int, topic: str, kind: str, message: Any) -> None:
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=messages.store)
+            writer.write(topics[topic], stamp, messages.store.serialize_cdr(message, kind))
+
+        for record in sorted(records, key=lambda one: one[0]):
+            write(*record)
+        first: float | None = None
+        for stamp, frame in decode(film, FilmStatistics()):
+            image = upright(frame)
+            first = stamp if first is None else first
+            at = _START + round(((stamp or 0.0) - (first or 0.0)) * 1e9)
+            rows, columns = image.shape[:2]
+            info = messages.camera_info(truth.intrinsics.tolist(), (columns, rows), at)
+            write(at, "/camera/camera_info", "sensor_msgs/msg/CameraInfo", info)
+            raw = types["sensor_msgs/msg/Image"](
+                messages.header(at), rows, columns, "rgb8", 0, 3 * columns, image.ravel()
+            )
+            write(at, "/camera/image_raw", "sensor_msgs/msg/Image", raw)
+
+
+def _drifted(base: np.ndarray) -> np.ndarray:
+    """Odometry of a base's poses (n, 4, 4), in the frame of the first."""
+    local = inverse_pose(base[0]) @ base
+    steps = np.diff(local[:, :3, 3], axis=0)
+    way = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=1)))
+    turn = Rotation.from_rotvec(np.outer(_TURN * way, [0.0, 0.0, 1.0]))
+    out = local.copy()
+    out[:, :3, :3] = turn.as_matrix() @ local[:, :3, :3]
+    out[1:, :3, 3] = np.cumsum(_LONG * turn[:-1].apply(steps), axis=0)
+    out[0, :3, 3] = 0.0
+    return out
+
+
+def _at(x: float, y: float, z: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def _transform(types: Any, header: Any, child: str, pose: np.ndarray) -> Any:
+    rotation = types["geometry_msgs/msg/Quaternion"](*Rotation.from_matrix(pose[:3, :3]).as_quat().tolist())
+    shift = types["geometry_msgs/msg/Vector3"](*pose[:3, 3].tolist())
+    return types["geometry_msgs/msg/TransformStamped"](
+        header, child, types["geometry_msgs/msg/Transform"](shift, rotation)
+    )
+
+
+def figures(root: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """The compared figures of a build."""
+    scene = SceneDir(root)
+    cameras = Cameras.load(scene.stage("metric"))
+    errors: dict[str, Any] = camera_errors(cameras.camera_to_world, matched_poses(Truth.load(scene.truth), cameras))
+    if "mjcf" in report:
+        errors = compare(scene)["figures"]
+    report = {**report, "truth": errors}
+    out: dict[str, Any] = {}
+    for section, name in FIGURES:
+        value = report.get(section, {}).get(name)
+        if value is None:
+            continue
+        for key, one in value.items() if isinstance(value, dict) else [("", value)]:
+            out[f"{section}.{name}" + (f".{key}" if key else "")] = one
+    return out
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Builds a generated place from films and from bags made of them.")
+    parser.add_argument("scene", type=Path, help="a folder written by `twin reality film`")
+    parser.add_argument("--work", type=Path, required=True, help="folder for bags and both scenes")
+    parser.add_argument("--films", nargs="+", metavar="NAME", help="default: all")
+    parser.add_argument("--again", action="store_true", help="build the films twice")
+    parser.add_argument("--until", choices=("metric", "mjcf"), default="mjcf", help="last stage (default %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="a small field, for the tiny place")
+    add_record_options(parser)
+    options = parser.parse_args()
+    truth = Truth.load(options.scene / "truth")
+    table = tomllib.loads((options.scene / "scene.toml").read_text())
+    names = options.films or list(truth.films)
+    sources = {Path(one["path"]).stem: one for one in table["source"] if Path(one["path"]).stem in names}
+    scenes = {kind: options.work / kind for kind in ("films", *(["again"] if options.again else []), "bags")}
+    settings = [f'name = "{options.scene.name}"', "[metric]", f"camera_height = {truth.camera_height}"]
+    for kind, root in scenes.items():
+        (root / "input").mkdir(parents=True, exist_ok=True)
+        shutil.copytree(options.scene / "truth", root / "truth", dirs_exist_ok=True)
+        lines = list(settings)
+        for k, (name, one) in enumerate(sources.items()):
+            film = options.scene / one["path"]
+            if kind != "bags":
+                shutil.copyfile(film, root / "input" / film.name)
+                camera = one["camera"]
+                lines += ["[[source]]", f'path = "input/{film.name}"', f"lighting = {toml_string(one['lighting'])}"]
+                lines += [
+                    f'camera = {{ model = "{camera["model"]}", params = {camera["params"]}, '
+                    f"width = {camera['width']}, height = {camera['height']} }}"
+                ]
+            else:
+                write_bag(root / "input" / name, film, truth, name, k)
+                lines += ["[[source]]", f'path = "input/{name}"', f"lighting = {toml_string(one['lighting'])}"]
+        write_text(root / "scene.toml", "\n".join(lines) + "\n")
+    shown = options.work / "new"
+    remove(shown)
+    new_scene(shown, [scenes["bags"] / "input" / name for name in sources])
+    overrides = _QUICK if options.quick else ()
+    results = {
+        kind: figures(root, build(root, until=options.until, overrides=overrides)) for kind, root in scenes.items()
+    }
+    same = _same_pictures(scenes)
+    print(f"{'':34}" + "".join(f" {kind:>12}" for kind in results))
+    for name in results["films"]:
+        print(f"{name:34}" + "".join(f" {one[name]:12.5g}" for one in results.values()))
+    print(f"{same:.1%} of the kept frames are the same files")
+    scales = {}
+    for name in ("odometry", "gps"):
+        given = (f"metric.{name}=true", "metric.camera_height=0.0")
+        try:
+            metric = build(scenes["bags"], until="metric", overrides=(*overrides, *given))["metric"]
+        except InputError as problem:  # GPS on a short road
+            print(f"scale by {name}: {problem}")
+            continue
+        cameras = Cameras.load(SceneDir(scenes["bags"]).stage("metric"))
+        error = camera_errors(cameras.camera_to_world, matched_poses(truth, cameras))["scale_error"]
+        scales[name] = {"scale_error": error, "uncertainty": metric["scale_uncertainty"]}
+        print(
+            f"scale by {name}: {error:+.2%} from the truth, said to be uncertain by {metric['scale_uncertainty']:.2%}"
+        )
+    if options.json:
+        save(options.json, {"builds": results, "same_frames": same, "scales": scales}, options.replace_record)
+    return 0
+
+
+def _same_pictures(scenes: dict[str, Path]) -> float:
+    """Fraction of the kept frames of the films' scene that the bags' scene has, too, bit for bit."""
+    images = {kind: SceneDir(root).stage("capture") / "images" for kind, root in scenes.items()}
+    kept = sorted(path.relative_to(images["films"]) for path in images["films"].rglob("*.png"))
+    equal = [
+        (images["bags"] / path).exists() and digest_file(images["bags"] / path) == digest_file(images["films"] / path)
+        for path in kept
+    ]
+    return float(np.mean(equal))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

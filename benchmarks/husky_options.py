@@ -1,0 +1,152 @@
+"""Cost of the options that a scene can override against the Husky's tires, see `twin.mjcf.husky.check`.
+
+    python benchmarks/husky_options.py [--json FILE]
+
+Turns on the spot at a commanded 1 rad/s on a plane and on a flat road as the mesh stage reconstructs it: yaw rate and
+motor torque over those with the right options on the plane, power of the motors over the contacts' dissipation (1 if
+energy is conserved), and the vertical acceleration at the camera (jolt). Parked on a slope: creep. Takes a minute.
+"""
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import mujoco
+import numpy as np
+from acceptance.drives import drive, on_ground, on_plane
+from acceptance.grounds import reconstructed
+from acceptance.rows import GRAVITY
+from record import add_record_options, save
+
+from twin.assets.ground import Ground
+from twin.mjcf.husky import check
+from twin.robot import WHEELS, HuskyParams
+
+Edit = Callable[[mujoco.MjSpec], None]
+
+
+def option(**values: object) -> Edit:
+    """Sets options of the scene."""
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        for name, value in values.items():
+            setattr(spec.option, name, value)
+
+    return edit
+
+
+def ground(**values: object) -> Edit:
+    """Sets attributes of the ground."""
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        for name, value in values.items():
+            setattr(spec.geom("ground"), name, value)
+
+    return edit
+
+
+def pairs(spec: mujoco.MjSpec) -> None:
+    """Gives every tire's contact with the ground explicitly."""
+    for name in WHEELS:
+        spec.add_pair(geomname1=f"{name}_tyre", geomname2="ground")
+
+
+RIGHT = "as `set_options` sets them"
+Integrator, Solver = mujoco.mjtIntegrator, mujoco.mjtSolver
+CASES: dict[str, Edit | None] = {
+    RIGHT: None,
+    "`cone` pyramidal (MuJoCo's default)": option(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL),
+    "`impratio` 1 (MuJoCo's default)": option(impratio=1.0),
+    "`impratio` 100": option(impratio=100.0),
+    "`integrator` Euler (MuJoCo's default)": option(integrator=Integrator.mjINT_EULER),
+    "`integrator` RK4": option(integrator=Integrator.mjINT_RK4),
+    "`integrator` implicit": option(integrator=Integrator.mjINT_IMPLICIT),
+    "`timestep` 5 ms": option(timestep=0.005),
+    "`timestep` 4 ms": option(timestep=0.004),
+    "`timestep` 10 ms": option(timestep=0.01),
+    "`solver` PGS": option(solver=Solver.mjSOL_PGS),
+    "`solver` CG": option(solver=Solver.mjSOL_CG),
+    "`solver` PGS, 10 `iterations`": option(solver=Solver.mjSOL_PGS, iterations=10),
+    "`iterations` 1": option(iterations=1),
+    "`iterations` 3": option(iterations=3),
+    "`iterations` 10": option(iterations=10),
+    "`tolerance` 1e-2": option(tolerance=1e-2),
+    "`noslip_iterations` 5": option(noslip_iterations=5),
+    "ground of `priority` 2, otherwise MuJoCo's default": ground(priority=2),
+    "the same with `condim` 1": ground(priority=2, condim=1),
+    "flag `override` enabled": option(enableflags=mujoco.mjtEnableBit.mjENBL_OVERRIDE),
+    "contact `pair` of each tire, otherwise MuJoCo's default": pairs,
+    "cone, impratio, integrator as MuJoCo's default": option(
+        cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=1.0, integrator=Integrator.mjINT_EULER, tolerance=1e-8
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a model does that `check` judges."""
+
+    yaw_rate: float
+    """Turning on the spot on a plane [rad/s]."""
+    torque: float
+    """Of a motor, per wheel [N m]."""
+    balance: float
+    """Power of the motors over the contacts' dissipation."""
+    jolt: float
+    """Vertical acceleration at the camera [m/s²]."""
+    ground_yaw_rate: float
+    """The turn on a reconstructed flat road [rad/s]."""
+    ground_jolt: float
+    """And its jolt [m/s²]."""
+    creep: float
+    """Speed of the parked robot on a slope 2° below that on which it slides, after 2 s [mm/s]."""
+    faults: int
+    """Number of options that `check` calls wrong."""
+
+    def differs(self, right: "Cost") -> bool:
+        """True if it does not do what the right options do: 2 % of yaw rate, 5 % of torque, a jolt, a creep."""
+        turns = abs(self.yaw_rate / right.yaw_rate - 1) < 0.02 and abs(self.ground_yaw_rate / right.yaw_rate - 1) < 0.02
+        quiet = self.jolt < 0.2 and self.ground_jolt < 1.0
+        return not (turns and quiet and abs(self.torque / right.torque - 1) < 0.05 and self.creep < 5.0)
+
+
+def measure(edit: Edit | None, road: Ground) -> Cost:
+    model = on_plane(edit=edit)
+    turn = drive(model, 0.0, 1.0, 1.5, 1.5)
+    dissipated = turn.dissipated.mean()
+    balance = float(turn.power.mean() / dissipated) if dissipated else math.nan
+    there = drive(on_ground(road, edit=edit), 0.0, 1.0, 1.5, 1.5)
+    angle = math.atan(HuskyParams.friction) - math.radians(2.0)
+    parked = on_plane(edit=edit)
+    parked.opt.gravity[:] = GRAVITY * np.array([0.0, math.sin(angle), -math.cos(angle)])
+    data = mujoco.MjData(parked)
+    mujoco.mj_step(parked, data, round(2.0 / parked.opt.timestep))
+    creep = 1000 * float(np.linalg.norm(data.qvel[:2]))
+    torque = float(np.abs(turn.torque).mean() / 2)
+    return Cost(turn.yaw_rate, torque, balance, turn.jolt, there.yaw_rate, there.jolt, creep, len(check(model)))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_record_options(parser)
+    arguments = parser.parse_args()
+    road = reconstructed(np.random.default_rng(0))
+    rows = {name: measure(edit, road) for name, edit in CASES.items()}
+    right = rows[RIGHT]
+    columns = "yaw rate", "torque", "power balance", "jolt, m/s²", "road: yaw rate", "road: jolt, m/s²", "creep, mm/s"
+    print(f"| options of the scene | {' | '.join(columns)} | found |\n|---|{'---|' * (len(columns) + 1)}")
+    for name, row in rows.items():
+        values = [row.yaw_rate / right.yaw_rate, row.torque / right.torque, row.balance]
+        texts = [f"{value:.3f}" for value in values] + [
+            f"{row.jolt:.2g}",
+            f"{row.ground_yaw_rate / right.yaw_rate:.3f}",
+        ]
+        texts += [f"{row.ground_jolt:.2g}", f"{row.creep:.2g}", "yes" if row.faults else "no"]
+        print(f"| {name} | {' | '.join(texts)} |")
+    return save(arguments.json, {name: asdict(row) for name, row in rows.items()}, arguments.replace_record)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,394 @@
+"""Packs: one drives as the built scene, bit for bit; what is private stays behind; hostile ones get one line."""
+
+import io
+import json
+import multiprocessing
+import stat
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load as load_safetensors
+from safetensors.numpy import save as to_safetensors
+from tiny_runs import tiny_runs
+from tiny_twin import tiny_twin
+
+import twin
+from twin import unpack
+from twin.__main__ import main
+from twin.capture.capture_data import NO_GPS, Capture, SourceInfo
+from twin.drive import chosen_policy, chosen_task
+from twin.errors import InputError
+from twin.geometry.cameras import Cameras, Viewpoints
+from twin.geometry.poses import look_at
+from twin.nerf.baked import BakedField
+from twin.nerf.fog import Fog
+from twin.nerf.lightings import AddedLighting
+from twin.pack import pack, rounded
+from twin.scene import SceneDir, stage_result, write_stamp
+from twin.unpack import decode_differences, encode_differences, open_scene
+
+MORE = """
+[[obstacle]]  # beside my neighbor's house
+kind = "box"
+station = 2.123456789012345
+"""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    root = tiny_twin(tmp_path_factory.mktemp("pack") / "place", more=MORE)
+    tiny_runs(root, {"task": "ahead"})
+    scene = SceneDir(root)
+    AddedLighting(
+        "dusk", [0.5, 0.5, 0.0, 0.0], Fog(0.01, (0.5, 0.5, 0.5)), stage_result(scene, "field"), "/home/me/dusk.jpg", {}
+    ).save(scene)
+    return root
+
+
+@pytest.fixture(scope="module")
+def packed(root, tmp_path_factory) -> Path:
+    return pack(root, tmp_path_factory.mktemp("packed") / "place.twin", ["ahead"])[0]
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "twin" / "packs"
+
+
+def episode(scene: Path) -> list[np.ndarray]:
+    """States and pixels of a drive with obstacles, under a mixture with a lighting of a photo."""
+    env = twin.load(scene, "ahead", seed=3, lighting="day:dusk:0.5")
+    step, out = env.reset(), []
+    for action in ([1.0, 0.1], [0.8, -0.4], [0.8, 0.3], [1.0, 0.0]):
+        out += [step.observation["pixels"], env.physics.data.qpos.copy(), env.physics.data.qvel.copy()]
+        step = env.step(action)
+    return out
+
+
+def test_a_packed_scene_drives_as_the_built_one_bit_for_bit(root, packed, tmp_path):
+    unpack.unpack(packed, tmp_path / "there")
+    built = episode(root)
+    for scene in (tmp_path / "there", packed):
+        for a, b in zip(built, episode(scene), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_replaced_samples_are_read_by_no_ray(root, packed, tmp_path):
+    unpack.unpack(packed, tmp_path / "there")
+    fields = [twin.load_scene(scene).field() for scene in (root, tmp_path / "there")]
+    assert (fields[0].arrays["features"] != fields[1].arrays["features"]).any()
+    rng = np.random.default_rng(0)
+    eyes = rng.uniform([-3, -8, 0.2], [12, 3, 2.5], (40, 3))
+    poses = np.array([look_at(eye, eye + rng.normal(size=3)) for eye in eyes])
+    views = Viewpoints.of(poses, [60.0, 60.0, 40.0, 22.5], (80, 45))
+    a, b = (field.render(views, "night") for field in fields)
+    for name in ("rgb", "depth", "opacity"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_fewer_levels_make_a_smaller_pack_of_another_field(root, packed, tmp_path):
+    small, manifest = pack(root, tmp_path / "small.twin", levels=8)
+    assert manifest["levels"] == 8 and small.stat().st_size < 0.8 * packed.stat().st_size
+    opened = twin.load_scene(small)
+    assert stage_result(opened.scene, "field") != stage_result(SceneDir(root), "field")
+    assert "dusk" in opened.field().lightings  # its embedding is as valid as before
+    views = Viewpoints.of(
+        np.array([look_at(np.array([0.0, 0, 1]), np.array([3.0, 0, 0.8]))]), [60, 60, 40, 22], (80, 44)
+    )
+    a, b = (scene.field().render(views, "day").rgb for scene in (opened, twin.load_scene(root)))
+    assert 0 < np.abs(a - b).mean() < 0.05
+
+
+def test_rounding_keeps_zero_and_stays_within_half_a_step():
+    values = np.arange(256, dtype=np.uint8)
+    for step in (1.0, 4.0, 32.0, 25.6):
+        out = rounded(values, step).astype(int)
+        assert out[128] == 128 and np.abs(out - values).max() <= step / 2 + 0.5
+        assert len(np.unique(out)) <= 256 / step + 2
+
+
+def test_coding_is_undone_exactly():
+    rng = np.random.default_rng(1)
+    arrays = {
+        "cube": rng.integers(0, 256, (3, 7, 5), np.uint8),
+        "flat": rng.integers(0, 256, 9, np.uint8),
+        "none": np.zeros((0, 4), np.uint8),
+        "float": rng.normal(size=(4, 4)).astype(np.float32),
+    }
+    content = to_safetensors(arrays)
+    coded = encode_differences(content)
+    assert len(coded) == len(content) and coded != content
+    assert decode_differences(coded) == content
+    np.testing.assert_array_equal(load_safetensors(coded)["float"], arrays["float"])
+
+
+def test_the_same_scene_gives_the_same_pack(root, packed, tmp_path):
+    again, _ = pack(root, tmp_path / "place.twin", ["ahead"])
+    assert again.read_bytes() == packed.read_bytes()
+
+
+def test_what_is_private_stays_behind(root, packed):
+    with zipfile.ZipFile(packed) as archive:
+        names = archive.namelist()
+        text = b"".join(archive.read(name) for name in names if not name.endswith((".npz", ".safetensors", ".onnx")))
+        note = archive.read("README.txt").decode()
+    assert b"neighbor" not in text and b"/home/me" not in text and b"input/" not in text
+    assert not any(name.startswith(("input", "build/1", "build/2_cameras", "build/6", "runs/left")) for name in names)
+    assert "PRIVACY" in note and "not stated" in note and "No GPS position" in note
+
+
+def test_positions_are_taken_along_when_asked_for(root, tmp_path):
+    with pytest.raises(InputError, match="no 1_capture yet"):
+        pack(root, tmp_path / "a.twin", positions=True)
+    scene = SceneDir(root)
+    names, n = ("day/000000", "day/000001"), 2
+    source = SourceInfo(**dict.fromkeys(SourceInfo.__annotations__, "") | {"name": "day", "camera_params": ()})
+    gps = np.array([[48.5, 9.05, 340.0], NO_GPS])
+    scene.stage("capture").mkdir()
+    Capture((source,), names, np.zeros(n, int), np.arange(2.0), np.zeros(n, bool), gps).save(scene.stage("capture"))
+    write_stamp(scene.stage("capture"), "capture")
+    filmed = Cameras.load(scene.stage("metric"))
+    assert set(names) & set(filmed.names)
+    out, manifest = pack(root, tmp_path / "b.twin", positions=True, licence="CC BY 4.0")
+    with zipfile.ZipFile(out) as archive:
+        rows = archive.read("positions.csv").decode().splitlines()
+        assert "CC BY 4.0" in archive.read("README.txt").decode() and manifest["licence"] == "CC BY 4.0"
+    assert len(rows) == 2 and rows[1].startswith("day/000000,48.5,9.05,340.0,")
+
+
+def test_what_came_with_the_pack_drives_it(packed, tmp_path):
+    unpack.unpack(packed, tmp_path / "there")
+    opened = twin.load_scene(tmp_path / "there")
+    policy = chosen_policy(opened, None)
+    assert policy == "ahead" and chosen_task(opened, None, policy, False) == "ahead"
+    assert chosen_policy(opened, "other") == "other" and chosen_task(opened, "bend", policy, False) == "bend"
+
+
+def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "tiny.twin").write_bytes(packed.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    assert main(["drive", "tiny", "--lighting", "night"]) == 0
+    film = Path(capsys.readouterr().out.split(": ")[-1].strip())
+    assert film.name.startswith("tiny_ahead_") and film.stat().st_size > 10_000
+    assert main(["drive", "nowhere"]) == 2
+    assert "no nowhere.twin here or in scenes/" in capsys.readouterr().err
+
+
+def test_verbs_that_add_results_ask_for_a_folder(packed, capsys):
+    for arguments in (["validate", str(packed), "--policy", "ahead"], ["train", str(packed), "--run", "x"]):
+        assert main(arguments) == 2
+        assert "unpack it where results may go: twin unpack" in capsys.readouterr().err
+
+
+def test_verbs_that_need_films_say_what_is_absent(packed, tmp_path, capsys):
+    unpack.unpack(packed, tmp_path / "there")
+    (tmp_path / "photo.png").write_bytes(b"")
+    there = str(tmp_path / "there")
+    assert main(["relight", there, str(tmp_path / "photo.png"), "--name", "noon"]) == 2
+    assert "has no 1_capture, nor films" in capsys.readouterr().err
+    assert main(["build", there]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_an_unpacked_scene_is_validated(packed, tmp_path):
+    there = str(tmp_path / "there")
+    assert main(["unpack", str(packed), there, "--quiet"]) == 0
+    run = [
+        "validate",
+        there,
+        "--policy",
+        "ahead",
+        "--task",
+        "ahead",
+        "--episodes",
+        "2",
+        "--lightings",
+        "day",
+        "--quiet",
+    ]
+    assert main(run) == 0
+    assert (tmp_path / "there" / "validation" / "episodes.csv").exists()
+
+
+def _open(packed: str) -> str:
+    return str(open_scene(Path(packed)))
+
+
+def test_two_processes_open_a_pack_at_once(packed, cache):
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        a, b = pool.map(_open, [str(packed)] * 2, chunksize=1)
+    assert a == b and [path.name for path in cache.iterdir()] == [Path(a).name]
+    before = (Path(a) / "scene.toml").stat().st_mtime_ns
+    assert _open(str(packed)) == a and (Path(a) / "scene.toml").stat().st_mtime_ns == before
+
+
+# ---- hostile packs
+
+
+def rewritten(packed: Path, out: Path, change) -> Path:
+    """A copy of a pack whose entries, a list of (ZipInfo, content), and manifest `change` has edited in place."""
+    with zipfile.ZipFile(packed) as archive:
+        entries = [(entry, archive.read(entry)) for entry in archive.infolist()]
+    manifest = json.loads(entries[1][1])
+    more = change(manifest, entries)
+    entries[1] = entries[1][0], json.dumps(manifest).encode()
+    with pytest.MonkeyPatch.context() as patch, zipfile.ZipFile(out, "w") as archive:
+        patch.setattr("warnings.warn", lambda *_, **__: None)
+        for entry, content in entries:
+            archive.writestr(entry, content)
+    if more is not None:
+        out.write_bytes(more(out.read_bytes()))
+    return out
+
+
+def add(name: str, content: bytes = b"x", mode: int = stat.S_IFREG | 0o644, **declared):
+    def change(manifest, entries):
+        entry = zipfile.ZipInfo(name)
+        entry.external_attr = mode << 16
+        entry.compress_type = zipfile.ZIP_DEFLATED
+        entries.append((entry, content))
+        manifest["files"][name] = {
+            "bytes": len(content), "sha256": unpack.digest(content), "coding": "plain", **declared
+        }  # fmt: skip
+
+    return change
+
+
+def declare(key: str, value):
+    return lambda manifest, _: manifest.update({key: value})
+
+
+def twice(manifest, entries):
+    entries.append(next(one for one in entries if one[0].filename == "scene.toml"))
+
+
+def edit(name: str, change):
+    """Changes a file, with a right digest and size."""
+
+    def edited(manifest, entries):
+        k = next(i for i, one in enumerate(entries) if one[0].filename == name)
+        content = change(entries[k][1])
+        entries[k] = entries[k][0], content
+        manifest["files"][name] |= {"bytes": len(content), "sha256": unpack.digest(content)}
+
+    return edited
+
+
+def huge_shape(content: bytes) -> bytes:
+    (length,) = struct.unpack_from("<Q", content)
+    head = json.loads(content[8 : 8 + length])
+    head["features"]["shape"] = [10**12, 729, 16]
+    text = json.dumps(head).encode()
+    return struct.pack("<Q", len(text)) + text + content[8 + length :]
+
+
+def wrong_digest(manifest, _):
+    manifest["files"]["scene.toml"]["sha256"] = "0" * 64
+
+
+FIELD, XML = "build/3_field/baked.safetensors", "build/5_mjcf/scene.xml"
+HOSTILE = {
+    "traversal": (add("../../evil.toml"), "has no place in a scene"),
+    "absolute": (add("/tmp/evil.toml"), "has no place in a scene"),
+    "inner traversal": (add("build/5_mjcf/assets/../../../x.obj"), "has no place in a scene"),
+    "backslash": (add("build\\evil.obj"), "has no place in a scene"),
+    "code": (add("build/5_mjcf/evil.py"), "has no place in a scene"),
+    "hidden": (add("lightings/.bashrc"), "has no place in a scene"),
+    "link": (add("build/5_mjcf/assets/a.obj", b"/etc/passwd", stat.S_IFLNK | 0o777), "is a link"),
+    "bomb": (add("build/5_mjcf/assets/a.obj", bytes(90 << 20)), "unpacks to"),
+    "huge": (add("build/5_mjcf/assets/a.obj", bytes=10**13), "expected at most"),
+    "negative": (add("build/5_mjcf/assets/a.obj", bytes=-1), "expected at most"),
+    "other size": (add("build/5_mjcf/assets/a.obj", bytes=5), "its list says otherwise"),
+    "digest": (wrong_digest, "not as it was packed"),
+    "huge shape": (edit(FIELD, huge_shape), "features"),
+    "short header": (edit(FIELD, lambda b: struct.pack("<Q", 10**15) + b[8:]), "a header of"),
+    "twice": (twice, "a name twice"),
+    "version": (declare("version", 99), "version 99, expected 1"),
+    "format": (declare("format", "tar"), "no twin pack"),
+    "no files": (declare("files", 3), "is damaged"),
+    "unlisted": (lambda manifest, _: manifest["files"].pop("scene.toml") and None, "in its list"),
+    "truncated": (lambda *_: lambda content: content[: len(content) // 2], "is damaged"),
+    "no zip": (lambda *_: lambda content: b"twin" * 100, "is damaged"),
+    "include": (edit(XML, lambda b: b.replace(b"<asset>", b'<include file="/a"/><asset>', 1)), "names a file"),
+    "path": (edit(XML, lambda b: b.replace(b'meshdir="assets"', b'meshdir="/etc"', 1)), "names a file"),
+    "config": (edit("scene.toml", lambda b: b + b"surprise = 1\n"), "surprise"),
+    "untrusted": (add("policies/a.zip"), "if you trust its sender, --trust"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_hostile_pack_gets_one_line_and_leaves_nothing(packed, tmp_path, capsys, what):
+    change, message = HOSTILE[what]
+    bad = rewritten(packed, tmp_path / "bad.twin", change)
+    place = tmp_path / "place"
+    place.mkdir()
+    assert main(["unpack", str(bad), str(place / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and message in error, error
+    assert not list(place.iterdir()) and not (tmp_path / "evil.toml").exists()
+    assert main(["drive", str(bad)]) == 2  # nor does the cache keep anything
+    assert not list((tmp_path / "cache" / "twin" / "packs").glob("*"))
+
+
+def test_a_folder_with_something_in_it_is_kept(packed, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").write_text("x")
+    with pytest.raises(InputError, match="exists"):
+        unpack.unpack(packed, tmp_path / "mine")
+    (tmp_path / "empty").mkdir()
+    unpack.unpack(packed, tmp_path / "empty")
+
+
+def test_an_sb3_zip_is_packed_and_unpacked_by_trust_alone(root, tmp_path, monkeypatch):
+    zipped = tmp_path / "a.zip"
+    with zipfile.ZipFile(zipped, "w") as archive:
+        archive.writestr("data", "{}")
+    with pytest.raises(InputError, match="runs code"):
+        pack(root, tmp_path / "x.twin", [str(zipped)])
+    monkeypatch.setattr("twin.pack.load_policy", lambda *_: None)  # stable-baselines3 would refuse this one
+    out, manifest = pack(root, tmp_path / "x.twin", [str(zipped)], trust=True)
+    assert manifest["policies"] == ["policies/a.zip"]
+    with pytest.raises(InputError, match="--trust"):
+        open_scene(out)
+    unpack.unpack(out, tmp_path / "y", trust=True)
+    assert (tmp_path / "y" / "policies" / "a.zip").read_bytes() == zipped.read_bytes()
+
+
+def test_a_function_has_no_place_in_a_pack(root, tmp_path):
+    with pytest.raises(InputError, match="policy operator:neg"):
+        pack(root, tmp_path / "x.twin", ["operator:neg"])
+
+
+@pytest.mark.parametrize(
+    "name, change",
+    [
+        ("features", lambda a: a[:-1]),
+        ("near", lambda a: a + 1000),
+        ("near", lambda a: np.concatenate([a[:1], a[:-1]])),
+        ("near_leap", lambda a: a[:-4]),
+        ("network.head.1", lambda a: a[:, :4]),
+        ("network.head.0", lambda a: a[:4]),
+        ("network.backdrop.1", lambda a: a[:, :2]),
+        ("step", lambda a: a[:3]),
+    ],
+)
+def test_a_field_that_a_kernel_would_read_beyond_is_refused(root, tmp_path, name, change):
+    folder = SceneDir(root).stage("field")
+    arrays = load_safetensors((folder / "baked.safetensors").read_bytes())
+    arrays[name] = np.ascontiguousarray(change(arrays[name]))
+    (tmp_path / "baked.json").write_bytes((folder / "baked.json").read_bytes())
+    (tmp_path / "baked.safetensors").write_bytes(to_safetensors(arrays))
+    with pytest.raises(InputError, match="damaged"):
+        BakedField.load(tmp_path)
+
+
+def test_the_page_of_a_manifest_is_readable(packed):
+    manifest = unpack.read_manifest(packed)
+    assert manifest["policies"] == ["ahead"] and manifest["levels"] == 256
+    with zipfile.ZipFile(io.BytesIO(packed.read_bytes())) as archive:
+        assert archive.testzip() is None

@@ -1,0 +1,270 @@
+"""Gaussian splats (Kerbl et al. 2023, "3D Gaussian Splatting") of a radiance field, and their `.ply` files.
+
+These Gaussians are not fitted to photos. Each is a pixel of a view rendered from a filmed pose: a disk as large as the
+pixel's footprint on the surface; where views overlap, the smallest is kept. Their color does not depend on the viewing
+direction. Gaussians of one set of views have the same geometry under every lighting and differ in color alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from twin.assets.views import ColorField, Views, render_views
+from twin.errors import InputError
+from twin.files import read_bytes
+from twin.geometry.cameras import Cameras
+from twin.types import Array
+
+VIEWS, WIDTH = 60, 320
+"""Number of rendered views, and their width [px]."""
+FAR = 100.0  # [m] beyond which geometry becomes background
+_BACKGROUND = 150.0  # [m] distance of the background's splats
+_MIN_SKY, _MAX_SKY = 500, 50_000  # pixels that the sky's color is fitted to
+_SKY_TOLERANCE = 30.0  # rms difference over lightings and channels, of 255, up to which a color is the sky's
+_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # the same, and within how many pixels [px], beside the former
+_MIN_CELL = 0.01  # [m] side of the smallest thinning cell, which keeps one Gaussian
+_DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
+_MAX_ELONGATION = 4.0  # length / width of a disk seen at a grazing angle
+_OPACITY = 0.97
+_SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """k disks, each with a normal along its z axis."""
+
+    positions: NDArray[np.float32]
+    """[m], shape (k, 3)."""
+    rotations: NDArray[np.float32]
+    """Quaternions w, x, y, z, shape (k, 4)."""
+    scales: NDArray[np.float32]
+    """Standard deviations along the axes [m], shape (k, 3)."""
+    rgb: NDArray[np.float32]
+    """In [0, 1], shape (k, 3)."""
+    opacity: NDArray[np.float32]
+    """In (0, 1), shape (k,)."""
+
+    def render_settings(self) -> dict[str, NDArray[np.float32]]:
+        """Arguments of `mujoco_warp.create_render_context` that make it draw these splats."""
+        return {
+            "splat_position": np.ascontiguousarray(self.positions),
+            "splat_rotation": np.ascontiguousarray(self.rotations),
+            "splat_scale": np.ascontiguousarray(self.scales),
+            "splat_rgba": np.concatenate([self.rgb, self.opacity[:, None]], 1).astype(np.float32),
+        }
+
+    def to_ply(self) -> bytes:
+        """Binary `.ply` for 3DGS viewers: colors as spherical harmonics, opacities as logits, scales as logarithms."""
+        columns = {
+            **dict(zip("xyz", self.positions.T, strict=True)),
+            **{f"n{axis}": np.zeros(len(self.rgb)) for axis in "xyz"},
+            **{f"f_dc_{c}": (self.rgb[:, c] - 0.5) / _SH_CONSTANT for c in range(3)},
+            "opacity": np.log(self.opacity / (1.0 - self.opacity)),
+            **{f"scale_{c}": np.log(self.scales[:, c]) for c in range(3)},
+            **{f"rot_{c}": self.rotations[:, c] for c in range(4)},
+        }
+        rows = np.empty(len(self.rgb), [(name, "<f4") for name in columns])
+        for name, values in columns.items():
+            rows[name] = values
+        properties = "".join(f"property float {name}\n" for name in columns)
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+        return head.encode() + rows.tobytes()
+
+
+_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
+_TYPES |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "short": "<i2", "ushort": "<u2", "char": "i1"}
+_MAX_HEAD = 1 << 16  # [bytes]
+_MAX_PLY = 4 << 30  # [bytes]
+_MAX_COORDINATE = 1e6  # [m]
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Reads a binary `.ply` of 3DGS trainers and viewers, in the frame that the file has.
+
+    Only the constant color is kept, no higher spherical harmonics. Gaussians that are not finite are left out.
+
+    Raises:
+        InputError: no such file, another format, or one cut off.
+    """
+    content = read_bytes(path, _MAX_PLY)
+    cure = "expected a 3D Gaussian splat .ply (binary, little endian), as 3DGS trainers write"
+    head, found, _ = content[:_MAX_HEAD].partition(b"end_header\n")
+    if not found or not head.startswith(b"ply"):
+        raise InputError(f"{path} is no ply file; {cure}")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    if ["format", "binary_little_endian", "1.0"] not in lines:
+        raise InputError(f"{path} has another format; {cure}")
+    elements = [line for line in lines if line[:1] == ["element"]]
+    if not elements or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3 or not elements[0][2].isdigit():
+        raise InputError(f"{path} does not begin with its vertices; {cure}")
+    count, names = int(elements[0][2]), []
+    for line in lines[lines.index(elements[0]) + 1 :]:
+        if line[:1] == ["element"]:
+            break
+        if line[:1] == ["property"]:
+            if len(line) != 3 or line[1] not in _TYPES:
+                raise InputError(f"{path}: property {' '.join(line[1:])!r} is unknown; {cure}")
+            names.append((line[2], _TYPES[line[1]]))
+    wanted = ["x", "y", "z", "opacity", *(f"{kind}_{c}" for kind, n in _COLUMNS.items() for c in range(n))]
+    missing = [name for name in wanted if name not in dict(names)]
+    if missing or len(dict(names)) < len(names):
+        raise InputError(f"{path} lacks {missing or 'different names of its properties'}; {cure}")
+    row = np.dtype(names)
+    start = len(head) + len(found)
+    if len(content) - start < count * row.itemsize:
+        raise InputError(f"{path} is cut off: {count} splats of {row.itemsize} bytes announced; copy it again")
+    rows = np.frombuffer(content, row, count, start)
+
+    def columns(*of: str) -> NDArray[np.float32]:
+        return np.stack([rows[name] for name in of], -1).astype(np.float32)
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        position, rotation = columns("x", "y", "z"), columns(*(f"rot_{c}" for c in range(4)))
+        length = np.linalg.norm(rotation, axis=1, keepdims=True)
+        scale = np.exp(columns(*(f"scale_{c}" for c in range(3))))
+        rgb = np.clip(columns(*(f"f_dc_{c}" for c in range(3))) * np.float32(_SH_CONSTANT) + np.float32(0.5), 0.0, 1.0)
+        opacity = 1.0 / (1.0 + np.exp(-columns("opacity")[:, 0]))
+    sound = (np.abs(position) < _MAX_COORDINATE).all(1) & (scale < _MAX_COORDINATE).all(1) & (length[:, 0] > 1e-6)
+    sound &= np.isfinite(rgb).all(1) & np.isfinite(opacity) & np.isfinite(rotation).all(1)
+    if not sound.any():
+        raise InputError(f"{path} has no splat whose numbers are finite; {cure}")
+    return Gaussians(*(a[sound] for a in (position, rotation / np.maximum(length, 1e-6), scale, rgb, opacity)))
+
+
+_COLUMNS = {"f_dc": 3, "scale": 3, "rot": 4}
+
+
+def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[str]) -> dict[str, Views]:
+    """The views that Gaussians are made of, in air without fog, under each of the lightings; all have the same depth.
+
+    Raises:
+        InputError: unknown lighting.
+    """
+    filmed = [name for name in field.lightings if name in cameras.lightings]
+    names = dict.fromkeys([*lightings, *filmed])
+    views = {name: render_views(field, cameras, VIEWS, WIDTH, FAR, name) for name in names}
+    depth = views[lightings[0]].depth.copy()
+    depth[sky_on_surfaces([views[name] for name in filmed])] = 10.0 * FAR
+    return {name: replace(views[name], depth=depth) for name in lightings}
+
+
+def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
+    """Gaussians under each lighting of `views_by_lighting`: the same ones in other colors."""
+    splats, pixel = gaussians_of_views(next(iter(views.values())), _BACKGROUND)
+    return {name: replace(splats, rgb=_colors(one, pixel)) for name, one in views.items()}
+
+
+def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
+    """Mask of pixels (n, h, w) that show the sky's color on something nearer, such as a gap in a crown.
+
+    Seen from elsewhere they would be blue clumps; they belong to the background. The sky's color is fitted to the
+    pixels of the background as a quadratic function of the direction; a pixel above the horizon has that color if it
+    does under every lighting. Pixels beside such ones may differ more from it, as they blend it with leaves.
+
+    Args:
+        views: The same views under each filmed lighting.
+    """
+    sky = views[0].depth > FAR
+    if np.count_nonzero(sky) < _MIN_SKY:
+        return np.zeros(sky.shape, bool)
+    rays = np.stack([views[0].points(i, np.ones(sky.shape[1:])) for i in range(len(sky))])
+    rays -= views[0].camera_to_world[:, None, None, :3, 3]
+    x, y, z = np.moveaxis(rays / np.linalg.norm(rays, axis=-1, keepdims=True), -1, 0)
+    basis = np.stack([np.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, z * z], -1)
+    some = np.flatnonzero(sky)
+    some = some[:: max(1, len(some) // _MAX_SKY)]
+    error = np.zeros(sky.shape)
+    for one in views:
+        colors = one.rgb.reshape(-1, 3)[some].astype(np.float64)
+        fitted, *_ = np.linalg.lstsq(basis.reshape(-1, 9)[some], colors, rcond=None)
+        error += ((one.rgb - basis @ fitted) ** 2).mean(-1)
+    error[(z <= 0.0) | sky] = np.inf
+    found, blended = (error / len(views) < limit**2 for limit in (_SKY_TOLERANCE, _BLEND_TOLERANCE))
+    reach = np.zeros((3, 3, 3), bool)
+    reach[1] = True  # within a view
+    return ndimage.binary_dilation(found, reach, _BLEND_REACH, mask=blended)
+
+
+def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDArray[np.int64]]:
+    """One Gaussian per pixel, thinned to one per cell of about its own size.
+
+    Pixels of depth 0 are skipped; depths are limited to `background` [m].
+
+    Returns:
+        k Gaussians, and the pixel of each as an index into the views' (n · h · w) pixels, shape (k,).
+    """
+    columns: list[list[NDArray]] = []
+    for i in range(len(views)):
+        depth = np.minimum(views.depth[i], background)
+        use = depth > 0.0
+        camera = views.camera_to_world[i, :3, 3]
+        position = views.points(i, depth)[use]
+        ray = position - camera
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        normal = _surface_normals(views.points(i, depth))[use]
+        facing = (normal * ray).sum(1, keepdims=True)
+        normal = np.where(facing > 0.0, -normal, normal)
+        normal = np.where(np.abs(facing) < 1e-3, -ray, normal)  # edge-on, or undefined
+        slant = np.clip(-(normal * ray).sum(1), 1.0 / _MAX_ELONGATION, 1.0)
+        width = depth[use] / views.intrinsics[i, 0]
+        pixel = np.flatnonzero(use) + i * use.size
+        columns.append([position, position - camera, normal, width, width / slant, pixel])
+    joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
+    keep = select_sharpest(joined[0], joined[3])
+    position, rays, normal, width, length, pixel = (column[keep] for column in joined)
+    along = rays - (rays * normal).sum(1, keepdims=True) * normal  # the ray projected onto the surface: the long axis
+    along += 1e-6 * np.cross(normal, [0.3, 0.5, 0.8])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    frame = np.stack([along, np.cross(normal, along), normal], -1)
+    quaternion = Rotation.from_matrix(frame).as_quat()[:, [3, 0, 1, 2]]
+    scales = np.stack([_DISK * length, _DISK * width, _THICKNESS * width], -1)
+    splats = Gaussians(
+        position.astype(np.float32),
+        quaternion.astype(np.float32),
+        scales.astype(np.float32),
+        _colors(views, pixel),
+        np.full(len(pixel), _OPACITY, np.float32),
+    )
+    return splats, pixel
+
+
+def _colors(views: Views, pixel: NDArray[np.int64]) -> NDArray[np.float32]:
+    return views.rgb.reshape(-1, 3)[pixel].astype(np.float32) / np.float32(255.0)
+
+
+def _surface_normals(points: Array) -> Array:
+    """Unit normals (h, w, 3) of a grid of points, from differences to the nearer neighbor along each axis."""
+
+    def difference(axis: int) -> Array:
+        step = np.diff(points, axis=axis)
+        ahead = np.concatenate([step, np.take(step, [-1], axis)], axis)
+        behind = np.concatenate([np.take(step, [0], axis), step], axis)
+        nearer = np.linalg.norm(ahead, axis=-1) < np.linalg.norm(behind, axis=-1)
+        return np.where(nearer[..., None], ahead, behind)
+
+    normal = np.cross(difference(1), difference(0))
+    return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+
+
+def select_sharpest(points: Array, width: Array) -> NDArray[np.int64]:
+    """Indices of the points (k, 3) to keep: in each cell without a finer point, that of the smallest width (k,) [m].
+
+    A point's cell size is its width, rounded up to `_MIN_CELL` times a power of two.
+    """
+    level = np.maximum(np.ceil(np.log2(width / _MIN_CELL)), 0).astype(int)
+    kept: list[NDArray[np.int64]] = []
+    low = points.min(0) if len(points) else 0.0
+    for n in np.unique(level):
+        own = np.flatnonzero(level == n)
+        own = own[np.argsort(width[own], kind="stable")]
+        side = _MIN_CELL * 2.0**n
+        finer = np.concatenate(kept) if kept else own[:0]
+        cells = np.floor((points[np.concatenate([finer, own])] - low) / side).astype(np.int64)
+        _, first = np.unique(cells @ [1 << 42, 1 << 21, 1], return_index=True)
+        kept.append(own[first[first >= len(finer)] - len(finer)])
+    return np.sort(np.concatenate(kept))

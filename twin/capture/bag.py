@@ -1,0 +1,274 @@
+"""Robots' recordings (bags), read with `rosbags` (the extra `ros`; no ROS installation is needed).
+
+A bag is the folder of a ROS 2 bag (MCAP or SQLite), one of its .mcap or .db3 files, or a .bag file of ROS 1. Messages
+are deserialized by the standard definitions of their types: definitions inside the bag, from which `rosbags` would
+generate code, are not used. Messages are streamed; memory holds one chunk of the file.
+
+Topics are found by message type: geometry_msgs/Twist or TwistStamped for commands; sensor_msgs/JointState, with joints
+named like a Husky's wheels, for wheel speeds; nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped
+for poses, preferably without a word of `FROM_WHEELS` in the topic's name; sensor_msgs/Imu for accelerations; Image or
+CompressedImage for pictures, and the CameraInfo whose name shares most with theirs. Times are nanoseconds.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin import runtime
+from twin.errors import InputError, join_names
+from twin.files import is_file
+from twin.robot import WHEELS
+
+if TYPE_CHECKING:
+    from twin_policy import CompressedPicture, RawPicture
+
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+METADATA = "metadata.yaml"
+"""The file that makes a folder a ROS 2 bag."""
+RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO, FIX = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/NavSatFix"
+ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+TYPES = {
+    "commands": ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"),
+    "wheels": ("sensor_msgs/msg/JointState",),
+    "poses": (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"),
+    "imu": ("sensor_msgs/msg/Imu",),
+}
+"""Message types of each kind of topic."""
+FROM_WHEELS = ("platform", "wheel", "velocity_controller")
+"""Words in names of topics whose odometry comes from the wheels."""
+MIN_POSES = 10
+"""Topics with fewer poses are taken only where there are no others; such are those of an operator's clicks."""
+_OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")  # words in names of other images' topics
+_CLOCK = 1_000_000_000  # [ns] by which the headers' clock may differ from the bag's
+_MAX_METADATA = 16 << 20  # [bytes]
+_MAX_CHUNK = 1 << 30  # [bytes] of an MCAP chunk, unpacked
+
+
+def is_bag(path: Path) -> bool:
+    """True for the folder of a ROS 2 bag, and for an existing file named like a bag's."""
+    return (path.suffix.lower() in BAG_SUFFIXES and is_file(path)) or is_file(path / METADATA)
+
+
+def bag_files(path: Path) -> list[Path]:
+    """The files of a bag."""
+    return sorted(filter(is_file, path.iterdir())) if path.is_dir() else [path]
+
+
+class Bag:
+    """An open bag."""
+
+    def __init__(self, path: Path, reader: Any, deserialize: Callable[[bytes, str], Any], cure: str) -> None:
+        self._path, self._reader, self._deserialize, self._cure = path, reader, deserialize, cure
+        self.connections: list[Any] = list(reader.connections)
+        """Of rosbags, with `topic`, `msgtype` and `msgcount`; a topic may have several."""
+        self.begin = int(reader.start_time)
+        """Time of the first message [ns]."""
+
+    def messages(self, connections: Sequence[Any]) -> Iterator[tuple[Any, int, Any]]:
+        """Yields connection, time of recording [ns] and message. Raises InputError: a damaged bag."""
+        if not connections:
+            return
+        with _wrap_errors(self._path, self._cure):
+            for connection, recorded, raw in self._reader.messages(connections=connections):
+                yield connection, recorded, self._deserialize(raw, connection.msgtype)
+
+    def on(self, *topics: str) -> list[Any]:
+        """The connections of these topics."""
+        return [one for one in self.connections if one.topic in topics]
+
+
+@contextmanager
+def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Bag]:
+    """Opens a bag. Raises InputError: rosbags is not installed, no bag, or a damaged one; `cure` ends the message."""
+    try:
+        from rosbags import rosbag1, rosbag2
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise InputError(f"{path}: reading a bag needs rosbags; pip install 'twin[ros]'") from None
+    if not is_bag(path):
+        raise InputError(f"{path}: not a bag; expected a ROS 2 bag's folder, or a .mcap, .db3 or .bag file")
+    metadata = path / METADATA
+    if path.is_dir() and metadata.stat().st_size > _MAX_METADATA:
+        raise InputError(f"{metadata} has {metadata.stat().st_size:,} bytes; expected at most {_MAX_METADATA:,}")
+    with contextlib.ExitStack() as stack:
+        with _wrap_errors(path, cure):
+            if path.suffix.lower() == ".bag":
+                store = get_typestore(Stores.ROS1_NOETIC)
+                store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+                reader: Any = stack.enter_context(rosbag1.Reader(path))
+                deserialize = store.deserialize_ros1
+            else:
+                deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+                reader = stack.enter_context(rosbag2.Reader(path))
+                _check_chunks(reader)
+            bag = Bag(path, reader, deserialize, cure)
+        yield bag
+
+
+def _check_chunks(reader: Any) -> None:
+    """Refuses MCAP chunks that would not fit into memory."""
+    storages = getattr(reader.storage, "storages", [reader.storage])
+    chunks = [chunk for storage in storages for chunk in getattr(storage, "chunks", ())]
+    largest = max((chunk.uncompressed_size for chunk in chunks), default=0)
+    if largest > _MAX_CHUNK:
+        raise ValueError(f"a chunk of {largest:,} bytes; expected at most {_MAX_CHUNK:,}")
+
+
+@contextmanager
+def _wrap_errors(path: Path, cure: str) -> Iterator[None]:
+    try:
+        yield
+    except (InputError, GeneratorExit):
+        raise
+    except Exception as error:  # of the reader: not a bag, a damaged one, unknown messages
+        if "end magic" in str(error) or "seems to be empty" in str(error):
+            cure = "the recording was cut off: repair it by `mcap recover`, or " + cure
+        elif "not indexed" in str(error):
+            cure = "the recording was cut off: repair it by `rosbag reindex`, or " + cure
+        said = str(error).rstrip(".") or type(error).__name__
+        raise InputError(f"{path}: not a readable bag: {said}; {cure}") from None
+
+
+# ---- topics
+
+
+def topic_names(connections: Iterable[Any]) -> str:
+    """The names of the topics, for a message."""
+    return ", ".join(sorted({one.topic for one in connections})) or "none"
+
+
+def messages_by_topic(connections: Iterable[Any], types: Sequence[str]) -> dict[str, int]:
+    """The number of messages of each topic that has some and whose type is one of `types`."""
+    counts: dict[str, int] = {}
+    for one in connections:
+        if one.msgtype in types and one.msgcount:
+            counts[one.topic] = counts.get(one.topic, 0) + one.msgcount
+    return counts
+
+
+def picture_topics(connections: Iterable[Any]) -> list[str]:
+    """The topics with pictures, those with most messages first."""
+    counts = messages_by_topic(connections, (RAW, COMPRESSED))
+    good = [topic for topic in counts if not any(word in topic for word in _OTHER_IMAGES)]
+    return sorted(good, key=lambda topic: (counts[topic], topic), reverse=True)
+
+
+def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> str:
+    """The topic of the pictures: the given one, or the one with most messages. Raises InputError: there is none."""
+    if topic:
+        if topic not in messages_by_topic(connections, (RAW, COMPRESSED)):
+            have = join_names(picture_topics(connections), most=12)
+            raise InputError(f"{path}: no pictures on topic {topic}; there are pictures on {have}")
+        return topic
+    found = picture_topics(connections)
+    if not found:
+        raise InputError(f"{path}: no topic with pictures among {topic_names(connections)}; record the front camera")
+    return found[0]
+
+
+def choose_camera_info(connections: Iterable[Any], pictures: str) -> str | None:
+    """The CameraInfo whose topic shares most leading parts with that of the pictures; None if there is none."""
+    found = messages_by_topic(connections, (CAMERA_INFO,))
+    return max(found, key=lambda topic: _common(topic, pictures), default=None)
+
+
+def _common(one: str, other: str) -> int:
+    """Number of leading parts that two topics share."""
+    pairs = list(zip(one.split("/"), other.split("/"), strict=False))
+    return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
+
+
+def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
+    """The connection of each kind, a key of `TYPES`. Raises InputError: a kind other than imu has none."""
+    chosen = {}
+    for kind in kinds:
+        types = TYPES[kind]
+        found = [c for c in connections if c.msgtype in types and c.msgcount]
+        if kind == "commands":  # prefer the controller's input to the multiplexer's
+            found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
+        elif kind == "poses":
+            found.sort(key=lambda c: (c.msgcount < MIN_POSES, is_from_wheels(c.topic), -c.msgcount))
+        else:
+            found.sort(key=lambda c: -c.msgcount)
+        if found:
+            chosen[kind] = found[0]
+        elif kind != "imu":
+            raise InputError(
+                f"{path}: no topic with {kind} ({' or '.join(types)}) among {topic_names(connections)}; record it"
+            )
+    return chosen
+
+
+def is_from_wheels(topic: str) -> bool:
+    """True for a topic named like odometry from the wheels."""
+    return any(word in topic for word in FROM_WHEELS)
+
+
+# ---- messages
+
+
+def picture_of(message: Any) -> "RawPicture | CompressedPicture":
+    """The picture in an Image or CompressedImage."""
+    from twin_policy import CompressedPicture, RawPicture
+
+    if hasattr(message, "format"):
+        return CompressedPicture(message.data)
+    return RawPicture(message.encoding, message.width, message.height, message.step, message.data)
+
+
+def header_time(message: Any) -> int:
+    """The stamp of a message's header [ns]; 0 without one."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return stamp.sec * 10**9 + stamp.nanosec if stamp is not None else 0
+
+
+def message_times(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[np.int64]:
+    """Times of a topic's messages [ns] from those of headers and of recording, (n, 2).
+
+    They are those of the headers; where these have another clock than the bag, or none, those of recording.
+    """
+    header, recorded = times.reshape(-1, 2).T
+    if not header.any():
+        return recorded.copy()
+    if abs(int(np.median(recorded - header))) > _CLOCK:
+        runtime.log_line(f"{path}: headers on {topic} have another clock; the times of recording are used")
+        return recorded.copy()
+    return header.copy()
+
+
+def fix_of(message: Any) -> tuple[float, float, float]:
+    """Latitude [°], longitude [°], altitude [m] of a NavSatFix; NaN without a fix."""
+    good = message.status.status >= 0
+    return (message.latitude, message.longitude, message.altitude) if good else (np.nan,) * 3
+
+
+def _twist(message: Any) -> tuple[float, ...]:
+    twist = getattr(message, "twist", message)
+    return twist.linear.x, twist.angular.z
+
+
+def _wheels(message: Any) -> tuple[float, ...] | None:
+    speeds = dict(zip(message.name, message.velocity, strict=False))
+    sides = [[v for name, v in speeds.items() for w in WHEELS[i::2] if name.startswith(w)] for i in (0, 1)]
+    return tuple(float(np.mean(side)) for side in sides) if all(sides) else None
+
+
+def _pose(message: Any) -> tuple[float, ...]:
+    pose = message.pose
+    pose = getattr(pose, "pose", pose)
+    p, q = pose.position, pose.orientation
+    return p.x, p.y, float(np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
+
+
+def _imu(message: Any) -> tuple[float, ...]:
+    return message.linear_acceleration.x, message.linear_acceleration.y
+
+
+VALUES: dict[str, Callable[[Any], Any]] = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
+"""Functions from a message of each kind to its numbers: v, ω; wheel speeds; x, y, yaw; accelerations."""

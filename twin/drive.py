@@ -1,0 +1,70 @@
+"""Verb: shows the Husky driving in a scene or a pack, as a film or in the browser.
+
+    python -m twin.drive demo
+    python -m twin.drive scenes/demo --policy first --lighting night --view
+
+The policy that came with a pack drives, or the only run of a scene, on the task of its training; without one, the
+scripted driver. `twin.film` has more options.
+"""
+
+import argparse
+import sys
+from functools import partial
+
+from twin import commands
+from twin.config_file import load_config
+from twin.env.route_segments import scene_tasks
+from twin.errors import InputError
+from twin.film import film, film_options, summary
+from twin.learn.policy import JSON, find_policy, load_policy
+from twin.loading import Twin, load_scene
+from twin.unpack import SUFFIX, packed_policies
+
+
+def chosen_policy(twin: Twin, name: str | None) -> str | None:
+    """The policy that drives: the one named, else the first of the pack, else the only run; None: scripted."""
+    root = twin.scene.root
+    if name is None:
+        runs = sorted(path.parent.name for path in root.glob(f"runs/*/{JSON}"))
+        name = next(iter(packed_policies(root)), runs[0] if len(runs) == 1 else None)
+    return str(root / name) if name is not None and (root / name).exists() else name
+
+
+def chosen_task(twin: Twin, name: str | None, policy: str | None, trust: bool) -> str:
+    """The task: the one named, else that of the policy's training if the scene has it, else the scene's first."""
+    tasks = scene_tasks(twin.world(), load_config(twin.scene.config_file).task)
+    if name is None and policy is not None:
+        name = load_policy(find_policy(twin.scene.root, policy), trust).trained.get("task")
+        name = name if name in tasks else None
+    return name or next(iter(tasks))
+
+
+def command(given: argparse.Namespace) -> None:
+    """Runs the verb with the options parsed by `twin.commands`."""
+    if not given.scene.exists() and len(given.scene.parts) == 1:
+        named = f"{given.scene.name.removesuffix(SUFFIX)}{SUFFIX}"
+        cure = f"no folder, and no {named} here or in scenes/"
+        try:
+            twin = load_scene(given.scene)
+        except InputError:
+            more = "; it is scenes/demo.twin of twin's repository: download it" if named == f"demo{SUFFIX}" else ""
+            raise InputError(f"{given.scene}: {cure}{more}") from None
+    else:
+        twin = load_scene(given.scene)
+    policy = chosen_policy(twin, given.policy)
+    task = chosen_task(twin, given.task, policy, given.trust)
+    if given.view:
+        from twin.view.__main__ import serve
+
+        view = {"task": task, "policy": policy, "host": "127.0.0.1", "port": given.port}
+        serve(twin, argparse.Namespace(**{**vars(given), **view}))
+        return
+    path, episode = film(given.scene, task, policy, given.seed, given.out, given.trust, **film_options(given.lighting))
+    if not given.quiet:
+        print(summary(path, episode))
+
+
+main = partial(commands.main, "drive")
+
+if __name__ == "__main__":
+    sys.exit(main())

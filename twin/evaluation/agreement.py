@@ -1,0 +1,399 @@
+"""Agreement of success rates in the twin and on the road: correlations, bias and scores of predictions.
+
+A *group* is the policies of one task, or of all tasks, that were driven on the road. A *day* is a lighting of the real
+trials; a *training* is a run, with all its checkpoints. Every number is an `Estimate`: a value with its count, or the
+reason why there is no value; and a 90 % interval where one is known to have that coverage, or the reason why there is
+none. Intervals are about the population of trainings and days of which these are a sample (modules `jackknife` and
+`rate_model`, with their coverage in `benchmarks/intervals.py`), not about these cells.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import join_names
+from twin.evaluation.jackknife import (
+    STATISTICS,
+    PairedCells,
+    jackknife_interval,
+    mean_bias,
+    mean_over_tasks,
+    pair_cells,
+)
+from twin.evaluation.probability_scores import (
+    SCORE_DIFFERENCE,
+    CalibrationBin,
+    DayErrors,
+    brier,
+    calibration,
+    errors_by_day,
+    log_score,
+    mean_score,
+    other_trainings,
+    recalibrated,
+    score_pair,
+    shuffled_days,
+    twin_probabilities,
+)
+from twin.evaluation.rate_model import padded_counts
+from twin.evaluation.statistics import (
+    MIN_POLICIES,
+    MIN_PREDICTORS,
+    MIN_TRIALS,
+    UndefinedStatistic,
+    leave_one_group_out,
+    mmrv,
+    pearson,
+    prediction_powered_mean,
+    rate_difference,
+    spearman,
+    winner_batched,
+)
+from twin.evaluation.trials import Cell
+from twin.types import Array, Indices
+
+DEPENDENT = "none: policies, and their predictions, depend on each other"
+"""The reason why a fraction of policies or cells has no interval."""
+
+_MAXIMUM = "none at one place: it hangs on the best policy alone"
+
+Cells = Mapping[tuple[str, str, str], Cell]
+"""The twin's cells by `Cell.key`."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its interval, or the reason for its absence."""
+
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+    n: int = 0
+    """Number of trials for a rate, of policies or cells for a statistic."""
+    missing: str = ""
+    """The reason; empty if there is a value."""
+    no_interval: str = ""
+    """The reason why the value has no interval, and what is missing for one; else empty."""
+
+
+@dataclass(frozen=True)
+class CellPair:
+    """A real cell and the twin cell it is compared with."""
+
+    policy: str
+    task: str
+    lighting: str
+    twin_lighting: str
+    twin: Estimate
+    real: Estimate
+    bias: Estimate
+    """Real minus twin rate."""
+    within_chance: bool
+    """True if Newcombe's interval of the difference, with independent trials, contains 0."""
+
+
+@dataclass(frozen=True)
+class PredictorScore:
+    """Scores of a predictor of the trials on the road; see `probability_scores`. Lower is better."""
+
+    predictor: str
+    brier: Estimate
+    log: Estimate
+    gain: Estimate
+    """Log score of this predictor minus that of the twin: above 0 the twin is better. Missing for the twin itself."""
+
+
+@dataclass(frozen=True)
+class OrderedPairs:
+    """Pairs of policies of one task with different real rates, by the difference of their twin scores."""
+
+    low: float
+    high: float
+    pairs: int
+    right: float
+    """Number of pairs in the road's order; a pair tied in the twin counts one half."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of twin and road for a group."""
+
+    task: str
+    policies: int
+    cells: int
+    missing: tuple[str, ...]
+    """Data that are missing; if any are, the estimates below have no values."""
+    pearson: Estimate
+    spearman: Estimate
+    mmrv: Estimate
+    winner_agreement: Estimate
+    winner_regret: Estimate
+    bias: Estimate
+    """Mean over cells of real minus twin rate."""
+    coverage: Estimate
+    """Fraction of cells for which the interval of `CellPair.bias` contains 0."""
+    corrected_coverage: Estimate
+    """Fraction of candidates whose real rate lies in the interval predicted without them."""
+    mean_real: Estimate
+    """Prediction-powered mean real rate of policies such as these, driven or not."""
+    trainings: int = 0
+    days: int = 0
+    twin_error: Estimate = Estimate(missing="not measured")
+    """Mean over policies of the absolute difference of real rate and twin score."""
+    scores: tuple[PredictorScore, ...] = ()
+    """The twin first, then its recalibration and the baselines."""
+    calibration: tuple[CalibrationBin, ...] = ()
+    errors: tuple[DayErrors, ...] = ()
+    ordered: tuple[OrderedPairs, ...] = ()
+
+
+# ---- parts that the forecast uses, too
+
+
+def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
+    """Data that are missing for a statistic over these real cells."""
+    policies = len({cell.policy for cell in real})
+    out = []
+    if policies < MIN_POLICIES:
+        more = MIN_POLICIES - policies
+        out.append(f"{policies} policies driven on the road, {MIN_POLICIES} are needed: drive {more} more")
+    short = [
+        f"{c.policy} under {c.lighting} has {c.trials} {kind} ({MIN_TRIALS - c.trials} more)"
+        for kind, cells in (
+            ("real trials", real),
+            ("trials in the twin", dict.fromkeys(twin[cell.twin_key] for cell in real)),
+        )
+        for c in cells
+        if c.trials < MIN_TRIALS
+    ]
+    if short:
+        out.append(f"cells of fewer than {MIN_TRIALS} trials: {join_names(short)}; or leave these cells out")
+    return out
+
+
+def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
+    """Successes and trials of each policy's units: a unit is a cell if `by_day`, else a single episode."""
+    if by_day:
+        return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
+    won = [sum(c.successes for c in row) for row in rows]
+    driven = [sum(c.trials for c in row) for row in rows]
+    return padded_counts([[(int(k < w), 1) for k in range(n)] for w, n in zip(won, driven, strict=True)])
+
+
+def compare_cells(cell: Cell, mate: Cell) -> CellPair:
+    """A real cell and the twin's cell `mate`, with the interval of their difference."""
+    value, low, high = rate_difference(
+        twin_successes=mate.successes,
+        twin_trials=mate.trials,
+        real_successes=cell.successes,
+        real_trials=cell.trials,
+    )
+    alone = "none for a single cell"
+    in_twin, on_road = (Estimate(c.rate, n=c.trials, no_interval=alone) for c in (mate, cell))
+    bias = Estimate(float(value), n=cell.trials, no_interval=alone)
+    within = bool(low <= 0.0 <= high)
+    return CellPair(cell.policy, cell.task, cell.lighting, mate.lighting, in_twin, on_road, bias, within)
+
+
+def share_estimate(count: int, total: int, no_interval: str) -> Estimate:
+    """A fraction without an interval, and the reason for that."""
+    return Estimate(count / total, n=total, no_interval=no_interval)
+
+
+# ---- agreement
+
+
+def measure_agreement(task: str, real: Sequence[Cell], twin: Cells, further: Sequence[float]) -> Agreement:
+    """Agreement of a group's real cells with the twin's cells that they are compared with.
+
+    Args:
+        task: Name of the task, or of all tasks together.
+        real: Real cells of the group.
+        twin: The twin's cells by key.
+        further: Twin scores of policies without real trials, for `Agreement.mean_real`.
+    """
+    missing = missing_data(real, twin)
+    data = pair_cells(real, twin)
+    if missing:
+        none = Estimate(n=data.policies, missing="; ".join(missing))
+        return Agreement(
+            task, data.policies, data.cells, tuple(missing), *(none,) * 9, data.trainings, data.days, twin_error=none
+        )
+    rates, pairs = data.rates(), [compare_cells(cell, twin[cell.twin_key]) for cell in real]
+    return Agreement(
+        task=task,
+        policies=data.policies,
+        cells=data.cells,
+        missing=(),
+        pearson=_statistic("pearson", pearson, data),
+        spearman=_statistic("spearman", spearman, data),
+        mmrv=_statistic("mmrv", mmrv, data),
+        **_winner(data),
+        bias=_statistic("bias", lambda **rates: float(mean_bias(**rates)), data),
+        coverage=share_estimate(sum(pair.within_chance for pair in pairs), len(pairs), DEPENDENT),
+        corrected_coverage=_corrected_coverage(data),
+        mean_real=_mean_real(data, further),
+        trainings=data.trainings,
+        days=data.days,
+        twin_error=Estimate(float(np.abs(rates["real"] - rates["twin"]).mean()), n=data.policies),
+        **_probabilities(data, real, twin),
+        ordered=_ordered(data),
+    )
+
+
+def _statistic(name: str, of: Callable[..., float], data: PairedCells) -> Estimate:
+    try:
+        value = of(**data.rates())
+    except UndefinedStatistic as refusal:
+        return Estimate(n=data.policies, missing=str(refusal))
+    try:
+        low, high = jackknife_interval(STATISTICS[name], data)
+    except UndefinedStatistic as refusal:
+        return Estimate(value, n=data.policies, no_interval=str(refusal))
+    return Estimate(value, float(low), float(high), data.policies)
+
+
+def _winner(data: PairedCells) -> dict[str, Any]:
+    """Agreement and regret of the winner, as means over tasks with two policies or more."""
+    n, names = data.policies, ("winner_agreement", "winner_regret")
+    if all(len(members) < 2 for members in data.strata):
+        return dict.fromkeys(names, Estimate(n=n, missing="no task has two policies"))
+    values = mean_over_tasks(winner_batched, data)
+    return {k: Estimate(float(v), n=n, no_interval=_MAXIMUM) for k, v in zip(names, values, strict=True)}
+
+
+def _corrected_coverage(data: PairedCells) -> Estimate:
+    """Coverage of predictions from other trainings, task by task."""
+    hits: list[bool] = []
+    rates = data.rates()
+    for members in data.strata:
+        f, y = rates["twin"][members], rates["real"][members]
+        groups = data.training[members]
+        if len(members) - np.bincount(groups).max() < MIN_PREDICTORS:
+            continue
+        try:
+            _, low, high = leave_one_group_out(twin=f, real=y, groups=groups.tolist())
+        except UndefinedStatistic:
+            continue
+        hits += list((low <= y) & (y <= high))
+    if not hits:
+        return Estimate(missing=f"{MIN_PREDICTORS} policies of a task, of other trainings, are needed for each")
+    return share_estimate(int(sum(hits)), len(hits), DEPENDENT)
+
+
+def _mean_real(data: PairedCells, further: Sequence[float]) -> Estimate:
+    rates = data.rates()
+    try:
+        mean = prediction_powered_mean(twin=rates["twin"], real=rates["real"], twin_only=further)
+    except UndefinedStatistic as refusal:
+        return Estimate(missing=str(refusal))
+    alike = "none: it would take a day's trials as independent"
+    return Estimate(mean.value, n=data.policies + len(further), no_interval=alike)
+
+
+TWIN, RECALIBRATED, OTHERS, SHUFFLED = (
+    "the twin",
+    "the twin, recalibrated on other trainings",
+    "without the twin: mean of the other trainings",
+    "the twin, its days shuffled",
+)
+"""Names of predictors."""
+
+
+def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict[str, Any]:
+    """Scores of the twin and of baselines, its calibration, and its errors by day."""
+    probability, several = _twin_probabilities(data, real, twin)
+    logs = {TWIN: log_score(probability, data.real)}
+    briers = {TWIN: brier(probability, data.real)}
+    others = np.broadcast_to(other_trainings(data, np.zeros(data.policies, int))[:, None], probability.shape)
+    for name, p in ((RECALIBRATED, recalibrated(probability, data)), (OTHERS, others)):
+        if data.trainings > 1:
+            logs[name], briers[name] = log_score(p, data.real), brier(p, data.real)
+    if several:
+        logs[SHUFFLED] = shuffled_days(probability, data.weight, data.real, log_score)
+        briers[SHUFFLED] = shuffled_days(probability, data.weight, data.real, brier)
+    scores = tuple(
+        PredictorScore(
+            name,
+            Estimate(mean_score(data, briers[name]), n=data.cells),
+            Estimate(mean_score(data, logs[name]), n=data.cells),
+            _gain(data, logs[TWIN], logs[name]) if name != TWIN else Estimate(missing="compared with itself"),
+        )
+        for name in logs
+    )
+    used = data.weight > 0
+    trials, days = _trials_and_days(real)
+    return {
+        "scores": scores,
+        "calibration": calibration(probability[used], data.real[used], trials[used]),
+        "errors": errors_by_day(probability[used], data.real[used], days[used].tolist()),
+    }
+
+
+def _gain(data: PairedCells, score: Array, baseline: Array) -> Estimate:
+    pair = score_pair(data, score, baseline)
+    value = float(mean_bias(**pair.rates()))
+    try:
+        low, high = jackknife_interval(SCORE_DIFFERENCE, pair)
+    except UndefinedStatistic as refusal:
+        return Estimate(value, n=data.cells, no_interval=str(refusal))
+    return Estimate(value, float(low), float(high), data.cells)
+
+
+def _real_rows(real: Sequence[Cell]) -> list[list[Cell]]:
+    """Real cells by policy, in the order of `pair_cells`."""
+    tasks = dict.fromkeys(cell.task for cell in real)
+    keys = [p for task in tasks for p in dict.fromkeys((c.policy, c.task) for c in real if c.task == task)]
+    return [[cell for cell in real if (cell.policy, cell.task) == key] for key in keys]
+
+
+def _trials_and_days(real: Sequence[Cell]) -> tuple[Indices, NDArray[np.object_]]:
+    """Trials and day of each cell, in the layout of `pair_cells`."""
+    rows = _real_rows(real)
+    shape = len(rows), max(map(len, rows))
+    trials, days = np.zeros(shape, np.int64), np.full(shape, "", dtype=object)
+    for i, row in enumerate(rows):
+        for j, cell in enumerate(row):
+            trials[i, j], days[i, j] = cell.trials, cell.lighting
+    return trials, days
+
+
+def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> tuple[Array, bool]:
+    """The twin's probability of success in each cell, and whether any policy has several."""
+    rows = _real_rows(real)
+    mine = [list(dict.fromkeys(cell.twin_key for cell in row)) for row in rows]
+    several = max(map(len, mine)) > 1
+    counts = unit_counts([[twin[key] for key in keys] for keys in mine], several)
+    by_unit = twin_probabilities(*counts)
+    out = np.full(data.weight.shape, 0.5)
+    for i, (row, keys) in enumerate(zip(rows, mine, strict=True)):
+        for j, cell in enumerate(row):
+            driven = counts[1][i] > 0
+            out[i, j] = by_unit[i, keys.index(cell.twin_key)] if several else by_unit[i, driven].mean()
+    return out, several
+
+
+_GAPS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # ends of the bins of differences of twin scores
+_ROUNDING = 1e-9
+
+
+def _ordered(data: PairedCells) -> tuple[OrderedPairs, ...]:
+    rates = data.rates()
+    gaps: list[float] = []
+    right: list[float] = []
+    for members in data.strata:
+        f, y = rates["twin"][members], rates["real"][members]
+        for i, j in zip(*np.triu_indices(len(members), 1), strict=True):
+            if abs(y[i] - y[j]) > _ROUNDING:
+                gap = f[i] - f[j]
+                gaps.append(abs(float(gap)))
+                right.append(0.5 if abs(gap) < _ROUNDING else float((gap > 0) == (y[i] > y[j])))
+    index = np.clip(np.searchsorted(_GAPS, np.array(gaps) + _ROUNDING, "right") - 1, 0, len(_GAPS) - 2)
+    return tuple(
+        OrderedPairs(_GAPS[b], _GAPS[b + 1], int(of.sum()), float(np.array(right)[of].sum()))
+        for b in range(len(_GAPS) - 1)
+        if (of := index == b).any()
+    )

@@ -1,0 +1,171 @@
+"""Verb: writes a built place for other programs.
+
+    python -m twin.export scenes/demo --usd road.usdz
+    python -m twin.export scenes/demo --glb road.glb --ply road.ply --lighting night
+    python -m twin.export scenes/demo --nerfstudio road_ns --colmap road_colmap
+
+One module per format: `usd`, `gltf`, `nerfstudio`, `colmap`; splats are made in `twin.assets.gaussians`.
+"""
+
+import argparse
+import contextlib
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from twin import commands
+from twin.assets.gaussians import gaussians_by_lighting, views_by_lighting
+from twin.assets.views import render_views
+from twin.errors import InputError
+from twin.export import gltf, usd
+from twin.export.colmap import write_colmap
+from twin.export.nerfstudio import write_nerfstudio
+from twin.files import load_arrays, remove, write_bytes
+from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.images import write_image
+from twin.loading import Twin, load_scene
+from twin.mjcf.scene_xml import Parts
+from twin.mjcf.world import SCENE_XML
+from twin.scene import require_stage
+
+_MEGABYTE = 1e6
+
+
+def command(given: argparse.Namespace) -> None:
+    """Runs the verb with the options parsed by `twin.commands`."""
+    lines = export(given.scene, given.lighting, given.usd, given.glb, given.ply, given.nerfstudio, given.colmap)
+    if not given.quiet:
+        print("\n".join(lines))
+
+
+def export(
+    scene: Path,
+    lighting: str | None = None,
+    usd_file: Path | None = None,
+    glb: Path | None = None,
+    ply: Path | None = None,
+    nerfstudio: Path | None = None,
+    colmap: Path | None = None,
+) -> list[str]:
+    """Writes the given files and folders, in colors without fog; returns a summary line for each.
+
+    Raises:
+        InputError: nothing to write, the scene is not built, the lighting is unknown, an output folder does not exist,
+            or a folder to write is there already.
+    """
+    files, folders = [one for one in (usd_file, glb, ply) if one], [one for one in (nerfstudio, colmap) if one]
+    if not files and not folders:
+        raise InputError("nothing to write; give --usd, --glb, --ply, --nerfstudio or --colmap")
+    for path in (*files, *folders):
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: there is no folder {path.parent}; create it, or give another path")
+    for path in files:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder; give a file")
+    for path in folders:
+        if path.exists() or path.is_symlink():
+            raise InputError(f"{path} is there already; remove it, or give another folder")
+    if usd_file is not None:
+        if usd_file.suffix.lower() not in usd.SUFFIXES:
+            raise InputError(f"{usd_file}: expected a file ending in {', '.join(usd.SUFFIXES)}")
+        usd.require_usd()
+    twin = load_scene(scene)
+    lines = _field_files(twin, lighting, usd_file, glb, ply) if files else []
+    if folders:
+        cameras = twin.cameras()
+        points = SparsePoints.load(require_stage(twin.scene, "metric"))
+        for out, write in ((nerfstudio, _write_nerfstudio), (colmap, _write_colmap)):
+            if out is not None:
+                write(out, cameras, points)
+                lines.append(f"{out}: {len(cameras)} frames, {len(points)} points, z up [m]")
+    return lines
+
+
+def _field_files(
+    twin: Twin, lighting: str | None, usd_file: Path | None, glb: Path | None, ply: Path | None
+) -> list[str]:
+    """Writes the files whose colors are rendered from the field."""
+    field, cameras = twin.field(), twin.cameras()
+    lighting = lighting or field.lightings[0]
+    field.embedding(lighting)  # raises early for an unknown name
+    lines = []
+    mesh = load_arrays(require_stage(twin.scene, "mesh") / "visual.npz") if usd_file or glb else {}
+    if usd_file or ply:
+        names = dict.fromkeys([lighting, *field.lightings]) if usd_file else [lighting]
+        views = views_by_lighting(field, cameras, list(names))
+        splats = gaussians_by_lighting(views)
+        if ply:
+            write_bytes(ply, splats[lighting].to_ply())
+            lines.append(f"{ply}: {len(splats[lighting].rgb)} gaussians under {lighting}, z up [m]")
+        if usd_file:
+            tints = {name: gltf.vertex_colors(one, mesh["vertices"].astype(np.float64)) for name, one in views.items()}
+            parts = Parts.load(require_stage(twin.scene, "mesh") / "parts.npz")
+            world = twin.world() if twin.scene.has_route else None
+            model = mujoco.MjModel.from_xml_path(str(require_stage(twin.scene, "mjcf") / SCENE_XML))
+            surface = mesh["vertices"], mesh["faces"]
+            usd.write_usd(usd_file, splats, surface, tints, parts, model, world, lighting)
+            lines.append(
+                f"{usd_file}: {len(splats[lighting].rgb)} gaussians under {', '.join(splats)}, {len(parts.vertices)} "
+                f"convex parts{', the Husky' if world else ''}, {usd_file.stat().st_size / _MEGABYTE:.0f} MB, z up [m]"
+            )
+    if glb:
+        views_of_one = render_views(field, cameras, gltf.VIEWS, gltf.WIDTH, gltf.FAR, lighting)
+        write_bytes(glb, gltf.textured_glb(mesh["vertices"].astype(np.float64), mesh["faces"], views_of_one))
+        lines.append(f"{glb}: {len(mesh['faces'])} textured faces under {lighting}, y up [m]")
+    return lines
+
+
+# ---- frames and cameras
+
+
+def _write_nerfstudio(out: Path, cameras: Cameras, points: SparsePoints) -> None:
+    masked = any(cameras.mask_path(i) for i in range(len(cameras)))
+    with _whole_folder(out) as folder:
+        _copy_frames(cameras, folder, lambda name: f"{name}.png", white=masked)
+        write_nerfstudio(folder, cameras, points, masked)
+
+
+def _write_colmap(out: Path, cameras: Cameras, points: SparsePoints) -> None:
+    with _whole_folder(out) as folder:
+        _copy_frames(cameras, folder, lambda name: f"{name}.png.png", white=False)
+        write_colmap(folder, cameras, points)
+
+
+@contextlib.contextmanager
+def _whole_folder(out: Path) -> Iterator[Path]:
+    """A temporary folder that becomes `out` when the block ends, or is removed if it fails."""
+    partial_folder = out.with_name(f".{out.name[:200]}.partial")
+    remove(partial_folder)
+    partial_folder.mkdir()
+    try:
+        yield partial_folder
+        partial_folder.rename(out)
+    finally:
+        remove(partial_folder)
+
+
+def _copy_frames(cameras: Cameras, folder: Path, mask_name: Callable[[str], str], white: bool) -> None:
+    """Copies frames to `images/` and masks to `masks/`; `white` makes masks for frames without one."""
+    for i, name in enumerate(cameras.names):
+        image = folder / "images" / f"{name}.png"
+        image.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(cameras.image_path(i), image)
+        mask = cameras.mask_path(i)
+        if mask or white:
+            target = folder / "masks" / mask_name(name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if mask:
+                shutil.copyfile(mask, target)
+            else:
+                write_image(target, np.full(cameras.sizes[i, ::-1], 255, np.uint8))
+
+
+main = partial(commands.main, "export")
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,285 @@
+"""Verb: packs a built scene into one file, with what driving needs and chosen policies, for another machine.
+
+    python -m twin.pack scenes/demo --policy first -o demo.twin
+    python -m twin.pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
+
+Packed are the baked field, the MJCF scene with its assets, ground, parts and cameras, tasks, robot, and lightings of
+photos. Films, frames, the field as trained and reports stay behind, and so does what is private and not needed:
+comments and paths of `scene.toml`, photos, dependencies in stamps, GPS positions. `twin.unpack` has the format.
+
+A pack drives as the scene does, bit for bit: of the field only those samples are replaced that no ray reads
+(`samples_read`). With `--levels` below 256 the features are rounded to so many values, which shrinks the pack and makes
+it another field.
+"""
+
+import argparse
+import csv
+import io
+import sys
+import zipfile
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save as to_bytes
+
+from twin import commands, runtime, unpack
+from twin.capture.capture_data import Capture
+from twin.config_file import ROBOT_TOML
+from twin.errors import InputError
+from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
+from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
+from twin.loading import Twin, load_scene
+from twin.nerf.baked import BrickLayout, samples_read
+from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
+
+LEVELS = 256
+"""Values of a byte: as built."""
+_ZERO = 128  # byte about which features are rounded; it is the value 0 of detail
+_FINER = 4  # levels of the density per level of a feature: it decides where surfaces are
+_VERTEX_STEP = 2  # steps of the hash grid's vertices, whose range is half as wide, per step of a feature
+_PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "baked.safetensors")}
+_MESH = ("ground.npz", "parts.npz", "visual.npz")
+_TEXT = """\
+A pack of {name}, made by twin {version}: a place to drive in, on MuJoCo, as `twin build` made it of films.
+
+  pip install twin                       the program, see its README
+  twin drive {file}     the Husky drives in it{driver}
+  twin unpack {file} FOLDER              a scene folder, in which all verbs work that need no films
+
+LICENCE
+  {licence}
+
+PRIVACY
+  The place is shown as its films show it: people, license plates and private ground that are in them may be
+  recognizable in rendered pictures. Whoever passes this file on answers for that.
+  Films, frames, photos and their EXIF headers are not in it. {positions}
+
+Nothing in this file runs when it is opened{zips}. manifest.json has the SHA-256 of every file.
+"""
+
+
+def pack(
+    root: Path,
+    out: Path | None = None,
+    policies: Sequence[str] = (),
+    levels: int = LEVELS,
+    licence: str = "",
+    positions: bool = False,
+    trust: bool = False,
+) -> tuple[Path, dict[str, Any]]:
+    """Packs a built scene; returns the pack's path and its manifest.
+
+    Args:
+        root: The scene.
+        out: The file; by default `<name of the folder>.twin` in the working folder.
+        policies: Runs, checkpoints, policy folders or ONNX files; with `trust` also zips of stable-baselines3.
+        levels: Values to which the field's features are rounded, 2 to 256.
+        licence: Terms for whoever receives it.
+        positions: Adds the films' GPS positions.
+        trust: Packs policies that may run code; whoever unpacks the file must trust them, too.
+
+    Raises:
+        InputError: the scene is not built, a policy cannot be packed, no GPS positions, or a setting out of range.
+    """
+    if not 2 <= levels <= LEVELS:
+        raise InputError(f"--levels {levels}: expected 2 to {LEVELS}")
+    twin = load_scene(root)
+    scene = twin.scene
+    name = scene.root.resolve().name
+    out = out or Path(f"{name}{unpack.SUFFIX}")
+    if out.suffix != unpack.SUFFIX or not out.parent.is_dir():
+        raise InputError(f"-o {out}: expected a file NAME{unpack.SUFFIX} in a folder that exists")
+    files: dict[str, bytes] = {"scene.toml": _scene_toml(scene, name)}
+    if (scene.root / ROBOT_TOML).exists():
+        files[ROBOT_TOML] = _toml(read_toml(scene.root / ROBOT_TOML))
+    names = [_add_policy(files, scene.root, one, trust) for one in dict.fromkeys(policies)]
+    if positions:
+        files["positions.csv"] = _positions(twin)
+    field = _add_stages(files, scene, levels)
+    for path in sorted(scene.lightings.glob("*.json")):
+        lighting = read_json(path)
+        if lighting.get("field") == stage_result(scene, "field"):  # others are stale
+            lighting |= {"field": field, "photo": PurePath(str(lighting.get("photo"))).name}
+            files[f"lightings/{path.name}"] = json_bytes(lighting)
+    head = {
+        "format": unpack.FORMAT,
+        "version": unpack.VERSION,
+        "name": name,
+        "licence": licence or "not stated; ask the sender",
+        "positions": positions,
+        "policies": names,
+        "levels": levels,
+        "packages": package_versions(),
+    }
+    return out, _write(out, files, head, trust)
+
+
+def _scene_toml(scene: SceneDir, name: str) -> bytes:
+    """`scene.toml` without comments and without the folders of its films."""
+    table = read_toml(scene.config_file)
+    for source in table.get("source", ()):
+        source |= {key: PurePath(source[key]).name for key in ("path", "images", "mask") if source.get(key)}
+    return _toml({"name": name} | table)
+
+
+def _toml(table: dict[str, Any]) -> bytes:
+    return "".join(f"{key} = {toml_value(value)}\n" for key, value in table.items()).encode()
+
+
+def _add_policy(files: dict[str, bytes], root: Path, source: str, trust: bool) -> str:
+    """Adds the files of a policy; returns its name in the pack."""
+    path = Path(find_policy(root, source))
+    path = path.parent if path.name == JSON else path
+    load_policy(path if path.exists() else source, trust)  # raises InputError if it is damaged
+    if path.is_dir():
+        kept = f"{path.parent.parent.name}/checkpoints/{path.name}" if path.parent.name == "checkpoints" else path.name
+        for name in (JSON, WEIGHTS, ONNX):
+            if (path / name).exists():
+                files[f"runs/{kept}/{name}"] = read_bytes(path / name)
+        return kept.replace("/checkpoints/", "/")
+    if not path.is_file():
+        raise InputError(
+            f"--policy {source}: runs a function of yours, which has no place in a pack; export it to ONNX"
+        )
+    files[f"policies/{path.name}"] = read_bytes(path)
+    return f"policies/{path.name}"
+
+
+def _positions(twin: Twin) -> bytes:
+    """GPS positions of the filmed frames beside their positions in the scene, as CSV."""
+    capture = Capture.load(require_stage(twin.scene, "capture"))
+    cameras = twin.cameras()
+    known = {name: gps for name, gps in zip(capture.names, capture.gps, strict=True) if np.isfinite(gps[:2]).all()}
+    if not known:
+        raise InputError(f"--with-positions: no frame of {twin.scene.root} has a GPS position")
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["frame", "latitude_deg", "longitude_deg", "altitude_m", "x_m", "y_m", "z_m"])
+    for name, position in zip(cameras.names, cameras.positions, strict=True):
+        if name in known:
+            table.writerow([name, *known[name].tolist(), *position.tolist()])
+    return text.getvalue().encode()
+
+
+def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
+    """Adds what driving needs of each stage, with stamps of that alone; returns the field's result.
+
+    Results are those of the build, so that lightings and tables remain valid, unless the field is rounded.
+    """
+    results = {}
+    for stage in unpack.STAGES_PACKED:
+        folder = require_stage(scene, stage)
+        names: tuple[str, ...] = _PACKED.get(stage, _MESH)
+        if stage == "mjcf":
+            names = tuple(p.relative_to(folder).as_posix() for p in sorted(folder.rglob("*")) if p.is_file())
+        kept = {name: read_bytes(folder / name) for name in names if name != "stamp.json" and (folder / name).is_file()}
+        stamp = Stamp.verified(folder)
+        results[stage] = stamp.result
+        if stage == "field":
+            layout = BrickLayout(**_tuples(read_json(folder / "baked.json")["layout"]))
+            kept["baked.safetensors"] = to_bytes(
+                packed_field(layout, load_tensors(folder / "baked.safetensors"), levels)
+            )
+            if levels < LEVELS:
+                results[stage] = digest_json([stamp.result, levels])
+        sizes = {name: len(content) for name, content in kept.items()}
+        digests = {name: unpack.digest(content) for name, content in kept.items()}
+        stamp = replace(stamp, result=results[stage], depends={}, metrics={}, files=sizes, sha256=digests)
+        kept["stamp.json"] = stamp.content()
+        files |= {f"build/{STAGES[stage]}/{name}": content for name, content in kept.items()}
+    return results["field"]
+
+
+def _tuples(table: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+
+
+def packed_field(layout: BrickLayout, arrays: dict[str, NDArray], levels: int = LEVELS) -> dict[str, NDArray]:
+    """The arrays of a baked field (see `BakedField`) for a pack.
+
+    Samples that no ray reads repeat the one before, which takes no space. Below 256 `levels`, densities and features
+    are rounded.
+    """
+    step = LEVELS / levels
+    features = arrays["features"]
+    if step > 1:
+        features = np.concatenate(
+            [rounded(features[..., :1], max(1.0, step / _FINER)), rounded(features[..., 1:], step)], -1
+        )
+        coarser = {"detail.texels": step, "detail.vertices": _VERTEX_STEP * step}
+        detail = {name: rounded(arrays[name], by) for name, by in coarser.items() if name in arrays}
+        arrays = arrays | detail
+    read = samples_read(layout, arrays).ravel()
+    last = np.maximum.accumulate(np.where(read, np.arange(len(read)), 0))
+    flat = features.reshape(len(read), -1)
+    return arrays | {"features": flat[last].reshape(features.shape)}
+
+
+def rounded(values: NDArray[np.uint8], step: float) -> NDArray[np.uint8]:
+    """Bytes rounded to multiples of a step from `_ZERO`."""
+    table = np.round((np.arange(LEVELS) - _ZERO) / step) * step + _ZERO
+    return np.clip(np.round(table), 0, LEVELS - 1).astype(np.uint8)[values]
+
+
+def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool) -> dict[str, Any]:
+    coded = {name: unpack.DIFFERENCES if name.endswith("baked.safetensors") else unpack.PLAIN for name in files}
+    facts = {
+        name: {"bytes": len(content), "sha256": unpack.digest(content), "coding": coded[name]}
+        for name, content in sorted(files.items())
+    }
+    manifest = head | {"files": facts}
+    text = _TEXT.format(
+        name=head["name"],
+        version=head["packages"]["twin"],
+        file=out.name,
+        driver=f", by the policy {head['policies'][0]}" if head["policies"] else "",
+        licence=head["licence"],
+        positions="GPS positions of the frames are in positions.csv."
+        if head["positions"]
+        else "No GPS position is, either.",
+        zips=", but a policy in policies/ may when it is loaded" if trust else "",
+    )
+    with (
+        atomic_path(out) as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+        runtime.bar("pack", len(files), "file", after=1.0) as progress,
+    ):
+        archive.writestr(_entry(unpack.README), text.encode())
+        archive.writestr(_entry(unpack.MANIFEST), json_bytes(manifest))
+        for name in facts:
+            content = files[name]
+            archive.writestr(
+                _entry(name), unpack.encode_differences(content) if coded[name] == unpack.DIFFERENCES else content
+            )
+            progress.update()
+    return manifest
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    """An entry without a time, so that the same scene gives the same pack."""
+    entry = zipfile.ZipInfo(name)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.external_attr = 0o100644 << 16
+    return entry
+
+
+def command(given: argparse.Namespace) -> None:
+    """Runs the verb with the options parsed by `twin.commands`."""
+    out, manifest = pack(
+        given.scene, given.out, given.policy, given.levels, given.licence, given.with_positions, given.trust
+    )
+    if not given.quiet:
+        total = sum(one["bytes"] for one in manifest["files"].values())
+        size = f"{out.stat().st_size / 1e6:.1f} MB, {total / 1e6:.1f} unpacked"
+        print(f"{out}: {size}; drive in it: twin drive {out}")
+
+
+main = partial(commands.main, "pack")
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,314 @@
+"""Verb: unpacks a *pack*, one file with all that driving in a built scene needs; `twin.pack` writes them.
+
+    python -m twin.unpack demo.twin scenes/demo_copy
+
+A pack is a zip: `README.txt` for people, `manifest.json`, then the files of a scene folder. The manifest has the size
+and SHA-256 of each file as unpacked, and its *coding*: `plain`, or `differences` for the field
+(see `encode_differences`).
+
+A pack may come from anyone. Nothing in it runs. A name outside the places in `_PLACES`, such as a path that leads
+elsewhere, a link, a doubled name, a size above the bounds or other than declared, or a wrong digest is refused, and
+then nothing stays on the disk.
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import os
+import re
+import shutil
+import stat
+import struct
+import sys
+import tempfile
+import zipfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from twin import commands
+from twin.config_file import load_config
+from twin.errors import InputError, short_repr
+from twin.files import digest_file, exists, is_file, parse_json, read_json, require_text, wrap_read_errors
+from twin.geometry.cameras import Cameras
+from twin.mjcf.world import SCENE_XML
+from twin.scene import PACK_JSON, STAGES, SceneDir
+
+SUFFIX = ".twin"
+FORMAT, VERSION = "twin pack", 1
+MANIFEST, README = "manifest.json", "README.txt"
+PLAIN, DIFFERENCES = "plain", "differences"
+STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
+"""Stages of a build that are packed, in part."""
+
+_MAX_FILES = 20_000
+_MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] of a file and of all, unpacked
+_MAX_RATIO, _FREE = 30, 16 << 20  # total size over the pack's, from a total of `_FREE` bytes on
+_MAX_MANIFEST = 16 << 20  # [bytes]
+_CHUNK = 4 << 20  # [bytes]
+_N = r"\w[\w.+-]{0,99}"  # a name in a path; a leading dot, and so "..", has no place
+_PLACES = re.compile(
+    rf"scene\.toml|robot\.toml|positions\.csv|lightings/{_N}\.json"
+    rf"|build/{STAGES['metric']}/(cameras\.(json|npz)|stamp\.json)"
+    rf"|build/{STAGES['field']}/(baked\.(json|safetensors)|stamp\.json)"
+    rf"|build/{STAGES['mesh']}/({_N}\.(npz|png)|stamp\.json)"
+    rf"|build/{STAGES['mjcf']}/(scene\.xml|world\.json|stamp\.json|assets/{_N}\.(obj|png|bin))"
+    rf"|runs/{_N}/(checkpoints/{_N}/)?policy\.(json|safetensors|onnx)|policies/{_N}\.(onnx|zip)"
+)
+_CURE = "fetch it again, or ask its sender for another"
+_NOT_A_PACK = "expected a pack, as twin pack writes it"
+_XML_PATHS = ("file", "meshdir", "texturedir", "assetdir", "fileright", "fileleft", "fileup", "filedown", "filefront")
+_XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # of other files, or of code
+_HEADER = 8  # [bytes] before the header of a safetensors file: its length
+
+
+def digest(content: bytes) -> str:
+    """SHA-256 of a file's content."""
+    return hashlib.sha256(content).hexdigest()
+
+
+# ---- coding of the field
+
+
+def encode_differences(content: bytes) -> bytes:
+    """A safetensors file whose byte arrays of two axes and more are stored so that they compress well; of equal length.
+
+    Each channel (the last axis) lies together, as differences modulo 256 from one value to the next, because neighbors
+    are alike. `decode_differences` is its exact inverse.
+    """
+    return _recode(content, lambda a: np.diff(np.ascontiguousarray(np.moveaxis(a, -1, 0)).ravel(), prepend=np.uint8(0)))
+
+
+def decode_differences(content: bytes) -> bytes:
+    """The inverse of `encode_differences`. Raises ValueError for a damaged safetensors file."""
+
+    def decode(a: np.ndarray) -> np.ndarray:
+        moved = np.cumsum(a.ravel(), dtype=np.uint8).reshape(a.shape[-1], *a.shape[:-1])
+        return np.ascontiguousarray(np.moveaxis(moved, 0, -1)).ravel()
+
+    return _recode(content, decode)
+
+
+def _recode(content: bytes, change: Any) -> bytes:
+    (length,) = struct.unpack_from("<Q", content)
+    if length > len(content) - _HEADER:
+        raise ValueError(f"a header of {length:,} bytes in {len(content):,}")
+    out, start = bytearray(content), _HEADER + length
+    for name, tensor in json.loads(content[_HEADER:start]).items():
+        if name == "__metadata__" or tensor["dtype"] != "U8" or len(tensor["shape"]) < 2:
+            continue
+        first, last = tensor["data_offsets"]
+        shape = [int(n) for n in tensor["shape"]]
+        if not 0 <= first <= last <= len(content) - start or min(shape) < 0 or math.prod(shape) != last - first:
+            raise ValueError(
+                f"{short_repr(name)} of shape {shape} in bytes {first} to {last} of {len(content) - start}"
+            )
+        if last > first:
+            flat = np.frombuffer(content, np.uint8, last - first, start + first)
+            out[start + first : start + last] = change(flat.reshape(shape)).tobytes()
+    return bytes(out)
+
+
+# ---- unpacking
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The checked manifest of a pack.
+
+    Raises InputError: no pack, another version, or names, links, or declared sizes that are refused.
+    """
+    if not is_file(path):
+        raise InputError(f"{path} is no file; {_NOT_A_PACK}")
+    with wrap_read_errors(path, _NOT_A_PACK), zipfile.ZipFile(path) as archive:
+        return _checked_manifest(archive, path)
+
+
+def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
+    """Unpacks a pack into a new folder; returns its manifest.
+
+    The folder appears when all is written and checked, or not at all.
+
+    Args:
+        path: The pack.
+        folder: A folder that does not exist, or is empty.
+        trust: Also takes policies that may run code when they are loaded.
+
+    Raises:
+        InputError: see `read_manifest`; a file that is not as declared; the folder exists; an untrusted policy.
+    """
+    manifest = read_manifest(path)
+    zips = [name for name in manifest["files"] if name.endswith(".zip")]
+    if zips and not trust:
+        raise InputError(
+            f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, --trust"
+        )
+    if exists(folder) and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder} exists; give a folder that does not")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name[:80]}.", suffix=".partial", dir=folder.parent))
+    try:
+        with wrap_read_errors(path, _CURE), zipfile.ZipFile(path) as archive:
+            for name, facts in manifest["files"].items():
+                target = partial / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                _extract(archive, name, facts, target)
+        _check_contents(partial, path)
+        (partial / PACK_JSON).write_bytes(json.dumps(manifest, indent=1).encode())
+        partial.chmod(0o755)
+        if folder.is_dir():
+            folder.rmdir()
+        partial.rename(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return manifest
+
+
+def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
+    entries = archive.infolist()
+    if len(entries) > _MAX_FILES:
+        raise InputError(f"{path} has {len(entries):,} files; expected at most {_MAX_FILES:,}")
+    by_name = {entry.filename: entry for entry in entries}
+    if len({name.lower() for name in by_name}) < len(entries):
+        raise InputError(f"{path} has a name twice; {_CURE}")
+    if MANIFEST not in by_name or by_name[MANIFEST].file_size > _MAX_MANIFEST:
+        raise InputError(f"{path} has no {MANIFEST} of at most {_MAX_MANIFEST >> 20} MB; {_NOT_A_PACK}")
+    head = parse_json(archive.read(MANIFEST).decode("utf-8"), f"{path}: {MANIFEST}")
+    if not isinstance(head, dict) or head.get("format") != FORMAT:
+        raise InputError(f"{path}: no {FORMAT}; {_NOT_A_PACK}")
+    if head.get("version") != VERSION:
+        raise InputError(
+            f"{path}: version {short_repr(head.get('version'))}, expected {VERSION}: it was written by another version "
+            "of twin; use that version, or pack the scene again with this one"
+        )
+    total = 0
+    for name, facts in head["files"].items():
+        if not _PLACES.fullmatch(name):
+            raise InputError(f"{path}: {short_repr(name)} has no place in a scene; {_CURE}")
+        size = facts["bytes"]
+        if not isinstance(size, int) or not 0 <= size <= _MAX_FILE or facts["coding"] not in (PLAIN, DIFFERENCES):
+            raise InputError(f"{path}: {name} of {short_repr(size)} bytes; expected at most {_MAX_FILE:,}")
+        require_text(facts["sha256"])
+        total += size
+    bound = min(_MAX_TOTAL, max(_FREE, _MAX_RATIO * path.stat().st_size))
+    if total > bound:
+        raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} of a file of its size")
+    if missing := {*head["files"], README, MANIFEST} ^ set(by_name):
+        raise InputError(f"{path}: {short_repr(min(missing))} is in its list and not in it, or the reverse; {_CURE}")
+    for name, entry in by_name.items():
+        kind = stat.S_IFMT(entry.external_attr >> 16)
+        if kind not in (0, stat.S_IFREG) or entry.is_dir():
+            raise InputError(f"{path}: {name} is a link or no file; {_CURE}")
+        if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise InputError(f"{path}: {name} is encrypted or compressed in another way; {_CURE}")
+        if name in head["files"] and entry.file_size != head["files"][name]["bytes"]:
+            raise InputError(f"{path}: {name} has {entry.file_size:,} bytes; its list says otherwise; {_CURE}")
+    head["name"] = require_text(head["name"])
+    head["policies"] = list(map(require_text, head["policies"]))
+    return head
+
+
+def _extract(archive: zipfile.ZipFile, name: str, facts: dict[str, Any], target: Path) -> None:
+    left = facts["bytes"]
+    with archive.open(name) as source, target.open("xb") as file:
+        while block := source.read(_CHUNK):
+            left -= len(block)
+            if left < 0:
+                raise ValueError(f"{name} is longer than declared")
+            file.write(block)
+    if left:
+        raise ValueError(f"{name} is {left:,} bytes shorter than declared")
+    if facts["coding"] == DIFFERENCES:
+        target.write_bytes(decode_differences(target.read_bytes()))
+    if digest_file(target) != facts["sha256"]:
+        raise ValueError(f"{name} is not as it was packed")
+
+
+def _check_contents(root: Path, path: Path) -> None:
+    """Raises InputError for files that name others outside the scene."""
+    scene = SceneDir(root)
+    try:
+        load_config(scene.config_file)
+        cameras = Cameras.load(scene.stage("metric"))
+        read = [os.path.relpath(cameras.images, scene.build.resolve()), *cameras.names]
+    except ValueError as error:  # also InputError
+        raise InputError(f"{path}: {str(error).replace(f'{root}{os.sep}', '')}") from None
+    bad = next((one for one in read if one.startswith("/") or ".." in one.split("/")), None)
+    xml = scene.stage("mjcf") / SCENE_XML
+    if bad is None and xml.exists():
+        with wrap_read_errors(path, _CURE):
+            for element in ElementTree.parse(xml).getroot().iter():
+                paths = [element.get(key, "x") for key in _XML_PATHS]
+                if element.tag in _XML_REFUSED or not all(re.fullmatch(_N, one) for one in paths):
+                    bad = f"<{element.tag}> of {SCENE_XML}"
+    if bad is not None:
+        raise InputError(f"{path}: {short_repr(bad)} names a file outside the scene; {_CURE}")
+
+
+# ---- packs in the place of scene folders
+
+
+def open_scene(path: Path) -> Path:
+    """The folder of a scene: `path`, or if that is a pack, or the name of one, its contents in a cache.
+
+    A pack is unpacked once into `$XDG_CACHE_HOME/twin/packs`, by its digest; several processes may do so at once.
+
+    Raises InputError: see `unpack`.
+    """
+    pack = find_pack(path)
+    if pack is None:
+        return path
+    folder = _cache() / f"{pack.stem[:60]}-{digest_file(pack)[:32]}"
+    if not (folder / PACK_JSON).exists():
+        try:
+            unpack(pack, folder)
+        except (InputError, OSError):
+            if not (folder / PACK_JSON).exists():  # else another process was faster
+                raise
+    return folder
+
+
+def find_pack(path: Path) -> Path | None:
+    """The pack at a path, or by a name alone, such as `demo`, here, in `scenes/`, or in that of a checkout of twin.
+
+    None if there is none.
+    """
+    if is_file(path):
+        return path if path.suffix == SUFFIX or zipfile.is_zipfile(path) else None
+    if exists(path) or len(path.parts) != 1:
+        return None
+    places = (Path(), Path("scenes"), Path(__file__).resolve().parents[1] / "scenes")
+    return next((one for place in places if is_file(one := place / f"{path.name}{SUFFIX}")), None)
+
+
+def is_cached(root: Path) -> bool:
+    """True for a scene folder in the cache of packs, which is no place for results."""
+    return root.parent == _cache()
+
+
+def _cache() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(home) if home.startswith("/") else Path.home() / ".cache") / "twin" / "packs"
+
+
+def packed_policies(root: Path) -> list[str]:
+    """Names of the policies that came in a scene's pack; empty for a scene that was built here."""
+    return [str(name) for name in read_json(root / PACK_JSON)["policies"]] if (root / PACK_JSON).exists() else []
+
+
+def command(given: argparse.Namespace) -> None:
+    """Runs the verb with the options parsed by `twin.commands`."""
+    manifest = unpack(find_pack(given.pack) or given.pack, given.folder, given.trust)
+    if not given.quiet:
+        policies = f", with the policies {', '.join(manifest['policies'])}" if manifest["policies"] else ""
+        print(f"{given.folder}: {manifest['name']}{policies}; drive in it: twin drive {given.folder}")
+
+
+main = partial(commands.main, "unpack")
+
+if __name__ == "__main__":
+    sys.exit(main())
