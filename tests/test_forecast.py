@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 from scipy.special import expit
 
-from twin.env.options import CAUSES
+from twin.config import CAUSES
 from twin.errors import InputError
 from twin.evaluation.agreement import OTHERS, SHUFFLED, TWIN, Estimate
 from twin.evaluation.forecasting import ALL_TASKS, Forecast, make_forecast

@@ -16,7 +16,7 @@ from tiny_twin import tiny_twin
 import twin
 from twin import trial
 from twin.commands import parser_of
-from twin.env.options import CAUSES
+from twin.config import CAUSES
 from twin.errors import InputError
 from twin.evaluation.trials import Cell, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy

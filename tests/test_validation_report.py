@@ -139,7 +139,7 @@ def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
 
 
 def test_every_cause_has_words():
-    from twin.env.options import CAUSES
+    from twin.config import CAUSES
 
     assert set(FAILURES) == set(CAUSES) - {"goal"}
     cell = {"causes": {"collision": 2, "out_of_bounds": 9}}

@@ -18,6 +18,11 @@ RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 RANDOMIZED = "+randomised"
 """Suffix of randomized conditions in tables, see `Condition`; not allowed at the end of a lighting's name."""
 
+CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
+"""Causes of an episode's or trial's end, in the order of tables; judges decide which one takes precedence."""
+TWIST, STEERING = "twist", "steering"
+"""Kinds of a policy's actions: speed and yaw rate, or the yaw rate at a fixed speed."""
+
 KINDS = ("auto", "video", "bag", "images", "colmap", "transforms")
 MAPPERS = ("auto", "global", "incremental")
 UPS = ("ground", "cameras", "poses")

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.config import STEERING
 from twin.env.controller import CONTROL_PERIOD
-from twin.env.options import STEERING, check_actions
+from twin.env.options import check_actions
 from twin.env.physics import HuskyPhysics
 from twin.errors import InputError, short_repr
 from twin.mjcf.world import World, arc_lengths, heading_error, nearest_on_route, point_at

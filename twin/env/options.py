@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.config import TRAINING, ObstacleConfig
+from twin.config import STEERING, TRAINING, TWIST, ObstacleConfig
 from twin.env.camera_noise import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.domain_randomization import Ranges
@@ -20,10 +20,6 @@ from twin.errors import InputError, short_repr
 from twin.types import Array
 from twin.warp_runtime import wp
 
-CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
-"""Causes of an episode's end, in the order of tables. `RewardAndTermination` decides which one takes precedence."""
-
-TWIST, STEERING = "twist", "steering"
 NERF, SIMULATOR, SPLATS = "nerf", "simulator", "splats"
 CPU, CUDA = "cpu", "cuda"
 

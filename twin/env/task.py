@@ -19,10 +19,10 @@ import numpy as np
 from dm_env import specs
 from numpy.typing import NDArray
 
-from twin.config import ObstacleConfig
+from twin.config import CAUSES, STEERING, ObstacleConfig
 from twin.env.domain_randomization import NominalModel, RandomizationSample
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
-from twin.env.options import CAUSES, STEERING, Options, check_actions
+from twin.env.options import Options, check_actions
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError

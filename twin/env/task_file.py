@@ -1,9 +1,8 @@
-"""A task as a JSON file, for whoever runs trials without this package: the line, its width, the rules and the pictures.
+"""A task as a JSON file, for judges that share no code with this package: the line, its width, the limits and the start.
 
     {"format": "twin task", "version": 1, "name": "straight", "line": [[x, y, z], ...], "half_width": 1.0, ...}
 
-Coordinates are those of the scene, metres, z up. The rules are those of `twin.env.task.RewardAndTermination`, stated as
-numbers, so that another judge needs none of its code.
+The rules are those of `twin.env.task.RewardAndTermination`, as numbers, so that another judge needs none of its code.
 """
 
 import math
@@ -14,25 +13,21 @@ from twin.env.options import Options
 from twin.env.route_segments import RouteSegment
 from twin.env.task import BUMPER_OFFSET, ROLLOVER_COSINE, STUCK_DISTANCE, STUCK_TIME, RewardAndTermination
 from twin.files import write_json
-from twin.mjcf.world import World, heading_at, point_at
+from twin.mjcf.world import World
 
 FORMAT, VERSION = "twin task", 1
 
 
 def task_table(world: World, segment: RouteSegment, options: Options) -> dict[str, Any]:
-    """The contents of the file, JSON-able.
+    """The contents of the file, in the scene's frame (z up), meters, seconds, radians.
 
-    `line` is on the ground [m], shape (m, 3), in driving order; stations are arc lengths along it [m]. `start.pose` is x, y [m] and
-    yaw [rad]; trials begin within ± `offset` [m] beside it and ± `heading` [°] of it. `goal` is the station that the
-    base must reach; `give_up` [m], [s] ends a trial that moves less than that in that time; `max_tilt` [rad].
-    `camera` is the seat of the twin's camera: forward, left and up from the base on the ground [m], downward pitch,
-    yaw to the left, roll to the right [°], fx, fy, cx, cy and width, height [px]. A control step takes
-    `control_timestep` [s]; a policy gets the last `stack` pictures.
+    `line` (m, 3) is on the ground, in driving order; a *station* is an arc length along it, of which height takes no
+    part. Trials start at the station `start`, up to `offset` beside the line and `heading` off its direction. They
+    succeed at the station `goal`, and end without success where the base is further than `half_width` from the line,
+    touches an object, tilts by more than `max_tilt`, after `time_limit`, or where it moves by less than
+    `stuck.distance` in `stuck.time`. Commands come every `control_timestep` and are bounded by `limits`.
     """
-    rules, robot = RewardAndTermination(world, segment, options), world.robot
-    route = world.route[:, :2]
-    x, y = point_at(route, segment.start).tolist()
-    camera = robot.camera(world.camera)
+    rules = RewardAndTermination(world, segment, options)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -41,23 +36,15 @@ def task_table(world: World, segment: RouteSegment, options: Options) -> dict[st
         "half_width": rules.half_width,
         "start": {
             "station": segment.start,
-            "pose": [x, y, float(heading_at(route, segment.start))],
             "offset": options.start_offset,
-            "heading": options.start_heading,
+            "heading": math.radians(options.start_heading),
         },
         "goal": segment.end - BUMPER_OFFSET,
         "time_limit": rules.time_limit,
-        "give_up": {"distance": STUCK_DISTANCE, "time": STUCK_TIME},
+        "stuck": {"distance": STUCK_DISTANCE, "time": STUCK_TIME},
         "max_tilt": math.acos(ROLLOVER_COSINE),
         "limits": {"speed": options.speed, "yaw_rate": options.yaw_rate},
         "control_timestep": options.control_timestep,
-        "camera": {
-            "position": [*robot.camera_offset, robot.camera_height],
-            "angles": [robot.camera_pitch, robot.camera_yaw, robot.camera_roll],
-            "intrinsics": list(camera.intrinsics),
-            "size": list(camera.size),
-        },
-        "pictures": {"size": list(options.size), "stack": options.stack},
     }
 
 

@@ -34,7 +34,7 @@ class JudgedTrial:
     progress: Array
     """Distance along the task's route segment [m], shape (k,)."""
     cause: str
-    """One of `twin.env.options.CAUSES`; empty if the recording ends before an outcome."""
+    """One of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
     start_heading: float
     """Yaw against the route at the start [rad]."""
 

@@ -13,11 +13,11 @@ that name: it names the one to compare with, such as `held-out+randomised` for `
 import csv
 import difflib
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from twin.env.options import CAUSES
+from twin.config import CAUSES
 from twin.errors import InputError
 from twin.evaluation.statistics import wilson
 from twin.files import read_text, wrap_read_errors, write_text
@@ -28,9 +28,10 @@ CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "lo
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
 """Columns of `results.csv`."""
-ROBOT_COLUMNS = ("robot", "camera", "outside_training")
-"""Which robot and camera drove, and what of them lies outside training's ranges; `twin.reality` writes them."""
-OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *ROBOT_COLUMNS)
+SETUP_COLUMNS = ("place", "day", "robot", "camera", "outside_training")
+"""Numbers of place, day, robot and camera, and what of the latter lies outside training's ranges; `twin.reality` writes
+them."""
+OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *SETUP_COLUMNS)
 """Further columns that `results.csv` may have."""
 RECENT_EPISODES = 20
 """Number of newest episodes, started at the segment's beginning, that a training's success rate is counted over; a
@@ -49,7 +50,7 @@ class Trial:
     lighting: str
     seed: int
     cause: str
-    """One of `twin.env.options.CAUSES`; only `goal` is a success."""
+    """One of `twin.config.CAUSES`; only `goal` is a success."""
     progress: float
     """Distance along the task's route segment [m]."""
     steps: int
@@ -122,30 +123,32 @@ def cells_csv(cells: Iterable[Cell]) -> str:
 
 
 def write_real_trials(
-    trials: Sequence[Trial], table: Path, out: Path, twin_lighting: str, robot: Sequence[str] = ()
+    trials: Sequence[Trial],
+    table: Path,
+    out: Path,
+    twin_lighting: str,
+    setup: Callable[[str], tuple[str, ...]] | None = None,
 ) -> None:
     """Writes real trials, a row each, to `table`, and their counts to `out`, as `read_results` reads them.
 
-    Cells that `out` already has keep their `twin_lighting` and `ROBOT_COLUMNS`; new ones get the given ones, where
-    `robot` has a value for each of `ROBOT_COLUMNS`, or none.
+    Cells that `out` already has keep their `twin_lighting` and `SETUP_COLUMNS`; `setup` gives those of a new lighting.
     """
-    known: dict[tuple[str, str, str], tuple[str, ...]] = {}
-    with_robot = bool(robot)
+    known: dict[tuple[str, str, str], dict[str, str]] = {}
     if out.exists():
         with wrap_read_errors(out, "give another --out"):
             for row in csv.DictReader(io.StringIO(read_text(out), newline="")):
-                with_robot |= ROBOT_COLUMNS[0] in row
-                kept = (row["twin_lighting"], *(row.get(name) or "" for name in ROBOT_COLUMNS))
-                known[row["policy"], row["task"], row["lighting"]] = kept
-    new = (twin_lighting, *(robot or ("",) * len(ROBOT_COLUMNS)))
-    columns = (*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS)[: None if with_robot else -len(ROBOT_COLUMNS)]
-    rows = [
-        (c.policy, c.lighting, str(c.trials), str(c.successes), c.task, *known.get(c.key, new))[: len(columns)]
-        for c in tally(trials)
-    ]
+                known[row["policy"], row["task"], row["lighting"]] = row
+    rows = []
+    for c in tally(trials):
+        new = {"twin_lighting": twin_lighting}
+        new |= dict(zip(SETUP_COLUMNS, setup(c.lighting), strict=True)) if setup else {}
+        counts = {"policy": c.policy, "lighting": c.lighting, "trials": str(c.trials), "successes": str(c.successes)}
+        rows.append({**known.get(c.key, new), **counts, "task": c.task})
+    wide = any(SETUP_COLUMNS[0] in row for row in rows)
+    columns = (*RESULT_COLUMNS, *OPTIONAL_RESULT_COLUMNS)[: None if wide else -len(SETUP_COLUMNS)]
     for path, text in (
         (table, csv_text(EPISODE_COLUMNS, [trial.row() for trial in trials])),
-        (out, csv_text(columns, rows)),
+        (out, csv_text(columns, [[row.get(name) or "" for name in columns] for row in rows])),
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)

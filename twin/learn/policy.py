@@ -23,8 +23,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as safetensors_load
 from safetensors.numpy import save as safetensors_save
 
-from twin.env.drivers import find_callable
-from twin.env.options import STEERING, TWIST
+from twin.config import STEERING, TWIST
 from twin.errors import InputError, short_repr
 from twin.files import atomic_path, digest_file, json_bytes, parse_json, read_bytes, read_json
 from twin.learn.policy_network import Architecture, onnx_bytes
@@ -270,6 +269,9 @@ def _tensors(model: Any) -> Iterator[Any]:
 
 
 def _from_callable(name: str) -> Policy:
+    # Only here: files of policies load without the environments.
+    from twin.env.drivers import find_callable
+
     function = find_callable(name)
 
     def output_of(stack: Image) -> Array32:

@@ -7,9 +7,9 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from twin.config import ANY, HELD_OUT, TRAINING
+from twin.config import ANY, HELD_OUT, STEERING, TRAINING, TWIST
 from twin.env.domain_randomization import Ranges
-from twin.env.options import CPU, CUDA, NERF, SIMULATOR, STEERING, TWIST, Rewards
+from twin.env.options import CPU, CUDA, NERF, SIMULATOR, Rewards
 from twin.errors import InputError, short_repr
 from twin.learn.policy import Control
 from twin.learn.policy_network import Architecture

@@ -175,9 +175,7 @@ def camera_to_base(camera: HiddenCamera) -> Array:
     """Pose of the camera in the base on the ground (axes forward, left, up), OpenCV axes, shape (4, 4)."""
     pitch = np.deg2rad(_PITCH)
     # Columns: right, down, forward.
-    nominal = np.array(
-        [[0.0, -np.sin(pitch), np.cos(pitch)], [-1.0, 0.0, 0.0], [0.0, -np.cos(pitch), -np.sin(pitch)]]
-    )
+    nominal = np.array([[0.0, -np.sin(pitch), np.cos(pitch)], [-1.0, 0.0, 0.0], [0.0, -np.cos(pitch), -np.sin(pitch)]])
     flip = np.diag([1.0, -1.0, -1.0])  # between axes right, up, back and right, down, forward
     angles = (camera.turn_right, camera.turn_up, camera.turn_back)
     turn = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
@@ -316,9 +314,7 @@ class RealCamera:
         ground = float(robot.base_to_world(middle)[2, 3])
         return self.develop(*self._rasterizer(pose), pose, motion, ground, robot.time)
 
-    def develop(
-        self, light: Array32, depth: Array32, pose: Array, motion: Array, ground: float, time: float
-    ) -> Image:
+    def develop(self, light: Array32, depth: Array32, pose: Array, motion: Array, ground: float, time: float) -> Image:
         """A picture (h, w, 3) of the light (h, w, 3) and z-depth (h, w) [m] at a pose (4, 4).
 
         Args:
@@ -408,4 +404,3 @@ def compressed(picture: Image, quality: int) -> Image:
     """A picture (h, w, 3) after JPEG of a quality."""
     data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-

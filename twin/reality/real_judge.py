@@ -40,7 +40,7 @@ class RealJudge:
         """
         task = self._task
         self._locate(x, y)
-        distance, patience = task.give_up
+        distance, patience = task.stuck
         if hypot(x - self._rested[0], y - self._rested[1]) > distance:
             self._rested, self._since = (x, y), time
         if tilt > task.max_tilt:

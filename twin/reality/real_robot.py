@@ -26,7 +26,7 @@ side sets U; above it a controller turns commands into the two speeds. Both have
 
 from collections import deque
 from dataclasses import asdict, dataclass, fields
-from math import atan2, copysign, cos, exp, hypot, pi, sin, sqrt, tanh
+from math import atan2, copysign, cos, exp, hypot, pi, sin, sqrt
 
 import numpy as np
 
@@ -339,8 +339,6 @@ class RealRobot:
             self._voltage[i] = min(max(wanted, -most), most)
             if wanted == self._voltage[i]:
                 self._integral[i] += r.loop_integral * error * elapsed
-            if self._target[i] == 0.0 and abs(self._wheel[i]) < 0.02:
-                self._integral[i] *= 0.9  # a side at rest brakes and does not push
 
     # ---- motion
 
@@ -350,17 +348,13 @@ class RealRobot:
         mass, vx, vy, rate = self._mass, self._vx, self._vy, self._rate
         _, pitch, roll = self._rest
         weight = mass * _GRAVITY * cos(pitch) * cos(roll)
-        front = 0.25 * weight * 2.0 * r.center_forward / _WHEELBASE - 0.5 * self._height * (
-            self._force[0] / _WHEELBASE
-        )
+        front = 0.25 * weight * 2.0 * r.center_forward / _WHEELBASE - 0.5 * self._height * (self._force[0] / _WHEELBASE)
         left = 0.25 * weight * 2.0 * r.center_left / _TRACK - 0.5 * self._height * self._force[1] / _TRACK
-        loads = [
-            max(0.0, 0.25 * weight + f * front + s * left + f * s * self._warp_load) for f, s, _ in _TIRES
-        ]
+        loads = [max(0.0, 0.25 * weight + f * front + s * left + f * s * self._warp_load) for f, s, _ in _TIRES]
         share = weight / max(sum(loads), 1e-9)
         mu_x, mu_y = r.friction, r.friction * r.lateral_grip
         along = across = moment = 0.0
-        side_torque = [0.0, 0.0]
+        side_torque, resisting = [0.0, 0.0], [0.0, 0.0]
         for i, (f, s, side) in enumerate(_TIRES):
             load = share * loads[i]
             px = f * 0.5 * _WHEELBASE - r.center_forward
@@ -382,15 +376,18 @@ class RealRobot:
             fy = -load * (r.bristle_stiffness * new_y + r.bristle_damping * (new_y - z[1]) / _STEP)
             z[0], z[1] = new_x, new_y
             along, across, moment = along + fx, across + fy, moment + px * fy - py * fx
-            side_torque[side] -= radius * fx + r.rolling_resistance * load * radius * tanh(spin / 0.1)
+            side_torque[side] -= radius * fx
+            resisting[side] += r.rolling_resistance * load * radius
         gain = _GEAR * r.torque_constant
         for side in (0, 1):
             spin = self._wheel[side]
             current = (self._voltage[side] - gain * spin) / r.resistance
             current = min(max(current, -r.current_limit), r.current_limit)
             self._current[side] = current
-            torque = gain * current - r.gear_friction * tanh(spin / 0.1) + side_torque[side]
-            self._wheel[side] = spin + _STEP * torque / self._side_inertia
+            # Gear and tires at rest hold up to their friction, so it may stop a wheel and not turn it back.
+            free = spin + _STEP * (gain * current + side_torque[side]) / self._side_inertia
+            held = _STEP * (r.gear_friction + resisting[side]) / self._side_inertia
+            self._wheel[side] = copysign(max(abs(free) - held, 0.0), free)
         keep = _STEP / _LOAD_LAG
         self._force[0] += keep * (along - self._force[0])
         self._force[1] += keep * (across - self._force[1])

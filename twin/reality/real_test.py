@@ -222,7 +222,9 @@ def _check_setup(setup: Setup, table: Path, record: Path) -> None:
         if known != given:
             raise InputError(f"{table} is of {known}; this is {given}; give another --out")
     elif table.exists():
-        raise InputError(f"{table} was driven in the reality of version 1; this is {REALITY_VERSION}; give another --out")
+        raise InputError(
+            f"{table} was driven in the reality of version 1; this is {REALITY_VERSION}; give another --out"
+        )
     record.parent.mkdir(parents=True, exist_ok=True)
     robot, camera = asdict(draw_robot(setup.robot)), asdict(draw_camera(setup.camera))
     write_json(record, {**given, "outside_training": setup.outside, "robot_values": robot, "camera_values": camera})

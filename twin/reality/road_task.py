@@ -1,8 +1,8 @@
 """The task of a trial: a line on the road, its width, start, goal and limits, as numbers.
 
-The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it
-and brings it from the scene's frame into the true one. Where no twin has been built, `task_of_place` states a
-place's tasks on its filmed path with the default rules. *Station*: arc length along the line [m].
+The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it and brings it
+from the scene's frame into the true one. Where no twin was built, `task_of_place` states a place's tasks on its filmed
+path with the default rules. *Station*: arc length along the line [m].
 """
 
 from dataclasses import dataclass
@@ -24,11 +24,12 @@ from twin.types import Array
 CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0.0, 60.349)}
 """Start and length [m] of the tasks of place 0, by name; a test holds them to what the twin finds on the same line."""
 
+_WRITE = "write one: python -m twin.export SCENE --task NAME --task-file FILE"
 _HALF_WIDTH = 1.0  # [m]
 _BUMPER = 0.5  # [m] ahead of the base
 _STUCK = (0.1, 5.0)  # [m], [s]
 _MAX_TILT = radians(60.0)
-_START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°]
+_START_OFFSET, _START_HEADING = 0.3, radians(10.0)  # [m], [rad]
 _HEADING_WINDOW = 1.0  # [m]
 
 
@@ -46,13 +47,13 @@ class RoadTask:
     start_offset: float
     """Bound of the start's distance from the line [m]."""
     start_heading: float
-    """Bound of the start's angle against the line [°]."""
+    """Bound of the start's angle against the line [rad]."""
     goal: float
     """Station that the base must reach [m]."""
     time_limit: float
     """[s]"""
-    give_up: tuple[float, float]
-    """A trial ends that moves less than this distance [m] in this time [s]."""
+    stuck: tuple[float, float]
+    """A robot is stuck that moves by less than this distance [m] in this time [s]."""
     max_tilt: float
     """Tilt beyond which the robot has rolled over [rad]."""
     speed: float
@@ -61,10 +62,6 @@ class RoadTask:
     """Largest yaw rate of a command [rad/s]."""
     control_timestep: float
     """[s]"""
-    size: tuple[int, int] = (160, 90)
-    """Width, height of the policy's pictures [px]."""
-    stack: int = 4
-    """Pictures that the policy gets at once."""
 
     def __post_init__(self) -> None:
         line = self.line
@@ -103,7 +100,7 @@ class RoadTask:
         """A start pose: x, y [m], yaw [rad]."""
         x, y, heading = self.at(self.start)
         off = float(rng.uniform(-self.start_offset, self.start_offset))
-        turn = radians(float(rng.uniform(-self.start_heading, self.start_heading)))
+        turn = float(rng.uniform(-self.start_heading, self.start_heading))
         return x - off * sin(heading), y + off * cos(heading), heading + turn
 
 
@@ -115,8 +112,8 @@ def read_task(path: Path, to_truth: Similarity | None = None) -> RoadTask:
     """
     table = read_json(path)
     if not isinstance(table, dict) or (table.get("format"), table.get("version")) != ("twin task", 1):
-        raise InputError(f"{path}: {short_repr(table)} is not a task; write one: python -m twin.export SCENE --task-file")
-    with wrap_read_errors(path, "write it again: python -m twin.export SCENE --task NAME --task-file FILE"):
+        raise InputError(f"{path}: {short_repr(table)} is not a task; {_WRITE}")
+    with wrap_read_errors(path, _WRITE):
         return parse_task(table, to_truth)
 
 
@@ -124,8 +121,7 @@ def parse_task(table: dict[str, Any], to_truth: Similarity | None = None) -> Roa
     """A task from the contents of its file. Raises KeyError, TypeError or ValueError for missing or wrong entries."""
     line = np.array(table["line"], float)
     line = to_truth.points(line) if to_truth else line
-    start, limits, pictures = table["start"], table["limits"], table["pictures"]
-    width, height = pictures["size"]
+    start, limits = table["start"], table["limits"]
     return RoadTask(
         name=str(table["name"]),
         line=line[:, :2],
@@ -135,13 +131,11 @@ def parse_task(table: dict[str, Any], to_truth: Similarity | None = None) -> Roa
         start_heading=float(start["heading"]),
         goal=float(table["goal"]),
         time_limit=float(table["time_limit"]),
-        give_up=(float(table["give_up"]["distance"]), float(table["give_up"]["time"])),
+        stuck=(float(table["stuck"]["distance"]), float(table["stuck"]["time"])),
         max_tilt=float(table["max_tilt"]),
         speed=float(limits["speed"]),
         yaw_rate=float(limits["yaw_rate"]),
         control_timestep=float(table["control_timestep"]),
-        size=(int(width), int(height)),
-        stack=int(pictures["stack"]),
     )
 
 
@@ -173,7 +167,7 @@ def task_of_place(
     return RoadTask(
         *(name, line, _HALF_WIDTH, start, _START_OFFSET, _START_HEADING, end - _BUMPER),
         time_limit=2.0 * (end - start) / speed,
-        give_up=_STUCK,
+        stuck=_STUCK,
         max_tilt=_MAX_TILT,
         speed=speed,
         yaw_rate=yaw_rate,
