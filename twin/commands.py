@@ -481,6 +481,17 @@ def _reality(parser: argparse.ArgumentParser) -> None:
             help="0: the demo's street; from 1: drawn places (1 to 49 are for development)",
         )
 
+    def robot(command: argparse.ArgumentParser, camera: bool = True) -> None:
+        place(command)
+        command.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="robot of the real test")
+        if camera:
+            command.add_argument("--camera", type=int, default=0, metavar="NUMBER", help="its camera")
+
+    def one_weather(command: argparse.ArgumentParser) -> None:
+        either = command.add_mutually_exclusive_group(required=True)
+        either.add_argument("--lighting", metavar="NAME", help="a weather of the test")
+        either.add_argument("--day", type=int, nargs=1, metavar="NUMBER", help="a drawn day of the test, from 1")
+
     command = add("film", "film the place into a scene folder")
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
     place(command)
@@ -492,10 +503,16 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("scene", type=Path, help="folder of a built scene")
     command = add("drive", "the real test: drive policy files in weather that was not filmed")
     command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
-    command.add_argument("--task", required=True, help="{straight,right_turn}; a drawn place names its own")
-    place(command)
+    command.add_argument(
+        "--task",
+        required=True,
+        help="{straight,right_turn}; a drawn place names its own; or a .json of twin export --task-file",
+    )
+    command.add_argument("--scene", type=Path, help="the built scene that such a file was exported from")
+    robot(command)
     command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
     command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
+    command.add_argument("--day", type=int, nargs="+", metavar="NUMBER", help="drawn days of the test, from 1")
     command.add_argument(
         "--out",
         type=Path,
@@ -509,21 +526,21 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command = add("log", "a drive log of the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
     command.add_argument("--duration", type=float, default=300.0, help="[s]")
-    place(command)
+    robot(command, camera=False)
     command = add("onboard", "a film by that Husky's own camera, for twin align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
-    place(command)
+    robot(command)
     command = add("bag", "a ROS 2 bag of one trial of that Husky, for twin trial")
     command.add_argument("--out", type=Path, required=True, help="folder of the bag")
     command.add_argument("--policy", type=Path, help="policy folder; default: the robot follows the route")
     command.add_argument("--task", default="straight", help="{straight,right_turn}; a drawn place names its own")
-    command.add_argument("--lighting", required=True, metavar="NAME", help="a weather of the test")
+    one_weather(command)
     command.add_argument("--seed", type=int, default=0, help="of start, camera and noise")
-    place(command)
+    robot(command)
     command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
-    command.add_argument("--lighting", required=True, metavar="NAME", help="a weather of the test")
+    one_weather(command)
     command.add_argument("--out", type=Path, required=True, help="photo.png")
-    place(command)
+    robot(command)
 
 
 VERBS = {

@@ -1,4 +1,4 @@
-"""A task as a JSON file, for judges that share no code with this package: the line, its width, the limits and the start.
+"""A task as a JSON file, for judges that share no code with this package: line, width, limits, start.
 
     {"format": "twin task", "version": 1, "name": "straight", "line": [[x, y, z], ...], "half_width": 1.0, ...}
 

@@ -2,7 +2,8 @@
 
     python -m twin.reality film [--place NUMBER] --out DIR
     python -m twin.reality compare DIR
-    python -m twin.reality drive --policy FILE... --task straight|right_turn --out results.csv
+    python -m twin.reality drive --policy FILE... --task straight [--place N] [--robot N] [--camera N] --day 1 2
+        --out results.csv
     python -m twin.reality log --out drive.csv
     python -m twin.reality onboard --out robot.mp4
     python -m twin.reality bag --lighting dawn --out dawn_1
@@ -26,18 +27,21 @@ from twin.build import publish
 from twin.errors import InputError, short_repr
 from twin.evaluation.trials import cells_csv, tally
 from twin.files import toml_string, write_text
+from twin.geometry.cameras import Cameras
 from twin.loading import load_scene
 from twin.reality import place as places
 from twin.reality import real_test, recordings
 from twin.reality.centerline import RoadLine
-from twin.reality.comparison import compare
+from twin.reality.comparison import align_rigid, compare, matched_poses
 from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
 from twin.reality.lighting import LIGHTINGS, WEATHER
 from twin.reality.place_spec import PlaceSpec, draw, tasks
+from twin.reality.real_test import Setup
+from twin.reality.road_task import RoadTask, read_task
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
-from twin.scene import SceneDir
+from twin.scene import SceneDir, require_stage
 
 TINY = FilmingPlan(
     lightings=("sun", "overcast"), start=24.0, length=12.0, speed=2.0, fps=4, width=320, height=180, samples=2, crf=18
@@ -136,36 +140,56 @@ def command(options: argparse.Namespace) -> None:
         figures = compare(scene)["figures"]
         publish(scene, load_scene(options.scene).report())
         print("\n".join(f"{name:<32} {value:.4g}" for name, value in figures.items() if value is not None))
-    elif options.command == "log":
-        recordings.write_log(options.out, recordings.record_log(options.duration, options.place))
+    else:
+        _with_robot(options, Setup(options.place, options.robot, getattr(options, "camera", 0)))
+
+
+def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
+    """Runs a verb in which a robot drives or looks."""
+    days = [f"day_{number}" for number in getattr(options, "day", None) or []]
+    if options.command == "log":
+        recordings.write_log(options.out, recordings.record_log(options.duration, setup))
     elif options.command == "onboard":
-        recordings.write_film(options.out, options.place)
+        recordings.write_film(options.out, setup)
     elif options.command == "bag":
         from twin.reality.robot_bag import write_robot_bag
 
-        _check_lightings([options.lighting], WEATHER)
-        if options.seed < 0:
-            raise InputError(f"--seed {options.seed}: expected 0 or more")
-        given = options.out, options.policy, options.task, options.lighting, options.seed, options.place
-        trial = write_robot_bag(*given)
+        (lighting,) = days or [options.lighting]
+        trial = write_robot_bag(options.out, options.policy, options.task, lighting, options.seed, setup)
         print(f"{options.out}: {trial.cause} after {trial.progress:.1f} m")
     elif options.command == "photo":
-        _check_lightings([options.lighting], WEATHER)
-        recordings.write_photo(options.lighting, options.out, options.place)
+        (lighting,) = days or [options.lighting]
+        recordings.write_photo(lighting, options.out, setup)
     else:
-        options.lightings = options.lightings or list(WEATHER)
-        _check_lightings(options.lightings, WEATHER)
+        if options.lightings is None and not days:
+            options.lightings = list(WEATHER)
         trials = real_test.run(
             options.policy,
-            options.task,
-            options.lightings,
+            _task(options.task, options.scene, setup.place),
+            [*(options.lightings or []), *days],
             options.trials,
             options.out,
             options.twin_lighting,
             options.films,
-            options.place,
+            setup,
         )
         print(cells_csv(tally(trials)), end="")
+        print(setup)
+
+
+def _task(given: str, scene: Path | None, place: int) -> str | RoadTask:
+    """The task of a file, brought from its scene's frame into the true one; or the name of a task as it is."""
+    if not given.endswith(".json"):
+        return given
+    if scene is None:
+        raise InputError(f"{given} is in the frame of a scene; give --scene, the folder that it was exported from")
+    root = SceneDir(scene)
+    if not (root.truth / "truth.npz").exists():
+        raise InputError(f"{scene} has no truth; only scenes of `python -m twin.reality film` have one")
+    truth, cameras = Truth.load(root.truth), Cameras.load(require_stage(root, "metric"))
+    if truth.number != place:
+        raise InputError(f"{scene} is a film of place {truth.number}; give --place {truth.number}")
+    return read_task(Path(given), align_rigid(cameras.camera_to_world, matched_poses(truth, cameras)))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import mujoco_warp
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import opencv_to_mujoco
+from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.reality import SEED, true_world
 from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.place_objects import DrivenLine, KnownPlace
@@ -216,9 +216,13 @@ def film_pass(
     rng = np.random.default_rng([SEED, 13, sum(map(ord, name))])
     render = Renderer(lighting, place, plan)
     steps = track(list(zip(poses, gains, strict=True)), f"film {name}", unit="frame")
-    write_video(
-        (sensor_image(rng, apply_haze(*render(pose), light), light, float(gain)) for pose, gain in steps), plan, path
-    )
+    rays = unproject(pixel_grid(plan.width, plan.height), plan.intrinsics)
+
+    def frame(pose: Array, gain: float) -> NDArray[np.uint8]:
+        ground = float(place.route.ground_height(pose[:2, 3]))
+        return sensor_image(rng, apply_haze(*render(pose), rays, pose, light, ground), light, gain)
+
+    write_video((frame(pose, float(gain)) for pose, gain in steps), plan, path)
     return times, poses
 
 

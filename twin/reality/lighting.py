@@ -53,7 +53,7 @@ class Lighting:
     wet: float = 0.0
     """Darkening of the wet ground, 0 to 1."""
     visibility: float = float("inf")
-    """Distance at which haze transmits 1/e of the light [m]; haze has the color of the horizon."""
+    """Distance on the ground over which haze transmits 1/e of the light [m]; haze has the color of the horizon."""
 
 
 LIGHTINGS: dict[str, Lighting] = {
@@ -174,12 +174,44 @@ def sky_cube_map(
     return (np.clip(out, 0.0, 1.0) * 255 + 0.5).astype(np.uint8).reshape(6 * width, width, 3)
 
 
-def apply_haze(light: NDArray[np.float32], depth: NDArray[np.float32], lighting: Lighting) -> NDArray[np.float32]:
-    """An image (h, w, 3) with haze applied by z-depth (h, w) [m]; sky pixels (depth 0) stay as they are."""
+_HAZE_HEIGHT = 25.0  # [m] over which haze thins out to 1/e
+_FORWARD_SCATTER = 0.35  # excess of the haze's brightness towards the sun
+_SKY = 400.0  # [m] length of a ray through haze to the sky
+
+
+def apply_haze(
+    light: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    rays: NDArray,
+    camera_to_world: NDArray[np.float64],
+    lighting: Lighting,
+    ground: float,
+) -> NDArray[np.float32]:
+    """An image with haze, whose extinction falls exponentially with height and which is brighter towards the sun.
+
+    Args:
+        light: Linear RGB, shape (h, w, 3).
+        depth: z-depth [m], 0 = sky, shape (h, w).
+        rays: Rays of the pixels at z = 1 in the camera, shape (h, w, 3).
+        camera_to_world: OpenCV axes, shape (4, 4).
+        lighting: `visibility` is the haze's at the ground; its color is that of the horizon.
+        ground: Height of the ground [m].
+    """
     if np.isinf(lighting.visibility):
         return light
-    share = np.where(depth > 0.0, np.exp(-depth / lighting.visibility), 1.0).astype(np.float32)[..., None]
-    return share * light + (1.0 - share) * np.asarray(lighting.horizon, np.float32)
+    world = rays @ camera_to_world[:3, :3].T
+    per_depth = np.linalg.norm(rays, axis=-1)
+    length = np.where(depth > 0.0, depth * per_depth, _SKY)
+    # A ray below the ground would gain without bound.
+    rise = np.clip(world[..., 2] / per_depth * length / _HAZE_HEIGHT, -3.0, 60.0)
+    start = np.exp(-max(float(camera_to_world[2, 3]) - ground, 0.0) / _HAZE_HEIGHT)
+    level = np.abs(rise) < 1e-4
+    mean = np.where(level, 1.0, -np.expm1(-rise) / np.where(level, 1.0, rise))  # of exp(−h) over heights 0 to `rise`
+    through = np.exp(-length / lighting.visibility * start * mean)[..., None]
+    toward = -np.asarray(lighting.suns[0][0]) / np.linalg.norm(lighting.suns[0][0])
+    facing = np.clip((world * toward).sum(-1) / per_depth, 0.0, 1.0)
+    airlight = np.asarray(lighting.horizon) * (1.0 + _FORWARD_SCATTER * facing[..., None] ** 4)
+    return (through * light + (1.0 - through) * airlight).astype(np.float32)
 
 
 def add_lights(spec: mujoco.MjSpec, lighting: Lighting, lamp_heads: NDArray[np.float64]) -> None:
@@ -428,3 +460,8 @@ def weather_index(name: str) -> int:
     if name in WEATHER:
         return list(WEATHER).index(name)
     return len(WEATHER) - _DAYS - 1 + int(name.removeprefix("day_"))
+
+
+def day_number(name: str) -> str:
+    """The number of a drawn day, as text; empty for the weathers that have names."""
+    return name.removeprefix("day_") if name.startswith("day_") else ""

@@ -1,10 +1,10 @@
 """The front camera of the robot of the real test, by number: its seat, and all that stands between light and picture.
 
-A picture is made in the order of nature. *Air*: haze scatters by the length of each ray, and thins out with height.
-*Shutter*: rows are read one after another while the robot moves, and each is open for a while. *Lens*: dirt, vignetting,
-bloom around what is brighter than the sensor takes. *Exposure*: a second-order automatic exposure that sees the last
-pictures, lags and overshoots. *White balance* drifts over seconds. *Sensor*: noise, a response curve of its own.
-*Compression*: JPEG. The light comes from `rasterizer.py`.
+A picture is made in the order of nature. *Air*: haze by the length of each ray and by height (`lighting.py`).
+*Shutter*: rows are read one after another while the robot moves, and each is open for a while. *Lens*: dirt,
+vignetting, bloom around what is brighter than the sensor takes. *Exposure*: a second-order automatic exposure that sees
+the last pictures, lags and overshoots. *White balance* drifts over seconds. *Sensor*: noise, a response curve of its
+own. *Compression*: JPEG. The light comes from `rasterizer.py`.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, smooth_noise
-from twin.reality.lighting import Lighting
+from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.real_robot import RealRobot
 from twin.types import Array, Array32, Image
@@ -147,11 +147,6 @@ def draw_camera(number: int) -> HiddenCamera:
     return HiddenCamera(number, **values)
 
 
-def askew(camera: HiddenCamera) -> list[str]:
-    """Names of the camera's numbers that lie outside what training randomises."""
-    return [name for name, (low, high) in TRAINED.items() if not low <= getattr(camera, name) <= high]
-
-
 def native_size() -> tuple[int, int]:
     """Width, height of the camera's own pictures [px]."""
     film = FilmingPlan()
@@ -181,45 +176,8 @@ def camera_to_base(camera: HiddenCamera) -> Array:
     turn = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
     out = np.eye(4)
     out[:3, :3] = nominal @ flip @ turn @ flip
-    out[:3, 3] = np.array(_SEAT) + (camera.shift_forward, camera.shift_left, camera.shift_up)
+    out[:3, 3] = np.add(_SEAT, (camera.shift_forward, camera.shift_left, camera.shift_up))
     return out
-
-
-# ---- air
-
-_HAZE_HEIGHT = 25.0  # [m] over which haze thins out to 1/e
-_FORWARD_SCATTER = 0.35  # excess of the haze's brightness towards the sun
-_SKY = 400.0  # [m] length of a level ray through haze to the sky
-
-
-def haze_by_ray(
-    light: Array32, depth: Array32, rays: Array, camera_to_world: Array, lighting: Lighting, ground: float
-) -> Array32:
-    """An image with haze whose extinction falls exponentially with height above the ground.
-
-    Args:
-        light: Linear RGB, shape (h, w, 3).
-        depth: z-depth [m], 0 = sky, shape (h, w).
-        rays: Rays of the pixels at z = 1 in the camera, shape (h, w, 3).
-        camera_to_world: OpenCV axes, shape (4, 4).
-        lighting: `visibility` is the haze's at the ground; its color is that of the horizon.
-        ground: Height of the ground [m].
-    """
-    if np.isinf(lighting.visibility):
-        return light
-    world = rays @ camera_to_world[:3, :3].T
-    per_depth = np.linalg.norm(rays, axis=-1)
-    length = np.where(depth > 0.0, depth * per_depth, _SKY)
-    rise = world[..., 2] / per_depth * length / _HAZE_HEIGHT
-    start = np.exp(-max(float(camera_to_world[2, 3]) - ground, 0.0) / _HAZE_HEIGHT)
-    # The mean of exp(−h) over the ray's heights 0 to `rise`; a ray into the ground gains little, so it is bounded.
-    rise = np.clip(rise, -3.0, 60.0)
-    mean = np.where(np.abs(rise) < 1e-4, 1.0, -np.expm1(-rise) / np.where(rise == 0.0, 1.0, rise))
-    through = np.exp(-length / lighting.visibility * start * mean)[..., None]
-    toward = -np.asarray(lighting.suns[0][0]) / np.linalg.norm(lighting.suns[0][0])
-    facing = np.clip((world * toward).sum(-1) / per_depth, 0.0, 1.0)
-    airlight = np.asarray(lighting.horizon) * (1.0 + _FORWARD_SCATTER * facing[..., None] ** 4)
-    return (through * light + (1.0 - through) * airlight).astype(np.float32)
 
 
 # ---- lens, exposure and sensor
@@ -326,7 +284,7 @@ class RealCamera:
             time: [s].
         """
         camera, lighting = self.camera, self._lighting
-        light = haze_by_ray(light, depth, self._rays, pose, lighting, ground)
+        light = apply_haze(light, depth, self._rays, pose, lighting, ground)
         light = self._read(light, depth, motion)
         light = light * (self._falloff * np.float32(lighting.exposure))
         brightness = float(light.mean())
@@ -359,7 +317,7 @@ class RealCamera:
         """
         if not np.any(motion):
             return light
-        width, height = self._size
+        height = self._size[1]
         points = self._rays * np.where(depth > 0.0, depth, np.float32(_SKY_DISTANCE))[..., None]
         flow = np.cross(motion[:3], points) + motion[3:]
         rows = (np.arange(height) + 0.5) / height - 0.5

@@ -4,6 +4,7 @@ It knows the task's numbers and what it sees of the robot, and shares no code wi
 test compares both on a thousand paths.
 """
 
+from bisect import bisect_left, bisect_right
 from math import hypot
 
 from twin.reality.road_task import RoadTask
@@ -22,7 +23,7 @@ class RealJudge:
     def begin(self, x: float, y: float) -> None:
         """Starts a trial at a position [m]."""
         self.cause = ""
-        """Why the trial has ended: goal, collision, out_of_bounds, timeout, rollover or stuck; empty while it goes on."""
+        """Cause of the trial's end, one of `twin.config.CAUSES`; empty while it goes on."""
         self.station, self.offset = self._task.start, 0.0
         """Station of the nearest point of the line, and the distance from it, left positive [m]."""
         self._locate(x, y)
@@ -66,9 +67,8 @@ class RealJudge:
         """Moves on to the nearest point of the line around the last one."""
         low, high = self.station - _BEHIND, self.station + _AHEAD
         best = (float("inf"), self.station, 0.0)
-        for k in range(len(self._points) - 1):
-            if self._knots[k + 1] < low or self._knots[k] > high:
-                continue
+        first = max(bisect_left(self._knots, low) - 1, 0)
+        for k in range(first, min(bisect_right(self._knots, high), len(self._points) - 1)):
             (ax, ay), (bx, by) = self._points[k], self._points[k + 1]
             dx, dy = bx - ax, by - ay
             squared = dx * dx + dy * dy

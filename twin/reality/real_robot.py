@@ -5,27 +5,27 @@ its own load and its own slip; the two tires of a side turn together, behind one
 follow the ground under the tires as a lightly damped oscillator, which bumps and the road's texture excite: at 1 m/s
 the ground changes over tenths of a second, a bounce on the tires over hundredths.
 
-Tire: the averaged lumped LuGre model (Canudas de Wit, Tsiotras, Velenis, Basset, Gissinger 2003, Vehicle System Dynamics
-39(3)) in its anisotropic planar form (Velenis, Tsiotras, Canudas de Wit, Sorine 2005, Vehicle System Dynamics 43(1)).
-For the deflection z of the bristles [m] along the tire's two axes i, slip velocity v, friction coefficients μ, rolling
+Tire: the averaged lumped LuGre model (Canudas de Wit, Tsiotras, Velenis, Basset, Gissinger 2003, Vehicle System
+Dynamics 39(3)) in its anisotropic planar form (Velenis, Tsiotras, Canudas de Wit, Sorine 2005, same journal 43(1)). For
+the deflection z of the bristles [m] along the tire's two axes i, slip velocity v, friction coefficients μ, rolling
 speed u = |r ω| and the patch's length L:
 
     dz_i/dt = v_i − (σ₀ |M v| / (μ_i² g) + κ₀ u / L) z_i,    |M v| = √((μ_x v_x)² + (μ_y v_y)²)
     F_i = −(σ₀ z_i + σ₁ dz_i/dt) N,    κ₀ = 7/6 (Deur 2001, IFAC Workshop Advances in Automotive Control)
 
-with g = 1 + (s − 1) exp(−√(|v| / v_s)), Stribeck's excess s of static over sliding friction. In steady sliding the force
-is that of Coulomb's ellipse; a rolling tire creeps in proportion to its force; at rest it holds like a spring.
+with g = 1 + (s − 1) exp(−√(|v| / v_s)), Stribeck's excess s of static over sliding friction. In steady sliding the
+force is that of Coulomb's ellipse; a rolling tire creeps in proportion to its force; at rest it holds like a spring.
 
 Loads: on four equal springs the weight, the load transfer of acceleration (h ΣF/L along, h ΣF/B across) and the warp of
-the ground under the four tires superpose. Motor: torque k i, current i = (U − k ω) / R within ±the limit of the current;
-U is at most the battery's voltage, which sags by its resistance times the current drawn. A velocity loop (PI) per
-side sets U; above it a controller turns commands into the two speeds. Both have their own clock, whose period jitters.
+the ground under the four tires superpose. Motor: torque k i, current i = (U − k ω) / R within its limit; U is at most
+the battery's voltage, which sags by its resistance times the current drawn. A velocity loop (PI) per side sets U; above
+it a controller turns commands into the two speeds. Both have their own clock, whose period jitters.
 
 `RANGES` are the ranges of drawn robots; `TRAINED` are those that the twin's training randomises, as facts about it.
 """
 
 from collections import deque
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from math import atan2, copysign, cos, exp, hypot, pi, sin, sqrt
 
 import numpy as np
@@ -207,12 +207,6 @@ def draw_robot(number: int) -> HiddenRobot:
         values[name] = float(rng.uniform(low, high))
     period, timeout = _CONTROLLERS[int(rng.integers(len(_CONTROLLERS))) if number else 0]
     return HiddenRobot(number, controller_period=period, timeout=timeout, **values)
-
-
-def outside_training(robot: HiddenRobot) -> list[str]:
-    """Names of the robot's numbers that lie outside what training randomises."""
-    values = asdict(robot)
-    return [name for name, (low, high) in TRAINED.items() if not low <= values[name] <= high]
 
 
 # ---- dynamics

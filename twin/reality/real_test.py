@@ -1,9 +1,10 @@
 """The real test: a policy file drives a robot on the true road, in weather that was never filmed.
 
-A policy receives images only, and its file is the only input from the training side. Robot, camera, haze and judge are
-equations of their own (`real_robot.py`, `real_camera.py`, `real_judge.py`), the renderer is `rasterizer.py`: of the twin
-only the loader of policy files and the format of tables are used. Robots, cameras and days have numbers; what of a robot
-or camera lies outside the ranges of training is written into the results (`outside_training`).
+A policy receives images only, and its file is the only input from the training side; a task may be one that the twin
+wrote as JSON. Robot, camera, haze and judge are equations of their own (`real_robot.py`, `real_camera.py`,
+`lighting.py`, `real_judge.py`), the renderer is `rasterizer.py`. Of the twin only the loader of policy files and the
+format of tables are used. Places, days, robots and cameras have numbers; the values of a robot or camera that lie
+outside the ranges of training stand in the results (`outside_training`).
 
 The k-th trial in a weather has the same seed for every policy, hence the same start, shake and noise, so that policies
 can be compared in pairs.
@@ -27,11 +28,13 @@ from twin.files import digest_file, read_json, wrap_read_errors, write_json
 from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import REALITY_VERSION, true_world
 from twin.reality.filming import FilmingPlan, write_video
-from twin.reality.lighting import weather, weather_index
+from twin.reality.lighting import day_number, weather, weather_index
 from twin.reality.rasterizer import Rasterizer
-from twin.reality.real_camera import RealCamera, askew, draw_camera, intrinsics_of
+from twin.reality.real_camera import TRAINED as camera_ranges
+from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
 from twin.reality.real_judge import RealJudge
-from twin.reality.real_robot import RealRobot, draw_robot, outside_training
+from twin.reality.real_robot import TRAINED as robot_ranges
+from twin.reality.real_robot import RealRobot, draw_robot
 from twin.reality.road_task import CAMPUS_TASKS, RoadTask, task_of_place
 from twin.reality.trial_place import place_on_test_day, shadow_range
 from twin.runtime import bar, exclusive_lock
@@ -49,7 +52,7 @@ _START, _ROBOT, _CAMERA = range(3)  # random streams of a trial
 
 @dataclass(frozen=True)
 class Setup:
-    """Where and with what trials are driven."""
+    """Where and with what trials are driven, by number."""
 
     place: int = 0
     robot: int = 0
@@ -57,12 +60,23 @@ class Setup:
 
     @property
     def outside(self) -> list[str]:
-        """Names of the robot's and camera's numbers that lie outside what training randomises."""
-        return outside_training(draw_robot(self.robot)) + askew(draw_camera(self.camera))
+        """The robot's and camera's values outside what training samples: name, value and that range."""
+        drawn = ((draw_robot(self.robot), robot_ranges), (draw_camera(self.camera), camera_ranges))
+        return [
+            f"{name} {getattr(one, name):.4g} ({low:.4g} to {high:.4g})"
+            for one, ranges in drawn
+            for name, (low, high) in ranges.items()
+            if not low <= getattr(one, name) <= high
+        ]
 
-    def columns(self) -> tuple[str, str, str]:
-        """Values of `twin.evaluation.trials.ROBOT_COLUMNS`."""
-        return str(self.robot), str(self.camera), " ".join(self.outside)
+    def columns(self, lighting: str) -> tuple[str, ...]:
+        """Values of `twin.evaluation.trials.SETUP_COLUMNS` in a weather."""
+        outside = " ".join(text.split()[0] for text in self.outside)
+        return str(self.place), day_number(lighting), str(self.robot), str(self.camera), outside
+
+    def __str__(self) -> str:
+        said = f"outside training's ranges: {', '.join(self.outside)}" if self.outside else "inside training's ranges"
+        return f"place {self.place}, robot {self.robot}, camera {self.camera}; {said}"
 
 
 def load_policy_file(path: Path) -> Policy:
@@ -85,73 +99,82 @@ def rasterizer(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, in
 
 
 class RealTest:
-    """One policy on one task of the real test."""
+    """A robot with its camera and judge on one task."""
 
     __test__ = False  # not a pytest class
 
-    def __init__(self, policy: Policy, task: str | RoadTask, setup: Setup | None = None) -> None:
+    def __init__(self, task: RoadTask, setup: Setup | None = None, size: tuple[int, int] = (160, 90)) -> None:
         """
         Args:
-            policy: Drives.
-            task: A task, or the name of one of the place's.
+            task: The task.
             setup: Place, robot and camera.
+            size: Width, height of pictures [px].
 
         Raises:
-            InputError: unknown task, place, robot or camera, or a task whose pictures are not the policy's.
+            InputError: no such place, robot or camera.
         """
-        self.policy, self.setup = policy, setup or Setup()
-        c = policy.control
-        if isinstance(task, str):
-            task = task_of_place(self.setup.place, task, c.speed, c.yaw_rate, c.control_timestep)
-        elif (task.size, task.stack) != (policy.size, policy.stack):
-            raise InputError(
-                f"task {task.name!r} has {task.stack} pictures of {task.size}; policy {policy.name} takes {policy.stack} "
-                f"of {policy.size}; write the task for this policy: twin export SCENE --policy RUN --task-file FILE"
-            )
-        self.task = task
+        self.task, self.setup, self.size = task, setup or Setup(), size
         self.robot = RealRobot(draw_robot(self.setup.robot), place_on_test_day(self.setup.place))
         self.camera = draw_camera(self.setup.camera)
-        self.judge = RealJudge(self.task)
+        self.judge = RealJudge(task)
 
     def reset(self, lighting: str, seed: int) -> RealCamera:
         """Puts the robot at the start of a trial and returns its camera; arguments as in `run_trial`."""
         start = self.task.sample_start(np.random.default_rng([seed, _START]))
         self.robot.set_pose(*start, np.random.default_rng([seed, _ROBOT]))
         self.judge.begin(*start[:2])
-        size = self.policy.size
-        raster = rasterizer(lighting, tuple(intrinsics_of(self.camera, size).tolist()), size, self.setup.place)
-        return RealCamera(raster, weather(lighting), self.camera, size, np.random.default_rng([seed, _CAMERA]))
+        raster = rasterizer(
+            lighting, tuple(intrinsics_of(self.camera, self.size).tolist()), self.size, self.setup.place
+        )
+        return RealCamera(raster, weather(lighting), self.camera, self.size, np.random.default_rng([seed, _CAMERA]))
 
-    def run_trial(self, lighting: str, seed: int, on_image: Callable[[Image], None] | None = None) -> Trial:
+    def step(self, v: float, yaw_rate: float) -> None:
+        """One control step under a command [m/s], [rad/s], within the task's limits, and the judge's look at it."""
+        robot, task = self.robot, self.task
+        robot.command(min(max(v, 0.0), task.speed), min(max(yaw_rate, -task.yaw_rate), task.yaw_rate))
+        robot.step(task.control_timestep)
+        self.judge.see(robot.pose[0], robot.pose[1], robot.tilt, robot.touched, robot.time)
+
+    def run_trial(
+        self, policy: Policy, lighting: str, seed: int, on_image: Callable[[Image], None] | None = None
+    ) -> Trial:
         """Drives one trial.
 
         Args:
+            policy: Takes pictures of this test's size.
             lighting: See `twin.reality.lighting.weather`.
             seed: Seed of all randomness in the trial.
             on_image: Called with every image (h, w, 3).
         """
-        policy, robot, judge = self.policy, self.robot, self.judge
-        camera = self.reset(lighting, seed)
-        width, height = policy.size
+        camera, judge = self.reset(lighting, seed), self.judge
+        width, height = self.size
         stack, steps = np.zeros((policy.stack, 3, height, width), np.uint8), 0
         while not judge.cause:
-            image = camera.capture(robot)
+            image = camera.capture(self.robot)
             if on_image:
                 on_image(image)
             newest = image.transpose(2, 0, 1)
             stack = np.concatenate([stack[1:], newest[None]]) if steps else np.repeat(newest[None], policy.stack, 0)
-            v, yaw_rate = policy.command(policy(stack.reshape(3 * policy.stack, height, width)))
-            self.drive(v, yaw_rate)
+            self.step(*policy.command(policy(stack.reshape(3 * policy.stack, height, width))))
             steps += 1
         return Trial(policy.name, self.task.name, lighting, seed, judge.cause, judge.progress, steps)
 
-    def drive(self, v: float, yaw_rate: float) -> None:
-        """One control step under a command [m/s], [rad/s], within the task's limits, and the judge's look at it."""
-        robot, task = self.robot, self.task
-        bounded = min(max(yaw_rate, -task.yaw_rate), task.yaw_rate)
-        robot.command(min(max(v, 0.0), task.speed), bounded)
-        robot.step(task.control_timestep)
-        self.judge.see(robot.pose[0], robot.pose[1], robot.tilt, robot.touched, robot.time)
+
+def task_for(policy: Policy, task: str | RoadTask, place: int) -> RoadTask:
+    """A task, or that of a name in a place, for a policy's speed and timing.
+
+    Raises:
+        InputError: no such task, or one with another control step than the policy's.
+    """
+    c = policy.control
+    if isinstance(task, str):
+        return task_of_place(place, task, c.speed, c.yaw_rate, c.control_timestep)
+    if task.control_timestep != c.control_timestep:
+        raise InputError(
+            f"task {task.name!r} has a control step of {task.control_timestep:g} s, policy {policy.name} one of "
+            f"{c.control_timestep:g} s; write the task's control_timestep anew, or give another policy"
+        )
+    return task
 
 
 def run(
@@ -197,7 +220,7 @@ def run(
         done = read_trials(table) if table.exists() else []
         known = {(*_key(one), one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
-            test = RealTest(policy, task, setup)
+            test = RealTest(task_for(policy, task, setup.place), setup, policy.size)
             for lighting in dict.fromkeys(lightings):
                 # Each weather has its own seeds; shared ones would repeat the same ten starts in every weather.
                 first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
@@ -205,11 +228,11 @@ def run(
                 missing = [seed for seed in seeds if (policy.name, test.task.name, lighting, seed) not in known]
                 with bar(f"{policy.name}, {test.task.name}, {lighting}", len(missing), "trial") as progress:
                     for seed in missing:
-                        done.append(_run_trial(test, lighting, seed, films))
-                        write_real_trials(done, table, out, twin_lighting, setup.columns())
+                        done.append(_run_trial(test, policy, lighting, seed, films))
+                        write_real_trials(done, table, out, twin_lighting, setup.columns)
                         progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
                         progress.update()
-        write_real_trials(done, table, out, twin_lighting, setup.columns())
+        write_real_trials(done, table, out, twin_lighting, setup.columns)
     return done
 
 
@@ -230,10 +253,10 @@ def _check_setup(setup: Setup, table: Path, record: Path) -> None:
     write_json(record, {**given, "outside_training": setup.outside, "robot_values": robot, "camera_values": camera})
 
 
-def _run_trial(test: RealTest, lighting: str, seed: int, films: Path | None) -> Trial:
+def _run_trial(test: RealTest, policy: Policy, lighting: str, seed: int, films: Path | None) -> Trial:
     """Drives one trial and films it if `films` is given."""
     frames: list[Image] = []
-    trial = test.run_trial(lighting, seed, frames.append if films else None)
+    trial = test.run_trial(policy, lighting, seed, frames.append if films else None)
     if films:
         _write_film(frames, films / f"{trial.policy.replace('/', '_')}_{trial.task}_{lighting}_{seed}.mp4")
     return trial

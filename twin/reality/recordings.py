@@ -1,4 +1,4 @@
-"""Recordings of the hidden robot, without poses of its camera.
+"""Recordings of a robot of the real test, without poses of its camera.
 
 A film of a drive along the filmed road, in a filmed lighting, lets `twin.align` estimate the camera's extrinsics. A
 photo in the weather of a trial lets `twin.relight` fit its lighting. A drive log lets `twin.align` identify the robot.
@@ -12,16 +12,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.options import Options
 from twin.errors import InputError
 from twin.geometry.images import write_image
 from twin.reality import SEED, true_world
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, write_video
-from twin.reality.lighting import WEATHER, Lighting
+from twin.reality.lighting import Lighting, weather
 from twin.reality.place_objects import DrivenLine
 from twin.reality.rasterizer import Rasterizer
-from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, place_on_test_day, shadow_range
+from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of, native_size
+from twin.reality.real_robot import RealRobot, draw_robot
+from twin.reality.real_test import Setup
+from twin.reality.trial_place import place_on_test_day, shadow_range
 from twin.runtime import track
 from twin.types import Array
 
@@ -35,7 +37,7 @@ _FPS = 4
 _CONTROL_STEP = 0.05  # [s]
 
 
-def write_film(path: Path, number: int = 0) -> None:
+def write_film(path: Path, setup: Setup) -> None:
     """Drives the robot down the road and writes a film by its camera, 4 frames per second as the robot is slow.
 
     Raises:
@@ -43,62 +45,52 @@ def write_film(path: Path, number: int = 0) -> None:
     """
     if path.suffix != ".mp4" or path.is_dir():
         raise InputError(f"{path}: expected a .mp4 file to write, such as robot.mp4")
-    husky = hidden_robot()
-    width, height = husky.params.camera_size
+    filmed = place_on_test_day(setup.place).lightings
+    robot, camera = robot_and_camera(setup, filmed.get(LIGHTING) or next(iter(filmed.values())))
     path.parent.mkdir(parents=True, exist_ok=True)
-    frames = round((_STATIONS[1] - _STATIONS[0]) / _SPEED * _FPS)
+    count = round((_STATIONS[1] - _STATIONS[0]) / _SPEED * _FPS)
+    width, height = native_size()
     plan = replace(FilmingPlan(), width=width, height=height, fps=_FPS, crf=16)
-    write_video(track(_frames(frames, number), "film from the robot", unit="frame", total=frames), plan, path)
+    frames = _frames(robot, camera, place_on_test_day(setup.place).route, count)
+    write_video(track(frames, "film from the robot", unit="frame", total=count), plan, path)
 
 
-def write_photo(weather: str, path: Path, number: int = 0) -> None:
+def write_photo(lighting: str, path: Path, setup: Setup) -> None:
     """Writes a photo for `twin.relight` from the robot's start pose.
 
     Raises:
         InputError: unknown weather, or `path` is not a .png or .jpg file.
     """
-    if weather not in WEATHER:
-        raise InputError(f"lighting {weather!r}: reality's are {', '.join(WEATHER)}")
+    light = weather(lighting)
     if path.suffix not in (".png", ".jpg") or path.is_dir():
         raise InputError(f"{path}: expected a .png or .jpg file to write, such as dawn.png")
-    road, camera = _road_and_camera(WEATHER[weather], number)
-    _set_start_pose(road, road.place.route)
+    robot, camera = robot_and_camera(setup, light)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_image(path, camera.capture(road.physics.camera_to_world, 0.0))
+    write_image(path, camera.capture(robot))
 
 
-def _road_and_camera(light: Lighting, number: int) -> tuple[TrueRoad, RealCamera]:
-    """The road, and the robot's camera at its full image size."""
-    husky = hidden_robot()
-    road, size = _true_road(number), husky.params.camera_size
-    intrinsics = road.intrinsics(size)
-    model = true_world.world_spec(light, road.place).compile()
-    raster = Rasterizer(model, intrinsics, size, shadow_range(road.place))
-    return road, RealCamera(raster, light, husky, intrinsics, size, np.random.default_rng([SEED, 43]))
+def robot_and_camera(setup: Setup, light: Lighting) -> tuple[RealRobot, RealCamera]:
+    """The robot at rest at the first station of `_STATIONS`, and its camera at the full image size."""
+    place, numbers, size = place_on_test_day(setup.place), draw_camera(setup.camera), native_size()
+    robot = RealRobot(draw_robot(setup.robot), place)
+    set_on_line(robot, place.route, _STATIONS[0])
+    model = true_world.world_spec(light, place).compile()
+    raster = Rasterizer(model, intrinsics_of(numbers, size), size, shadow_range(place))
+    return robot, RealCamera(raster, light, numbers, size, np.random.default_rng([SEED, 43]))
 
 
-def _set_start_pose(road: TrueRoad, line: DrivenLine) -> None:
-    """Puts the robot at the first station of `_STATIONS`."""
-    start = line.at(_STATIONS[0])
-    road.physics.robot.set_pose(float(start[0]), float(start[1]), float(line.heading(_STATIONS[0])))
+def set_on_line(robot: RealRobot, line: DrivenLine, station: float) -> None:
+    """Puts the robot at rest on a line at a station [m]."""
+    x, y = line.at(station).tolist()
+    robot.set_pose(x, y, float(line.heading(station)), np.random.default_rng([SEED, 45]))
 
 
-def _true_road(number: int) -> TrueRoad:
-    return TrueRoad("whole" if number else "straight", hidden_robot(), Options(pixels=False), number)
-
-
-def _frames(count: int, number: int) -> Iterator[NDArray[np.uint8]]:
-    filmed = place_on_test_day(number).lightings
-    light = filmed.get(LIGHTING) or next(iter(filmed.values()))
-    road, camera = _road_and_camera(light, number)
-    line = road.place.route
-    _set_start_pose(road, line)
-    physics = road.physics.robot
-    for i in range(count):
-        yield camera.capture(road.physics.camera_to_world, i / _FPS)
+def _frames(robot: RealRobot, camera: RealCamera, line: DrivenLine, count: int) -> Iterator[NDArray[np.uint8]]:
+    for _ in range(count):
+        yield camera.capture(robot)
         for _ in range(round(1.0 / _FPS / _CONTROL_STEP)):
-            physics.command(_SPEED, _steering(line, physics.planar_pose))
-            physics.step(_CONTROL_STEP)
+            robot.command(_SPEED, _steering(line, np.array(robot.pose)))
+            robot.step(_CONTROL_STEP)
 
 
 def _steering(line: DrivenLine, pose: NDArray[np.float64]) -> float:
@@ -129,7 +121,7 @@ _WHEEL_NOISE, _ACCELERATION_NOISE = 0.03, 0.08  # [rad/s], [m/s²]
 _MAX_TRIES = 40
 
 
-def record_log(duration: float, number: int = 0) -> dict[str, Array]:
+def record_log(duration: float, setup: Setup) -> dict[str, Array]:
     """A drive log of `duration` [s] on the straight segment: columns by name, each of shape (rows,).
 
     Random joystick commands drive forwards, backwards and turning, never off the asphalt. The log has commands, wheel
@@ -138,23 +130,20 @@ def record_log(duration: float, number: int = 0) -> dict[str, Array]:
     if not duration >= 10.0:
         raise InputError(f"duration = {duration:g} s; expected at least 10")
     rng = np.random.default_rng([SEED, 42])
-    road = _true_road(number)
-    physics, line = road.physics.robot, road.place.route
-    start = line.at(12.0)
-    physics.set_pose(float(start[0]), float(start[1]), float(line.heading(12.0)))
-    first = physics.planar_pose
+    line = place_on_test_day(setup.place).route
+    robot = RealRobot(draw_robot(setup.robot), place_on_test_day(setup.place))
+    set_on_line(robot, line, 12.0)
+    first = np.array(robot.pose)
     command, until, rows = np.zeros(2), 1.0, []
     for i in range(round(duration / _LOG_PERIOD)):
-        now = i * _LOG_PERIOD
-        if now >= until or not _stays_inside(line, physics.planar_pose, command, 0.6):
+        now, pose = i * _LOG_PERIOD, np.array(robot.pose)
+        if now >= until or not _stays_inside(line, pose, command, 0.6):
             hold = float(rng.uniform(*_HOLD))
-            command, until = _sample_command(rng, line, physics.planar_pose, hold), now + hold
+            command, until = _sample_command(rng, line, pose, hold), now + hold
         if i % _COMMAND_ROWS == 0:
-            physics.command(*command.tolist())
-        wheels = physics.wheel_velocity
-        rows.append((now, *command, wheels[[0, 2]].mean(), wheels[[1, 3]].mean(), *physics.planar_pose))
-        rows[-1] += tuple(physics.accelerometer[:2])
-        physics.step(_LOG_PERIOD)
+            robot.command(*command.tolist())
+        rows.append((now, *command, *robot.wheel_speeds, *pose, *robot.acceleration))
+        robot.step(_LOG_PERIOD)
     table = np.array(rows)
     table[:, 7] = np.unwrap(table[:, 7])
     noise = (_WHEEL_NOISE, _WHEEL_NOISE, _POSITION_NOISE, _POSITION_NOISE, _YAW_NOISE)

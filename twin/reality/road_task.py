@@ -72,7 +72,7 @@ class RoadTask:
             else f"start {self.start:g} m and goal {self.goal:g} m on a line of {knots[-1]:.2f} m"
             if not -1e-6 <= self.start < self.goal <= knots[-1] + 1e-6
             else "half width, time limit, speed, yaw rate and control step; expected all above 0"
-            if min(self.half_width, self.time_limit, self.speed, self.yaw_rate, self.control_timestep) <= 0.0
+            if not min(self.half_width, self.time_limit, self.speed, self.yaw_rate, self.control_timestep) > 0.0
             else ""
         )
         if wrong:

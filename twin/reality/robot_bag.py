@@ -1,13 +1,12 @@
-"""A ROS 2 bag of one trial of the hidden robot, as a real Husky would record it, for `twin.trial`.
+"""A ROS 2 bag of one trial of the real test, as a real Husky would record it, for `twin.trial`.
 
-The robot runs `twin_policy`'s pilot on JPEG pictures of its native camera, or, without a policy, follows the route. The
+The robot runs `twin_policy`'s pilot on JPEG pictures of its camera, or, without a policy, follows the line. The
 bag has those pictures, camera_info, commands, and poses such as RTK gives them, in a frame of their own. Recording goes
 on for a moment after the trial's end.
 """
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +14,22 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from twin.env.drivers import PurePursuit
-from twin.env.options import STEERING, TWIST, parse_options
-from twin.env.task import CAMERA, control
 from twin.errors import InputError
 from twin.evaluation.trials import Trial
 from twin.files import remove
-from twin.learn.policy import Control
-from twin.reality import SEED, true_world
-from twin.reality.lighting import WEATHER
-from twin.reality.rasterizer import Rasterizer
-from twin.reality.real_robot import RealCamera, TrueRoad, hidden_robot, shadow_range
+from twin.reality import SEED
+from twin.reality.lighting import weather_index
+from twin.reality.real_camera import intrinsics_of, native_size
+from twin.reality.real_robot import follow
+from twin.reality.real_test import RealTest, Setup
+from twin.reality.road_task import task_of_place
 from twin.runtime import bar
 from twin.types import Array
 from twin_policy import Camera, CompressedPicture, Limits, OnnxPolicy, Pilot
 
 _START = 1_700_000_000  # [s] time of the first trial
-_APART = 1000  # [s] between the starts of two trials
+_APART = 400  # [s] between the starts of two trials
+_WEATHERS, MOST_SEED = 1000, 999  # upper bounds, so that ROS's seconds of 32 bits suffice
 _WIDTH = 640  # [px] of the camera's stream
 _QUALITY = 92  # of JPEG
 _POSITION_NOISE, _YAW_NOISE = 0.01, 0.003  # [m], [rad]
@@ -45,16 +43,18 @@ _TOPICS = {
 }
 
 
-def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, seed: int = 0, number: int = 0) -> Trial:
+def write_robot_bag(
+    path: Path, policy: Path | None, task: str, lighting: str, seed: int = 0, setup: Setup | None = None
+) -> Trial:
     """Drives one trial and records it; returns its true outcome.
 
     Args:
         path: Folder of the bag to write.
-        policy: A policy folder with policy.onnx; None: the robot follows the route.
-        task: See `TrueRoad`.
-        lighting: One of `WEATHER`.
+        policy: A policy folder with policy.onnx; None: the robot follows the line.
+        task: Name of one of the place's tasks.
+        lighting: See `twin.reality.lighting.weather`.
         seed: Of all randomness.
-        number: Number of the place.
+        setup: Place, robot and camera.
 
     Raises:
         InputError: rosbags is not installed, the path exists, or an unknown policy, task or lighting.
@@ -65,28 +65,23 @@ def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, s
         raise InputError(f"{path}: writing a ROS 2 bag needs rosbags; pip install 'twin[ros]'") from None
     if path.exists():
         raise InputError(f"{path} exists; give another --out, or delete it")
-    if lighting not in WEATHER:
-        raise InputError(f"unknown lighting {lighting!r}; the real test offers {', '.join(WEATHER)}")
-    robot = hidden_robot()
-    onnx, driving = None, Control(TWIST)
+    weather_number, setup = weather_index(lighting), setup or Setup()
+    if not 0 <= seed <= MOST_SEED or weather_number >= _WEATHERS:
+        raise InputError(f"seed {seed} under {lighting}; expected a seed from 0 to {MOST_SEED}, and a day up to 980")
+    onnx, limits = None, (1.0, 1.0, 0.1)
     if policy:
         try:
             onnx = OnnxPolicy(policy)
         except ValueError as error:
             raise InputError(str(error)) from None
-        driving = Control(onnx.action, onnx.speed, onnx.max_yaw_rate, onnx.timestep)
-    road = TrueRoad(task, robot, parse_options({**asdict(driving), "pixels": False}), number)
-    drive, physics = road.drive, road.physics
-    environment = control.Environment(physics, drive, control_timestep=driving.control_timestep)
-    drive.seed(seed)
-    environment.reset()
-    size = _WIDTH, round(_WIDTH * robot.params.camera_size[1] / robot.params.camera_size[0])
-    fx, fy, cx, cy = road.intrinsics(size).tolist()
-    model = true_world.world_spec(WEATHER[lighting], road.place).compile()
-    raster = Rasterizer(model, np.array((fx, fy, cx, cy)), size, shadow_range(road.place))
-    camera = RealCamera(raster, WEATHER[lighting], robot, np.array((fx, fy, cx, cy)), size, drive.rng(CAMERA))
+        limits = onnx.speed, onnx.max_yaw_rate, onnx.timestep
+    size = _WIDTH, round(_WIDTH * native_size()[1] / native_size()[0])
+    test = RealTest(task_of_place(setup.place, task, *limits), setup, size)
+    robot, judge, timestep = test.robot, test.judge, test.task.control_timestep
+    camera = test.reset(lighting, seed)
+    fx, fy, cx, cy = intrinsics_of(test.camera, size).tolist()
     rng, messages = np.random.default_rng([SEED, 44, seed]), BagMessages()
-    begin = now = (_START + _APART * (list(WEATHER).index(lighting) + len(WEATHER) * seed)) * 10**9
+    begin = now = (_START + _APART * (weather_number + _WEATHERS * seed)) * 10**9
 
     def clock() -> int:
         return now
@@ -94,10 +89,9 @@ def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, s
     pilot = Pilot(onnx, Limits(), None, clock, clock) if onnx else None
     if pilot:
         pilot.set_camera(Camera(size, (fx, fy, cx, cy)))
-    pursuit = PurePursuit(road.world.route, driving.speed, driving.yaw_rate, road.segment.start)
-    steps, left = 0, round(_AFTER / driving.control_timestep)
+    steps, left = 0, round(_AFTER / timestep)
     path.parent.mkdir(parents=True, exist_ok=True)
-    limit = round(drive.time_limit / driving.control_timestep) + left
+    limit = round(test.task.time_limit / timestep) + left
     with contextlib.ExitStack() as stack:
         unfinished = stack.enter_context(contextlib.ExitStack())  # what Ctrl-C leaves behind is no bag
         unfinished.callback(remove, path)
@@ -109,31 +103,31 @@ def write_robot_bag(path: Path, policy: Path | None, task: str, lighting: str, s
             writer.write(topics[kind], now, messages.store.serialize_cdr(message, _TOPICS[kind][1]))
 
         while left:
-            now = begin + round(physics.time() * 1e9)
-            shutter = now - round(robot.params.camera_latency * 1e9)
-            image = camera.capture(physics.camera_to_world, physics.time())
+            now = begin + round(robot.time * 1e9)
+            shutter = now - round(test.camera.latency * 1e9)
+            image = camera.capture(robot)
             jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
             write("camera", messages.camera_info((fx, fy, cx, cy), size, shutter))
-            write("pose", messages.odometry(_measured(physics.base_to_world, rng), now))
+            write("pose", messages.odometry(_measured(robot.base_to_world(robot.time), rng), now))
             write("picture", messages.jpeg(jpeg, shutter))
             if pilot:
                 given = pilot.picture(CompressedPicture(jpeg), shutter)
                 v, yaw_rate = given.v, given.yaw_rate
             else:
-                pursuit.update(physics.planar_pose)
-                v, yaw_rate = pursuit.command(physics.planar_pose)
+                v = test.task.speed
+                yaw_rate = follow(test.task.line, robot.pose, judge.station, v, test.task.yaw_rate)
             write("command", messages.command(v, yaw_rate, now))
-            if drive.cause:
-                physics.robot.command(v, yaw_rate)
-                physics.robot.step(driving.control_timestep)
+            if judge.cause:
+                robot.command(v, yaw_rate)
+                robot.step(timestep)
                 left -= 1
             else:
-                environment.step(np.array([yaw_rate] if driving.action == STEERING else [v, yaw_rate]))
+                test.step(v, yaw_rate)
                 steps += 1
             progress.update()
         unfinished.pop_all()
     name = onnx.name if onnx else "route follower"
-    return Trial(name, drive.segment.name, lighting, seed, drive.cause, drive.progress, steps)
+    return Trial(name, task, lighting, seed, judge.cause, judge.progress, steps)
 
 
 def _measured(base_to_world: Array, rng: np.random.Generator) -> Array:
