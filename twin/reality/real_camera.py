@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
@@ -354,7 +355,7 @@ def dirt_mask(camera: HiddenCamera, size: tuple[int, int]) -> NDArray[np.float32
         u = (x - at[0]) * np.cos(angle) + (y - at[1]) * np.sin(angle)
         v = (y - at[1]) * np.cos(angle) - (x - at[0]) * np.sin(angle)
         distance = np.sqrt(u**2 + (v / stretch) ** 2) / radius
-        clear *= 1.0 - np.float32(opacity) / (1.0 + np.exp(6.0 * (distance - 1.0))).astype(np.float32)
+        clear *= (1.0 - opacity * expit(6.0 * (1.0 - distance))).astype(np.float32)
     return (1.0 - clear)[..., None]
 
 
