@@ -1,40 +1,43 @@
-"""The real test: whose robot, which road, which light, and that nothing but pictures goes in or rows come out."""
+"""The real test: road, light, numbers; nothing but pictures goes in, and nothing but rows come out."""
 
 import ast
+import csv
 import hashlib
-from dataclasses import asdict, replace
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import av
 import mujoco
 import numpy as np
 import pytest
-from dm_control.rl import control
-from scipy.spatial.transform import Rotation
 
 from twin.config import MjcfConfig
-from twin.env.drivers import RouteDriver
 from twin.env.options import parse_options
-from twin.env.route_segments import STANDARD_TASKS
+from twin.env.route_segments import STANDARD_TASKS, find_task
+from twin.env.task_file import task_table
 from twin.errors import InputError
-from twin.evaluation.trials import Cell, read_results, read_trials
+from twin.evaluation.trials import SETUP_COLUMNS, Cell, read_results, read_trials
 from twin.geometry.images import read_image
 from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.learn.policy_network import Architecture
-from twin.mjcf.world import arc_lengths, point_at
+from twin.mjcf.world import World, arc_lengths, point_at
 from twin.reality import place as places
-from twin.reality import real_robot, real_test, recordings
+from twin.reality import real_test, recordings
 from twin.reality.__main__ import main
 from twin.reality.centerline import RoadLine
-from twin.reality.lighting import LIGHTINGS, WEATHER
-from twin.reality.real_robot import HiddenRobot, hidden_robot
-from twin.reality.real_test import RealTest
-from twin.robot import HuskyParams
+from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index
+from twin.reality.real_camera import native_size
+from twin.reality.real_robot import follow
+from twin.reality.real_test import RealTest, Setup, task_for
+from twin.reality.road_task import CAMPUS_TASKS, parse_task, task_of_place
+from twin.reality.trial_place import place_on_test_day, true_route
 from twin.runtime import exclusive_lock
 from twin.sysid.logs import read_log
 
 ROOT = Path(__file__).parents[1]
-STEERING = parse_options({"action": "steering", "pixels": False})
 NARROW = Architecture(convolutions=((2, 8, 8),), features=2, hidden=(2,))
 
 
@@ -47,6 +50,10 @@ def steering(yaw_rate: float, seen: list | None = None) -> Policy:
         return np.full((len(stacks), 1), yaw_rate, np.float32)
 
     return Policy("constant", act, Control())
+
+
+def straight(setup: Setup | None = None) -> RealTest:
+    return RealTest(task_of_place(0, "straight"), setup)
 
 
 def written(folder: Path, yaw_rate: float) -> Path:
@@ -66,52 +73,79 @@ class Grey:
 
 @pytest.fixture
 def gray(monkeypatch):
-    monkeypatch.setattr(real_test, "_rasterizer", lambda *_: Grey())
+    monkeypatch.setattr(real_test, "rasterizer", lambda *_: Grey())
 
 
-# ---- robot, road, light
+# ---- independence
 
 
-def test_the_robot_is_one_and_another_than_the_published():
-    mine, published = asdict(hidden_robot().params), asdict(HuskyParams())
-    assert hidden_robot() == hidden_robot()
-    for name in ("payload_mass", "friction", "wheel_radius", "servo_lag", "command_latency", "camera_latency"):
-        assert mine[name] != published[name]
-    assert (
-        hidden_robot().camera.vibration > 0.0
-        and hidden_robot().exposure_drift > 0.0
-        and hidden_robot().camera.shutter > 0.0
+def test_nothing_leaks():
+    """No module outside `twin/reality` imports from it: robot, weather, road and trials belong to the test alone."""
+    for path in (ROOT / "twin").rglob("*.py"):
+        if path.parent.name == "reality":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+            module = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
+            assert not [name for name in names if f"{module}.{name}".startswith("twin.reality")], path
+
+
+FOUNDATIONS = {"errors", "types", "files", "robot", "config", "runtime", "warp_runtime", "geometry"}
+"""Rooms of `twin` below the pipeline: files, messages, settings, geometry of cameras."""
+TABLES = {"evaluation", "evaluation.trials", "evaluation.statistics"}
+"""The format of tables of trials."""
+LOADER = {"learn", "learn.policy", "learn.policy_network"}
+"""The loader of policy files."""
+
+
+def test_the_real_test_runs_without_the_twin():
+    """A trial, the recordings and the judge load only foundations, the loader of policies and tables of trials."""
+    code = (
+        "import sys\n"
+        "from twin.learn.policy import Control, Policy\n"
+        "import numpy as np\n"
+        "from twin.reality import real_test, recordings, robot_bag\n"
+        "class Grey:\n"
+        "    def __call__(self, pose):\n"
+        "        return np.full((90, 160, 3), 0.4, np.float32), np.full((90, 160), 5.0, np.float32)\n"
+        "real_test.rasterizer = lambda *_: Grey()\n"
+        "policy = Policy('left', lambda stacks: np.full((len(stacks), 1), 0.9, np.float32), Control())\n"
+        "test = real_test.RealTest(real_test.task_for(policy, 'straight', 0))\n"
+        "assert test.run_trial(policy, 'rain', 1).cause == 'out_of_bounds'\n"
+        "print(*sys.modules)"
     )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env)
+    loaded = {name.removeprefix("twin.") for name in done.stdout.split() if name.startswith("twin.")}
+    own = {name for name in loaded if name.split(".")[0] == "reality"}
+    others = {name for name in loaded - own if name.split(".")[0] not in FOUNDATIONS}
+    assert len(own) > 15 and others == TABLES | LOADER
+    assert "dm_control" not in done.stdout
 
 
-def test_the_same_commands_lead_elsewhere():
-    """With the published robot on the same road: the training side cannot know where reality's goes."""
-    ends = []
-    for one in (hidden_robot(), HiddenRobot(HuskyParams(), (0.0, 0.0, 0.0), hidden_robot().camera, 0.0)):
-        physics = real_robot.TrueRoad("straight", one, STEERING).physics.robot
-        physics.set_pose(10.0, 0.0, 0.0)
-        for k in range(40):
-            physics.command(0.8, 0.6 if k < 20 else -0.6)
-            physics.step()
-        ends.append(physics.planar_pose)
-    assert np.linalg.norm(ends[0][:2] - ends[1][:2]) > 0.05
+# ---- road, light
 
 
 def test_tasks_are_the_twins():
     """Straight 30 m and right turn 60 m of the filmed path, which is nowhere far from the road's centre."""
-    for task in STANDARD_TASKS:
-        one = real_robot.TrueRoad(task, hidden_robot(), STEERING)
-        assert one.segment.length == pytest.approx({"straight": 30.0, "right_turn": 60.0}[task], abs=1.0)
-        assert one.drive.half_width == MjcfConfig().half_width
-    line = real_robot.true_route()
+    line = true_route()
+    world = World(line, MjcfConfig().half_width, (0.0, 0.0, 0.0, 0.0), Path())
+    options = parse_options({"pixels": False, "action": "steering"})
+    for name in CAMPUS_TASKS:
+        theirs = parse_task(task_table(world, find_task(name, world), options))
+        mine = task_of_place(0, name)
+        for field, value in vars(mine).items():
+            same = value == theirs.name if field == "name" else np.allclose(getattr(theirs, field), value, atol=1e-3)
+            assert same, (name, field)
+    assert set(STANDARD_TASKS) < set(CAMPUS_TASKS)
     assert arc_lengths(line)[-1] == pytest.approx(60.0, abs=1.0)
     assert np.abs(places.build().route.project(line[:, :2])[1]).max() < 0.35
 
 
 def test_the_corridor_is_free_and_a_drive_along_it_arrives():
     """The robot's width beyond the corridor, nothing solid stands; who knows the way reaches the goal."""
-    points = point_at(real_robot.true_route()[:, :2], np.arange(0.0, 60.0, 0.1))
-    for obj in real_robot.place_on_test_day().objects:
+    points = point_at(true_route()[:, :2], np.arange(0.0, 60.0, 0.1))
+    for obj in place_on_test_day().objects:
         for solid in obj.solids:
             c, s = np.cos(solid.yaw), np.sin(solid.yaw)
             off = (points - solid.center[:2]) @ np.array([[c, -s], [s, c]])
@@ -119,14 +153,29 @@ def test_the_corridor_is_free_and_a_drive_along_it_arrives():
             square = np.linalg.norm(np.maximum(np.abs(off) - solid.half[:2], 0.0), axis=1)
             distance = (round_one if solid.kind == "cylinder" else square).min()
             assert distance > MjcfConfig().half_width + 0.35, obj.name
-    for task in STANDARD_TASKS:
-        one = real_robot.TrueRoad(task, hidden_robot(), STEERING)
-        environment = control.Environment(one.physics, one.drive, control_timestep=0.1)
-        one.drive.seed(3)
-        step, driver = environment.reset(), RouteDriver()
-        while not step.last():
-            step = environment.step(driver(environment, step))
-        assert one.drive.cause == "goal"
+    for name, number in (("straight", 0), ("right_turn", 2), ("right_turn", 11)):
+        test = RealTest(task_of_place(0, name), Setup(robot=number))
+        assert follow_the_line(test).cause == "goal"
+
+
+def follow_the_line(test: RealTest, speed: float = 1.0):
+    """Drives a test by pure pursuit, without pictures; returns the judge."""
+    start = test.task.sample_start(np.random.default_rng(3))
+    test.robot.set_pose(*start, np.random.default_rng(4))
+    test.judge.begin(*start[:2])
+    while not test.judge.cause:
+        test.step(speed, follow(test.task.line, test.robot.pose, test.judge.station, speed, test.task.yaw_rate))
+    return test.judge
+
+
+def test_a_robot_that_drives_into_a_house_has_touched_it():
+    test = straight()
+    boxes = [one for obj in place_on_test_day().objects for one in obj.solids if one.kind == "box"]
+    one = max(boxes, key=lambda box: box.half[0])
+    test.robot.set_pose(*one.center[:2].tolist(), 0.0, np.random.default_rng(0))
+    test.judge.begin(*one.center[:2].tolist())
+    test.step(0.0, 0.0)
+    assert test.judge.cause == "collision"
 
 
 def test_small_things_have_moved_and_nothing_else():
@@ -155,86 +204,23 @@ def test_some_days_are_hazy_and_some_are_clear():
     assert np.all((sight[hazy] >= 60.0) & (sight[hazy] <= 400.0))
 
 
-def test_the_camera_is_mounted_askew():
-    """By the hidden angles about its axes right, up and back, beside one that is mounted as its parameters say."""
-    mine = hidden_robot()
-    assert np.abs(mine.camera_misalignment).max() > 0.1
-    seen = []
-    for one in (mine, replace(mine, camera_misalignment=(0.0, 0.0, 0.0))):
-        physics = real_robot.TrueRoad("straight", one, STEERING).physics
-        physics.robot.set_pose(10.0, 0.0, 0.3)
-        seen.append(physics.camera_to_world[:3, :3] @ np.diag([1.0, -1.0, -1.0]))  # axes right, up, back
-    turned = Rotation.from_matrix(seen[1].T @ seen[0]).as_euler("XYZ", degrees=True)
-    assert turned == pytest.approx(np.array(mine.camera_misalignment), abs=1e-4)
+def test_every_number_is_a_day_and_other_weathers_keep_their_seeds():
+    assert weather("day_15") == WEATHER["day_15"] and weather("day_300") != weather("day_301")
+    names = [*WEATHER, "day_16", "day_300"]
+    assert [weather_index(name) for name in names] == [*range(len(WEATHER)), len(WEATHER), 304]
+    for name in ("day_0", "day_01", "day_x", "noon"):
+        with pytest.raises(InputError, match=f"no lighting '{name}' in the real test; expected one of dawn"):
+            weather(name)
 
 
-class Plain:
-    """Stands for a raster before which everything is of one color and equally far [m]; notes from where it is asked."""
-
-    def __init__(self, color: np.ndarray, distance: float) -> None:
-        self._color, self._distance, self.poses = color, distance, []
-
-    def __call__(self, pose):
-        self.poses.append(pose)
-        return np.full((90, 160, 3), self._color, np.float32), np.full((90, 160), self._distance, np.float32)
-
-
-@pytest.fixture
-def images(monkeypatch):
-    """What the robot's camera sees of a raster in a weather at some times, standing still at the start of a trial."""
-    policy = RealTest(steering(0.0), "straight")
-
-    def see(raster: Plain, lighting: str, times: np.ndarray) -> np.ndarray:
-        monkeypatch.setattr(real_test, "_rasterizer", lambda *_: raster)
-        camera = policy.reset(lighting, 1)
-        still = policy.road.physics.camera_to_world
-        return np.stack([camera.capture(still, time) for time in times.tolist()])
-
-    return see
-
-
-@pytest.mark.parametrize("distance", [5.0, 60.0])
-def test_haze_veils_what_the_robot_sees(images, monkeypatch, distance):
-    """A dark wall in the haze looks like a wall in clear air that is as bright as wall and haze together."""
-    light, dark, now = WEATHER["haze"], np.full(3, 0.1), np.zeros(1)
-    seen = images(Plain(dark, distance), "haze", now).astype(float)
-    left = np.exp(-distance / light.visibility)
-    monkeypatch.setitem(WEATHER, "haze", replace(light, visibility=np.inf))
-    veiled = images(Plain(left * dark + (1.0 - left) * np.array(light.horizon), distance), "haze", now).astype(float)
-    assert np.abs(seen - veiled).max() <= 1.0
-    assert seen.mean() > images(Plain(dark, distance), "haze", now).mean() + 10.0
-
-
-def test_the_camera_shakes_on_the_road(images):
-    """A robot that stands still looks in another direction in every picture, from the same place."""
-    wall = Plain(np.full(3, 0.4), 5.0)
-    images(wall, "rain", np.arange(0.0, 20.0, 0.1))
-    poses = np.array(wall.poses)
-    assert np.ptp(poses[:, :3, 3], axis=0).max() < 1e-9
-    turns = Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).as_rotvec(degrees=True)
-    assert turns.std(0).min() > 0.1
-    assert turns.std(0) == pytest.approx(np.full(3, hidden_robot().camera.vibration), rel=0.3)
-
-
-def test_the_cameras_exposure_drifts(images):
-    """Of a wall as gray as ever, pictures get brighter and darker over seconds, not from one to the next."""
-    times = np.arange(0.0, 590.0, 3.0)
-    seen = images(Plain(np.full(3, 0.2), 5.0), "afternoon", times).mean((1, 2, 3))
-    assert np.log(seen).std() > 0.04
-    assert np.log(seen).std() == pytest.approx(hidden_robot().exposure_drift, rel=0.2)
-    soon = images(Plain(np.full(3, 0.2), 5.0), "afternoon", times[:20] + 0.1).mean((1, 2, 3))
-    assert np.abs(np.log(soon / seen[:20])).max() < 0.3 * np.ptp(np.log(seen))
-
-
-def test_nothing_leaks():
-    """No module outside `twin/reality` imports from it: robot, weather, road and trials belong to the test alone."""
-    for path in (ROOT / "twin").rglob("*.py"):
-        if path.parent.name == "reality":
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
-            module = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
-            assert not [name for name in names if f"{module}.{name}".startswith("twin.reality")], path
+def test_drawn_days_change_a_picture_by_10_gray_levels_or_more():
+    """Rendered from one pose of the true road by one camera."""
+    test, seen = straight(), []
+    for name in ("evening", "day_6", "day_9"):
+        camera = test.reset(name, 1)
+        seen.append(camera.capture(test.robot).astype(float))
+    apart = [np.abs(one - other).mean() for k, one in enumerate(seen) for other in seen[:k]]
+    assert min(apart) > 9.5 and np.mean(apart) > 20.0, apart
 
 
 # ---- trials
@@ -242,7 +228,7 @@ def test_nothing_leaks():
 
 def test_a_policy_sees_pictures_and_nothing_else(gray):
     seen: list = []
-    trial = RealTest(steering(0.9, seen), "straight").run_trial("rain", 1)
+    trial = straight().run_trial(steering(0.9, seen), "rain", 1)
     assert trial.cause == "out_of_bounds" and len(seen) == trial.steps
     assert all(stacks.shape == (1, 12, 90, 160) and stacks.dtype == np.uint8 for stacks in seen)
     assert np.array_equal(seen[0][0, :3], seen[0][0, 9:])  # at first the first picture four times
@@ -254,7 +240,7 @@ def test_trials_repeat_and_differ_by_seed():
     sums, ends = [], []
     for seed in (1, 1, 2):
         frames: list = []
-        ends.append(RealTest(steering(0.9), "straight").run_trial("evening", seed, frames.append))
+        ends.append(straight().run_trial(steering(0.9), "evening", seed, frames.append))
         sums.append(hashlib.sha256(np.stack(frames).tobytes()).hexdigest())
     assert sums[0] == sums[1] != sums[2] and ends[0] == ends[1]
     assert ends[0].progress != ends[2].progress
@@ -263,13 +249,11 @@ def test_trials_repeat_and_differ_by_seed():
 
 def test_the_seed_alone_decides_where_a_trial_starts(gray):
     """Not the trials before it, nor the policy, nor the light: policies are compared pair by pair."""
-    one, starts = RealTest(steering(0.0), "straight"), []
-    environment = one._environment
+    one, starts = straight(), []
     for seed, lighting in ((5, "rain"), (6, "dawn"), (5, "haze")):
-        one.run_trial(lighting, seed)
-        one.road.drive.seed(seed)
-        environment.reset()
-        starts.append(one.road.physics.planar_pose)
+        one.run_trial(steering(0.5), lighting, seed)
+        one.reset(lighting, seed)
+        starts.append(one.robot.pose)
     assert np.array_equal(starts[0], starts[2]) and not np.array_equal(starts[0], starts[1])
 
 
@@ -299,9 +283,48 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     assert [film.name for film in (tmp_path / "films").iterdir()] == [f"left_straight_rain_{third}.mp4"]
     after = out.with_name("results_trials.csv").read_text()
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
+    with pytest.raises(InputError, match=r"is of \{'place': 0, 'robot': 0.*; this is .*give another --out"):
+        real_test.run([left], "straight", ["rain"], 4, out, setup=Setup(robot=1))
+    out.with_name("results_setup.json").unlink()
+    with pytest.raises(InputError, match="was driven in the reality of version 1; this is 2; give another --out"):
+        real_test.run([left], "straight", ["rain"], 4, out)
+
+
+def test_another_file_under_a_known_name_is_refused(gray, tmp_path):
+    left = written(tmp_path / "left", 0.9)
+    real_test.run([left], "straight", ["rain"], 1, tmp_path / "results.csv")
     written(left, 0.5)
     with pytest.raises(InputError, match="another file under the name 'left'"):
-        real_test.run([left], "straight", ["rain"], 4, out)
+        real_test.run([left], "straight", ["rain"], 2, tmp_path / "results.csv")
+
+
+def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
+    """Place, day, robot, camera, and what of them lies outside training, which is printed as well."""
+    left, out = written(tmp_path / "left", 0.9), tmp_path / "results.csv"
+    given = ["drive", "--policy", str(left), "--task", "whole", "--trials", "1", "--out", str(out)]
+    numbers = ["--place", "3", "--robot", "2", "--camera", "5", "--day", "21", "--lightings", "rain"]
+    assert main([*given, *numbers]) == 0
+    said = capsys.readouterr().out
+    assert "place 3, robot 2, camera 5; outside training's ranges: payload 23.97 (0 to 20), wheel_radius 0.9741" in said
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["lighting"] for row in rows] == ["rain", "day_21"]
+    outside = "payload wheel_radius wheel_difference shift_left turn_up"
+    for row, day in zip(rows, ("", "21"), strict=True):
+        assert [row[name] for name in SETUP_COLUMNS] == ["3", day, "2", "5", outside]
+    record = json.loads((tmp_path / "results_setup.json").read_text())
+    assert (record["place"], record["robot"], record["camera"]) == (3, 2, 5) and record["version"] == 2
+    assert record["robot_values"]["payload"] == pytest.approx(23.97, abs=0.01)
+    assert read_results(out, [Cell("left", "whole", "held-out+randomised", 10, 5)])
+    assert main([*given, "--place", "3", "--robot", "-1"]) == 2
+    assert "robot -1: expected 0 or more" in capsys.readouterr().err
+
+
+def test_a_task_of_another_control_step_is_refused():
+    policy = Policy("slow", lambda stacks: np.zeros((len(stacks), 1), np.float32), Control(control_timestep=0.2))
+    assert task_for(policy, "straight", 0).control_timestep == 0.2
+    with pytest.raises(InputError, match=r"task 'straight' has a control step of 0\.1 s, policy slow one of 0\.2 s"):
+        task_for(policy, task_of_place(0, "straight"), 0)
 
 
 @pytest.mark.parametrize("what", ["math:sqrt", "missing", "policy.zip", "policy.txt", "folder"])
@@ -346,7 +369,7 @@ def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
     assert station[0] < 5.0 and 26.0 < station[-1] < 32.0 and np.all(np.diff(station)[5:] > 0.05)
     assert lateral.min() < -0.3 and lateral.max() > 0.3 and np.abs(lateral).max() < 1.0
     with av.open(str(path)) as film:
-        assert (film.streams.video[0].width, film.streams.video[0].height) == hidden_robot().params.camera_size
+        assert (film.streams.video[0].width, film.streams.video[0].height) == native_size()
     assert [one.name for one in tmp_path.iterdir()] == ["robot.mp4"]
 
 
@@ -358,7 +381,7 @@ def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
     )
     path = tmp_path / "photos" / "haze.png"
     assert main(["photo", "--lighting", "haze", "--out", str(path)]) == 0
-    assert lights == [WEATHER["haze"]] and read_image(path).shape == (*hidden_robot().params.camera_size[::-1], 3)
+    assert lights == [WEATHER["haze"]] and read_image(path).shape == (*native_size()[::-1], 3)
     capsys.readouterr()
     assert main(["photo", "--lighting", "haze", "--out", str(tmp_path / "haze.txt")]) == 2
     assert "expected a .png or .jpg file" in capsys.readouterr().err
@@ -367,13 +390,14 @@ def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
 
 
 def test_the_log_is_what_alignment_reads(tmp_path):
-    table = recordings.record_log(40.0)
+    table = recordings.record_log(40.0, Setup())
     recordings.write_log(tmp_path / "drive.csv", table)
     windows = read_log(tmp_path / "drive.csv")
     assert len(windows) == 19 and windows.twist and windows.acceleration is not None
     assert np.ptp(table["cmd_v"]) > 0.8 and np.ptp(table["cmd_yaw_rate"]) > 1.5
     assert np.abs(table["y"]).max() < 2.2
     assert np.abs(np.diff(table["yaw"])).max() < 0.3
-    assert np.array_equal(recordings.record_log(12.0)["x"], recordings.record_log(12.0)["x"])
+    first, again, other = (recordings.record_log(12.0, Setup(robot=number))["x"] for number in (0, 0, 1))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
     with pytest.raises(InputError, match="duration = 3 s"):
-        recordings.record_log(3.0)
+        recordings.record_log(3.0, Setup())

@@ -58,6 +58,10 @@ class Setup:
     robot: int = 0
     camera: int = 0
 
+    def __post_init__(self) -> None:
+        """Raises InputError: no such robot or camera."""
+        draw_robot(self.robot), draw_camera(self.camera)
+
     @property
     def outside(self) -> list[str]:
         """The robot's and camera's values outside what training samples: name, value and that range."""
