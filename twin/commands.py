@@ -322,7 +322,7 @@ def _view(parser: argparse.ArgumentParser) -> None:
 def _export(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Write a built place for other programs: all of it as USD, its mesh as glTF, its field as Gaussian splats, its "
-        "frames and cameras for other trainers."
+        "frames and cameras for other trainers, a task's rules for other judges."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument(
@@ -338,6 +338,10 @@ def _export(parser: argparse.ArgumentParser) -> None:
         "--nerfstudio", type=Path, metavar="DIR", help="write transforms.json, frames, masks and sparse points"
     )
     parser.add_argument("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
+    parser.add_argument(
+        "--task-file", type=Path, metavar="FILE", help="write the rules of --task as JSON, for another judge"
+    )
+    parser.add_argument("--task", metavar="NAME", help="a task of the scene, such as straight")
     parser.add_argument(
         "--lighting",
         help="of --glb and --ply, and shown first by --usd: a name, or a mixture sun:night:0.5; default: first filmed "

@@ -3,8 +3,10 @@
     python -m twin.export scenes/demo --usd road.usdz
     python -m twin.export scenes/demo --glb road.glb --ply road.ply --lighting night
     python -m twin.export scenes/demo --nerfstudio road_ns --colmap road_colmap
+    python -m twin.export scenes/demo --task straight --task-file straight.json
 
-One module per format: `usd`, `gltf`, `nerfstudio`, `colmap`; splats are made in `twin.assets.gaussians`.
+One module per format: `usd`, `gltf`, `nerfstudio`, `colmap`; splats are made in `twin.assets.gaussians`, task files in
+`twin.env.task_file`.
 """
 
 import argparse
@@ -21,6 +23,10 @@ import numpy as np
 from twin import commands
 from twin.assets.gaussians import gaussians_by_lighting, views_by_lighting
 from twin.assets.views import render_views
+from twin.config_file import load_config
+from twin.env.options import Options
+from twin.env.route_segments import find_task
+from twin.env.task_file import write_task
 from twin.errors import InputError
 from twin.export import gltf, usd
 from twin.export.colmap import write_colmap
@@ -38,7 +44,8 @@ _MEGABYTE = 1e6
 
 def command(given: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    lines = export(given.scene, given.lighting, given.usd, given.glb, given.ply, given.nerfstudio, given.colmap)
+    paths = given.usd, given.glb, given.ply, given.nerfstudio, given.colmap
+    lines = export(given.scene, given.lighting, *paths, given.task_file, given.task)
     if not given.quiet:
         print("\n".join(lines))
 
@@ -51,20 +58,25 @@ def export(
     ply: Path | None = None,
     nerfstudio: Path | None = None,
     colmap: Path | None = None,
+    task_file: Path | None = None,
+    task: str | None = None,
 ) -> list[str]:
     """Writes the given files and folders, in colors without fog; returns a summary line for each.
 
     Raises:
-        InputError: nothing to write, the scene is not built, the lighting is unknown, an output folder does not exist,
-            or a folder to write is there already.
+        InputError: nothing to write, the scene is not built, the lighting or task is unknown, an output folder does not
+            exist, or a folder to write is there already.
     """
     files, folders = [one for one in (usd_file, glb, ply) if one], [one for one in (nerfstudio, colmap) if one]
-    if not files and not folders:
-        raise InputError("nothing to write; give --usd, --glb, --ply, --nerfstudio or --colmap")
-    for path in (*files, *folders):
+    task_files = [task_file] if task_file else []
+    if not files and not folders and not task_files:
+        raise InputError("nothing to write; give --usd, --glb, --ply, --nerfstudio, --colmap or --task-file")
+    if (task_file is None) != (task is None):
+        raise InputError("--task and --task-file belong together; give both, such as --task straight --task-file FILE")
+    for path in (*files, *folders, *task_files):
         if not path.parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}; create it, or give another path")
-    for path in files:
+    for path in (*files, *task_files):
         if path.is_dir():
             raise InputError(f"{path} is a folder; give a file")
     for path in folders:
@@ -76,6 +88,13 @@ def export(
         usd.require_usd()
     twin = load_scene(scene)
     lines = _field_files(twin, lighting, usd_file, glb, ply) if files else []
+    if task_file and task:
+        if not twin.scene.has_route:
+            raise InputError(f"{twin.scene.root}: its build has no route (mjcf.route), so it has no tasks")
+        world = twin.world()
+        segment = find_task(task, world, load_config(twin.scene.config_file).task)
+        write_task(task_file, world, segment, Options())
+        lines.append(f"{task_file}: {task}, {segment.length:.1f} m from {segment.start:.1f} m of the route, z up [m]")
     if folders:
         cameras = twin.cameras()
         points = SparsePoints.load(require_stage(twin.scene, "metric"))
