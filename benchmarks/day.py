@@ -29,6 +29,7 @@ from twin.reality import recordings
 from twin.reality.centerline import RoadLine
 from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.lighting import WEATHER
+from twin.reality.real_test import Setup
 from twin.reality.truth import Truth
 from twin.runtime import track
 
@@ -46,13 +47,12 @@ def true_images(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
     """Images of every day at every station, and the camera_to_world poses (stations, 4, 4) in the true world."""
     line, rows, poses = RoadLine(), [], np.zeros((len(STATIONS), 4, 4))
     for light in track([WEATHER[name] for name in days], "images of days", unit="day"):
-        road, camera = recordings._road_and_camera(light, number=0)
+        robot, camera = recordings.robot_and_camera(Setup(), light)
         row = []
         for k, station in enumerate(STATIONS):
-            x, y = line.at(station).tolist()
-            road.physics.robot.set_pose(x, y, float(line.heading(station)))
-            poses[k] = road.physics.camera_to_world
-            row.append(np.asarray(resize(camera.capture(poses[k], 0.0), *SIZE), np.float32) / 255.0)
+            recordings.set_on_line(robot, line, station)
+            poses[k] = camera.pose(robot, robot.time)
+            row.append(np.asarray(resize(camera.capture(robot), *SIZE), np.float32) / 255.0)
         rows.append(row)
     return np.array(rows), poses
 

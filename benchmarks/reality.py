@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from record import add_record_options, save
 
-from twin.geometry.cameras import Cameras
+from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
 from twin.mjcf.world import nearest_on_route
@@ -29,9 +29,10 @@ from twin.reality import filming, true_world
 from twin.reality import place as places
 from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.drawn_place import build
+from twin.reality.lighting import apply_haze
 from twin.reality.place_spec import draw
 from twin.reality.rasterizer import Rasterizer
-from twin.reality.real_robot import true_route
+from twin.reality.trial_place import true_route
 from twin.reality.truth import Truth
 from twin.runtime import track
 
@@ -88,9 +89,11 @@ def contact_sheet(path: Path) -> None:
         place, plan = build(spec), replace(filming.FilmingPlan.of(spec), width=width, height=height)
         lighting = plan.lightings[number % len(plan.lightings)]
         poses = filming.trajectory(plan, place.route, lighting)[1]
-        light, depth = filming.Renderer(lighting, place, plan)(poses[int(len(poses) * (0.15 + 0.12 * (number % 5)))])
-        look = place.lightings[lighting]
-        image = filming.sensor_image(np.random.default_rng(0), filming.apply_haze(light, depth, look), look, 1.0)
+        pose, look = poses[int(len(poses) * (0.15 + 0.12 * (number % 5)))], place.lightings[lighting]
+        light, depth = filming.Renderer(lighting, place, plan)(pose)
+        rays, ground = unproject(pixel_grid(width, height), plan.intrinsics), place.route.ground_height(pose[:2, 3])
+        hazy = apply_haze(light, depth, rays, pose, look, float(ground))
+        image = filming.sensor_image(np.random.default_rng(0), hazy, look, 1.0)
         label = (str(number), (5, 15), cv2.FONT_HERSHEY_DUPLEX, 0.45)
         frames.append(cv2.putText(np.ascontiguousarray(image), *label, (255, 255, 255), 1, cv2.LINE_AA))
     rows = [np.hstack(frames[k : k + 6]) for k in range(0, len(frames), 6)]

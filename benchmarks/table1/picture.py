@@ -24,7 +24,7 @@ from twin.evaluation.forecasting import Forecast
 from twin.evaluation.training_curves import write_success_curve
 from twin.learn.policy import load_policy
 from twin.reality.lighting import WEATHER
-from twin.reality.real_test import RealTest
+from twin.reality.real_test import RealTest, task_for
 from twin.report.figures import CARD, INK, LINE, MUTED, SERIES
 from twin.report.forecast_report import rates_against_road
 from twin.types import Image
@@ -51,8 +51,9 @@ def main() -> None:
     parser.add_argument("--run", default="straight_varied_0", help="run whose success curve is shown")
     given = parser.parse_args()
     run = given.scene / "runs" / given.run
-    test = RealTest(load_policy(run), "straight")
-    road = [test.reset(name, _TRIAL).capture(test.road.physics.camera_to_world, 0.0) for name in _SHOWN]
+    policy = load_policy(run)
+    test = RealTest(task_for(policy, "straight", 0), size=policy.size)
+    road = [test.reset(name, _TRIAL).capture(test.robot) for name in _SHOWN]
     agreement = rates_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(write_success_curve(run)))[..., ::-1]
     parts = [
