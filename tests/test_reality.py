@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import cv2
-import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -14,7 +13,7 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
-from twin.reality import centerline, filming, place, true_world
+from twin.reality import centerline, filming, place
 from twin.reality.centerline import RoadLine
 from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
@@ -127,22 +126,6 @@ def test_sky_is_seamless_and_brighter_by_day():
     assert day.mean() > 2 * night.mean()
     # +X and −Z share an edge of the cube map (columns), up to one texel's difference.
     assert np.abs(day[0][:, -1] - day[5][:, 0]).mean() < 12.0
-
-
-def test_one_drives_on_the_true_ground(campus):
-    """A ball dropped on the road comes to rest on the height field, which is the true ground."""
-    spec = true_world.collision_spec(campus)
-    xy = campus.route.at(np.array([12.3, 36.4, 55.1]), np.array([0.2, -0.9, 1.1]))
-    for k, point in enumerate(xy):
-        body = spec.worldbody.add_body(name=f"ball_{k}", pos=[*point, campus.route.ground_height(point) + 0.12])
-        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], damping=4.0)
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0], mass=1.0)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_step(model, data, 600)
-    for k, point in enumerate(xy):
-        rest = data.body(f"ball_{k}").xpos[2] - 0.1
-        assert rest == pytest.approx(campus.route.ground_height(point), abs=0.006)
 
 
 def test_truth_survives_saving(truth, tmp_path):

@@ -1,4 +1,4 @@
-"""The known-truth world as a MuJoCo model: visual geoms (groups 0 and 1), which are filmed, and collision geoms (3)."""
+"""The known-truth world as a MuJoCo model of visual geoms, which is filmed; nothing in it collides."""
 
 import mujoco
 import numpy as np
@@ -47,47 +47,14 @@ def ground_visibility(place: KnownPlace) -> dict[str, Array]:
 
 # ---- model
 
-_HFIELD_CELL = 0.2  # [m] of the height field
-COLLISION_GROUP = 3
-
-
-def collision_spec(place: KnownPlace) -> mujoco.MjSpec:
-    """The collision geoms alone, in group 3: the height field `ground`, boxes and cylinders. Quick to compile."""
-    model = mujoco.MjSpec()
-    low, high = (np.array(corner) for corner in place.layout.field)
-    columns, rows = (np.round((high - low) / _HFIELD_CELL).astype(int) + 1).tolist()
-    x, y = np.meshgrid(np.linspace(low[0], high[0], columns), np.linspace(low[1], high[1], rows))
-    z = place.route.ground_height(np.stack([x, y], -1))
-    field = model.add_hfield(name="ground", nrow=rows, ncol=columns)
-    field.size = [*((high - low) / 2), float(np.ptp(z)), 0.5]
-    field.userdata = ((z - z.min()) / np.ptp(z)).astype(np.float32).ravel()
-    model.worldbody.add_geom(
-        name="ground",
-        type=mujoco.mjtGeom.mjGEOM_HFIELD,
-        hfieldname="ground",
-        pos=[*((low + high) / 2), float(z.min())],
-        group=COLLISION_GROUP,
-    )
-    for obj in place.objects:
-        for k, solid in enumerate(obj.solids):
-            model.worldbody.add_geom(
-                name=f"{obj.name}_solid_{k}",
-                type=mujoco.mjtGeom.mjGEOM_BOX if solid.kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER,
-                pos=solid.center,
-                size=list(solid.half),
-                quat=[np.cos(solid.yaw / 2), 0, 0, np.sin(solid.yaw / 2)],
-                group=COLLISION_GROUP,
-            )
-    return model
-
 
 def world_spec(lighting: Lighting | str, place: KnownPlace) -> mujoco.MjSpec:
-    """The world under one lighting, with textures, lights, collision geoms and a camera named `film`.
+    """The world under one lighting, with textures, lights and a camera named `film`; nothing in it collides.
 
-    Visual geoms are in groups 0 (ground) and 1 and do not collide; collision geoms are in group 3 and are not filmed.
+    Geoms are in groups 0 (ground) and 1.
     """
     light = place.lightings[lighting] if isinstance(lighting, str) else lighting
-    model = collision_spec(place)
+    model = mujoco.MjSpec()
     model.modelname = f"reality_{light.name}"
     model.visual.map.znear, model.visual.map.zfar = 0.001, 10.0
     model.stat.extent, model.stat.center = 60.0, [20.0, -5.0, 0.0]
