@@ -228,7 +228,7 @@ def _command_line(k: int, seed: int, work: Path, seconds: float) -> Outcome:
     changed = changed_files(before, snapshot(work))
     if not failure and ((work / "marker").exists() or changed):
         failure = f"changed outside its folder: {changed}, or a payload ran"
-    line = f"{' '.join(one[:60] for one in arguments)}"
+    line = " ".join(one[:60] for one in arguments)
     return Outcome("command line", k, accepted, failure, line, time.perf_counter() - start)
 
 
