@@ -205,14 +205,14 @@ def _command_line(k: int, seed: int, work: Path, seconds: float) -> Outcome:
     for name in ("kept", "cwd", "case"):
         (work / name).mkdir(parents=True)
     (work / "kept" / "notes.txt").write_text("kept\n")
-    module, arguments = command_of(Case(Random(f"{seed}/command line/{k}"), work / "case", None))
+    arguments = command_of(Case(Random(f"{seed}/command line/{k}"), work / "case", None))
     before = snapshot(work)
     environment = {**os.environ, MARKER_VARIABLE: str(work / "marker"), "PYTHONPATH": str(_ROOT)}
     start = time.perf_counter()
     accepted, failure = False, ""
     try:
         done = subprocess.run(
-            [sys.executable, "-m", module, *arguments],
+            [sys.executable, "-m", "twin", *arguments],
             cwd=work / "cwd",
             env=environment,
             capture_output=True,
@@ -228,7 +228,7 @@ def _command_line(k: int, seed: int, work: Path, seconds: float) -> Outcome:
     changed = changed_files(before, snapshot(work))
     if not failure and ((work / "marker").exists() or changed):
         failure = f"changed outside its folder: {changed}, or a payload ran"
-    line = f"{module} {' '.join(one[:60] for one in arguments)}"
+    line = " ".join(one[:60] for one in arguments)
     return Outcome("command line", k, accepted, failure, line, time.perf_counter() - start)
 
 

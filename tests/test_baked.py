@@ -158,7 +158,7 @@ def test_march_equals_the_reference():
     slow = slow_march(field, pose[0, :3, 3], directions, 0.005)
     assert 0.2 < slow[:, 0].mean() < 0.95
     assert np.abs(features[:, 0] - slow[:, 0]).mean() < 0.01
-    assert np.abs(features - slow).mean() < 0.02
+    assert np.abs(features - slow).mean() < 0.025  # a ray ends where 6 % of it is left
     assert np.abs(out.opacity.ravel() - slow[:, 0]).max() < 0.3  # at a rim the two may differ
 
 

@@ -1,6 +1,5 @@
 """Fuzz target of verbs: command lines that a verb must refuse, or finish at once."""
 
-import importlib
 import os
 import shutil
 from collections.abc import Sequence
@@ -13,8 +12,9 @@ from fuzzing.samples import EPISODES_CSV, SCENE_TABLE
 from fuzzing.settings import override
 from fuzzing.tables import mutated_csv
 from fuzzing.values import OUTSIDE_PATH, mutated_text, toml_text
+from twin.__main__ import main
 
-VERBS = ("build", "train", "validate", "forecast", "align", "relight", "export", "film", "new", "reality")
+VERBS = ("build", "train", "validate", "forecast", "align", "relight", "export", "film", "new", "pack", "reality")
 _VALUES = (
     *("", " ", "-1", "0", "1", "nan", "inf", "-inf", "1e400", "abc", "9" * 5000, "1" + "0" * 400, "²", "\udcff"),
     *("a\nb", OUTSIDE_PATH, "/", "..", ".", "x" * 300, "a:b:c", "straight", "nothing", "\x1b[31m", "--", "None"),
@@ -34,7 +34,13 @@ _OPTIONS: dict[str, dict[str, Sequence[str]]] = {
     "forecast": {"--real": ("results.csv", "/dev/null", "/dev/zero"), "--seed": ()},
     "align": {"--out": ("OUT",)},
     "relight": {"--name": ("training", "day", "afternoon", "a/b")},
-    "export": {"--glb": ("OUT", "OUT/x.glb"), "--ply": ("OUT",), "--lighting": ("day:night:2", "day")},
+    "export": {
+        **dict.fromkeys(("--ply", "--nerfstudio", "--colmap"), ("OUT",)),
+        "--usd": ("OUT/x.usdz", "OUT"),
+        "--glb": ("OUT", "OUT/x.glb"),
+        "--lighting": ("day:night:2", "day"),
+    },
+    "pack": {"--out": ("OUT", "OUT/x.twin"), "--levels": ("6", "17"), "--policy": ("nothing",)},
     "film": {
         **dict.fromkeys(("--task", "--lighting", "--obstacles", "--seed"), ()),
         "--policy": ("ahead", "math:floor"),
@@ -43,7 +49,7 @@ _OPTIONS: dict[str, dict[str, Sequence[str]]] = {
     "new": {"--camera-height": ()},
 }
 """Options of a verb that take a value, each with further values besides `_VALUES`."""
-_OUTPUTS = ("--out", "--glb", "--ply")
+_OUTPUTS = ("--out", "--glb", "--ply", "--usd", "--nerfstudio", "--colmap")
 _FLAGS = {
     "train": ("--randomise", "--no-privileged"),
     "validate": ("--worst", "--films", "--trust"),
@@ -56,17 +62,15 @@ _REQUIRED = {"train": ("--run", "r"), "validate": ("--policy", "ahead"), "religh
 
 
 def verb(case: Case) -> bool:
-    module, arguments = command_of(case)
-    name = f"{module}.__main__" if module == "twin.reality" else module
-    return call_verb(importlib.import_module(name).main, arguments)
+    return call_verb(main, command_of(case))
 
 
-def command_of(case: Case) -> tuple[str, list[str]]:
-    """Module and arguments of a verb."""
+def command_of(case: Case) -> list[str]:
+    """Arguments of `twin`: a verb and its own."""
     rng = case.rng
     name = rng.choice(VERBS)
     if name == "reality":
-        return "twin.reality", _reality(case)
+        return ["reality", *_reality(case)]
     arguments = [_scene(case)]
     if name == "new":
         arguments = [str(case.folder / rng.choice(("made", "made", "a\nb", "x" * 300)))]
@@ -82,7 +86,7 @@ def command_of(case: Case) -> tuple[str, list[str]]:
         arguments.append(rng.choice(("--nothing", "--", "-", "-x", "--help=1", *_VALUES)))
     if name != "new":
         arguments.append("--quiet")
-    return f"twin.{name}", arguments
+    return [name, *arguments]
 
 
 def _positional(case: Case) -> str:

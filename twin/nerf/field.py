@@ -136,15 +136,12 @@ class RadianceField:
             device=self.device,
         )
 
-    def query(self, ws: Workspace, start: int, count: int, levels: int | None = None) -> None:
-        """Grid positions → network outputs, for rows (samples, not rays) [start, start + count).
-
-        The coarsest `levels` of the hash grid are used, by default all.
-        """
+    def query(self, ws: Workspace, start: int, count: int) -> None:
+        """Grid positions → network outputs, for rows (samples, not rays) [start, start + count)."""
         wp.launch(
             hashgrid.encode,
             count,
-            [ws.w_positions, self.w_table, self.w_levels, self.layout.levels if levels is None else levels, start],
+            [ws.w_positions, self.w_table, self.w_levels, start],
             [ws.w_features],
             device=self.device,
         )

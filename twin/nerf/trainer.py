@@ -96,8 +96,6 @@ _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # rates at which opacity grid cells follow higher and lower samples
 _LOG_OFFSET = 0.05  # of the distortion's logarithmic distance [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
-_COARSE_LEVELS = 5  # of the hash grid at first; the finer ones join at equal intervals, and later steps use all
-_COARSE_SHARE = 0.3  # share of the steps until all levels are used
 _EXPLORATION_SHARE = 0.15  # share of the steps over which sampling narrows down; cameras move only after it
 
 
@@ -179,15 +177,6 @@ class Trainer:
         warm = min(1.0, (self.steps_done + 1) / _WARM_UP)
         return warm * math.exp(math.log(_FINAL_RATE) * self.steps_done / self.config.steps)
 
-    @property
-    def used_levels(self) -> int:
-        """Levels of the hash grid that the current step uses. Coarse ones come first, which is fast and leaves less
-        noise in space that no ray has reached yet."""
-        levels = self.config.levels
-        coarse = min(_COARSE_LEVELS, levels)
-        passed = self.steps_done / (_COARSE_SHARE * self.config.steps)
-        return min(levels, coarse + int(passed * (levels - coarse + 1)))
-
     def step(self) -> float:
         """Runs one training step and returns the mean squared error of its colors."""
         ws, device = self.ws, self.device
@@ -205,9 +194,7 @@ class Trainer:
 
         results = parallel(lambda shard: self._shard(shard, color, triples, free is not None), range(_SHARDS), device)
         rate = self.rate()
-        skipped = range(self.used_levels, self.config.levels)
-        tasks = [task for task in range(self.config.levels + 2) if task not in skipped]
-        parallel(lambda task: self._update(task, rate), tasks, device)
+        parallel(lambda task: self._update(task, rate), range(self.config.levels + 2), device)
         for tensor, *gradients in zip(self.torch_parameters.values(), *(r[1] for r in results), strict=True):
             tensor.grad = torch.stack(gradients).sum(0) if len(gradients) > 1 else gradients[0]
         for group in self.optimizer.param_groups:
@@ -230,7 +217,7 @@ class Trainer:
 
         f.cast(ws, self.arrays, start, count)
         f.sample(ws, start, count, 0.1 + explore, target_mass=0.3, seed=self.seed * 1_000_003 + self.steps_done)
-        f.query(ws, samples.start, samples.stop - samples.start, self.used_levels)
+        f.query(ws, samples.start, samples.stop - samples.start)
         f.composite(ws, start, count)
 
         composited = ws.composited[rays].detach().requires_grad_(True)
@@ -291,7 +278,7 @@ class Trainer:
     def _free_backward(self, start: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Gradient of free · mean(log(1 + σ·scale)) over the free points; it saturates at high density."""
         f, ws = self.field, self.ws
-        f.query(ws, start, _FREE_POINTS, self.used_levels)
+        f.query(ws, start, _FREE_POINTS)
         rows = slice(start, start + _FREE_POINTS)
         density = torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit
         depth = density * f.layout.near_box.scale

@@ -81,16 +81,13 @@ def encode(
     positions: wp.array(dtype=wp.vec3f),
     table: wp.array2d(dtype=Feature),
     levels: Levels,
-    used: wp.int32,
     start: wp.int32,
     features: wp.array2d(dtype=Feature),
 ):
-    """Trilinear features of grid positions [start, start + dim), shape (n, levels); 0 on levels from `used` on."""
+    """Trilinear features of grid positions [start, start + dim), shape (n, levels)."""
     i = start + wp.tid()
     p = positions[i]
-    for level in range(used, levels.cells.shape[0]):
-        features[i, level] = Feature()
-    for level in range(used):
+    for level in range(levels.cells.shape[0]):
         cell = cell_at(p, levels.cells[level])
         value = Feature()
         for n in range(8):
