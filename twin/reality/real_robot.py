@@ -392,10 +392,9 @@ class RealRobot:
         self._vy = vy + _STEP * (ay - rate * vx)
         self._rate = rate + _STEP * moment / self._yaw_inertia
         base_x, base_y = self._vx + self._rate * r.center_left, self._vy - self._rate * r.center_forward
-        c, s = cos(self._yaw), sin(self._yaw)
-        level = cos(pitch)
-        self._x += _STEP * level * (c * base_x - s * base_y)
-        self._y += _STEP * level * (s * base_x + c * base_y)
+        ahead, aside, level = cos(self._yaw), sin(self._yaw), cos(pitch)
+        self._x += _STEP * level * (ahead * base_x - aside * base_y)
+        self._y += _STEP * level * (aside * base_x + ahead * base_y)
         self._yaw += _STEP * self._rate
 
     def _sample_ground(self) -> None:
