@@ -362,4 +362,6 @@ def dirt_mask(camera: HiddenCamera, size: tuple[int, int]) -> NDArray[np.float32
 def compressed(picture: Image, quality: int) -> Image:
     """A picture (h, w, 3) after JPEG of a quality."""
     data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    return cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    back = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert back is not None
+    return np.ascontiguousarray(back[..., ::-1], np.uint8)
