@@ -18,6 +18,7 @@ from twin.export.__main__ import main
 from twin.geometry.cameras import Cameras, SparsePoints, project
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
+from twin.loading import load_scene
 from twin.scene import write_stamp
 
 SIZE = (96, 64)
@@ -64,9 +65,16 @@ def scene(tmp_path_factory) -> Path:
 def out(scene, tmp_path_factory) -> Path:
     """Everything that the verb writes."""
     out = tmp_path_factory.mktemp("out")
-    options = {"usd": "p.usdz", "glb": "p.glb", "ply": "p.ply", "nerfstudio": "ns", "colmap": "cm"}
+    options = {
+        "usd": "p.usdz",
+        "glb": "p.glb",
+        "ply": "p.ply",
+        "nerfstudio": "ns",
+        "colmap": "cm",
+        "task-file": "t.json",
+    }
     given = [text for name, value in options.items() for text in (f"--{name}", str(out / value))]
-    assert main([str(scene), *given, "--lighting", "night", "--quiet"]) == 0
+    assert main([str(scene), *given, "--task", "ahead", "--lighting", "night", "--quiet"]) == 0
     assert sorted(path.name for path in out.iterdir()) == sorted(options.values())
     return out
 
@@ -180,6 +188,13 @@ def test_vertices_have_the_colors_of_the_views() -> None:
     assert (colours[3] == colours[0]).all()  # hidden below the floor: as the nearest seen
 
 
+def test_a_task_file_has_the_scenes_line_and_rules(scene, out) -> None:
+    table = json.loads((out / "t.json").read_text())
+    world = load_scene(scene).world()
+    assert (table["format"], table["name"], table["half_width"]) == ("twin task", "ahead", world.half_width)
+    assert np.array_equal(table["line"], world.route)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -190,6 +205,8 @@ def test_vertices_have_the_colors_of_the_views() -> None:
         (["--usd", "folder"], "is a folder; give a file"),
         (["--colmap", "folder"], "is there already"),
         (["--nerfstudio", "file"], "is there already"),
+        (["--task-file", "a.json"], "--task and --task-file belong together"),
+        (["--task-file", "folder", "--task", "ahead"], "is a folder; give a file"),
     ],
 )
 def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, words) -> None:

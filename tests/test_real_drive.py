@@ -19,7 +19,7 @@ from twin.env.options import parse_options
 from twin.env.route_segments import STANDARD_TASKS, find_task
 from twin.env.task_file import task_table
 from twin.errors import InputError
-from twin.evaluation.trials import SETUP_COLUMNS, Cell, read_results, read_trials
+from twin.evaluation.trials import SETUP_COLUMNS, Cell, read_results, read_trials, write_real_trials
 from twin.geometry.images import read_image
 from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.learn.policy_network import Architecture
@@ -312,6 +312,10 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     outside = "payload wheel_radius wheel_difference shift_left turn_up"
     for row, day in zip(rows, ("", "21"), strict=True):
         assert [row[name] for name in SETUP_COLUMNS] == ["3", day, "2", "5", outside]
+    # A trial recorded later, without numbers, leaves them as they are.
+    write_real_trials(read_trials(tmp_path / "results_trials.csv"), tmp_path / "t.csv", out, "sun")
+    with out.open(newline="") as file:
+        assert list(csv.DictReader(file)) == rows
     record = json.loads((tmp_path / "results_setup.json").read_text())
     assert (record["place"], record["robot"], record["camera"]) == (3, 2, 5) and record["version"] == 2
     assert record["robot_values"]["payload"] == pytest.approx(23.97, abs=0.01)
