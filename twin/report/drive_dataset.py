@@ -228,7 +228,8 @@ def _colors(pictures: Sequence[NDArray[np.uint8]]) -> dict[str, Array]:
     mean = share @ levels
     deviation = np.sqrt(share @ levels**2 - mean**2)
     low, high = (levels[[np.flatnonzero(one)[end] for one in counts]] for end in (0, -1))
-    return _summary(*(one[:, None, None] for one in (low, high, mean, deviation)), len(pictures))
+    low, high, mean, deviation = (one[:, None, None] for one in (low, high, mean, deviation))
+    return _summary(low, high, mean, deviation, len(pictures))
 
 
 def _summary(low: Array, high: Array, mean: Array, deviation: Array, count: int) -> dict[str, Array]:
