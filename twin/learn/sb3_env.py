@@ -35,7 +35,7 @@ class DriveVecEnv(VecEnv):
         self._returns, self._lengths = np.zeros(n_envs), np.zeros(n_envs, int)
         self.seed(seed)
 
-    def reset(self) -> NDArray:
+    def reset(self) -> Any:
         for i, seed in enumerate(self._seeds):
             if seed is not None:
                 self.vector_env.seed(i, seed)
@@ -48,7 +48,7 @@ class DriveVecEnv(VecEnv):
     def step_async(self, actions: NDArray) -> None:
         self._actions = actions
 
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, NDArray, NDArray, list[dict[str, Any]]]:
         out = self.vector_env.step(self._actions)
         infos = [{**self.vector_env.info(i), "state": self.vector_env.state(i)} for i in range(self.num_envs)]
         self._returns += out.reward
