@@ -23,6 +23,7 @@ from twin.learn.policy_network import Architecture
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(page for page in (ROOT / "docs").glob("*.md") if page.name != "benchmarks.md")])
 _IN_THE_SCENE = {
+    "--episodes 20": "--episodes 2",
     '"right_turn"': '"bend"',
     '"straight"': '"ahead"',
     "--task right_turn": "--task bend",

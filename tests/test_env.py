@@ -37,6 +37,7 @@ OPTION_SETS = {
     "night": SMALL | {"lighting": "day:night:0.7", "lighting_drift": True, "randomise": True},
     "crowded": SMALL | {"obstacles": 2, "lighting": ("day", "night"), "control_timestep": 0.05},
     "state": {"pixels": False, "randomise": True, "rewards": {"progress": 1.0, "cross_track": -0.1}},
+    "both": SMALL | {"state": "privileged"},
 }
 TASKS = ("ahead", "bend", "route")
 
@@ -144,6 +145,36 @@ def test_vector_environment_equals_single_environments(scene, name):
         if step.last():
             step = single.reset()
     envs.close()
+
+
+@pytest.mark.parametrize(("state", "size"), [("odometry", 2), ("privileged", 7)])
+def test_images_and_state_come_as_a_dict(scene, state, size):
+    from stable_baselines3 import PPO
+
+    from twin.learn.sb3_env import DriveVecEnv
+
+    options = SMALL | {"time_limit": 0.5, "lighting": "day"}
+    single = gymnasium.make("twin/Drive-v0", scene=scene, task="bend", state=state, **options)
+    plain = gymnasium.make("twin/Drive-v0", scene=scene, task="bend", **options)
+    numbers = gymnasium.make("twin/Drive-v0", scene=scene, task="bend", pixels=False, time_limit=0.5)
+    assert single.observation_space["state"].shape == (size,) and single.observation_space["state"].is_bounded()
+    for environment in (single, plain, numbers):
+        environment.reset(seed=3)
+    for _ in range(4):
+        action = single.action_space.sample()
+        seen, images, whole = (environment.step(action)[0] for environment in (single, plain, numbers))
+        np.testing.assert_array_equal(seen["pixels"], images)
+        np.testing.assert_array_equal(seen["state"], whole[:size])
+    vectors = DriveVecEnv(scene, "bend", 2, seed=1, state=state, **options)
+    vectors.reset()
+    for _ in range(5):
+        out, _, done, infos = vectors.step(np.zeros((2, 2), np.float32))
+    assert done.all() and out["state"].shape == (2, size)
+    assert infos[1]["terminal_observation"]["state"].shape == (size,)
+    large = DriveVecEnv(scene, "bend", 2, state=state, **(options | {"size": (40, 40)}))
+    PPO("MultiInputPolicy", large, n_steps=4, batch_size=4, n_epochs=1).learn(8)
+    with pytest.raises(InputError, match="with pixels=False"):
+        gymnasium.make("twin/Drive-v0", scene=scene, task="bend", pixels=False, state=state)
 
 
 def test_vector_environments_reset_in_the_same_step(scene):

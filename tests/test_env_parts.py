@@ -357,10 +357,30 @@ def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
     assert "task 'moon': unknown; there are route" in capsys.readouterr().err
 
 
+def test_a_dataset_has_the_drives_that_are_filmed(scene, tmp_path, capsys):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
+    out = tmp_path / "drives"
+    arguments = [str(scene.scene.root), "--task", "ahead", "--lighting", "night", "--obstacles", "0"]
+    assert main([*arguments, "--lerobot", str(out), "--episodes", "2", "--seed", "4"]) == 0
+    assert "2 drives, 2 to the goal" in capsys.readouterr().out
+    rows = parquet.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
+    numbers, actions = np.array(rows["episode_index"]), np.float32(rows["action"])
+    for k in range(2):
+        environment = twin.load(scene, "ahead", 4 + k, obstacles=0, lighting="night")
+        episode = record_episode(environment, RouteDriver())
+        np.testing.assert_array_equal(actions[numbers == k], np.float32(episode.actions[:-1]))
+    assert main([*arguments, "--lerobot", str(out), "--quiet"]) == 2
+    assert "is there already" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("option", "words"),
     [
         (["--seed", "-1"], "seed = -1: expected 0 or more"),
+        (["--episodes", "2"], "--episodes 2: a film shows one drive"),
+        (["--lerobot", "drives", "--episodes", "0"], "--episodes 0: expected 1 or more"),
+        (["--lerobot", "drives", "--out", "a.mp4"], "--out is of a film"),
+        (["--lerobot", "no/drives"], "there is no folder no"),
         (["--obstacles", "²"], "--obstacles '²': expected a number"),
         (["--obstacles", "-1"], "--obstacles '-1': expected a number"),
         (["--lighting", "day:night:30"], "share 30 is not from 0 to 1"),

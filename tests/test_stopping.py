@@ -118,7 +118,12 @@ def _left(children: list[psutil.Process]) -> list[psutil.Process]:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGKILL])
 def test_nothing_outlives_a_verb(cases, name, number):
     process, children = _started(name, cases[name])
-    time.sleep(1.5)  # GLFW asks for its version in a process of its own, which dm_control starts when it is imported
+    # GLFW asks for its version in a process of its own, which dm_control starts when it is imported.
+    alone = time.monotonic()
+    while time.monotonic() < alone + 1.5:
+        if any("glfwGetVersion" in " ".join(_command(one)) for one in psutil.Process(process.pid).children(True)):
+            alone = time.monotonic()
+        time.sleep(0.05)
     if number == signal.SIGINT:
         os.killpg(process.pid, number)  # as a terminal does
     else:

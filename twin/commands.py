@@ -241,6 +241,18 @@ def _film(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--randomise", action="store_true", help="randomize robot, weather and distractor objects")
     parser.add_argument("--seed", type=int, default=0, help="of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; default: a file in SCENE/films")
+    parser.add_argument(
+        "--lerobot",
+        type=Path,
+        metavar="DIR",
+        help="record drives as a LeRobot dataset instead of a film (pip install 'twin[lerobot]')",
+    )
+    parser.add_argument(
+        "--episodes",
+        type=int,
+        default=1,
+        help="drives in the dataset, with seeds from --seed on (default: %(default)s)",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 

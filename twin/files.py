@@ -325,7 +325,28 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yields a temporary folder that becomes `path` when the block ends, or is removed if it fails."""
+    partial = path.with_name(f".{path.name[:200]}.partial")
+    remove(partial)
+    partial.mkdir()
+    try:
+        yield partial
+        partial.rename(path)
+    finally:
+        remove(partial)
+
+
 # ---- paths given by users, which may be invalid
+
+
+def require_absent(path: Path) -> None:
+    """Raises InputError if a folder to be written is there already, or its parent is not."""
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}; create it, or give another path")
+    if path.exists() or path.is_symlink():
+        raise InputError(f"{path} is there already; remove it, or give another folder")
 
 
 def is_file(path: Path) -> bool:

@@ -2,10 +2,12 @@
 
     python -m twin.film scenes/demo --task right_turn --lighting night --obstacles 4
     python -m twin.film scenes/demo --policy first --task straight --lighting held-out --seed 7 --out drive.mp4
+    python -m twin.film scenes/demo --lerobot drives --episodes 20
 
 The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is
 scripted, or a policy that `twin.validate` accepts, in an environment with the policy's options. Task, lighting and seed
-determine the episode: those of a row of `validation/episodes.csv` reproduce it.
+determine the episode: those of a row of `validation/episodes.csv` reproduce it. `--lerobot` records drives as a dataset
+to learn from instead.
 """
 
 import argparse
@@ -20,10 +22,12 @@ import numpy as np
 from twin import commands, runtime
 from twin.env.suite import load
 from twin.errors import InputError
-from twin.loading import load_scene
+from twin.files import new_folder, require_absent
+from twin.loading import Twin, load_scene
 from twin.unpack import is_cached
 
 if TYPE_CHECKING:
+    from twin.env.drivers import Driver
     from twin.env.episode import Episode
 
 _MAX_DIGITS = 6  # of the number of obstacles
@@ -53,31 +57,20 @@ def film(
     Raises:
         InputError: an unknown scene, task, policy or option, or a negative seed.
     """
-    from twin.env.drivers import Driver, PolicyDriver, RouteDriver
     from twin.env.episode import record_episode
     from twin.report.episode_video import write_episode_video
     from twin.report.review_video import load_ground_and_parts
 
-    if seed < 0:
-        raise InputError(f"seed = {seed}: expected 0 or more")
     scene = load_scene(root)
-    driver: Driver = RouteDriver()
-    driver_name = "scripted driver"
-    if policy:
-        from twin.learn.policy import find_policy, load_policy
-
-        loaded = load_policy(find_policy(scene.scene.root, policy), trust)
-        driver, driver_name = PolicyDriver(loaded), loaded.name
-        options = {**loaded.options(), **options}
+    driver, driver_name, options = _driver(scene, policy, seed, trust, options)
     environment = load(scene, task, seed, **options)
     images: list[np.ndarray] = []
-    max_steps = round(environment.task.time_limit / environment.task.options.control_timestep)
 
     def watch(step: dm_env.TimeStep) -> None:
         images.append(step.observation["pixels"][-1])
         progress.update()
 
-    with runtime.bar("drive", max_steps, "step") as progress:
+    with runtime.bar("drive", _most_steps(environment), "step") as progress:
         episode = record_episode(environment, driver, watch)
     name = film_name(task, episode.lighting, seed)
     in_cache = is_cached(scene.scene.root)
@@ -87,6 +80,84 @@ def film(
     limits, title = (driven.segment.start, driven.segment.end), f"{task.replace('_', ' ')}: {driver_name}"
     write_episode_video(path, episode, images, driven.world, driven.half_width, limits, geometry, title)
     return path, episode
+
+
+def record_dataset(
+    root: Path,
+    out: Path,
+    episodes: int = 1,
+    task: str = "right_turn",
+    policy: str | None = None,
+    seed: int = 0,
+    trust: bool = False,
+    **options: Any,
+) -> list["Episode"]:
+    """Drives episodes and writes them as a LeRobot dataset, see `twin.report.drive_dataset`; returns the episodes.
+
+    Args:
+        root, task, policy, trust, options: See `film`.
+        out: The dataset's folder; must not exist.
+        episodes: Number of drives, at least 1.
+        seed: Seed of the first drive; the others have the following ones, each the episode that `film` drives.
+
+    Raises:
+        InputError: as `film`, or `out` exists, or pyarrow is not installed.
+    """
+    from twin.config import STEERING
+    from twin.env.episode import record_episode
+    from twin.report.drive_dataset import DriveDataset, require_pyarrow
+
+    if episodes < 1:
+        raise InputError(f"--episodes {episodes}: expected 1 or more")
+    require_pyarrow()
+    require_absent(out)
+    scene = load_scene(root)
+    driver, _, options = _driver(scene, policy, seed, trust, options)
+    recorded = []
+    with new_folder(out) as folder, runtime.bar("drives", episodes, "drive") as progress:
+        dataset = None
+        for k in range(episodes):
+            environment = load(scene, task, seed + k, **options)
+            driving = environment.task.options
+            if dataset is None:
+                names = ("linear_velocity", "angular_velocity")[driving.action == STEERING :]
+                place = scene.scene.root.resolve().name
+                words = f"Drive along the road of {place}: {task.replace('_', ' ')}."
+                dataset = DriveDataset(folder, driving.size, driving.control_timestep, names, words)
+            pictures: list[np.ndarray] = []
+            motion: list[tuple[float, float]] = []
+
+            def watch(step: dm_env.TimeStep, physics=environment.physics, pictures=pictures, motion=motion) -> None:
+                pictures.append(step.observation["pixels"][-1])
+                motion.append((physics.speed, physics.yaw_rate))
+
+            episode = record_episode(environment, driver, watch)
+            dataset.add(episode, pictures, np.array(motion))
+            recorded.append(episode)
+            progress.update()
+        assert dataset is not None
+        dataset.finish()
+    return recorded
+
+
+def _driver(
+    scene: Twin, policy: str | None, seed: int, trust: bool, options: dict[str, Any]
+) -> tuple["Driver", str, dict[str, Any]]:
+    """Driver, its name, and the environment's options: the given ones, else those of the policy."""
+    from twin.env.drivers import PolicyDriver, RouteDriver
+
+    if seed < 0:
+        raise InputError(f"seed = {seed}: expected 0 or more")
+    if not policy:
+        return RouteDriver(), "scripted driver", options
+    from twin.learn.policy import find_policy, load_policy
+
+    loaded = load_policy(find_policy(scene.scene.root, policy), trust)
+    return PolicyDriver(loaded), loaded.name, {**loaded.options(), **options}
+
+
+def _most_steps(environment: Any) -> int:
+    return round(environment.task.time_limit / environment.task.options.control_timestep)
 
 
 def film_name(task: str, lighting: str, seed: int) -> str:
@@ -103,7 +174,18 @@ def command(given: argparse.Namespace) -> None:
         obstacles = int(obstacles)
     options = {"lighting_drift": given.drift, "randomise": given.randomise, "obstacles": obstacles}
     options |= film_options(given.lighting)
-    path, episode = film(given.scene, given.task, given.policy, given.seed, given.out, given.trust, **options)
+    driven = (given.task, given.policy, given.seed)
+    if given.lerobot:
+        if given.out:
+            raise InputError("--out is of a film; --lerobot names the dataset's folder")
+        drives = record_dataset(given.scene, given.lerobot, given.episodes, *driven, given.trust, **options)
+        if not given.quiet:
+            frames, goals = sum(len(one.times) - 1 for one in drives), sum(one.success for one in drives)
+            print(f"{len(drives)} drives, {goals} to the goal, {frames} frames: {given.lerobot}")
+        return
+    if given.episodes != 1:
+        raise InputError(f"--episodes {given.episodes}: a film shows one drive; several are for --lerobot DIR")
+    path, episode = film(given.scene, *driven, given.out, given.trust, **options)
     if not given.quiet:
         print(summary(path, episode))
 

@@ -35,6 +35,7 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     from twin.evaluation.training_curves import training_summaries
     from twin.report.forecast_report import write_forecast_page
     from twin.report.forecast_text import candidates_csv
+    from twin.report.policy_card import write_policy_cards
 
     scene = SceneDir(root)
     if not root.is_dir():
@@ -50,6 +51,7 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     result.save(scene.forecast)
     write_text(scene.forecast / "forecast.csv", candidates_csv(result))
     write_forecast_page(result, scene.forecast)
+    write_policy_cards(scene, [cell.policy for cell in twin])
     return result
 
 

@@ -30,6 +30,7 @@ def command(given: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
     from twin.evaluation.training_curves import write_success_curve
     from twin.learn.train_config import PRESETS, TrainConfig
+    from twin.report.policy_card import write_policy_cards
 
     names = {field.name for field in dataclasses.fields(TrainConfig)}
     settings = {k: v for k, v in vars(given).items() if k in names and v is not None}
@@ -40,6 +41,7 @@ def command(given: argparse.Namespace) -> None:
     with exclusive_lock(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
         chosen = _train(twin, folder, config, given.processes)
     picture = write_success_curve(folder)
+    write_policy_cards(twin.scene, [given.run])
     if not given.quiet:
         won, trials = chosen["successes"], chosen["trials"]
         low, high = wilson(won, trials)

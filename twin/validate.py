@@ -27,6 +27,7 @@ from twin.files import digest_file, digest_json, read_json, wrap_read_errors, wr
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign
 from twin.loading import Twin, load_writable
+from twin.report.policy_card import write_policy_cards
 from twin.report.validation_report import (
     TrainingCurve,
     failure_map,
@@ -171,6 +172,7 @@ def _write_results(twin: Twin) -> dict:
     runs = dict.fromkeys(trained["run"] for trained in results["training"].values())
     curves = [TrainingCurve(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
     write_validation_page(twin.scene, results, curves)
+    write_policy_cards(twin.scene, [t.policy for t in trials])
     return results
 
 

@@ -8,7 +8,8 @@ stable-baselines3's SubprocVecEnv, need this.
 
 Actions in [-1, 1] span the action range of the dm_control environment. Observations are images, uint8, shape
 (3 · stack, height, width), the newest three channels last; with `pixels=False` the privileged state, float32, see
-`RewardAndTermination.state`, clipped to the bounds of the observation space. `info` contains `cause` (of the episode's
+`RewardAndTermination.state`, clipped to the bounds of the observation space. With the option `state` they are a dict of
+both, `pixels` and `state`. `info` contains `cause` (of the episode's
 end, or empty), `is_success`, `progress` [m], `start` [m] (offset of the start along the route segment), `cross_track`
 [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed` [m/s] and `touched`. `lighting` is the episode's: its
 name, or for a sampled one the set and the nearest mixture of filmed lightings, `training: sun 0.62, night 0.38`.
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from twin.env.mujoco_renderer import ChaseCamera, SceneCamera
 from twin.env.observation import PixelObserver
-from twin.env.options import IMAGE_SIZE, check_option, parse_options
+from twin.env.options import IMAGE_SIZE, check_option, parse_options, state_size
 from twin.env.vector_env import ProcessVectorEnv, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError, short_repr
@@ -39,14 +40,34 @@ ROBOT, CHASE = "robot", "chase"
 _RENDER_SIZE = 640, 360  # [px] default width and height of a chase view
 
 
-def make_spaces(envs: LocalVectorEnv | ProcessVectorEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def make_spaces(envs: LocalVectorEnv | ProcessVectorEnv) -> tuple[gymnasium.Space, gymnasium.spaces.Box]:
     """Observation and action space of one environment."""
     action = gymnasium.spaces.Box(-1.0, 1.0, (envs.action_size,), np.float32)
-    if envs.pixels:
-        width, height = envs.options.size
-        return gymnasium.spaces.Box(0, 255, (3 * envs.options.stack, height, width), np.uint8), action
     low, high = envs.get(0, "state_bounds")
-    return gymnasium.spaces.Box(low, high, dtype=np.float32), action
+    if not envs.pixels:
+        return gymnasium.spaces.Box(low, high, dtype=np.float32), action
+    width, height = envs.options.size
+    images = gymnasium.spaces.Box(0, 255, (3 * envs.options.stack, height, width), np.uint8)
+    size = state_size(envs.options)
+    if not size:
+        return images, action
+    state = gymnasium.spaces.Box(low[:size], high[:size], dtype=np.float32)
+    return gymnasium.spaces.Dict({"pixels": images, "state": state}), action
+
+
+def observations(envs: LocalVectorEnv | ProcessVectorEnv) -> NDArray | dict[str, NDArray]:
+    """Observations of all environments, with the environment as the first axis of each array."""
+    size = state_size(envs.options)
+    if not size:
+        return envs.observation()
+    return {"pixels": envs.observation(), "state": np.stack([envs.state(i)[:size] for i in range(len(envs))])}
+
+
+def of_one(observations: NDArray | dict[str, NDArray], i: int) -> NDArray | dict[str, NDArray]:
+    """Environment i's part of observations."""
+    if isinstance(observations, dict):
+        return {name: values[i] for name, values in observations.items()}
+    return observations[i]
 
 
 def _info(envs: LocalVectorEnv | ProcessVectorEnv, i: int) -> dict[str, Any]:
@@ -112,9 +133,7 @@ class DriveEnv(gymnasium.Env):
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vector_env.options.control_timestep)}
         self.observation_space, self.action_space = make_spaces(self.vector_env)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         if seed is not None:
             self.vector_env.seed(0, seed)
@@ -124,16 +143,16 @@ class DriveEnv(gymnasium.Env):
             base = self._local.physics[0].base_to_world
             self._chase = ChaseCamera(base)
             self._chase_pose = self._chase.follow(base)
-        return self.vector_env.observation()[0], _info(self.vector_env, 0)
+        return of_one(observations(self.vector_env), 0), _info(self.vector_env, 0)
 
-    def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if not self._started:
             raise ResetNeeded("step before reset; call reset() first")
         out = self.vector_env.step(np.asarray(action)[None])
         if self._chase:
             self._chase_pose = self._chase.follow(self._local.physics[0].base_to_world)
         end = bool(out.terminated[0]), bool(out.truncated[0])
-        return self.vector_env.observation()[0], float(out.reward[0]), *end, _info(self.vector_env, 0)
+        return of_one(observations(self.vector_env), 0), float(out.reward[0]), *end, _info(self.vector_env, 0)
 
     def render(self) -> NDArray | None:
         """A picture, uint8 (height, width, 3).
@@ -195,7 +214,7 @@ class DriveVectorEnv(VectorEnv):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Resets all environments; a single seed gives environment i the seed + i."""
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         for i, one in enumerate(seeds or ()):
@@ -203,23 +222,23 @@ class DriveVectorEnv(VectorEnv):
                 self.vector_env.seed(i, one)
         self.vector_env.begin(range(self.num_envs))
         self._started = True
-        return self.vector_env.observation(), self._infos(range(self.num_envs))
+        return observations(self.vector_env), self._infos(range(self.num_envs))
 
-    def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
+    def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
         if not self._started:
             raise ResetNeeded("step before reset; call reset() first")
         out = self.vector_env.step(np.asarray(actions))
         over = np.flatnonzero(out.over).tolist()
         final: dict[str, Any] = {}
         if over:
-            last = self.vector_env.observation()
+            last = observations(self.vector_env)
             final = {"final_obs": np.full(self.num_envs, None, object), "_final_obs": out.over.copy()}
             for i in over:
-                final["final_obs"][i] = last[i]
+                final["final_obs"][i] = of_one(last, i)
             final |= {"final_info": self._infos(over), "_final_info": out.over.copy()}
             self.vector_env.begin(over)
         infos = self._infos(range(self.num_envs)) | final
-        return self.vector_env.observation(), out.reward, out.terminated, out.truncated, infos
+        return observations(self.vector_env), out.reward, out.terminated, out.truncated, infos
 
     def render(self) -> tuple[NDArray, ...] | None:
         """The newest image of each environment, uint8 (height, width, 3)."""

@@ -20,7 +20,11 @@ from twin.errors import InputError, short_repr
 from twin.types import Array
 from twin.warp_runtime import wp
 
+STATE_SIZES = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": 3}
+"""Components of the state and their sizes; see `RewardAndTermination.state`."""
+
 NERF, SIMULATOR, SPLATS = "nerf", "simulator", "splats"
+ODOMETRY, PRIVILEGED = "odometry", "privileged"
 CPU, CUDA = "cpu", "cuda"
 
 
@@ -57,6 +61,9 @@ class Options:
     """Number of images in an observation, the newest last."""
     pixels: bool = True
     """Observe images; otherwise the state of `RewardAndTermination.state`, which needs no field."""
+    state: str | None = None
+    """Numbers observed besides the images: `odometry` (speed [m/s], yaw rate [rad/s]), `privileged` (the state of
+    `RewardAndTermination.state`, which needs the map), or None."""
     action: str = TWIST
     """twist (v [m/s], ω [rad/s]) or steering (ω [rad/s] at fixed speed)."""
     speed: float = 1.0
@@ -146,6 +153,7 @@ _CHECKS: dict[str, Check] = {
     "size": IMAGE_SIZE,
     "stack": (lambda value: _is_integer(value, 1, _MAX_STACK), f"a whole number from 1 to {_MAX_STACK}"),
     "pixels": _BOOLEAN,
+    "state": (lambda value: value in (None, ODOMETRY, PRIVILEGED), f"None, {ODOMETRY!r} or {PRIVILEGED!r}"),
     "action": _one_of(TWIST, STEERING),
     "speed": _AT_LEAST_001,
     "yaw_rate": _AT_LEAST_001,
@@ -200,9 +208,16 @@ def parse_options(given: dict[str, Any]) -> Options:
             f"observe = {options.observe!r}, splats = {short_repr(options.splats)}; expected both observe='splats' and "
             "splats='road.ply', or neither"
         )
+    if options.state is not None and not options.pixels:
+        raise InputError(f"state = {options.state!r} with pixels=False: the state is observed anyway; leave state out")
     if options.device == CUDA and not wp.is_cuda_available():
         raise InputError(f"device = {CUDA!r}: no CUDA device is visible to warp; use device={CPU!r}")
     return options
+
+
+def state_size(options: Options) -> int:
+    """Number of components of the privileged state, from the first on, that are observed besides images."""
+    return {None: 0, ODOMETRY: 2}.get(options.state, sum(STATE_SIZES.values()))
 
 
 def check_option(name: str, value: Any, check: Check) -> None:

@@ -28,7 +28,7 @@ from twin.env.episode_lighting import EpisodeLighting
 from twin.env.mujoco_renderer import SceneRenderer
 from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.obstacles import EpisodeObstacles, add_obstacles
-from twin.env.options import CPU, NERF, Options, parse_options
+from twin.env.options import CPU, NERF, Options, parse_options, state_size
 from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.task import DrivePhysics, DriveTask, RewardAndTermination, control
@@ -154,7 +154,10 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
 
 
 class DriveEnvironment(control.Environment):
-    """An environment with image observations: `pixels`, uint8, shape (stack, height, width, 3), the newest last."""
+    """An environment with image observations: `pixels`, uint8, shape (stack, height, width, 3), the newest last.
+
+    With the option `state`, `state` is observed, too, float32, shape (k,).
+    """
 
     def __init__(self, physics: DrivePhysics, task: DriveTask, pixels: PixelObserver) -> None:
         super().__init__(physics, task, control_timestep=task.options.control_timestep)
@@ -180,10 +183,17 @@ class DriveEnvironment(control.Environment):
 
     def observation_spec(self) -> dict[str, specs.BoundedArray]:
         _, stack, channels, height, width = self.pixels.stacks.shape
-        return {"pixels": specs.BoundedArray((stack, height, width, channels), np.uint8, 0, 255, name="pixels")}
+        images = specs.BoundedArray((stack, height, width, channels), np.uint8, 0, 255, name="pixels")
+        size = state_size(self.task.options)
+        low, high = self.task.state_bounds[:, :size]
+        state = {"state": specs.BoundedArray((size,), np.float32, low, high, name="state")}
+        return {"pixels": images} | (state if size else {})
 
     def _with_pixels(self, step: dm_env.TimeStep) -> dm_env.TimeStep:
-        return step._replace(observation={"pixels": np.ascontiguousarray(self.pixels.stacks[0].transpose(0, 2, 3, 1))})
+        observed = {"pixels": np.ascontiguousarray(self.pixels.stacks[0].transpose(0, 2, 3, 1))}
+        if size := state_size(self.task.options):
+            observed["state"] = self.task.state(self.physics)[:size]
+        return step._replace(observation=observed)
 
 
 def load(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from twin.config import CAUSES, STEERING, ObstacleConfig
 from twin.env.domain_randomization import NominalModel, RandomizationSample
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
-from twin.env.options import Options, check_actions
+from twin.env.options import STATE_SIZES, Options, check_actions
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
@@ -44,9 +44,6 @@ except ModuleNotFoundError as error:
     ) from None
 
 EnvIndices = Sequence[int] | NDArray[np.int64]
-
-STATE_SIZES = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": 3}
-"""Components of the state and their sizes; see `RewardAndTermination.state`."""
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
 BUMPER_OFFSET = 0.5  # [m] ahead of the base
@@ -334,10 +331,13 @@ class DriveTask(control.Task):
         return 0.0 if terminated[0] else 1.0 if truncated[0] else None
 
     def get_observation(self, physics: DrivePhysics) -> "OrderedDict[str, Array]":
-        """Returns the privileged state, see `RewardAndTermination.state`."""
-        state = self._evaluator.state([self._index], _robot_motion(physics))[0]
+        """Returns the components of the privileged state."""
         ends = np.cumsum(list(STATE_SIZES.values()))
-        return OrderedDict(zip(STATE_SIZES, np.split(state, ends[:-1]), strict=True))
+        return OrderedDict(zip(STATE_SIZES, np.split(self.state(physics), ends[:-1]), strict=True))
+
+    def state(self, physics: DrivePhysics) -> NDArray[np.float32]:
+        """Returns the privileged state, shape (7,), see `RewardAndTermination.state`."""
+        return self._evaluator.state([self._index], _robot_motion(physics))[0]
 
     def observation_spec(self, physics: DrivePhysics) -> "OrderedDict[str, specs.BoundedArray]":
         ends = np.cumsum(list(STATE_SIZES.values()))

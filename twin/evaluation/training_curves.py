@@ -37,11 +37,7 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
         By policy, JSON-able: run, step at which it was saved, task, observe and lighting of the training, and the
         `rate_summary` of the `RECENT_EPISODES` before that step.
     """
-    record = SceneDir(root).validation / "validated.json"
-    digests: dict[str, Any] = {}
-    if record.exists():
-        with wrap_read_errors(record, f"move {record.parent} away and validate anew"):
-            digests = dict(read_json(record)["policies"])
+    digests = validated_digests(root)
     out = {}
     for policy in policies:
         run, _, checkpoint = policy.partition("/")
@@ -59,6 +55,15 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
         recorded = {key: trained.get(key, "") for key in ("step", "task", "observe", "lighting")}
         out[policy] = {"run": run, **recorded, **rate_summary(int(won.sum()), len(won))}
     return out
+
+
+def validated_digests(root: Path) -> dict[str, Any]:
+    """Digests of the validated policies of a scene by name; empty before any validation."""
+    record = SceneDir(root).validation / "validated.json"
+    if not record.exists():
+        return {}
+    with wrap_read_errors(record, f"move {record.parent} away and validate anew"):
+        return dict(read_json(record)["policies"])
 
 
 def _is_there(path: Path) -> bool:

@@ -10,10 +10,9 @@ One module per format: `usd`, `gltf`, `nerfstudio`, `colmap`; splats are made in
 """
 
 import argparse
-import contextlib
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +30,7 @@ from twin.errors import InputError
 from twin.export import gltf, usd
 from twin.export.colmap import write_colmap
 from twin.export.nerfstudio import write_nerfstudio
-from twin.files import load_arrays, remove, write_bytes
+from twin.files import load_arrays, new_folder, require_absent, write_bytes
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import write_image
 from twin.loading import Twin, load_scene
@@ -80,8 +79,7 @@ def export(
         if path.is_dir():
             raise InputError(f"{path} is a folder; give a file")
     for path in folders:
-        if path.exists() or path.is_symlink():
-            raise InputError(f"{path} is there already; remove it, or give another folder")
+        require_absent(path)
     if usd_file is not None:
         if usd_file.suffix.lower() not in usd.SUFFIXES:
             raise InputError(f"{usd_file}: expected a file ending in {', '.join(usd.SUFFIXES)}")
@@ -144,28 +142,15 @@ def _field_files(
 
 def _write_nerfstudio(out: Path, cameras: Cameras, points: SparsePoints) -> None:
     masked = any(cameras.mask_path(i) for i in range(len(cameras)))
-    with _whole_folder(out) as folder:
+    with new_folder(out) as folder:
         _copy_frames(cameras, folder, lambda name: f"{name}.png", white=masked)
         write_nerfstudio(folder, cameras, points, masked)
 
 
 def _write_colmap(out: Path, cameras: Cameras, points: SparsePoints) -> None:
-    with _whole_folder(out) as folder:
+    with new_folder(out) as folder:
         _copy_frames(cameras, folder, lambda name: f"{name}.png.png", white=False)
         write_colmap(folder, cameras, points)
-
-
-@contextlib.contextmanager
-def _whole_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `out` when the block ends, or is removed if it fails."""
-    partial_folder = out.with_name(f".{out.name[:200]}.partial")
-    remove(partial_folder)
-    partial_folder.mkdir()
-    try:
-        yield partial_folder
-        partial_folder.rename(out)
-    finally:
-        remove(partial_folder)
 
 
 def _copy_frames(cameras: Cameras, folder: Path, mask_name: Callable[[str], str], white: bool) -> None:

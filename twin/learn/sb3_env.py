@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from twin.env.gym_env import make_spaces
+from twin.env.gym_env import make_spaces, observations, of_one
 from twin.env.vector_env import make_vector_env
 from twin.loading import Twin
 
@@ -35,7 +35,7 @@ class DriveVecEnv(VecEnv):
         self._returns, self._lengths = np.zeros(n_envs), np.zeros(n_envs, int)
         self.seed(seed)
 
-    def reset(self) -> NDArray:
+    def reset(self) -> Any:
         for i, seed in enumerate(self._seeds):
             if seed is not None:
                 self.vector_env.seed(i, seed)
@@ -43,22 +43,22 @@ class DriveVecEnv(VecEnv):
         self._returns[:], self._lengths[:] = 0.0, 0
         self.vector_env.begin(range(self.num_envs))
         self.reset_infos = [self.vector_env.info(i) for i in range(self.num_envs)]
-        return self.vector_env.observation()
+        return observations(self.vector_env)
 
     def step_async(self, actions: NDArray) -> None:
         self._actions = actions
 
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, NDArray, NDArray, list[dict[str, Any]]]:
         out = self.vector_env.step(self._actions)
         infos = [{**self.vector_env.info(i), "state": self.vector_env.state(i)} for i in range(self.num_envs)]
         self._returns += out.reward
         self._lengths += 1
         over = np.flatnonzero(out.over).tolist()
         if over:
-            last = self.vector_env.observation()
+            last = observations(self.vector_env)
             for i in over:
                 infos[i] |= {
-                    "terminal_observation": last[i],
+                    "terminal_observation": of_one(last, i),
                     "TimeLimit.truncated": bool(out.truncated[i]),
                     "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
                 }
@@ -66,7 +66,7 @@ class DriveVecEnv(VecEnv):
             self.vector_env.begin(over)
             for i in over:
                 infos[i]["first_state"] = self.vector_env.state(i)
-        return self.vector_env.observation(), out.reward.astype(np.float32), out.over, infos
+        return observations(self.vector_env), out.reward.astype(np.float32), out.over, infos
 
     def close(self) -> None:
         self.vector_env.close()

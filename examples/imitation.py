@@ -1,0 +1,82 @@
+"""Behavior cloning of recorded drives.
+
+    twin film scenes/demo --task straight --lerobot drives --episodes 20 --randomise
+    python examples/imitation.py drives
+    cd examples && twin film ../scenes/demo --task straight --policy imitation:act
+
+The last command drives by `act`, with the weights in `imitation.safetensors`.
+"""
+
+import argparse
+import functools
+from pathlib import Path
+
+import numpy as np
+import torch
+from pyarrow import parquet
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from twin.report.video_writer import read_frames
+
+WEIGHTS = Path(__file__).with_name("imitation.safetensors")
+STACK = 4  # pictures that a policy sees, the newest last
+
+
+def network() -> nn.Module:
+    layers = [
+        nn.Conv2d(3 * STACK, 32, 5, 4),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, 3, 2),
+        nn.ReLU(),
+        nn.AdaptiveAvgPool2d((4, 8)),
+    ]
+    return nn.Sequential(*layers, nn.Flatten(), nn.Linear(1024, 64), nn.ReLU(), nn.Linear(64, 2), nn.Tanh())
+
+
+@functools.cache
+def _trained() -> nn.Module:
+    model = network()
+    model.load_state_dict(load_file(WEIGHTS))
+    return model.eval()
+
+
+@torch.no_grad()
+def act(pixels: np.ndarray) -> np.ndarray:
+    """Action in [-1, 1] of the speed and the yaw rate, from pictures (12, height, width)."""
+    return _trained()(torch.as_tensor(pixels[None]).float() / 255.0 - 0.5)[0].numpy()
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--max-speed", type=float, default=1.0, help="[m/s], as in the environment")
+    given = parser.parse_args(arguments)
+
+    rows = parquet.read_table(given.dataset / "data/chunk-000/file-000.parquet").to_pydict()
+    films = sorted((given.dataset / "videos/observation.images.front").glob("chunk-*/*.mp4"))
+    pictures = torch.as_tensor(np.concatenate([list(read_frames(film)) for film in films])).permute(0, 3, 1, 2)
+    actions = torch.tensor(rows["action"])
+    actions[:, 0] = (
+        2.0 * actions[:, 0] / given.max_speed - 1.0
+    )  # the environment's range is from 0 to the highest speed
+    index, frame = torch.arange(len(actions)), torch.tensor(rows["frame_index"])
+    model, generator = network(), torch.Generator().manual_seed(0)
+    optimizer = torch.optim.Adam(model.parameters(), 1e-3)
+    for step in range(given.steps):
+        some = torch.randint(len(actions), (64,), generator=generator)
+        # At its start a drive has the first picture several times, as in the environment.
+        back = [index[some] - torch.minimum(frame[some], torch.tensor(k)) for k in reversed(range(STACK))]
+        seen = torch.cat([pictures[one] for one in back], 1).float() / 255.0 - 0.5
+        loss = (model(seen) - actions[some]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if step % 200 == 0 or step == given.steps - 1:
+            print(f"step {step}: mean squared error {loss.item():.4f}")
+    save_file(model.state_dict(), WEIGHTS)
+
+
+if __name__ == "__main__":
+    main()

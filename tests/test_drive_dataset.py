@@ -1,0 +1,144 @@
+"""Drives as a LeRobot dataset: what its readers need, on made-up drives."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.env.episode import Episode
+from twin.errors import InputError
+from twin.files import read_json
+from twin.report.drive_dataset import CAMERA, DriveDataset
+from twin.report.video_writer import read_frames
+
+pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow")
+parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
+
+SIZE = (64, 36)
+LENGTHS = (12, 7)
+
+
+def drive(count: int, seed: int, cause: str) -> tuple[Episode, list[np.ndarray], np.ndarray]:
+    """A drive of `count` instants: episode, pictures, motion."""
+    rng = np.random.default_rng(seed)
+    actions = rng.uniform(-1, 1, (count, 2))
+    actions[-1] = 0.0
+    base = np.tile(np.eye(4), (count, 1, 1))
+    base[:, 0, 3] = np.arange(count) * 0.1
+    episode = Episode(
+        times=np.arange(count) * 0.1,
+        base_to_world=base,
+        qpos=np.zeros((count, 7)),
+        actions=actions,
+        rewards=rng.uniform(0, 1, count),
+        speed=rng.uniform(0, 1, count),
+        cross_track=rng.uniform(-1, 1, count),
+        progress=np.arange(count) * 0.1,
+        trust=np.ones(count),
+        cause=cause,
+        touched=(),
+        task="straight",
+        lighting="day",
+        seed=seed,
+        randomisation={},
+        obstacles=(),
+    )
+    ramp = np.linspace(0, 200, SIZE[0])[None, :, None] * np.ones((SIZE[1], 1, 3))
+    pictures = [np.clip(ramp + 4 * k, 0, 255).astype(np.uint8) for k in range(count)]
+    return episode, pictures, rng.uniform(-1, 1, (count, 2))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> tuple[Path, list]:
+    folder = tmp_path_factory.mktemp("dataset")
+    drives = [drive(LENGTHS[0], 3, "goal"), drive(LENGTHS[1], 4, "collision")]
+    dataset = DriveDataset(folder, SIZE, 0.1, ("linear_velocity", "angular_velocity"), "Drive.")
+    for one in drives:
+        dataset.add(*one)
+    dataset.finish()
+    return folder, drives
+
+
+def table(folder: Path, name: str) -> dict[str, list]:
+    return parquet.read_table(folder / name).to_pydict()
+
+
+def test_frames_pair_each_picture_with_the_action_that_followed(written):
+    folder, drives = written
+    rows = table(folder, "data/chunk-000/file-000.parquet")
+    counts = [count - 1 for count in LENGTHS]
+    assert rows["index"] == list(range(sum(counts)))
+    assert rows["episode_index"] == [0] * counts[0] + [1] * counts[1]
+    assert rows["frame_index"] == [*range(counts[0]), *range(counts[1])]
+    np.testing.assert_array_equal(np.float32(rows["timestamp"]), np.float32(np.array(rows["frame_index"]) / 10))
+    for name, of in (("action", lambda e, m: e.actions[:-1]), ("observation.state", lambda e, m: m[:-1])):
+        wanted = np.concatenate([of(episode, motion) for episode, _, motion in drives])
+        np.testing.assert_array_equal(np.float32(rows[name]), np.float32(wanted))
+    np.testing.assert_array_equal(
+        np.float32(rows["next.reward"]), np.float32(np.concatenate([episode.rewards[1:] for episode, _, _ in drives]))
+    )
+    assert np.flatnonzero(rows["next.done"]).tolist() == [counts[0] - 1, sum(counts) - 1]
+    assert np.flatnonzero(rows["next.success"]).tolist() == [counts[0] - 1]
+
+
+def test_films_show_the_pictures_at_their_times(written):
+    folder, drives = written
+    episodes = table(folder, "meta/episodes/chunk-000/file-000.parquet")
+    for number, (_, pictures, _) in enumerate(drives):
+        assert episodes[f"videos/{CAMERA}/file_index"][number] == number
+        frames = list(read_frames(folder / f"videos/{CAMERA}/chunk-000/file-{number:03d}.mp4"))
+        assert len(frames) == episodes["length"][number] == len(pictures) - 1
+        assert np.abs(np.array(frames, int) - np.array(pictures[:-1], int)).mean() < 2.0  # of 255: the codec's error
+    assert episodes["dataset_from_index"] == [0, LENGTHS[0] - 1]
+    assert episodes["dataset_to_index"] == [LENGTHS[0] - 1, sum(LENGTHS) - 2]
+
+
+def test_statistics_are_those_of_all_frames(written):
+    folder, drives = written
+    stats = read_json(folder / "meta/stats.json")
+    actions = np.concatenate([episode.actions[:-1] for episode, _, _ in drives]).astype(np.float32)
+    for kind, wanted in (("mean", actions.mean(0)), ("std", actions.std(0)), ("min", actions.min(0))):
+        np.testing.assert_allclose(stats["action"][kind], wanted, rtol=1e-5)
+    colors = np.concatenate([pictures[:-1] for _, pictures, _ in drives]).reshape(-1, 3) / 255
+    np.testing.assert_allclose(np.ravel(stats[CAMERA]["mean"]), colors.mean(0))
+    np.testing.assert_allclose(np.ravel(stats[CAMERA]["std"]), colors.std(0))
+    assert np.shape(stats[CAMERA]["max"]) == (3, 1, 1) and stats[CAMERA]["count"] == [sum(LENGTHS) - 2]
+
+
+def test_info_describes_every_column(written):
+    folder, _ = written
+    info = read_json(folder / "meta/info.json")
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 10
+    assert (info["total_episodes"], info["total_frames"]) == (2, sum(LENGTHS) - 2)
+    rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet")
+    assert set(info["features"]) == {*rows.column_names, CAMERA}
+    for name in rows.column_names:
+        feature, kind = info["features"][name], rows.schema.field(name).type
+        vector = isinstance(kind, pyarrow.FixedSizeListType)
+        assert feature["shape"] == ([kind.list_size] if vector else [1])
+        assert pyarrow.type_for_alias(feature["dtype"]) == (kind.value_type if vector else kind)
+    index = json.loads(parquet.read_schema(folder / "meta/tasks.parquet").metadata[b"pandas"])["index_columns"]
+    assert index == ["task"] and table(folder, "meta/tasks.parquet") == {"task_index": [0], "task": ["Drive."]}
+
+
+def test_what_a_film_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(InputError, match="even sides"):
+        DriveDataset(tmp_path, (63, 36), 0.1, ("angular_velocity",), "Drive.")
+    with pytest.raises(InputError, match="whole pictures a second"):
+        DriveDataset(tmp_path, SIZE, 0.15, ("angular_velocity",), "Drive.")
+
+
+def test_lerobot_reads_it(written):
+    reader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed")
+    folder, drives = written
+    dataset = reader.LeRobotDataset("twin/drives", root=folder, video_backend="pyav")
+    assert len(dataset) == sum(LENGTHS) - 2
+    for i in range(len(dataset)):
+        item = dataset[i]
+        assert item["index"].item() == i and item["task"] == "Drive."
+        number, frame = item["episode_index"].item(), item["frame_index"].item()
+        episode, pictures, _ = drives[number]
+        np.testing.assert_array_equal(item["action"].numpy(), np.float32(episode.actions[frame]))
+        shown = item[CAMERA].numpy().transpose(1, 2, 0) * 255
+        assert np.abs(shown - pictures[frame]).mean() < 2.0

@@ -1,0 +1,263 @@
+"""Drives as a LeRobot dataset (version 3.0), from which imitation and offline reinforcement learning start.
+
+One film and one row of `meta/episodes` per drive; all frames in one table. A frame has the picture that the robot saw,
+its motion, the action that followed, and what came of it. The format is that of huggingface.co/docs/lerobot,
+"LeRobotDataset v3.0".
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.env.episode import Episode
+from twin.errors import InputError
+from twin.files import write_json
+from twin.report.video_writer import VideoWriter
+from twin.types import Array
+
+if TYPE_CHECKING:
+    import pyarrow
+
+VERSION = "v3.0"
+CAMERA = "observation.images.front"
+"""Key of the robot's pictures."""
+
+_CRF = 18
+_CHUNK = 1000  # films per folder
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_MOTION = ("linear_velocity", "angular_velocity")
+_PLACE = ("x", "y", "yaw", "cross_track", "progress")
+_INDICES = ("frame_index", "episode_index", "index", "task_index")
+
+
+@dataclass
+class DriveDataset:
+    """Collects drives in a folder; `finish` makes the dataset complete.
+
+    Raises:
+        InputError: the frame rate is no whole number, or the size of the pictures is odd; video needs both.
+    """
+
+    folder: Path
+    size: tuple[int, int]
+    """Width, height of the pictures [px]."""
+    timestep: float
+    """Time between two pictures [s]."""
+    action_names: Sequence[str]
+    instruction: str
+    """The task in words, which language-conditioned policies receive."""
+    _rows: list[dict[str, NDArray]] = field(default_factory=list)
+    _episodes: list[dict[str, Any]] = field(default_factory=list)
+    _stats: list[dict[str, dict[str, Array]]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        require_pyarrow()
+        self.fps = round(1.0 / self.timestep)
+        if abs(self.fps * self.timestep - 1.0) > 1e-6:
+            raise InputError(
+                f"control_timestep = {self.timestep} s: a dataset needs whole pictures a second, as by 0.1 s"
+            )
+        if self.size[0] % 2 or self.size[1] % 2:
+            raise InputError(f"size {self.size[0]}×{self.size[1]}: a dataset's films need even sides")
+
+    def add(self, episode: Episode, pictures: Sequence[NDArray[np.uint8]], motion: Array) -> None:
+        """Adds a drive of k instants.
+
+        Args:
+            episode: The drive. Its last instant has no action, so the dataset gets k − 1 frames.
+            pictures: What the robot saw at each instant, k times (height, width, 3).
+            motion: Speed [m/s] and yaw rate [rad/s] at each instant, shape (k, 2).
+        """
+        number, count = len(self._episodes), len(episode.times) - 1
+        start = self._episodes[-1]["dataset_to_index"] if self._episodes else 0
+        file = {"chunk_index": number // _CHUNK, "file_index": number % _CHUNK}
+        film = self.folder / "videos" / CAMERA / f"{_FILE.format(**file)}.mp4"
+        film.parent.mkdir(parents=True, exist_ok=True)
+        with VideoWriter(film, self.size, self.fps, _CRF) as writer:
+            for picture in pictures[:count]:
+                writer.write(picture)
+        last = np.arange(count) == count - 1
+        poses = episode.base_to_world[:count]
+        place = (*poses[:, :2, 3].T, np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+        frames = {
+            "observation.state": motion[:count],
+            "observation.environment_state": np.stack(
+                [*place, episode.cross_track[:count], episode.progress[:count]], -1
+            ),
+            "action": episode.actions[:count],
+            "next.reward": episode.rewards[1:],
+            "next.done": last,
+            "next.success": last & episode.success,
+            "timestamp": np.arange(count) / self.fps,
+            "frame_index": np.arange(count),
+            "episode_index": np.full(count, number),
+            "index": start + np.arange(count),
+            "task_index": np.zeros(count, np.int64),
+        }
+        rows = {name: values.astype(self.features[name]["dtype"]) for name, values in frames.items()}
+        self._rows.append(rows)
+        self._stats.append(
+            {name: _statistics(values) for name, values in rows.items()} | {CAMERA: _colors(pictures[:count])}
+        )
+        self._episodes.append(
+            {
+                "episode_index": number,
+                "tasks": [self.instruction],
+                "length": count,
+                "data/chunk_index": 0,
+                "data/file_index": 0,
+                "dataset_from_index": start,
+                "dataset_to_index": start + count,
+                **{f"videos/{CAMERA}/{name}": value for name, value in file.items()},
+                f"videos/{CAMERA}/from_timestamp": 0.0,
+                f"videos/{CAMERA}/to_timestamp": count / self.fps,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                "twin.cause": episode.cause,
+                "twin.lighting": episode.lighting,
+                "twin.seed": episode.seed,
+            }
+        )
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """The dataset's columns: type, shape and names."""
+        width, height = self.size
+        video = {
+            "video.height": height,
+            "video.width": width,
+            "video.channels": 3,
+            "video.codec": "h264",
+            "video.pix_fmt": "yuv420p",
+            "video.is_depth_map": False,
+            "video.fps": self.fps,
+            "has_audio": False,
+        }
+        shapes = {
+            "observation.state": ("float32", _MOTION),
+            "observation.environment_state": ("float32", _PLACE),
+            "action": ("float32", tuple(self.action_names)),
+            **dict.fromkeys(("next.reward", "timestamp"), ("float32", ())),
+            **dict.fromkeys(("next.done", "next.success"), ("bool", ())),
+            **dict.fromkeys(_INDICES, ("int64", ())),
+        }
+        columns = {
+            name: {"dtype": kind, "shape": [max(1, len(names))], "names": list(names) or None}
+            for name, (kind, names) in shapes.items()
+        }
+        picture = {
+            "dtype": "video",
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+            "info": video,
+        }
+        return {CAMERA: picture, **columns}
+
+    def finish(self, robot: str = "husky") -> None:
+        """Writes the tables. At least one drive must have been added."""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        def write(name: str, table: "pyarrow.Table") -> None:
+            (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            parquet.write_table(table, self.folder / name)
+
+        first = _FILE.format(chunk_index=0, file_index=0)
+        columns = {}
+        for name in self._rows[0]:
+            values = np.concatenate([rows[name] for rows in self._rows])
+            flat = pa.array(values.ravel())
+            columns[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
+        write(f"data/{first}.parquet", pa.table(columns))
+        stats = [
+            {f"stats/{name}/{kind}": value.tolist() for name, one in stats.items() for kind, value in one.items()}
+            for stats in self._stats
+        ]
+        rows = [episode | numbers for episode, numbers in zip(self._episodes, stats, strict=True)]
+        write(f"meta/episodes/{first}.parquet", pa.Table.from_pylist(rows))
+        write("meta/tasks.parquet", _task_table([self.instruction]))
+        merged = {name: _merged([one[name] for one in self._stats]) for name in self._stats[0]}
+        write_json(
+            self.folder / "meta" / "stats.json",
+            {name: {kind: value.tolist() for kind, value in one.items()} for name, one in merged.items()},
+        )
+        frames = self._episodes[-1]["dataset_to_index"]
+        write_json(
+            self.folder / "meta" / "info.json",
+            {
+                "codebase_version": VERSION,
+                "robot_type": robot,
+                "total_episodes": len(self._episodes),
+                "total_frames": frames,
+                "total_tasks": 1,
+                "chunks_size": _CHUNK,
+                "data_files_size_in_mb": 100,
+                "video_files_size_in_mb": 200,
+                "fps": self.fps,
+                "splits": {"train": f"0:{len(self._episodes)}"},
+                "data_path": f"data/{_FILE}.parquet",
+                "video_path": f"videos/{{video_key}}/{_FILE}.mp4",
+                "features": self.features,
+            },
+        )
+
+
+def require_pyarrow() -> None:
+    """Raises InputError where pyarrow, which writes the tables, is not installed."""
+    try:
+        import pyarrow  # noqa: F401
+    except ModuleNotFoundError:
+        raise InputError("a LeRobot dataset needs pyarrow: pip install 'twin[lerobot]'") from None
+
+
+def _statistics(values: NDArray) -> dict[str, Array]:
+    """Statistics of a column (k,) or (k, n) as LeRobot has them, each of shape (n,)."""
+    table = values.reshape(len(values), -1).astype(np.float64)
+    return _summary(table.min(0), table.max(0), table.mean(0), table.std(0), len(table))
+
+
+def _colors(pictures: Sequence[NDArray[np.uint8]]) -> dict[str, Array]:
+    """Statistics of the colors in [0, 1], each of shape (3, 1, 1)."""
+    counts = np.array([[np.bincount(one[..., c].ravel(), minlength=256) for c in range(3)] for one in pictures]).sum(0)
+    levels, share = np.arange(256) / 255.0, counts / counts.sum(1, keepdims=True)
+    mean = share @ levels
+    deviation = np.sqrt(share @ levels**2 - mean**2)
+    low, high = (levels[[np.flatnonzero(one)[end] for one in counts]] for end in (0, -1))
+    low, high, mean, deviation = (one[:, None, None] for one in (low, high, mean, deviation))
+    return _summary(low, high, mean, deviation, len(pictures))
+
+
+def _summary(low: Array, high: Array, mean: Array, deviation: Array, count: int) -> dict[str, Array]:
+    return {"min": low, "max": high, "mean": mean, "std": deviation, "count": np.array([count])}
+
+
+def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
+    """Statistics of several drives together."""
+    counts = np.array([one["count"][0] for one in stats], float)
+    means, deviations = (np.stack([one[kind] for one in stats]) for kind in ("mean", "std"))
+    weights = (counts / counts.sum()).reshape(-1, *[1] * (means.ndim - 1))
+    mean = (weights * means).sum(0)
+    variance = (weights * (deviations**2 + (means - mean) ** 2)).sum(0)
+    low, high = np.min([one["min"] for one in stats], 0), np.max([one["max"] for one in stats], 0)
+    return _summary(low, high, mean, np.sqrt(variance), int(counts.sum()))
+
+
+def _task_table(tasks: list[str]) -> "pyarrow.Table":
+    """Tasks as pandas writes a frame whose index is the task in words; LeRobot reads it with pandas."""
+    import pyarrow as pa
+
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
+    column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
+    index = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
+    described = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [one | {"metadata": None} for one in (column, index)],
+        "pandas_version": "2.0.0",
+    }
+    return table.replace_schema_metadata({"pandas": json.dumps(described)})

@@ -1,0 +1,167 @@
+"""Policy cards: `README.md` in a run's folder, with front matter as model hubs read it.
+
+A card says what a policy was trained on, how often it reached the goal in the twin, lighting by lighting, and on the
+real road. Every number is read from the records of `twin train`, `twin validate` and `twin forecast`, which write the
+card anew; what was not measured is said to be missing.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from twin.errors import InputError
+from twin.evaluation.agreement import Estimate
+from twin.evaluation.forecasting import Candidate, Forecast
+from twin.evaluation.statistics import CONFIDENCE, rate_summary
+from twin.evaluation.training_curves import validated_digests
+from twin.evaluation.trials import Cell, read_trials, tally
+from twin.files import digest_file, exists, read_json, wrap_read_errors, write_text
+from twin.learn.policy import JSON, Policy, load_policy
+from twin.scene import SceneDir
+
+CARD = "README.md"
+
+_CHOICE = "choice.json"
+
+
+def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
+    """Writes the cards of runs; names that are no run of the scene, such as `module:function`, have none.
+
+    Raises InputError: a damaged record.
+    """
+    cells = tally(read_trials(scene.episodes_csv)) if exists(scene.episodes_csv) else []
+    forecast = Forecast.load(scene.forecast) if exists(scene.forecast / "forecast.json") else None
+    digests = validated_digests(scene.root)
+    written = []
+    for run in dict.fromkeys(runs):
+        folder = scene.root / "runs" / run
+        if not _is_run(folder):
+            continue
+        # A run that was trained further is another policy than the validated one.
+        same = digest_file(folder / JSON) == digests.get(run)
+        mine = [cell for cell in cells if same and cell.policy == run]
+        known = [one for one in forecast.candidates if same and one.policy == run] if forecast else []
+        path = folder / CARD
+        write_text(path, card(load_policy(str(folder)), folder, mine, known))
+        written.append(path)
+    return written
+
+
+def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Candidate]) -> str:
+    """The card's text, from a policy, its folder, its episodes in the twin and its entries in the forecast."""
+    trained, (width, height), control = policy.trained, policy.size, policy.control
+    facts = {
+        "scene": trained.get("scene"),
+        "task": trained.get("task"),
+        "lightings": trained.get("lighting"),
+        "pictures from": trained.get("observe"),
+        "environment steps": f"{trained['step']:,}" if "step" in trained else None,
+        "seed": trained.get("seed"),
+    }
+    rows = [f"| {name} | {value} |" for name, value in facts.items() if value is not None]
+    action = "yaw rate at a constant speed" if control.actions == 1 else "speed and yaw rate"
+    sees = f"the last {policy.stack} pictures of {width} × {height} px, {1 / control.control_timestep:g} a second"
+    return "\n".join(
+        [
+            _front_matter(policy, cells),
+            f"# {policy.name}",
+            "",
+            f"A driving policy for a Clearpath Husky. It sees {sees}, and chooses {action}: "
+            f"up to {control.speed:g} m/s and {control.yaw_rate:g} rad/s.",
+            "",
+            "## Training",
+            "",
+            *(["| | |", "|---|---|", *rows] if rows else ["Unknown."]),
+            *_selection(folder),
+            "",
+            "## In the twin",
+            "",
+            *_twin_table(cells),
+            "",
+            "## On the road",
+            "",
+            *_road_table(known),
+            "",
+            "## Use",
+            "",
+            f"`twin film SCENE --policy {policy.name}` films a drive, `twin validate SCENE --policy {policy.name}` "
+            "measures it. `policy.onnx` runs on the robot, by `twin_policy` of the same project or any ONNX runtime.",
+            "",
+            "## Limits",
+            "",
+            "Success in the twin forecasts success on the road; it is no measurement of it. The rates hold for the "
+            "place, route, robot and camera of the twin. Nothing here was tested near people or other traffic.",
+            "",
+        ]
+    )
+
+
+def _is_run(folder: Path) -> bool:
+    try:
+        return exists(folder / JSON)
+    except InputError:  # an impossible name, as tables may contain any
+        return False
+
+
+def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:
+    """YAML as model hubs read it; strings and numbers are those of JSON, which YAML includes."""
+    lines = ["---", "library_name: twin", "pipeline_tag: reinforcement-learning"]
+    lines += [f"tags: {json.dumps(['robotics', 'mujoco', 'husky', 'sac', 'navigation'])}"]
+    if cells:
+        lines += ["model-index:", f"- name: {json.dumps(policy.name)}", "  results:"]
+    for cell in cells:
+        lines += [
+            "  - task: {type: reinforcement-learning, name: driving}",
+            f"    dataset: {{type: twin, name: {json.dumps(f'{cell.task}, {cell.lighting}')}}}",
+            f"    metrics: [{{type: success_rate, value: {cell.rate:.4f}, name: success of {cell.trials} episodes}}]",
+        ]
+    return "\n".join([*lines, "---", ""])
+
+
+def _selection(folder: Path) -> list[str]:
+    """How the policy was selected, and its success in episodes after that."""
+    if not exists(folder / _CHOICE):
+        return []
+    with wrap_read_errors(folder / _CHOICE, "delete it, and the best policy is selected again"):
+        choice = read_json(folder / _CHOICE)
+        last, count = choice["chosen"], len(choice["candidates"])
+        measured = rate_summary(int(last["successes"]), int(last["trials"]))
+    return [
+        "",
+        f"Selected among {count} checkpoints. In episodes after the selection it reached the goal "
+        f"{measured['successes']} times of {measured['trials']} ({_interval(measured['low'], measured['high'])}).",
+    ]
+
+
+def _twin_table(cells: Sequence[Cell]) -> list[str]:
+    if not cells:
+        return ["Not validated: run `twin validate`."]
+    out = ["| task | lighting | goal reached | rate |", "|---|---|---|---|"]
+    for cell in cells:
+        of = rate_summary(cell.successes, cell.trials)
+        interval = _interval(of["low"], of["high"])
+        out.append(
+            f"| {cell.task} | {cell.lighting} | {cell.successes} of {cell.trials} | {of['rate']:.2f} ({interval}) |"
+        )
+    return [*out, "", f"Intervals contain the rate of further episodes with {CONFIDENCE:.0%} confidence."]
+
+
+def _road_table(known: Sequence[Candidate]) -> list[str]:
+    driven = [one for one in known if one.driven]
+    if not driven:
+        predicted = [f"- {one.task}: {_estimate(one.corrected)}" for one in known if one.corrected.value is not None]
+        told = ["", "Predicted from other policies that were driven there:", "", *predicted] if predicted else []
+        return ["Not driven on the real road.", *told]
+    rows = [f"| {one.task} | {one.real.n} | {_estimate(one.real)} | {_estimate(one.twin)} |" for one in driven]
+    return ["| task | trials | rate on the road | rate in the twin |", "|---|---|---|---|", *rows]
+
+
+def _estimate(value: Estimate) -> str:
+    if value.value is None:
+        return value.missing
+    known = value.low is not None and value.high is not None
+    return f"{value.value:.2f}" + (f" ({_interval(value.low or 0.0, value.high or 0.0)})" if known else "")
+
+
+def _interval(low: float, high: float) -> str:
+    return f"{low:.2f} to {high:.2f}"
