@@ -116,7 +116,7 @@ def bake(bench: Bench) -> Figures:
     width = load_config(scene.config_file, ()).nerf.max_width
     cameras = Cameras.load(scene.stage("metric"))
     scores = evaluate(field, cameras, width, bench.pick(len(cameras), 1), baked=baked)
-    drops = {name: value - scores["psnr_unfitted"][name] for name, value in scores["psnr_trained"].items()}
+    drops = {name: -gain for name, gain in scores["baking_gain"].items()}
     file = bench.work / "baked/baked.safetensors"
     return {
         "bake.psnr_drop": float(np.mean(list(drops.values()))),

@@ -9,6 +9,7 @@ The last command drives by `act`, with the weights in `imitation.safetensors`.
 
 import argparse
 import functools
+import json
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +53,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--max-speed", type=float, default=1.0, help="[m/s], as in the environment")
+    parser.add_argument("--max-yaw-rate", type=float, default=1.0, help="[rad/s], as in the environment")
     given = parser.parse_args(arguments)
 
+    names = json.loads((given.dataset / "meta/info.json").read_text())["features"]["action"]["names"]
+    if names != ["linear_velocity", "angular_velocity"]:
+        parser.error(f"{given.dataset}: its actions are {names}; expected speed and yaw rate, as the scripted driver's")
     rows = parquet.read_table(given.dataset / "data/chunk-000/file-000.parquet").to_pydict()
     films = sorted((given.dataset / "videos/observation.images.front").glob("chunk-*/*.mp4"))
     pictures = torch.as_tensor(np.concatenate([list(read_frames(film)) for film in films])).permute(0, 3, 1, 2)

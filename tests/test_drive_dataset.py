@@ -138,7 +138,10 @@ def test_lerobot_reads_it(written):
         item = dataset[i]
         assert item["index"].item() == i and item["task"] == "Drive."
         number, frame = item["episode_index"].item(), item["frame_index"].item()
-        episode, pictures, _ = drives[number]
+        assert (number, frame) == ((0, i) if i < LENGTHS[0] - 1 else (1, i - LENGTHS[0] + 1))
+        assert item["timestamp"].item() == np.float32(frame / 10)
+        episode, pictures, motion = drives[number]
+        np.testing.assert_array_equal(item["observation.state"].numpy(), np.float32(motion[frame]))
         np.testing.assert_array_equal(item["action"].numpy(), np.float32(episode.actions[frame]))
         shown = item[CAMERA].numpy().transpose(1, 2, 0) * 255
         assert np.abs(shown - pictures[frame]).mean() < 2.0

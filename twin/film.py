@@ -67,7 +67,7 @@ def film(
     images: list[np.ndarray] = []
 
     def watch(step: dm_env.TimeStep) -> None:
-        images.append(step.observation["pixels"][-1])
+        images.append(step.observation["pixels"][-1].copy())
         progress.update()
 
     with runtime.bar("drive", _most_steps(environment), "step") as progress:
@@ -128,7 +128,7 @@ def record_dataset(
             motion: list[tuple[float, float]] = []
 
             def watch(step: dm_env.TimeStep, physics=environment.physics, pictures=pictures, motion=motion) -> None:
-                pictures.append(step.observation["pixels"][-1])
+                pictures.append(step.observation["pixels"][-1].copy())
                 motion.append((physics.speed, physics.yaw_rate))
 
             episode = record_episode(environment, driver, watch)
