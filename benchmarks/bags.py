@@ -1,13 +1,13 @@
-"""Benchmark of bags as films: a scene built from bags that were made of its films, beside the scene itself.
+"""Benchmark of bags as films: a scene is built from its films, and from bags made of them, and both are compared.
 
     python benchmarks/bags.py SCENE --work FOLDER [--films sun] [--quick] [--again] [--until metric] [--json FILE]
 
 SCENE is a generated place (`twin reality film`). For each film, FOLDER/bags gets a ROS 2 bag with the film's pictures
 (raw, so that both builds read the same pixels), their camera_info, and, from the true poses, what a robot records
-beside them: odometry that is 2 % long and turns by a degree per metre, fixes that wander by a metre, and /tf_static.
-Both scenes are built with the camera's height as scale; then the bags' scene is scaled by odometry and by GPS. Prints
-the figures of both builds, and each scale's error. With --again the films are built twice, which shows how far a
-build differs from itself.
+beside them: odometry that is 2 % too long and drifts by a degree per metre, fixes that wander by a metre, and
+/tf_static. Both scenes are built with the camera's height as scale; then the bags' scene is scaled by odometry and by
+GPS. Prints the figures of both builds, and each scale's error. With --again the films are built twice, which shows how
+far a build differs from itself.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def write_bag(path: Path, film: Path, truth: Truth, name: str, seed: int) -> Non
     types, poses = messages.types, truth.films[name].camera_to_world
     times = truth.films[name].times
     height = truth.camera_height
-    # The camera looks ahead and down as the mean film does.
+    # The camera on the robot is pitched by the mean pitch of the film's poses.
     pitch = float(np.mean(np.arcsin(-poses[:, 2, 2])))
     seat = np.eye(4)
     seat[:3, :3] = Rotation.from_euler("Y", pitch).as_matrix() @ CAMERA_AHEAD

@@ -4,7 +4,8 @@
 
 Pictures of 1280×720 px arrive as JPEG or BGRA from a camera with distortion; each is decoded, rectified, scaled,
 stacked and shown to the policy. Latency is the time from a picture's arrival to its command, on one core that no other
-program should use meanwhile. Without --policy, policies of the sizes of `twin train`'s presets with random weights.
+program should use meanwhile. Without --policy, measures policies that have the sizes of `twin train`'s presets and
+random weights.
 """
 
 import argparse

@@ -37,7 +37,7 @@ TARGETS: dict[str, tuple[str, float]] = {
     "gpu.render_fps": ("≥", 10000.0),
     "gpu.cpu_difference_mean": ("≤", 1 / 255),
 }
-"""Figure → sense and target. A PSNR within a budget also fails if training exceeded the budget."""
+"""Figure → comparison and target. A PSNR within a budget also fails if training exceeded the budget."""
 
 
 def verdict(name: str, figures: dict[str, Any]) -> tuple[str, str]:
@@ -81,7 +81,7 @@ def main() -> int:
     if not options.scene and any(name in NEED_SCENE for name in sections):
         parser.error(f"--scene is needed for {', '.join(name for name in sections if name in NEED_SCENE)}")
     if "fox" in sections and not (options.data / "fox").is_dir():
-        parser.error(f"no fox in {options.data}; give its folder with --data, or leave the section out with --only")
+        parser.error(f"no folder fox in {options.data}; give another --data, or leave the section out with --only")
 
     figures: dict[str, Any] = {}
     record: dict[str, Any] = {}

@@ -2,7 +2,7 @@
 
     python benchmarks/overlay.py --scene BUILT_SCENE_WITH_TRUTH [--json FILE] [--pictures FOLDER]
 
-The scene was filmed without obstacles. Each obstacle is placed along the route twice, composited into the twin and
+The scene was filmed without obstacles. At several places along the route, each obstacle is composited into the twin and
 rendered in the known-truth world, in the same colors. Both are rendered from the same pose of the robot's front camera
 at 160×90, with the film's camera response and without noise. *Obstacle pixels* are those that show the obstacle in the
 truth. *Unshaded* is the composite with plain colors. A drive along the route also compares the visual with the
@@ -134,9 +134,11 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
 
     Returns:
         Figures by name: `overlay.obstacle_psnr.<lighting>`, `overlay.unshaded_psnr.<lighting>` [dB],
-        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and per
-        lighting; `overlay.shadow_rms.<lighting>`, rms error of the shadow factor over pixels beside the obstacle that
-        the obstacle dims by 5 % in the twin or in the truth; `overlay.no_shadow_rms.<lighting>`, without any shadow.
+        `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and
+        `overlay.mask_iou.<lighting>`; `overlay.shadow_rms.<lighting>`, rms error of the shadow factor over pixels
+        beside the obstacle that the obstacle dims by 5 % in the twin or in the truth;
+        `overlay.no_shadow_rms.<lighting>`, the same error if the twin had no shadows; `overlay.places.<lighting>`,
+        number of placements.
     """
     scene = load_scene(scene_path)
     world, field = scene.world(), scene.field()

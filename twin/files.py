@@ -206,7 +206,7 @@ def toml_string(text: str) -> str:
 
 
 def toml_value(value: Any, digits: int | None = None) -> str:
-    """A value of TOML, tables inline, lists and tuples as arrays; numbers are exact, or have so many digits."""
+    """A value of TOML, tables inline, lists and tuples as arrays; floats are exact, or have `digits` digits."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):
@@ -298,8 +298,9 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
 def allocate(path: Path, size: int) -> None:
     """Allocates disk space for a file up to `size` [bytes]; keeps its contents, or creates it.
 
-    Otherwise a full disk ends a process that writes to the memory-mapped file by SIGBUS. On copy-on-write file systems
-    it may still do so. Raises OSError if the disk is full; a newly created file is removed.
+    Without this, a process that writes to the memory-mapped file while the disk is full ends with SIGBUS. On
+    copy-on-write file systems that may still happen. Raises OSError if the disk is full; a newly created file is
+    removed.
     """
     existed = path.exists()
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)

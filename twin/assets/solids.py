@@ -31,7 +31,7 @@ _MIN_HOVERING_VOXELS = 64  # smaller components are noise if they hover
 _HIDDEN_DEPTH = 0.3  # [m] behind a surface where hidden space is solid
 _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
 _SMOOTHING = 0.7  # voxels
-_EROSION = 0.06  # [m] inward offset of surfaces, since edges blur outwards and hulls only grow
+_EROSION = 0.06  # [m] inward offset of surfaces: blur moves edges outwards, and convex hulls add volume
 _CERTAIN_DEPTH = 0.02  # [m] voxels deeper than this behind a seen surface are never eroded
 _CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against rounding in later stages
 
@@ -111,8 +111,8 @@ def solid_pieces(
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
     """Distance field [m] of the solid: the fused field near seen surfaces, clipped to a voxel and eroded by `_EROSION`.
 
-    Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass them, and each pore costs
-    the decomposition time.
+    Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass them, and each one would
+    lengthen the decomposition.
     """
     voxel = volume.voxel
     seen = np.nan_to_num(volume.distance, nan=np.inf) < 0

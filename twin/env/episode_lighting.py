@@ -31,7 +31,7 @@ VERSION = 2
 _SEED = 20_240_315  # of the anchors; constant, so that every run on a build has the same sets
 _POOL_SIZE = 200  # random lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # besides the filmed lightings
-_MARGIN = 1.25  # the other set's nearest anchor must be this much further than the own one
+_MARGIN = 1.25  # the other set's nearest anchor must be this many times as far as that of the lighting's set
 _MAX_TRIES = 60  # proposals per sample, of which about every tenth is near the chosen anchor
 
 

@@ -1,8 +1,9 @@
 """Light on objects in a radiance field: irradiance, estimated from the field for any lighting, and contact shadows.
 
-A field stores colors, not light. *Irradiance* is the color, in the film under a lighting, of a perfectly white surface
-of a given normal: an object's own color times the irradiance is its color in the picture. The irradiance of a
-horizontal surface is the *ground irradiance*: the color of the reconstructed ground nearby over an assumed albedo.
+A field stores colors, not light. *Irradiance* is the color that a perfectly white surface with a given normal would
+have in a film under a lighting: an object's own color times the irradiance is its color in the picture. The irradiance
+of a horizontal surface is the *ground irradiance*: the color of the reconstructed ground nearby, divided by an assumed
+albedo.
 
 The irradiance of other normals is fitted to *probes*, surface points of the field. Each upright probe is compared with
 itself under the mean of the filmed lightings, which cancels its albedo; that mean is assumed to be the light of a
@@ -32,8 +33,8 @@ from twin.types import Array
 
 GROUND_ALBEDO = 0.37
 """Assumed reflectance of the ground along the route, in film colors: worn asphalt reflects about 11 %, which the tone
-curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %) obstacles at night missed the threshold of
-`benchmarks/overlay.py` (6 dB better than unshaded), so that benchmark is no independent test of it."""
+curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at night missed the threshold of
+`benchmarks/overlay.py` (6 dB better than unshaded). So that benchmark is no independent test of this value."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 """Horizontal directions that light is resolved into, shape (4, 3)."""
@@ -43,16 +44,16 @@ _CAMERA_STEP = 2.0  # [m] along the route
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] up to which probes are taken
 _GROUND_TOLERANCE = 0.12  # [m] from the ground
-_MIN_UPRIGHT_HEIGHT = 0.3  # [m] above the ground from which on a probe does not belong to it
+_MIN_UPRIGHT_HEIGHT = 0.3  # [m] above the ground; only probes higher than this count as upright
 _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
 _KERNEL_STD = 1.5  # [m] of the ground probes' weights around a position
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
-_UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky, 1 facing up
+_UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky; facing up it is 1
 _MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
 _MAX_BRIGHTNESS = 1.5  # times the ground's brightest: brighter surfaces emit light
 _NEIGHBORS = 8  # ground probes around an upright one
-_MIN_PROBES = 50  # fewer are not used
+_MIN_PROBES = 50  # fewer on the ground are an error; with fewer upright ones, a uniform sky is assumed
 _LIGHTINGS_CACHED, _POSITIONS_CACHED = 64, 1000
 
 
@@ -96,9 +97,9 @@ class Irradiance:
     def sun(self, xy: Array) -> tuple[float, Array]:
         """Share of the light at a position (2,) that comes from one direction, and that direction, shape (3,).
 
-        Averaged around a vertical pole, a uniform sky gives `_UPRIGHT_SKY` of the ground irradiance, and a sun at
-        elevation e gives cot e / π; only the sun favors one side, by cot e. So both its share and e follow from the
-        light on upright surfaces.
+        On average over all azimuths, an upright surface gets `_UPRIGHT_SKY` of the ground irradiance of a uniform sky,
+        and cot e / π of that of a sun at elevation e. Only the sun lights one side more than the opposite one, by cot e
+        of its ground irradiance. So both its share and e follow from the light on upright surfaces.
         """
         ground = self.ground(np.asarray(xy)[None])[0]
         parts = (self.constant + self.proportional * ground).mean(1) / max(float(ground.mean()), 1e-6)
@@ -276,7 +277,10 @@ def _nearest_indices(positions: Array, xy: Array) -> NDArray[np.int64]:
 
 
 def _uniform_sky_irradiance(normals: Array) -> Array:
-    """Irradiance of unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`, 1 facing up, (n,)."""
+    """Irradiance of unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`, shape (n,).
+
+    A surface that faces up has 1.
+    """
     up = normals[:, 2]
     return 0.5 * (1.0 + up) + 0.5 * (1.0 - up) * _BOUNCE
 

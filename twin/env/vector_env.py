@@ -33,7 +33,7 @@ from twin.errors import InputError
 from twin.loading import Twin
 from twin.runtime import available_cores
 
-_MIN_ENVS, _MAX_PROCESSES = 2, 8  # defaults: environments per process, and processes, as each needs its own memory
+_MIN_ENVS, _MAX_PROCESSES = 2, 8  # defaults: least environments per process; most processes, since each takes memory
 _CHILD_CODE = "from twin.env.vector_env import serve; serve()"  # not -m: classes would be pickled as those of __main__
 _PARENT_CHECK_PERIOD = 2.0  # [s] between two checks that the parent runs
 
@@ -216,7 +216,7 @@ class _Child:
             code = self.process.wait()
             raise InputError(
                 f"a process of the vector environment ended with exit status {code}; expected it to run. "
-                + ("If memory ran out, use fewer processes (1: none)" if code == -9 else "See its messages above")
+                + ("If memory ran out, use fewer processes (1 starts none)" if code == -9 else "See its messages above")
             ) from None
 
 

@@ -13,11 +13,12 @@ design is crossed, so the variance is that of two-way clustering (Cameron, Gelba
     V = V_training + V_day − V_both / 2
 
 V_both is the variance from leaving out one training on one day; V_training and V_day each contain it. For a linear
-statistic of many units all of it is subtracted. Here that made intervals too narrow where ranks jump, and subtracting
-nothing made them too wide (`benchmarks/intervals.py`). The interval is the estimate ± Student's t times √V on a scale
-on which the statistic is less skewed, with Satterthwaite's degrees of freedom, at least half of those of the trainings
-(few days made intervals too wide). There is no interval for fewer units than its coverage was tested with, nor if
-leaving units out changes nothing, since the variance cannot be estimated then.
+statistic of many units all of it is subtracted, as here for the bias. For the other statistics that made intervals too
+narrow where ranks jump, and subtracting nothing made them too wide (`benchmarks/intervals.py`). The interval is the
+estimate ± Student's t times √V on a scale on which the statistic is less skewed, with Satterthwaite's degrees of
+freedom, at least half of those of the trainings (few days made intervals too wide). There is no interval for fewer
+units than its coverage was tested with, nor if leaving units out changes nothing, since the variance cannot be
+estimated then.
 
 A bootstrap was worse (coverage 0.5 to 0.8): it samples some policies twice, which raises correlations, and twin and
 real rates that are sampled again agree less than the observed ones.
@@ -215,8 +216,8 @@ def place_interval(
 ) -> tuple[Array, Array, Array]:
     """A statistic over several places, and the ends of its interval with the place as the unit, shapes (...).
 
-    The value is the mean of the places' own statistics; `pooled`, the statistic of all their policies together. Raises
-    UndefinedStatistic as `jackknife_interval`.
+    The value is the mean of the places' own statistics; if `pooled`, it is the statistic of all their policies
+    together. Raises UndefinedStatistic as `jackknife_interval` does.
     """
     if len(places) < MIN_PLACES:
         raise UndefinedStatistic(f"too few for an interval: {len(places)} places, {MIN_PLACES} are needed")

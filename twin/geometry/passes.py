@@ -41,7 +41,7 @@ _MIN_PATH_FRAMES = 6
 _MAX_OUTLIER_FRACTION = 0.25  # if more frames of a source look wrong, its path is not smooth and no frame is removed
 _MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is a set of unordered photos, not a film
 _OUTLIER_SIGMAS = 8.0  # an outlier's residual exceeds this many robust standard deviations of all residuals
-_MAX_TURN = np.radians(5.0)  # [rad] smallest allowed deviation from the predicted direction
+_MAX_TURN = np.radians(5.0)  # [rad] smaller deviations from the predicted direction are always allowed
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def path_jumps(positions: Array, times: Array, min_jump: float = _MIN_JUMP) -> N
 
 
 def _between_jumps(cameras: Cameras, index: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], str]]:
-    """The frames of a source between its jumps, each with how the piece ends."""
+    """The pieces of a source between its jumps: the frames of each, and how it ends."""
     inliers = index[path_inliers(cameras.positions[index])]
     jumps = path_jumps(cameras.positions[inliers, :2], cameras.times[inliers])
     # Outliers are removed before the division, since one at the end of a piece could not be recognized: it has
@@ -137,7 +137,7 @@ def _between_retraces(
     cuts = _retraces(path)
     if not cuts:
         return [(frames, path, ending)]
-    # Frames follow their station; frames of a turn belong to no pass.
+    # Frames are assigned to passes by their station; frames of a turn belong to no pass.
     station = _frame_stations(positions[frames, :2], path)
     spacing = path_length(path) / (len(path) - 1)
     starts = [0, *(start for _, start, _ in cuts)]
@@ -322,8 +322,8 @@ def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
         worst = int(np.argmax(score))
         if score[worst] <= 1.0:
             return out
-        # An outlier also spoils its neighbors' predictions, so of the worst frame and its neighbors the one is removed
-        # without which the others agree best.
+        # An outlier also spoils its neighbors' predictions. So of the worst frame and its neighbors, the frame
+        # without which the others agree best is removed.
         candidates = [k for k in range(max(worst - 2, 0), min(worst + 3, len(kept))) if score[k] > 0.5]
         out[kept[min(candidates, key=lambda k: _score_without(camera_to_world[kept], k, max_offset, max_turn))]] = True
         if out.sum() > _MAX_OUTLIER_FRACTION * n:

@@ -122,7 +122,7 @@ def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[lis
             driven = pool.map(run_chunk, chunks)
         yield from driven
     except BrokenProcessPool:
-        cure = "if memory ran out, use fewer (--processes 1: none)"
+        cure = "if memory ran out, use fewer (--processes 1 starts none)"
         raise InputError(f"one of {processes} processes ended; {cure}") from None
     finally:
         if sys.exc_info()[0] is not None:  # do not wait for the remaining chunks

@@ -192,7 +192,7 @@ class Layout:
 class Workspace:
     """Arrays of `rays` rays with `samples` samples each and of `extra` points after them, reused by all batches.
 
-    Names with `w_` are Warp views of the torch tensors; `w_ray_` those of the samples on rays, by ray.
+    Names with `w_` are Warp views of the torch tensors; those with `w_ray_` hold the samples on rays, a row per ray.
     """
 
     def __init__(self, layout: Layout, rays: int, samples: int, device: str, extra: int = 0, training: bool = False):

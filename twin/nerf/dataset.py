@@ -109,7 +109,7 @@ class TrainingPixels:
         return join_depths(found)
 
     def _depths_of_path(self, camera_height: float) -> DepthSupervision:
-        """Depth supervision from the ground under the path ahead while it is nearly straight, so that it is visible."""
+        """Depth supervision from the ground under the path ahead, where a nearly straight path makes it visible."""
         found = []
         for source in dict.fromkeys(self.cameras.sources):
             frames = np.flatnonzero([s == source for s in self.cameras.sources])

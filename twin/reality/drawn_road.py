@@ -1,7 +1,9 @@
-"""The road of a drawn place: its driven line in plan, and the height of the ground on and around it.
+"""The road of a drawn place (sampled at random, see `place_spec.py`): its driven line in plan, and the height of the
+ground on and around it.
 
-Along the line the height follows the drawn grades and a slight unevenness; across it, the drawn section. The section
-ends with the verge, where the ground blends into open land, a smooth surface through the heights of the whole line.
+Along the line, the height follows the drawn grades and a slight unevenness; across the line, it follows the drawn cross
+section. The section ends with the verge, where the ground blends into open land, a smooth surface through the heights
+of the whole line.
 """
 
 from functools import cached_property
@@ -17,7 +19,7 @@ _BUMP_LENGTHS = (5.0, 20.0)  # [m] wave lengths of the unevenness
 _SWELL_LENGTHS = (25.0, 80.0)  # [m] wave lengths of the land
 _LAND_SAMPLE = 2.0  # [m] between the heights of the line that determine the land
 _LAND_SMOOTHING = 3.0  # [m]
-_DROP_LENGTH = 0.8  # [m] over which a kerb drops beside a mouth
+_DROP_LENGTH = 0.8  # [m] over which a kerb drops beside the mouth of a side road
 _CHUNK = 40_000  # points whose land height is evaluated together
 
 

@@ -211,7 +211,7 @@ def _is_lit(shadows: ShadowMap, x: int, y: int, along: float):
 def sun_visibility(shadows: ShadowMap, point: wp.vec3, normal: wp.vec3):
     """Fraction of sunlight at a surface point [m]: depth tests at the four nearest texels, interpolated."""
     facing = wp.max(-wp.dot(normal, shadows.ray), 1.0e-3)
-    # Bias: a slanted surface rises this far towards the light within half a texel and must not shade itself.
+    # Bias against self-shadowing: how far a slanted surface rises towards the light within a texel, and half a texel.
     slack = _SHADOW_TEXEL * wp.min(wp.sqrt(1.0 - facing * facing) / facing, _MAX_BIAS) + 0.5 * _SHADOW_TEXEL
     x = (wp.dot(point, shadows.right) - shadows.left_bottom[0]) / _SHADOW_TEXEL
     y = (wp.dot(point, shadows.up) - shadows.left_bottom[1]) / _SHADOW_TEXEL
@@ -374,7 +374,7 @@ def _sky(texels: wp.array[wp.uint8], level: wp.vec3i, ray: wp.vec3):
     """Color of a cube map with six faces stacked in OpenGL's order and its y axis along the world's z."""
     x, y, z = ray[0], ray[2], -ray[1]
     ax, ay, az = wp.abs(x), wp.abs(y), wp.abs(z)
-    face = int(0)  # noqa: RUF046 - a variable to Warp
+    face = int(0)  # noqa: RUF046 - int() declares a variable that Warp can change
     s, t, most = -z, -y, ax
     if ax >= ay and ax >= az:
         if x <= 0.0:
@@ -442,7 +442,7 @@ def _shade(
         z = wp.dot(a, plane) / wp.dot(d, plane)
         if sample == 0:
             depth[py, px] = z
-        # Barycentric coordinates here and one sample further right and down, which span the footprint.
+        # Barycentric coordinates one sample to the right, here, and one sample down; the uv steps span the footprint.
         wx = w + wp.vec3(na[0], nb[0], nc[0]) / intrinsics[0]
         wy = w + wp.vec3(na[1], nb[1], nc[1]) / intrinsics[1]
         here = w / (w[0] + w[1] + w[2])

@@ -62,10 +62,11 @@ _CONTINUES = 1.0  # [rad/s] change of wheel speeds between consecutive windows, 
 def measurement_times(fresh: NDArray[np.bool_]) -> Array:
     """Estimates when every pose of a log's windows was measured, from when poses changed.
 
-    A pose sensor measures at a steady rate, but its poses reach the log with varying delay: between fresh poses a robot
-    moves as far in 0.05 s as in 0.15 s (in turning windows of DRIVE's log, yaw is smooth to 0.3° over the number of
-    fresh poses, to 0.7° over their time of appearance). So the n-th fresh pose counts as measured n periods after the
-    first; if all later ones are late by more than half a period, poses were lost.
+    A pose sensor measures at a steady rate, but its poses reach the log with varying delay: a robot moves as far
+    between fresh poses that appear 0.05 s apart as between those that appear 0.15 s apart. (In turning windows of
+    DRIVE's log, yaw as a function of the number of the fresh pose is smooth to 0.3°, as a function of its time of
+    appearance to 0.7°.) So the n-th fresh pose counts as measured n periods after the first; if all later ones are late
+    by more than half a period, poses were lost.
 
     Times of appearance are used instead for windows that contradict the period by more than `_JITTER`, and for the
     whole log if many do or the sensor is fast.
@@ -373,7 +374,7 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def resample_poses(poses: Array, late: Array, before: int) -> Array:
-    """Poses relative to each robot's pose when its first pose was measured, shape (n, k + MAX_POSE_AGE + 1, 3).
+    """Poses from the measurement of the first one on, and relative to it, shape (n, k + MAX_POSE_AGE + 1, 3).
 
     Args:
         poses: `PERIOD` [s] apart, shape (n, m, 3); extrapolated linearly beyond the last one.
@@ -455,7 +456,7 @@ def check_log(windows: Windows, where: str) -> None:
 
 
 def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, float], str, dict[float, str]]]:
-    """Ratios that reveal wrong units: value, expected range, its text, and cures by the factor that units cause."""
+    """Ratios that reveal wrong units: value, expected range, message, and a cure per factor that wrong units cause."""
     sides = windows.wheels.mean(1) * WHEEL_RADIUS
     mean, half = sides.mean(1), (sides[:, 1] - sides[:, 0]) / 2  # [m/s]
     distance = np.hypot(windows.poses[:, -1, 0], windows.poses[:, -1, 1]) / DURATION

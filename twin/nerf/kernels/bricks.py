@@ -6,7 +6,7 @@ brick; the *index* gives it per brick of a grid, −1 where none is stored. *Blo
 near box, the *far* grid, of larger cells, the contracted cube.
 """
 
-# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
 # mypy: ignore-errors
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.sampler import inside_near_box, near_box_position

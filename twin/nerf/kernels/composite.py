@@ -5,7 +5,7 @@ density in slot 0 and features in the others. Weight wᵢ = Tᵢ·(1 − exp(−
 the *opacity* Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the others.
 """
 
-# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 

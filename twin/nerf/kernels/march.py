@@ -6,7 +6,7 @@ rays are empty before the tile's *start*. Bricks, blocks and grids: `bricks.py`;
 `space.py`.
 """
 
-# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
 # mypy: ignore-errors
 # ruff: noqa: RUF046
 from functools import cache
@@ -395,7 +395,7 @@ def march_kernel(lanes: int) -> Any:
                 x = o[0] + r0[j] * tj
                 y = o[1] + r1[j] * tj
                 z = o[2] + r2[j] * tj
-                # Lanes outside the box read an unused block of it.
+                # Lanes outside the box read some block of it and do not use the value.
                 i0 = wp.clamp(int(wp.clamp(x, -1.0, 1.0e6)), 0, n0 - 1)
                 i1 = wp.clamp(int(wp.clamp(y, -1.0, 1.0e6)), 0, n1 - 1)
                 i2 = wp.clamp(int(wp.clamp(z, -1.0, 1.0e6)), 0, n2 - 1)
@@ -453,7 +453,7 @@ def march_kernel(lanes: int) -> Any:
                     w1 = exit_distance(g[1], q1, i1 & -size, size, skip)
                     w2 = exit_distance(g[2], q2, i2 & -size, size, skip)
                     cell = 0.5 * wp.min(wp.min(wp.abs(q0), wp.abs(q1)), wp.abs(q2))  # length of a cell here [m]
-                    # Outward the contracted position is about linear in 1/m. Inward half the way is taken.
+                    # On an outward ray the contracted position is about linear in 1/m. An inward ray goes half the way.
                     advance = wp.min(wp.min(w0, w1), w2)
                     slack = 1.0 - advance * c4[3] / m
                     advance = wp.where(

@@ -6,7 +6,7 @@ to a source frame. The cost is 1 − NCC, weighted towards window pixels similar
 count, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
 """
 
-# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 

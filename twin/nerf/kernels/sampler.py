@@ -6,7 +6,7 @@ one the contracted cube. *Bin*: one step of the march through the grids. *Stratu
 quantiles of the bins' weights; it is sampled once, and the sample stands for its whole length.
 """
 
-# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
 # mypy: ignore-errors
 # ruff: noqa: RUF046
 from twin.nerf.kernels.composite import Strata

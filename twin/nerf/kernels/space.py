@@ -3,8 +3,9 @@
 *Near box*: axis-aligned box [m] that is mapped without distortion. *Unit position* u: offset from its center over its
 half side, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, (2 − 1/|u|)·u/|u| in the
 maximum norm outside (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so all of space is in (−2, 2)³.
-*Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: a meter inside the near box, the contracted
-length of a meter outside. Density is per contracted meter, so the far field starts no more opaque than the near field.
+*Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: a meter inside the near box; outside it, a
+length that is contracted to that of a meter inside, see `expansion`. Density is per contracted meter, so the far field
+starts no more opaque than the near field.
 """
 
 # Warp reads annotations as values.
@@ -21,7 +22,7 @@ class Contraction:
     center: wp.vec3f
     """[m]"""
     inverse_half: wp.vec3f
-    """Over the half sides [1/m]."""
+    """Inverse of the half sides [1/m]."""
 
 
 @wp.struct

@@ -8,7 +8,7 @@ per tile, −1 where none is stored. The hash grid (Müller et al. 2022) has one
 table. *Footprint*: width of a pixel on the surface [m], by which a ray chooses its levels.
 """
 
-# Warp reads annotations as values, and float() makes a variable of a kernel that changes within a loop.
+# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
 # mypy: ignore-errors
 # ruff: noqa: RUF046
 from twin.nerf.kernels.bricks import Bytes
