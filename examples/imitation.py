@@ -63,9 +63,8 @@ def main(arguments: list[str] | None = None) -> None:
     films = sorted((given.dataset / "videos/observation.images.front").glob("chunk-*/*.mp4"))
     pictures = torch.as_tensor(np.concatenate([list(read_frames(film)) for film in films])).permute(0, 3, 1, 2)
     actions = torch.tensor(rows["action"])
-    actions[:, 0] = (
-        2.0 * actions[:, 0] / given.max_speed - 1.0
-    )  # the environment's range is from 0 to the highest speed
+    # The environment's range is from 0 to the highest speed, and to the highest yaw rate on either side.
+    actions = actions / torch.tensor([given.max_speed / 2.0, given.max_yaw_rate]) - torch.tensor([1.0, 0.0])
     index, frame = torch.arange(len(actions)), torch.tensor(rows["frame_index"])
     model, generator = network(), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(model.parameters(), 1e-3)
