@@ -69,7 +69,7 @@ def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
 
 
 def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
-    """How far the route of a built scene lies from the route of the real test."""
+    """Distances of a built scene's tasks from those of the real test: name and value."""
     twin = load_scene(scene)
     truth = Truth.load(twin.scene.truth)
     cameras = Cameras.load(twin.scene.stage("metric"))

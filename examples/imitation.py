@@ -52,19 +52,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--max-speed", type=float, default=1.0, help="[m/s], as in the environment")
-    parser.add_argument("--max-yaw-rate", type=float, default=1.0, help="[rad/s], as in the environment")
     given = parser.parse_args(arguments)
 
-    names = json.loads((given.dataset / "meta/info.json").read_text())["features"]["action"]["names"]
-    if names != ["linear_velocity", "angular_velocity"]:
-        parser.error(f"{given.dataset}: its actions are {names}; expected speed and yaw rate, as the scripted driver's")
+    ranges = json.loads((given.dataset / "meta/info.json").read_text())["twin"]["action_range"]
+    if len(ranges) != 2:
+        parser.error(f"{given.dataset}: its actions are {list(ranges)}; expected speed and yaw rate")
+    low, high = torch.tensor(list(ranges.values())).T
     rows = parquet.read_table(given.dataset / "data/chunk-000/file-000.parquet").to_pydict()
     films = sorted((given.dataset / "videos/observation.images.front").glob("chunk-*/*.mp4"))
     pictures = torch.as_tensor(np.concatenate([list(read_frames(film)) for film in films])).permute(0, 3, 1, 2)
-    actions = torch.tensor(rows["action"])
-    # The environment's range is from 0 to the highest speed, and to the highest yaw rate on either side.
-    actions = actions / torch.tensor([given.max_speed / 2.0, given.max_yaw_rate]) - torch.tensor([1.0, 0.0])
+    actions = 2.0 * (torch.tensor(rows["action"]) - low) / (high - low) - 1.0
     index, frame = torch.arange(len(actions)), torch.tensor(rows["frame_index"])
     model, generator = network(), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(model.parameters(), 1e-3)

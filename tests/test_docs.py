@@ -33,7 +33,7 @@ _IN_THE_SCENE = {
     "count=5": "count=1",
     "--obstacles 4": "--obstacles 1",
 }
-"""What the small scene has, by what the demo has: tasks, lightings, room for obstacles."""
+"""Replacements of what only the demo has by what the small scene has: tasks, lightings, room for obstacles."""
 
 
 def _blocks(page: Path, kind: str) -> list[str]:

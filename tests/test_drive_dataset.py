@@ -17,6 +17,7 @@ parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
 
 SIZE = (64, 36)
 LENGTHS = (12, 7)
+ACTIONS = {"linear_velocity": (0.0, 0.8), "angular_velocity": (-0.5, 0.5)}
 
 
 def drive(count: int, seed: int, cause: str) -> tuple[Episode, list[np.ndarray], np.ndarray]:
@@ -53,7 +54,7 @@ def drive(count: int, seed: int, cause: str) -> tuple[Episode, list[np.ndarray],
 def written(tmp_path_factory) -> tuple[Path, list]:
     folder = tmp_path_factory.mktemp("dataset")
     drives = [drive(LENGTHS[0], 3, "goal"), drive(LENGTHS[1], 4, "collision")]
-    dataset = DriveDataset(folder, SIZE, 0.1, ("linear_velocity", "angular_velocity"), "Drive.")
+    dataset = DriveDataset(folder, SIZE, 0.1, ACTIONS, "Drive.")
     for one in drives:
         dataset.add(*one)
     dataset.finish()
@@ -110,6 +111,8 @@ def test_info_describes_every_column(written):
     folder, _ = written
     info = read_json(folder / "meta/info.json")
     assert info["codebase_version"] == "v3.0" and info["fps"] == 10
+    assert info["features"]["action"]["names"] == list(ACTIONS)
+    assert info["twin"]["action_range"] == {name: list(ends) for name, ends in ACTIONS.items()}
     assert (info["total_episodes"], info["total_frames"]) == (2, sum(LENGTHS) - 2)
     rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet")
     assert set(info["features"]) == {*rows.column_names, CAMERA}
@@ -124,9 +127,9 @@ def test_info_describes_every_column(written):
 
 def test_what_a_film_cannot_hold_is_refused(tmp_path):
     with pytest.raises(InputError, match="even sides"):
-        DriveDataset(tmp_path, (63, 36), 0.1, ("angular_velocity",), "Drive.")
+        DriveDataset(tmp_path, (63, 36), 0.1, ACTIONS, "Drive.")
     with pytest.raises(InputError, match="whole pictures a second"):
-        DriveDataset(tmp_path, SIZE, 0.15, ("angular_velocity",), "Drive.")
+        DriveDataset(tmp_path, SIZE, 0.15, ACTIONS, "Drive.")
 
 
 def test_lerobot_reads_it(written):

@@ -67,7 +67,7 @@ def test_a_validated_and_driven_policy_has_its_rates(scene):
     (row,) = [line for line in text.splitlines() if line.startswith("| straight | 10 |")]
     assert "0.90" in row
     front = text.split("---")[1]
-    assert "value: 0.9000, name: success of 10 episodes" in front
+    assert 'value: 0.9000, name: "success of 10 episodes (0.65 to 0.98)"' in front
     name = next(line for line in front.splitlines() if line.startswith("- name:")).removeprefix("- name: ")
     assert json.loads(name) == "first"
 

@@ -66,7 +66,7 @@ def still() -> SimpleNamespace:
 
 
 def pictures(camera=PLAIN, light=CLEAR, count=1, brightness=lambda k: 1.0) -> np.ndarray:
-    """What a camera sees at rest, every 0.1 s, shape (n, h, w, 3) of floats."""
+    """Pictures of a camera at rest, every 0.1 s, shape (n, h, w, 3) of floats."""
     street, robot, out = Street(intrinsics_of(camera, SIZE)), still(), []
     one = RealCamera(street, light, camera, SIZE, np.random.default_rng(0))
     for k in range(count):

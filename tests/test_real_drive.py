@@ -197,7 +197,7 @@ def test_its_light_is_not_filmed():
 
 
 def test_some_days_are_hazy_and_some_are_clear():
-    """Of fifteen days of which two in five are expected to be hazy; the air of those is as thick as stated."""
+    """Two in five of fifteen days are expected to be hazy; their air is as thick as stated."""
     sight = np.array([one.visibility for name, one in WEATHER.items() if name.startswith("day_")])
     hazy = np.isfinite(sight)
     assert len(sight) == 15 and 2 <= hazy.sum() <= 11

@@ -342,10 +342,15 @@ def new_folder(path: Path) -> Iterator[Path]:
 # ---- paths given by users, which may be invalid
 
 
-def require_absent(path: Path) -> None:
-    """Raises InputError if a folder to be written is there already, or its parent is not."""
+def require_parent(path: Path) -> None:
+    """Raises InputError if the folder in which a path is to be written is missing."""
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it, or give another path")
+
+
+def require_absent(path: Path) -> None:
+    """Raises InputError if a folder to be written is there already, or its parent is not."""
+    require_parent(path)
     if path.exists() or path.is_symlink():
         raise InputError(f"{path} is there already; remove it, or give another folder")
 

@@ -70,7 +70,8 @@ def film(
         images.append(step.observation["pixels"][-1].copy())
         progress.update()
 
-    with runtime.bar("drive", _most_steps(environment), "step") as progress:
+    max_steps = round(environment.task.time_limit / environment.task.options.control_timestep)
+    with runtime.bar("drive", max_steps, "step") as progress:
         episode = record_episode(environment, driver, watch)
     name = film_name(task, episode.lighting, seed)
     in_cache = is_cached(scene.scene.root)
@@ -113,29 +114,30 @@ def record_dataset(
     require_absent(out)
     scene = load_scene(root)
     driver, _, options = _driver(scene, policy, seed, trust, options)
+    environment = load(scene, task, seed, **options)
+    driving, spec = environment.task.options, environment.action_spec()
+    names = ("linear_velocity", "angular_velocity")[driving.action == STEERING :]
+    actions = {
+        name: (float(low), float(high)) for name, low, high in zip(names, spec.minimum, spec.maximum, strict=True)
+    }
+    words = f"Drive along the road of {scene.scene.root.resolve().name}: {task.replace('_', ' ')}."
+    pictures: list[np.ndarray] = []
+    motion: list[tuple[float, float]] = []
+
+    def watch(step: dm_env.TimeStep) -> None:
+        pictures.append(step.observation["pixels"][-1].copy())
+        motion.append((environment.physics.speed, environment.physics.yaw_rate))
+
     recorded = []
     with new_folder(out) as folder, runtime.bar("drives", episodes, "drive") as progress:
-        dataset = None
+        dataset = DriveDataset(folder, driving.size, driving.control_timestep, actions, words)
         for k in range(episodes):
-            environment = load(scene, task, seed + k, **options)
-            driving = environment.task.options
-            if dataset is None:
-                names = ("linear_velocity", "angular_velocity")[driving.action == STEERING :]
-                place = scene.scene.root.resolve().name
-                words = f"Drive along the road of {place}: {task.replace('_', ' ')}."
-                dataset = DriveDataset(folder, driving.size, driving.control_timestep, names, words)
-            pictures: list[np.ndarray] = []
-            motion: list[tuple[float, float]] = []
-
-            def watch(step: dm_env.TimeStep, physics=environment.physics, pictures=pictures, motion=motion) -> None:
-                pictures.append(step.observation["pixels"][-1].copy())
-                motion.append((physics.speed, physics.yaw_rate))
-
-            episode = record_episode(environment, driver, watch)
-            dataset.add(episode, pictures, np.array(motion))
-            recorded.append(episode)
+            environment.task.seed(seed + k)
+            pictures.clear()
+            motion.clear()
+            recorded.append(record_episode(environment, driver, watch))
+            dataset.add(recorded[-1], pictures, np.array(motion))
             progress.update()
-        assert dataset is not None
         dataset.finish()
     return recorded
 
@@ -154,10 +156,6 @@ def _driver(
 
     loaded = load_policy(find_policy(scene.scene.root, policy), trust)
     return PolicyDriver(loaded), loaded.name, {**loaded.options(), **options}
-
-
-def _most_steps(environment: Any) -> int:
-    return round(environment.task.time_limit / environment.task.options.control_timestep)
 
 
 def film_name(task: str, lighting: str, seed: int) -> str:

@@ -30,7 +30,7 @@ from twin.errors import InputError
 from twin.export import gltf, usd
 from twin.export.colmap import write_colmap
 from twin.export.nerfstudio import write_nerfstudio
-from twin.files import load_arrays, new_folder, require_absent, write_bytes
+from twin.files import load_arrays, new_folder, require_absent, require_parent, write_bytes
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import write_image
 from twin.loading import Twin, load_scene
@@ -72,10 +72,8 @@ def export(
         raise InputError("nothing to write; give --usd, --glb, --ply, --nerfstudio, --colmap or --task-file")
     if (task_file is None) != (task is None):
         raise InputError("--task and --task-file belong together; give both, such as --task straight --task-file FILE")
-    for path in (*files, *folders, *task_files):
-        if not path.parent.is_dir():
-            raise InputError(f"{path}: there is no folder {path.parent}; create it, or give another path")
     for path in (*files, *task_files):
+        require_parent(path)
         if path.is_dir():
             raise InputError(f"{path} is a folder; give a file")
     for path in folders:

@@ -38,7 +38,7 @@ class HiddenCamera:
 
     # Seat.
     shift_forward: float
-    """Of the lens against the drawing [m]."""
+    """Distance of the lens ahead of where the drawing has it [m]."""
     shift_left: float
     """[m]"""
     shift_up: float
@@ -92,7 +92,7 @@ class HiddenCamera:
     noise: float
     """Noise relative to that of the weather's films."""
     quality: float
-    """Of JPEG, rounded down."""
+    """JPEG quality, rounded down."""
 
 
 RANGES: dict[str, tuple[float, float]] = {
@@ -128,7 +128,7 @@ TRAINED: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("shift_forward", "shift_left", "shift_up"), (-0.02, 0.02)),
     **dict.fromkeys(("turn_right", "turn_up", "turn_back"), (-1.0, 1.0)),
 }
-"""What training randomises by default; a test holds these to the twin's values."""
+"""Ranges that training randomises by default; a test holds these to the twin's values."""
 
 
 def draw_camera(number: int) -> HiddenCamera:

@@ -69,7 +69,7 @@ class HiddenRobot:
     payload: float = 10.0
     """Mass on the top plate [kg]."""
     payload_height: float = 0.45
-    """Of its center above the ground [m]."""
+    """Height of its center above the ground [m]."""
     center_forward: float = -0.02
     """Center of mass, ahead of the middle between the axles [m]."""
     center_left: float = 0.0
@@ -107,15 +107,15 @@ class HiddenRobot:
 
     # Drivetrain.
     torque_constant: float = 0.035
-    """Of a motor, net of the gear's losses [N m/A]; also its back-EMF [V s/rad]."""
+    """Torque constant of a motor, net of the gear's losses [N m/A]; also its back-EMF [V s/rad]."""
     resistance: float = 0.35
-    """Of a motor with its leads [Ω]."""
+    """Resistance of a motor with its leads [Ω]."""
     current_limit: float = 24.0
-    """Of a motor [A]."""
+    """Greatest current of a motor [A]."""
     gear_friction: float = 1.5
     """Coulomb friction of motor and gear, at the wheels of a side [N m]."""
     rotor_inertia: float = 0.3
-    """Of motor and gear, at the wheels of a side [kg m²]."""
+    """Inertia of motor and gear, at the wheels of a side [kg m²]."""
     battery_voltage: float = 25.0
     """Without load [V]."""
     battery_resistance: float = 0.08
@@ -123,13 +123,13 @@ class HiddenRobot:
 
     # Control.
     loop_gain: float = 2.2
-    """Of the velocity loop [V s/rad]."""
+    """Proportional gain of the velocity loop [V s/rad]."""
     loop_integral: float = 25.0
-    """Of the velocity loop [V/rad]."""
+    """Integral gain of the velocity loop [V/rad]."""
     loop_period: float = 0.01
     """[s]"""
     controller_period: float = 0.1
-    """Of the controller that takes commands [s]."""
+    """Period of the controller that takes commands [s]."""
     timeout: float = 0.25
     """Time without a command after which the controller stops [s]."""
     jitter: float = 0.1
@@ -186,7 +186,7 @@ TRAINED: dict[str, tuple[float, float]] = {
     "wheel_radius": (0.98, 1.02),
     "wheel_difference": (-0.006, 0.006),
 }
-"""What training randomises by default, for the published robot; a test holds these to the twin's values."""
+"""Ranges that training randomises by default, for the published robot; a test holds these to the twin's values."""
 
 _CONTROLLERS = ((0.1, 0.25), (0.05, 0.5), (0.02, 0.5))  # period, timeout [s] of Clearpath's configurations
 
@@ -453,7 +453,7 @@ class RealRobot:
 
     @property
     def currents(self) -> tuple[float, float]:
-        """Of the two motors [A]."""
+        """Currents of the two motors [A]."""
         return self._current[0], self._current[1]
 
     def base_to_world(self, at: float) -> Array:

@@ -6,7 +6,7 @@ its motion, the action that followed, and what came of it. The format is that of
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,7 +48,8 @@ class DriveDataset:
     """Width, height of the pictures [px]."""
     timestep: float
     """Time between two pictures [s]."""
-    action_names: Sequence[str]
+    actions: Mapping[str, tuple[float, float]]
+    """Components of an action, each with its lowest and highest value in the environment."""
     instruction: str
     """The task in words, which language-conditioned policies receive."""
     _rows: list[dict[str, NDArray]] = field(default_factory=list)
@@ -141,7 +142,7 @@ class DriveDataset:
         shapes = {
             "observation.state": ("float32", _MOTION),
             "observation.environment_state": ("float32", _PLACE),
-            "action": ("float32", tuple(self.action_names)),
+            "action": ("float32", tuple(self.actions)),
             **dict.fromkeys(("next.reward", "timestamp"), ("float32", ())),
             **dict.fromkeys(("next.done", "next.success"), ("bool", ())),
             **dict.fromkeys(_INDICES, ("int64", ())),
@@ -203,6 +204,7 @@ class DriveDataset:
                 "data_path": f"data/{_FILE}.parquet",
                 "video_path": f"videos/{{video_key}}/{_FILE}.mp4",
                 "features": self.features,
+                "twin": {"action_range": {name: list(ends) for name, ends in self.actions.items()}},
             },
         )
 

@@ -110,10 +110,12 @@ def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:
     if cells:
         lines += ["model-index:", f"- name: {json.dumps(policy.name)}", "  results:"]
     for cell in cells:
+        of = rate_summary(cell.successes, cell.trials)
+        told = f"success of {cell.trials} episodes ({_interval(of['low'], of['high'])})"
         lines += [
             "  - task: {type: reinforcement-learning, name: driving}",
             f"    dataset: {{type: twin, name: {json.dumps(f'{cell.task}, {cell.lighting}')}}}",
-            f"    metrics: [{{type: success_rate, value: {cell.rate:.4f}, name: success of {cell.trials} episodes}}]",
+            f"    metrics: [{{type: success_rate, value: {cell.rate:.4f}, name: {json.dumps(told)}}}]",
         ]
     return "\n".join([*lines, "---", ""])
 

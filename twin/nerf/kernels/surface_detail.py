@@ -28,7 +28,7 @@ NO_GROUND = 1.0e6
 """Height of nodes where the ground is unknown [m]."""
 
 MAX_FOOTPRINT = 1.5
-"""Of a level [texels]."""
+"""Greatest footprint of a pixel that a level serves [texels]."""
 _UNKNOWN = 1.0e3  # height above which an interpolated one contains a node without ground [m]
 _MIN_DESCENT = 0.01  # descent per meter along the ray of rays that can meet the ground
 _TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m] between the ground and a surface that counts as ground
