@@ -234,10 +234,12 @@ def place_interval(
     return value, low, high
 
 
-def mean_difference_interval(differences: Array, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
+def mean_difference_interval(
+    differences: Array, confidence: float = CONFIDENCE, limits: tuple[float, float] = (-1.0, 1.0)
+) -> tuple[float, float, float]:
     """Mean of the differences of two setups, a value per pair of trainings or per place, (n,), and its interval (t).
 
-    Raises UndefinedStatistic: fewer than `MIN_PLACES`, or all equal.
+    The interval is kept within `limits`, those of a difference of rates by default. Raises UndefinedStatistic: fewer than `MIN_PLACES`, or all equal.
     """
     n = len(differences)
     if n < MIN_PLACES:
@@ -246,7 +248,7 @@ def mean_difference_interval(differences: Array, confidence: float = CONFIDENCE)
     if error < 1e-9:
         raise UndefinedStatistic("no interval: all pairs differ by the same")
     half = float(student.ppf(0.5 + confidence / 2, n - 1)) * error
-    return mean, max(mean - half, -1.0), min(mean + half, 1.0)
+    return mean, max(mean - half, limits[0]), min(mean + half, limits[1])
 
 
 def _variance(statistic: Statistic, replicates: Sequence[dict[str, Array]]) -> Array:

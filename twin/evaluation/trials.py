@@ -12,6 +12,7 @@ that name: it names the one to compare with, such as `held-out+randomised` for `
 
 import csv
 import difflib
+import gzip
 import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -155,7 +156,7 @@ def write_real_trials(
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """Reads `validation/episodes.csv`. Raises InputError: no such file, or an invalid row, with its line."""
+    """Reads `validation/episodes.csv`, or a compressed one (`.csv.gz`). Raises InputError: no such file, or an invalid row, with its line."""
     if not path.exists():
         raise InputError(
             f"{path} does not exist; drive the policies in the twin first: {_VALIDATE_COMMAND} SCENE --policy RUN"
@@ -257,7 +258,7 @@ def _name_hint(name: str, valid: Sequence[str]) -> str:
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
     """Yields the location of each row, and its fields by column name."""
-    reader = csv.reader(io.StringIO(read_text(path)))
+    reader = csv.reader(io.StringIO(_table_text(path)))
     wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
     try:
         header = [name.strip() for name in next(reader, [])]
@@ -290,6 +291,14 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
         raise InputError(f"{path} line {reader.line_num}: {error}; expected comma-separated text") from None
     if not count:
         raise InputError(f"{path} has a header and no rows; add one line per policy and lighting")
+
+
+def _table_text(path: Path) -> str:
+    """Text of a table, which may be compressed. Raises InputError: damaged."""
+    if path.suffix != ".gz":
+        return read_text(path)
+    with wrap_read_errors(path, "restore it"):
+        return gzip.decompress(path.read_bytes()).decode()
 
 
 def _parse_int(where: str, row: dict[str, str], name: str) -> int:

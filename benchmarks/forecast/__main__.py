@@ -1,0 +1,253 @@
+"""The forecast experiment: how well the twin forecasts success on the road, at places that nobody chose or looked at.
+
+    python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 100 101] [--ray ADDRESS]
+    python benchmarks/forecast --tables                     scores of the kept results alone, in seconds
+
+`protocol.toml` fixes every number in advance; `place_record.py` keeps every episode and trial in `results/`; the scores
+are defined in `place_scores.py`. Steps at a place, each a command of `twin` that resumes where it was interrupted:
+
+- film: films the place under its lightings, as its number draws it.
+- build: builds the twin; aligns the robot to a drive log and a film by its own camera; builds again with it.
+- photos: one photo of each day by the robot's camera gives the twin that day's lighting. A photo that cannot be placed
+  leaves the day to the held-out lightings.
+- train: one training per setup. Their digests are kept before anything drives.
+- validate: drives every policy in the twin, under the lighting of each day and under held-out lightings.
+- drive: drives every policy in the reality, on each day, on the task that the twin wrote.
+
+WORK holds the scenes (1 GB a place). The same command goes on after a kill, or when `--minutes` are over. A place of
+60 m takes about two hours of two cores. Results never lose a row. What fails stops its place with the command's error.
+"""
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from place_record import EPISODES, HELD_OUT_CONDITION, PLACE, TRIALS, by_photo, freeze, keep
+from place_scores import score, tables
+from protocol import PROTOCOL, Protocol, read_protocol
+
+from twin.errors import InputError, print_error
+from twin.evaluation.training_curves import CHOICE_FILE
+from twin.evaluation.trials import read_trials
+from twin.files import read_json, write_json
+from twin.loading import load_scene
+
+sys.path.append(str(Path(__file__).parents[1]))
+from record import save
+
+RESULTS = Path(__file__).with_name("results")
+_GRACE = 60.0  # [s] that a command has to save its state
+
+
+class TimeIsUp(Exception):
+    """The time given by `--minutes` is over."""
+
+
+class Commands:
+    """Runs `python -m twin.…` until a deadline."""
+
+    def __init__(self, minutes: float) -> None:
+        self._end = time.monotonic() + 60.0 * min(minutes, 1e6)
+
+    def __call__(self, *arguments: str | Path, cores: int = 1) -> int:
+        """Returns the exit status. Raises TimeIsUp at the deadline, after the command has saved its state."""
+        if time.monotonic() > self._end:
+            raise TimeIsUp
+        print("+", " ".join(map(str, arguments)), flush=True)
+        environment = {**os.environ, "OMP_NUM_THREADS": str(cores)}
+        process = subprocess.Popen([sys.executable, "-m", *map(str, arguments)], env=environment)
+        try:
+            return process.wait(max(0.0, self._end - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            raise TimeIsUp from None
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+                try:
+                    process.wait(_GRACE)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+    def must(self, *arguments: str | Path, cores: int = 1) -> None:
+        """Raises InputError: the command failed."""
+        status = self(*arguments, cores=cores)
+        if status:
+            raise InputError(f"{' '.join(map(str, arguments))}: exit status {status}; its own message is above")
+
+
+class PlaceRun:
+    """One place of the protocol: its scene in `work`, and its record in `results`."""
+
+    def __init__(self, protocol: Protocol, place: int, work: Path, results: Path, run: Commands, jobs: int) -> None:
+        self.protocol, self.place, self.run, self.jobs = protocol, place, run, jobs
+        self.scene = work / protocol.name / f"place_{place}"
+        self.record = results / protocol.name / f"place_{place}"
+        self.days = protocol.days_of(place)
+        self._number = ("--place", str(place))
+        self._robot = ("--place", str(place), "--robot", str(place), "--camera", str(place))
+
+    def film(self) -> None:
+        if not (self.scene / "scene.toml").exists():
+            self.run.must("twin.reality", "film", *self._number, "--out", self.scene)
+
+    def build(self) -> None:
+        command = ("twin.build", self.scene, "--quality", self.protocol.quality)
+        self.run.must(*command, cores=self.jobs)  # skips stages that are up to date
+        for kind, name, figures in (("log", "drive.csv", "align.json"), ("onboard", "robot.mp4", "camera.json")):
+            if not (self.scene / "alignment" / figures).exists():
+                robot = self._robot if kind == "onboard" else self._robot[:4]
+                self.run.must("twin.reality", kind, *robot, "--out", self.scene / name, cores=self.jobs)
+                self.run.must("twin.align", self.scene, self.scene / name, cores=self.jobs)
+        self.run.must(*command, cores=self.jobs)  # with the aligned robot
+        self.run.must("twin.reality", "compare", self.scene, cores=self.jobs)
+
+    def photos(self) -> None:
+        """Adds the days' lightings; `photos.json` in the scene names the days whose photo could not be placed."""
+        done = dict(read_json(self._photos)) if self._photos.exists() else {}
+        for day in (day for day in self.days if day not in done):
+            photo = self.scene / "photos" / f"{day}.png"
+            day_number = ("--day", day.removeprefix("day_"))
+            self.run.must("twin.reality", "photo", *self._robot, *day_number, "--out", photo, cores=self.jobs)
+            status = self.run("twin.relight", self.scene, photo, "--name", day, cores=self.jobs)
+            if status not in (0, 2):
+                raise InputError(f"{photo}: twin.relight ended with exit status {status}")
+            done[day] = status == 0
+            write_json(self._photos, done)
+
+    def train(self) -> None:
+        lightings = load_scene(self.scene).field().lightings_by_name.filmed().names
+
+        def one(setup: str) -> None:
+            if not (self._run_folder(setup) / CHOICE_FILE).exists():
+                options = ("--task", self.protocol.task, "--run", setup, "--seed", str(self.place))
+                setup_options = self.protocol.options_of(setup, list(lightings))
+                self.run.must("twin.train", self.scene, *options, *setup_options, "--quiet")
+
+        with ThreadPoolExecutor(self.jobs) as pool:
+            list(pool.map(one, self.protocol.setups))
+        freeze(self.record, {setup: self._run_folder(setup) for setup in self.protocol.setups})
+
+    def validate(self, ray: str | None) -> None:
+        spread = ("--ray", ray) if ray else ("--processes", str(self.jobs))
+        policies = [self._run_folder(setup) for setup in self.protocol.setups]
+        placed = read_json(self._photos)
+        for lightings, episodes in (
+            ([HELD_OUT_CONDITION], self.protocol.held_out_episodes),
+            ([by_photo(day) for day in self.days if placed[day]], self.protocol.episodes),
+        ):
+            if lightings:
+                count = ("--episodes", str(episodes))
+                what = ("--task", self.protocol.task, "--policy", *policies, "--lightings", *lightings)
+                self.run.must("twin.validate", self.scene, *what, *count, *spread)
+
+    def drive(self) -> None:
+        task = self.scene / f"{self.protocol.task}.json"
+        if not task.exists():
+            self.run.must("twin.export", self.scene, "--task", self.protocol.task, "--task-file", task)
+        days = [day.removeprefix("day_") for day in self.days]
+
+        def one(setup: str) -> None:
+            where = ("--scene", self.scene, *self._robot, "--day", *days, "--trials", str(self.protocol.trials))
+            out = ("--out", self._real(setup).with_name(f"{setup}.csv"))
+            self.run.must("twin.reality", "drive", "--policy", self._run_folder(setup), "--task", task, *where, *out)
+
+        with ThreadPoolExecutor(self.jobs) as pool:
+            list(pool.map(one, self.protocol.setups))
+
+    def write_record(self) -> None:
+        """Keeps what has been driven so far."""
+        episodes = self.scene / "validation" / "episodes.csv"
+        wanted = {HELD_OUT_CONDITION, *map(by_photo, self.days)}
+        if episodes.exists():
+            keep(self.record / EPISODES, [one for one in read_trials(episodes) if one.lighting in wanted])
+        driven = [self._real(setup) for setup in self.protocol.setups if self._real(setup).exists()]
+        if driven:
+            keep(self.record / TRIALS, [one for path in driven for one in read_trials(path)])
+            write_json(self.record / PLACE, self._facts())
+
+    def _facts(self) -> dict[str, Any]:
+        report = read_json(self.scene / "build" / "report.json")
+        setup = read_json(self.scene / "real" / f"{next(iter(self.protocol.setups))}_setup.json")
+        choices = {one: read_json(self._run_folder(one) / CHOICE_FILE) for one in self.protocol.setups}
+        return {
+            "place": self.place,
+            "setup": setup,
+            "photos_placed": read_json(self._photos),
+            "build": {name: report[name] for name in ("seed", "versions", "field", "metric", "truth", "cautions")},
+            "trainings": {name: {"steps": one["steps"], "chosen": one["chosen"]} for name, one in choices.items()},
+        }
+
+    @property
+    def _photos(self) -> Path:
+        return self.scene / "photos.json"
+
+    def _run_folder(self, setup: str) -> Path:
+        return self.scene / "runs" / setup
+
+    def _real(self, setup: str) -> Path:
+        return self.scene / "real" / f"{setup}_trials.csv"
+
+
+def run_place(one: PlaceRun, ray: str | None) -> None:
+    """All steps of a place. What was driven is kept even if a step fails or the time is up."""
+    steps: Sequence[Callable[[], None]] = (one.film, one.build, one.photos, one.train)
+    try:
+        for step in steps:
+            step()
+        one.validate(ray)
+        one.drive()
+    finally:
+        one.write_record()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path, nargs="?", help="folder of the scenes")
+    parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="default: protocol.toml beside this file")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="default: results beside this file")
+    parser.add_argument("--places", type=int, nargs="+", metavar="NUMBER", help="of the protocol's (default: all)")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop; the same command goes on")
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one core each")
+    parser.add_argument("--ray", metavar="ADDRESS", help="a Ray cluster that validates")
+    parser.add_argument("--tables", action="store_true", help="drive nothing")
+    given = parser.parse_args()
+    try:
+        protocol = read_protocol(given.protocol)
+        if not given.tables:
+            if given.work is None:
+                raise InputError("no folder of scenes; give WORK, or --tables")
+            _run(protocol, given)
+        found = score(protocol, given.results)
+    except (InputError, OSError) as error:
+        return print_error(error)
+    print(tables(protocol, found))
+    (given.results / protocol.name).mkdir(parents=True, exist_ok=True)
+    return save(given.results / protocol.name / "scores.json", found, replace=None)
+
+
+def _run(protocol: Protocol, given: argparse.Namespace) -> None:
+    places = given.places or protocol.places
+    for place in places:
+        if place not in protocol.places:
+            raise InputError(f"--places {place}: the protocol has {', '.join(map(str, protocol.places))}")
+    commands = Commands(given.minutes)
+    for place in places:
+        try:
+            run_place(PlaceRun(protocol, place, given.work, given.results, commands, given.jobs), given.ray)
+        except TimeIsUp:
+            print(f"the time is up at place {place}; the same command goes on", flush=True)
+            return
+        except InputError as error:
+            print_error(error)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

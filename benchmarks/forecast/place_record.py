@@ -1,0 +1,102 @@
+"""Record of a place, in files under version control: every episode and trial, and the digests of the policies.
+
+    results/version_N/place_P/
+      place.json            figures of the build and the trainings; robot, camera, and what of them training never sampled
+      policies.json         digest of every policy, written before the first trial
+      episodes.csv.gz       a row per episode in the twin
+      trials.csv.gz         a row per trial in the reality
+
+The same tables give the same bytes. A record never loses a row, and no row of it changes.
+"""
+
+import gzip
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from twin.config import HELD_OUT, Condition
+from twin.errors import InputError
+from twin.evaluation.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
+from twin.files import digest_file, read_json, write_bytes, write_json
+from twin.types import Array
+
+EPISODES, TRIALS, POLICIES, PLACE = "episodes.csv.gz", "trials.csv.gz", "policies.json", "place.json"
+HELD_OUT_CONDITION = str(Condition(HELD_OUT, True))
+
+
+def by_photo(day: str) -> str:
+    """The twin's condition for a day: lit as in its photo, the rest randomised."""
+    return str(Condition(day, True))
+
+
+@dataclass(frozen=True)
+class PlaceRecord:
+    """Counts of n policies on k days at one place."""
+
+    place: int
+    policies: tuple[str, ...]
+    """Names of the setups, in the protocol's order."""
+    days: tuple[str, ...]
+    twin: Array
+    """Successes and episodes in the twin under the photo of each day, shape (n, k, 2)."""
+    held_out: Array
+    """Successes and episodes under held-out lightings, shape (n, 2)."""
+    real: Array
+    """Successes and trials in the reality, shape (n, k, 2)."""
+
+
+def freeze(folder: Path, runs: dict[str, Path]) -> None:
+    """Records the digests of trained policies; `runs` names their folders.
+
+    Raises InputError: the record has other policies, so that trials would be driven by what was not frozen.
+    """
+    digests = {name: digest_file(path / "policy.json") for name, path in runs.items()}
+    record = folder / POLICIES
+    if record.exists() and read_json(record) != digests:
+        raise InputError(f"{record} has other policies than those trained now; move it away, or restore the runs")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(record, digests)
+
+
+def keep(path: Path, trials: list[Trial]) -> None:
+    """Writes a table of trials, sorted.
+
+    Raises InputError: the table has rows that are not among them; it is kept.
+    """
+    new = sorted(trials, key=lambda one: (one.policy, one.task, one.lighting, one.seed))
+    gone = set(read_trials(path)) - set(new) if path.exists() else set()
+    if gone:
+        one = min(gone, key=lambda one: one.row())
+        raise InputError(
+            f"{path} has {len(gone)} rows that the new table lacks, such as {','.join(one.row())}; it is kept: "
+            "move it away, or restore the scene that it was written from"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = csv_text(EPISODE_COLUMNS, [one.row() for one in new])
+    out = io.BytesIO()
+    with gzip.GzipFile(fileobj=out, mode="wb", mtime=0, filename="") as file:
+        file.write(text.encode())
+    write_bytes(path, out.getvalue())
+
+
+def read_place(folder: Path, place: int, policies: tuple[str, ...], days: list[str]) -> PlaceRecord | None:
+    """The record of a place; None unless all of it was driven."""
+    if not (folder / TRIALS).exists() or not (folder / EPISODES).exists():
+        return None
+    twin, real = _counts(read_trials(folder / EPISODES)), _counts(read_trials(folder / TRIALS))
+    photo = [[twin.get((policy, by_photo(day)), (0, 0)) for day in days] for policy in policies]
+    held_out = [twin.get((policy, HELD_OUT_CONDITION), (0, 0)) for policy in policies]
+    driven = [[real.get((policy, day), (0, 0)) for day in days] for policy in policies]
+    record = PlaceRecord(place, policies, tuple(days), np.array(photo), np.array(held_out), np.array(driven))
+    complete = all((counts[..., 1] > 0).all() for counts in (record.twin, record.held_out, record.real))
+    return record if complete else None
+
+
+def _counts(trials: list[Trial]) -> dict[tuple[str, str], tuple[int, int]]:
+    out: dict[tuple[str, str], tuple[int, int]] = {}
+    for one in trials:
+        won, driven = out.get((one.policy, one.lighting), (0, 0))
+        out[one.policy, one.lighting] = won + one.success, driven + 1
+    return out

@@ -1,0 +1,71 @@
+"""Protocol of the forecast experiment: places, days, trials and setups, and what must hold (`protocol.toml`)."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from twin.errors import InputError
+from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
+
+PROTOCOL = Path(__file__).with_name("protocol.toml")
+FIRST_TEST_PLACE = 100
+"""Places below this number were looked at in development."""
+_FIRST_LIGHTING = "{first}"
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The fields of `protocol.toml`, which explains them."""
+
+    version: int
+    places: tuple[int, ...]
+    days: int
+    task: str
+    quality: str
+    episodes: int
+    held_out_episodes: int
+    trials: int
+    setups: dict[str, tuple[str, ...]]
+    """Name → options of `twin.train`; a place has one training of each, with the setup's name."""
+    wanted: dict[str, float]
+
+    @property
+    def name(self) -> str:
+        """Name of the folder of results."""
+        return f"version_{self.version}"
+
+    def days_of(self, place: int) -> list[str]:
+        """Names of the days on which a place's trials are driven."""
+        return [f"day_{10 * place + k + 1}" for k in range(self.days)]
+
+    def options_of(self, setup: str, lightings: list[str]) -> list[str]:
+        """Options of a setup's training in a place that was filmed in `lightings`."""
+        return [lightings[0] if one == _FIRST_LIGHTING else one for one in self.setups[setup]]
+
+
+def read_protocol(path: Path = PROTOCOL) -> Protocol:
+    """Reads a protocol.
+
+    Raises:
+        InputError: no such file, a missing or unknown field, or numbers with which no forecast can be scored.
+    """
+    try:
+        table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+        setups = {str(name): tuple(map(str, options)) for name, options in table.pop("setups").items()}
+        wanted = {str(name): float(value) for name, value in table.pop("wanted").items()}
+        places = tuple(map(int, table.pop("places")))
+        protocol = Protocol(places=places, setups=setups, wanted=wanted, **table)
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: {error}; expected the fields of benchmarks/forecast/protocol.toml") from None
+    faults = [
+        (len(set(places)) != len(places) or not places, f"places = {list(places)}; expected different numbers"),
+        (not 1 <= protocol.days <= 10, f"days = {protocol.days}; expected 1 to 10, the days of a place"),
+        (len(setups) < MIN_POLICIES, f"{len(setups)} setups; expected {MIN_POLICIES} or more"),
+        (protocol.trials < MIN_TRIALS, f"trials = {protocol.trials}; expected {MIN_TRIALS} or more"),
+        (protocol.episodes < 1 or protocol.held_out_episodes < 1, "episodes below 1"),
+    ]
+    for wrong, text in faults:
+        if wrong:
+            raise InputError(f"{path}: {text}")
+    return protocol
