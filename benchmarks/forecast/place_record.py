@@ -1,7 +1,7 @@
 """Record of a place, in files under version control: every episode and trial, and the digests of the policies.
 
     results/version_N/place_P/
-      place.json            figures of the build and the trainings; robot, camera, and what of them training never sampled
+      place.json            figures of build and trainings; robot and camera, and what of these training never sampled
       policies.json         digest of every policy, written before the first trial
       episodes.csv.gz       a row per episode in the twin
       trials.csv.gz         a row per trial in the reality
@@ -40,7 +40,8 @@ class PlaceRecord:
     """Names of the setups, in the protocol's order."""
     days: tuple[str, ...]
     twin: Array
-    """Successes and episodes in the twin under the photo of each day, shape (n, k, 2)."""
+    """Successes and episodes in the twin under the photo of each day, or if that could not be placed under held-out
+    lightings, shape (n, k, 2)."""
     held_out: Array
     """Successes and episodes under held-out lightings, shape (n, 2)."""
     real: Array
@@ -86,8 +87,12 @@ def read_place(folder: Path, place: int, policies: tuple[str, ...], days: list[s
     if not (folder / TRIALS).exists() or not (folder / EPISODES).exists():
         return None
     twin, real = _counts(read_trials(folder / EPISODES)), _counts(read_trials(folder / TRIALS))
-    photo = [[twin.get((policy, by_photo(day)), (0, 0)) for day in days] for policy in policies]
     held_out = [twin.get((policy, HELD_OUT_CONDITION), (0, 0)) for policy in policies]
+    placed = read_json(folder / PLACE)["photos_placed"] if (folder / PLACE).exists() else {}
+    photo = [
+        [twin.get((policy, by_photo(day)), (0, 0)) if placed.get(day, True) else counts for day in days]
+        for policy, counts in zip(policies, held_out, strict=True)
+    ]
     driven = [[real.get((policy, day), (0, 0)) for day in days] for policy in policies]
     record = PlaceRecord(place, policies, tuple(days), np.array(photo), np.array(held_out), np.array(driven))
     complete = all((counts[..., 1] > 0).all() for counts in (record.twin, record.held_out, record.real))

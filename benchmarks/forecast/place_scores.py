@@ -93,8 +93,7 @@ def _held_out(one: PlaceRecord) -> Array:
 
 
 def _elsewhere(places: list[PlaceRecord], one: PlaceRecord, by_setup: bool) -> Array:
-    """Success on the road at other places, shape (n,): of the same setup, shrunk towards the mean as by one place more, or
-    of all setups."""
+    """Success on the road at other places, shape (n,): of all setups, or of the same, shrunk as by a place more."""
     others = [_real(other).mean(1) for other in places if other is not one]
     if not others:
         return np.full(len(one.policies), np.nan)

@@ -239,7 +239,9 @@ def mean_difference_interval(
 ) -> tuple[float, float, float]:
     """Mean of the differences of two setups, a value per pair of trainings or per place, (n,), and its interval (t).
 
-    The interval is kept within `limits`, those of a difference of rates by default. Raises UndefinedStatistic: fewer than `MIN_PLACES`, or all equal.
+    The interval is kept within `limits`, those of a difference of rates by default.
+
+    Raises UndefinedStatistic: fewer than `MIN_PLACES`, or all equal.
     """
     n = len(differences)
     if n < MIN_PLACES:

@@ -156,7 +156,10 @@ def write_real_trials(
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """Reads `validation/episodes.csv`, or a compressed one (`.csv.gz`). Raises InputError: no such file, or an invalid row, with its line."""
+    """Reads `validation/episodes.csv`, or a compressed one (`.csv.gz`).
+
+    Raises InputError: no such file, or an invalid row, with its line.
+    """
     if not path.exists():
         raise InputError(
             f"{path} does not exist; drive the policies in the twin first: {_VALIDATE_COMMAND} SCENE --policy RUN"
