@@ -26,8 +26,9 @@ from twin.evaluation.trials import csv_text
 from twin.files import write_json
 from twin.learn.policy import load_policy
 from twin.learn.sb3_env import DriveVecEnv
+from twin.learn.selection import FRESH_EPISODES
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import FRESH_EPISODES, TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
+from twin.learn.training import TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
 from twin.runtime import exclusive_lock
 
 

@@ -371,7 +371,12 @@ def _train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lighting", help="one lighting by name (default: training, which varies between episodes)")
     parser.add_argument("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes of network, batch and run")
     parser.add_argument("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
-    parser.add_argument("--steps", type=int, help="control steps of all worlds together (default: 12000; gpu: 120000)")
+    parser.add_argument(
+        "--success", type=float, help="success rate in tests at which the training ends (default: 0.95)"
+    )
+    parser.add_argument(
+        "--steps", type=int, help="most control steps, of all worlds together (default: 24000; gpu: 240000)"
+    )
     parser.add_argument("--worlds", type=int, help="number of worlds driven at once (default: 8; gpu: 32)")
     parser.add_argument(
         "--processes", type=int, help="processes that step the worlds (default: a core each, at most 8)"

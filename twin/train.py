@@ -4,7 +4,8 @@
     python -m twin.train scenes/demo --task straight --run plain --observe simulator
     python -m twin.train scenes/demo --task straight --run day --lighting sun
 
-The same command continues a stopped or killed run. The policy is in `runs/<name>` of the scene's folder.
+A training ends when tests without exploration arrive often enough (`--success`), when they get no better, or at
+`--steps`. The same command continues a stopped or killed run. The policy is in `runs/<name>` of the scene's folder.
 """
 
 import argparse
@@ -39,26 +40,41 @@ def command(given: argparse.Namespace) -> None:
     folder = run_folder(twin.scene, given.run)
     require_stage(twin.scene, "mjcf")  # before the run's folder is created
     with exclusive_lock(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
-        chosen = _train(twin, folder, config, given.processes)
+        choice = _train(twin, folder, config, given.processes)
     picture = write_success_curve(folder)
     write_policy_cards(twin.scene, [given.run])
     if not given.quiet:
-        won, trials = chosen["successes"], chosen["trials"]
-        low, high = wilson(won, trials)
-        print(
-            f"{folder}: the policy of step {chosen['step']}, which without exploring arrives in {won} of {trials} "
-            f"episodes like those of the training ({low:.2f} to {high:.2f}); success during the training: {picture}"
-        )
+        print("\n".join(_summary(folder, choice, picture)))
+
+
+def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
+    chosen = choice["chosen"]
+    won, trials = chosen["successes"], chosen["trials"]
+    low, high = wilson(won, trials)
+    asked = f"{choice['success']:.0%} success that was asked"
+    ends = {
+        "reached": f"a test reached the {asked}",
+        "no better": f"tests got no better, and stayed below the {asked}",
+        "steps": f"tests stayed below the {asked}; give more --steps",
+    }
+    lines = [
+        f"{folder}: trained for {choice['steps']:,} steps: {ends[choice['why']]}",
+        f"The policy of step {chosen['step']:,} is kept. In {trials} fresh episodes ({chosen['condition']}) it arrives "
+        f"{won} times ({low:.2f} to {high:.2f}).",
+    ]
+    if choice["failures"]:
+        lines.append(f"Where the kept policy fails: {choice['failures']}.")
+    return [*lines, f"Success during the training: {picture}"]
 
 
 def _train(twin: Twin, folder: Path, config: "TrainConfig", processes: int | None) -> dict[str, Any]:
-    """Trains with a progress bar; returns the evaluation of the selected checkpoint."""
+    """Trains with progress bars; returns the contents of `choice.json`."""
     try:
-        from twin.learn import training
+        from twin.learn.selection import train_until_learnt
     except ImportError as error:
         raise InputError(f"training needs more: pip install .[learn] ({error})") from None
 
-    with runtime.bar("train", config.steps, "step") as bar:
+    with runtime.bar("train, at most", config.steps, "step") as bar:
 
         def watch(steps: int, recent: Sequence[bool]) -> None:
             if not bar.n:  # steps of earlier calls do not count in the rate
@@ -68,8 +84,7 @@ def _train(twin: Twin, folder: Path, config: "TrainConfig", processes: int | Non
                 low, high = wilson(sum(recent), len(recent))
                 bar.set_postfix_str(f"success {sum(recent)}/{len(recent)} ({low:.2f} to {high:.2f})", refresh=False)
 
-        training.train(twin, folder, config, watch, processes)
-    return training.select_checkpoint(twin, folder, config, processes)["chosen"]
+        return train_until_learnt(twin, folder, config, watch, processes)
 
 
 main = partial(commands.main, "train")

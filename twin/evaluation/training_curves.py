@@ -115,7 +115,8 @@ def plot_success_curve(axes: Axes, steps: Indices, success: Indices, color: str)
 def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
     tried, chosen = choice["candidates"], choice["chosen"]
     shares = [one["successes"] / one["trials"] for one in tried]
-    label = f"without exploring, {tried[0]['trials']} episodes each"
+    counts = sorted({one["trials"] for one in tried})
+    label = f"tests without exploring, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes"
     axes.plot([one["step"] for one in tried], shares, "o", color="#d95f02", fillstyle="none", label=label)
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])

@@ -52,7 +52,7 @@ class EpisodeChunk:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """An episode's result: progress [m], mean trust over its pictures, sum of its rewards."""
+    """An episode's result: progress [m], mean trust over its pictures, sum of its rewards, lighting as sampled."""
 
     seed: int
     cause: str
@@ -60,6 +60,7 @@ class EpisodeResult:
     steps: int
     trust: float
     reward: float
+    lighting: str = ""
 
 
 def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:
@@ -101,7 +102,7 @@ def run_episodes(
             number, info = driving.pop(i), envs.info(i)
             trust = trusts[number]
             outcome = info["cause"], info["progress"], len(trust), float(np.mean(trust)), float(rewards[number])
-            done[number] = EpisodeResult(seeds[number], *outcome)
+            done[number] = EpisodeResult(seeds[number], *outcome, info.get("sampled_lighting", info["lighting"]))
             watch()
     return [done[number] for number in range(len(seeds))]
 

@@ -136,7 +136,7 @@ class FrameReplayBuffer(ReplayBuffer):
         self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
         self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
         self.states = np.zeros((*size, state_size), np.float32)
-        """The robot's state before each transition; NaN in an environment's first one of this process."""
+        """The robot's state before each transition; NaN in the first one after `break_off`."""
         self.states_after = np.zeros((*size, state_size), np.float32)
         self._state = np.full((n_envs, state_size), np.nan, np.float32)
         slack = -(-2 * slack // n_envs)
@@ -165,7 +165,7 @@ class FrameReplayBuffer(ReplayBuffer):
         done: NDArray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Adds a transition of every environment; its observations must be consecutive until `done`."""
+        """Adds a transition of every environment; its observations must be consecutive until `done` or `break_off`."""
         for i in range(self.n_envs):
             if self._ages[i] < 0:
                 self._write(i, obs[i, -3:])
@@ -234,6 +234,10 @@ class FrameReplayBuffer(ReplayBuffer):
             getattr(self, name)[:] = arrays[name]
         self.pos, self.full = rest["pos"], rest["full"]
         self.rng.bit_generator.state = rest["rng"]
+        self.break_off()
+
+    def break_off(self) -> None:
+        """States that all environments begin new episodes with the next transition."""
         self._ages[:], self._state[:] = -1, np.nan
 
     def _write(self, env_index: int, picture: NDArray) -> None:

@@ -165,6 +165,12 @@ class PixelSAC(SAC):
         for name, value in zip(_LOGGED, sums / gradient_steps, strict=True):
             self.logger.record(f"train/{name}", value)
 
+    def break_off_episodes(self) -> None:
+        """Lets all environments begin new episodes with the next step, whatever they were used for meanwhile."""
+        assert isinstance(self.replay_buffer, FrameReplayBuffer)
+        self.replay_buffer.break_off()
+        self._last_obs = None
+
     def _scaled(self, states: torch.Tensor) -> torch.Tensor:
         return (states / self._scale).clamp(-_MAX_STATE, _MAX_STATE)
 

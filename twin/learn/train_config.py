@@ -42,7 +42,9 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "shift": (0, 64),
     "colours": (0, 100),
     "checkpoints": (1, 10**6),
-    "trials": (1, 10**6),
+    "test_every": (1, 10**10),
+    "settle": (1, 10**10),
+    "success": (0, 1),
     "save_every": (1, 10**10),
 }
 """Limits of each number, beyond which arithmetic fails, memory runs out or a training never ends."""
@@ -68,7 +70,10 @@ class TrainConfig:
     lighting: str = TRAINING
     """See `env/episode_lighting.py`; the default is sampled for every episode."""
     seed: int = 0
-    steps: int = 12_000
+    success: float = 0.95
+    """Success rate at which the training ends (`selection.py`)."""
+    steps: int = 24_000
+    """Largest number."""
     worlds: int = 8
     action: str = STEERING
     """This and the next two: see `Control`."""
@@ -103,7 +108,7 @@ class TrainConfig:
     gamma: float = 0.97
     """Discount per step; a reward 33 steps (3 s) away counts a third."""
     learning_rate: float = 5e-4
-    """In the first half of the training; see `training.py`."""
+    """Until the training settles; see `training.py`."""
     tau: float = 0.01
     """Averaging rate of the target critics, per update."""
     shift: int = 2
@@ -112,8 +117,10 @@ class TrainConfig:
     """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
     checkpoints: int = 20
     """Policies saved during the training."""
-    trials: int = 8
-    """Episodes per candidate in the selection of the best policy (`training.py`)."""
+    test_every: int = 2_000
+    """Steps between two tests of the policy (`selection.py`)."""
+    settle: int = 2_000
+    """Steps at the end of the training over which the learning rate decreases."""
     save_every: int = 4_000
     """Steps between two saved states."""
     device: str = "cpu"
@@ -183,7 +190,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "worlds": 32,
         "batch": 256,
         "buffer": 100_000,
-        "steps": 120_000,
+        "steps": 240_000,
+        "test_every": 20_000,
+        "settle": 20_000,
         "shift": 4,
         "device": "cuda",
     },

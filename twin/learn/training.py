@@ -1,9 +1,9 @@
-"""A training run: SAC in many environments, then selection of the best policy.
+"""A training run: SAC in many environments; `selection.py` decides when it ends and which policy is kept.
 
 runs/<name>/
   config.json                             the configuration
   policy.json .safetensors .onnx          the newest policy (`policy.py`); after the training the selected one
-  choice.json                             the selection
+  tests.json, choice.json                 tests of policies, and the selection (`selection.py`)
   checkpoints/<steps>/                    policies saved during the training
   episodes.csv, log.csv, tensorboard/     episodes driven in training; speed, memory and losses at every save
   state/                                  the saved state (`sac.py`) and the replay buffer's pictures
@@ -17,6 +17,8 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +31,14 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin import runtime
 from twin.config import Condition
+from twin.env.options import Options
 from twin.env.suite import fingerprint
-from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.evaluation.trials import RECENT_EPISODES, csv_text
 from twin.files import read_json, wrap_read_errors, write_json, write_text
-from twin.learn.policy import copy_policy, load_policy, save_policy
-from twin.learn.policy_evaluation import run_episodes
+from twin.learn.policy import load_policy, save_policy
+from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.policy_network import preprocess
 from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.learn.sac import (
@@ -47,7 +49,6 @@ from twin.learn.sac import (
     has_state,
     load_state,
     save_state,
-    saved_steps,
 )
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
@@ -58,17 +59,32 @@ TRAINING_EPISODE_COLUMNS = (
     *("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m"),
 )
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
-FRESH_EPISODES = 20
-"""Number of fresh episodes from which the selected policy's success rate is reported."""
-
 Watch = Callable[[int, Sequence[bool]], None]
 """Receives the steps done, and the success of the last `RECENT_EPISODES` that started at the segment's beginning."""
 
+Drive = Callable[[Path, Sequence[int], Callable[[], object]], list[EpisodeResult]]
+"""Drives a policy folder in whole episodes of the training's kind, one per seed; see `run_episodes`."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A part of a training."""
+
+    until: int
+    """Steps at its end, where a checkpoint is saved."""
+    settle_from: int | None
+    """Step from which the learning rate decreases until the end; None: it does not."""
+    why: str = ""
+    """Reason to end the training after this segment; empty: it goes on."""
+
+
+Referee = Callable[[int, Drive], Segment | None]
+"""Returns the segment that follows when so many steps are done, or None to end the training; may drive policies."""
+
 _FINAL_RATE = 0.1  # of the learning rate, at the end
-_CANDIDATES = 4  # policies that the best one is selected from
-# A seed derives from the run's seed, one of these numbers and, in training, the number of resumptions, so that no
+# A seed derives from the run's seed, this number (`selection.py` has another) and the number of resumptions, so that no
 # random stream is used twice.
-_TRAINING_STREAM, _SELECTION_STREAM = 6, 7
+_TRAINING_STREAM = 6
 
 
 class PreprocessedVecEnv(VecEnvWrapper):
@@ -103,14 +119,16 @@ def train(
     config: TrainConfig,
     watch: Watch | None = None,
     processes: int | None = None,
+    referee: Referee | None = None,
 ) -> None:
     """Trains a policy, or resumes a training that was stopped or killed.
 
     SIGINT, SIGTERM and SIGHUP save the state and raise `Stopped`, a KeyboardInterrupt.
 
     Args:
-        config: Must equal that of an existing run, except for `steps`.
+        config: Must equal that of an existing run, except for `steps` and `success`.
         processes: See `make_vector_env`; the number does not change the result.
+        referee: Plans the training; by default it is one segment of `config.steps`.
 
     Raises:
         InputError: an existing run has another configuration or is damaged, the folder is not empty and not a run, or
@@ -149,21 +167,43 @@ def train(
             camera = twin.world().camera.resized(config.architecture.size)
             origin = {"scene": twin.scene.root.resolve().name, "camera": list(camera.intrinsics)}
             recorder = _RunRecorder(folder, config, settings, origin, before["wall"], resumed, watch, stop)
-            left = config.steps - model.num_timesteps
-            if left > 0:
+
+            def drive(policy: Path, seeds: Sequence[int], on_episode: Callable[[], object]) -> list[EpisodeResult]:
+                if stop.number:
+                    raise Stopped(stop.number)
+                _set_options(vec_env, dataclasses.replace(vec_env.vector_env.options, start_along=0.0))
+                try:
+                    return run_episodes(load_policy(policy), vec_env.vector_env, seeds, on_episode)
+                finally:
+                    _set_options(vec_env, vec_env.vector_env.options)
+                    model.break_off_episodes()
+                    again = np.random.SeedSequence([config.seed, resumed, _TRAINING_STREAM, model.num_timesteps])
+                    envs.seed(int(again.generate_state(1, np.uint64)[0]))
+
+            plan: Referee = referee or (lambda step, _: None if step >= whole.until else whole)
+            whole = Segment(config.steps, config.steps // 2)
+            while segment := plan(model.num_timesteps, drive):
+                left = segment.until - model.num_timesteps
+                if left <= 0:
+                    continue
                 (folder / CHOICE_FILE).unlink(missing_ok=True)  # more steps invalidate the selection
+                model.lr_schedule = partial(_learning_rate, config, model, segment)
                 model.learn(left, recorder, log_interval=10, reset_num_timesteps=False)
                 recorder.end()
                 if stop.number:
                     raise Stopped(stop.number)
 
 
+def _set_options(envs: DriveVecEnv, options: Options) -> None:
+    for i in range(envs.num_envs):
+        envs.vector_env.set(i, "options", options)
+
+
 def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
     model = PixelSAC(
         DrivePolicy,
         envs,
-        # Constant in the first half; decreases in the second, so that the policy converges.
-        learning_rate=lambda left: config.learning_rate * (_FINAL_RATE + (1.0 - _FINAL_RATE) * min(1.0, 2.0 * left)),
+        learning_rate=config.learning_rate,
         buffer_size=config.buffer,
         learning_starts=config.starts,
         batch_size=config.batch,
@@ -198,6 +238,14 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
     return model
 
 
+def _learning_rate(config: TrainConfig, model: PixelSAC, segment: Segment, _: float) -> float:
+    """Constant until `settle_from`; then it falls to `_FINAL_RATE` of that at the end, so that the policy converges."""
+    if segment.settle_from is None or model.num_timesteps <= segment.settle_from:
+        return config.learning_rate
+    left = max(0.0, (segment.until - model.num_timesteps) / (segment.until - segment.settle_from))
+    return config.learning_rate * (_FINAL_RATE + (1.0 - _FINAL_RATE) * left)
+
+
 def _check_run(folder: Path) -> None:
     """Raises InputError if a folder is neither empty nor a run, as a training deletes and replaces files.
 
@@ -225,7 +273,7 @@ def _check_same(folder: Path, settings: dict[str, Any]) -> None:
             "episodes differently; give another --run"
         )
     for name in settings:
-        if name != "steps" and previous.get(name) != settings[name]:
+        if name not in ("steps", "success") and previous.get(name) != settings[name]:
             raise InputError(
                 f"{folder} was trained with {name} = {previous.get(name)!r}, not {settings[name]!r}; "
                 "resume with the same, or give another --run"
@@ -291,7 +339,7 @@ class _RunRecorder(BaseCallback):
 
     def end(self) -> None:
         """Saves the last checkpoint and state."""
-        self._checkpoint()
+        self._save_policy(self._folder / "checkpoints" / f"{self.model.num_timesteps:09d}")
         self.save()
 
     def save(self) -> None:
@@ -348,56 +396,3 @@ def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
         return []
     success, start = columns.index("success"), columns.index("start_m")
     return [row[success] == "1" for row in rows if float(row[start]) == 0.0]
-
-
-# ---- selection of a checkpoint
-
-
-def select_checkpoint(twin: Twin, folder: Path, config: TrainConfig, processes: int | None = None) -> dict[str, Any]:
-    """Selects the best policy of a finished training as the run's; keeps an earlier selection of the same training.
-
-    *Candidates* are policies saved in the second half of the training. All drive the same `config.trials` whole
-    episodes, with the training's lighting and randomization and without exploration. The one with most successes is
-    selected, among equals the one with the highest mean reward. The best of several is partly lucky, so its reported
-    rate comes from fresh episodes.
-
-    Returns:
-        The content of `choice.json`: steps of the training; step, trials, successes and mean reward of every candidate,
-        and of the selected one on fresh episodes.
-    """
-    trained = saved_steps(folder / "state")
-    if (folder / CHOICE_FILE).exists():
-        with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is selected again"):
-            before = read_json(folder / CHOICE_FILE)
-            if before["steps"] == trained:
-                _ = [before["chosen"][name] + 0 for name in ("step", "trials", "successes")]  # raises if damaged
-                return before
-    candidates = _candidates(folder / "checkpoints", trained)
-    samples = np.random.SeedSequence([config.seed, _SELECTION_STREAM]).generate_state(config.trials + FRESH_EPISODES)
-    seeds = tuple(int(seed) for seed in samples)
-    shared, fresh = seeds[: config.trials], seeds[config.trials :]
-    options = {**config.options(), "start_along": 0.0}
-    results = []
-    bar = runtime.bar("choose", len(candidates) * len(shared) + len(fresh), "episode")
-    with closing(make_vector_env(twin, config.task, options, [None] * config.worlds, processes)) as envs, bar:
-
-        def evaluate(path: Path, which: tuple[int, ...]) -> dict[str, Any]:
-            driven = run_episodes(load_policy(path), envs, which, bar.update)
-            reward = round(float(np.mean([one.reward for one in driven])), 3)
-            won = sum(one.cause == "goal" for one in driven)
-            return {"step": int(path.name), "trials": len(driven), "successes": won, "reward": reward}
-
-        for path in candidates:
-            results.append(evaluate(path, shared))
-        best = max(range(len(results)), key=lambda i: (results[i]["successes"], results[i]["reward"]))
-        last = evaluate(candidates[best], fresh)
-    copy_policy(candidates[best], folder)
-    out = {"steps": trained, "candidates": results, "chosen": last}
-    write_json(folder / CHOICE_FILE, out)
-    return out
-
-
-def _candidates(folder: Path, steps: int) -> list[Path]:
-    """At most `_CANDIDATES` evenly spaced policies of the second half, including the last."""
-    late = sorted(path for path in folder.iterdir() if steps / 2 < int(path.name))
-    return late[:: -max(1, -(-len(late) // _CANDIDATES))][::-1]

@@ -1,0 +1,194 @@
+"""When a training ends, and which of its policies is kept."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+
+from test_training import SHORT
+from tiny_twin import tiny_twin
+
+import twin
+from twin import runtime
+from twin.errors import InputError
+from twin.evaluation.training_curves import CHOICE_FILE, write_success_curve
+from twin.learn import selection, training
+from twin.learn.policy import load_policy
+from twin.learn.policy_evaluation import EpisodeResult, run_episodes
+from twin.learn.selection import FRESH_EPISODES, TESTS_FILE, Failure, PolicyTest, next_segment, train_until_learnt
+from twin.learn.train_config import TrainConfig
+
+CONFIG = replace(SHORT, steps=160, save_every=160, checkpoints=8, test_every=40, settle=40)
+PLAN = TrainConfig(steps=24_000, test_every=2_000, settle=2_000, success=0.95)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    runtime.set_quiet(True)
+    return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
+
+
+def learn(scene, folder: Path, config: TrainConfig):
+    return train_until_learnt(scene, folder, config, processes=1)
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Episodes with scripted results: by step of the policy, the number of successes of a test and the reward."""
+    script: dict[int, tuple[int, float]] = {}
+    asked: list[tuple[int, tuple[int, ...], str]] = []
+
+    def pretend(policy, envs, seeds, watch):
+        step = policy.trained["step"]
+        order = selection._seeds(CONFIG)
+        asked.append((step, tuple(seeds), envs.options.lighting))
+        won, reward = script.get(step, (0, 0.0))
+        return [
+            EpisodeResult(
+                seed, "goal" if order.index(seed) < won else "out_of_bounds", 1.0 + won / 40, 9, 1.0, reward, "day"
+            )
+            for seed in seeds
+        ]
+
+    for module in (selection, training):
+        monkeypatch.setattr(module, "run_episodes", pretend)
+    return script, asked
+
+
+def _tests(*progress, trials=40, successes=0):
+    return [PolicyTest(2000 * (k + 1), trials, successes, x, 0.0) for k, x in enumerate(progress)]
+
+
+# ---- when it ends
+
+
+def test_a_training_goes_on_until_a_test_reaches_what_was_asked():
+    assert next_segment(PLAN, []).until == 2000 and next_segment(PLAN, []).settle_from is None
+    poor, good, luck = _tests(9.0, successes=37), _tests(9.0, successes=38), _tests(9.0, trials=8, successes=8)
+    assert not next_segment(PLAN, poor).why and not next_segment(PLAN, luck).why
+    assert next_segment(PLAN, good) == selection.Segment(4000, 2000, "reached")
+    assert next_segment(replace(PLAN, success=0.98), good).why == ""
+
+
+def test_a_training_that_gets_no_better_ends():
+    assert next_segment(PLAN, _tests(5.0, 9.0, 9.0, 9.0, 9.1)).why == ""
+    assert next_segment(PLAN, _tests(5.0, 9.0, 9.0, 9.0, 9.1, 9.1)) == selection.Segment(14_000, 12_000, "no better")
+    assert next_segment(PLAN, _tests(5.0, 9.0, 9.0, 9.0, 9.1, 9.2)).why == ""  # 2 % further than the best before
+    assert next_segment(PLAN, _tests(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)).why == ""  # it has not begun to drive
+
+
+def test_the_largest_number_of_steps_ends_it_with_a_learning_rate_that_has_decayed():
+    tests = _tests(*(float(k + 1) for k in range(11)))
+    assert next_segment(PLAN, tests[:10]) == selection.Segment(22_000, None)
+    assert next_segment(PLAN, tests) == selection.Segment(24_000, 22_000, "steps")
+    assert next_segment(replace(PLAN, steps=3000), []) == selection.Segment(3000, 1500, "steps")
+
+
+# ---- which policy is kept
+
+
+def test_a_run_ends_when_it_has_learnt_and_its_last_word_is_of_fresh_episodes(scene, tmp_path, scripted):
+    script, asked = scripted
+    script |= {40: (8, 1.0), 80: (39, 2.0), 120: (40, 1.0)}
+    choice = learn(scene, tmp_path, CONFIG)
+    assert (choice["steps"], choice["why"], choice["reached"]) == (120, "reached", True)
+    assert [(one["step"], one["trials"]) for one in choice["candidates"]] == [(40, 20), (80, 40), (120, 40)]
+    assert choice["chosen"]["step"] == 120 and choice["chosen"]["trials"] == FRESH_EPISODES
+    tested = {seed for _, seeds, _ in asked[:-1] for seed in seeds}
+    step, fresh, _ = asked[-1]
+    assert step == 120 and len(tested) == 40 and len(fresh) == FRESH_EPISODES and not tested & set(fresh)
+    assert [len(seeds) for at, seeds, _ in asked if at == 40] == [8, 12]  # a test is broken off after three failures
+    for name in ("policy.json", "policy.safetensors", "policy.onnx"):
+        assert (tmp_path / name).read_bytes() == (tmp_path / "checkpoints" / "000000120" / name).read_bytes()
+    assert load_policy(tmp_path).trained["step"] == 120
+    assert write_success_curve(tmp_path).exists()
+
+
+def test_the_best_of_a_run_that_did_not_learn_is_kept(scene, tmp_path, scripted):
+    script, _ = scripted
+    script |= {40: (20, 1.0), 80: (30, 1.5), 120: (30, 9.0), 160: (10, 9.0)}
+    choice = learn(scene, tmp_path, CONFIG)
+    assert (choice["steps"], choice["why"], choice["reached"]) == (160, "steps", False)
+    assert choice["chosen"]["step"] == 120  # of those with most successes the one that earns most
+    assert choice["failures"] == "50 of 50 failures at 0 to 5 m (50 by out_of_bounds); 50 in light mostly like day"
+
+
+@pytest.mark.slow
+def test_a_choice_stays_until_more_is_asked(scene, tmp_path, scripted):
+    script, asked = scripted
+    script |= {160: (30, 1.0), 240: (40, 1.0)}
+    first = learn(scene, tmp_path, CONFIG)
+    count = len(asked)
+    assert learn(scene, tmp_path, CONFIG) == first and learn(scene, tmp_path, replace(CONFIG, steps=80)) == first
+    assert len(asked) == count and json.loads((tmp_path / CHOICE_FILE).read_text()) == first
+    more = learn(scene, tmp_path, replace(CONFIG, steps=240))
+    assert more["steps"] == 240 and more["reached"] and more["chosen"]["step"] == 240
+    (tmp_path / CHOICE_FILE).write_text('{"steps": 240, "chosen": {}}')
+    with pytest.raises(InputError, match=r"choice\.json is damaged .*; delete it"):
+        learn(scene, tmp_path, replace(CONFIG, steps=240))
+
+
+@pytest.mark.slow
+def test_a_killed_run_repeats_no_test(scene, tmp_path, scripted, monkeypatch):
+    script, asked = scripted
+    script |= {80: (40, 1.0), 120: (40, 1.0)}
+    whole = learn(scene, tmp_path / "a", CONFIG)
+    count = len(asked)
+    real = selection._choose
+    monkeypatch.setattr(selection, "_choose", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        learn(scene, tmp_path / "b", CONFIG)
+    monkeypatch.setattr(selection, "_choose", real)
+    del asked[:]
+    again = learn(scene, tmp_path / "b", CONFIG)
+    assert again["candidates"] == whole["candidates"] and again["chosen"] == whole["chosen"]
+    assert len(asked) < count and {at for at, _, _ in asked if at < 120} <= {40, 80}
+
+
+@pytest.mark.slow
+def test_a_new_training_keeps_nothing_of_the_previous_one(scene, tmp_path, scripted):
+    learn(scene, tmp_path, CONFIG)
+    shutil.rmtree(tmp_path / "state")
+    (tmp_path / "state").mkdir()
+    assert selection._read_tests(tmp_path) == []
+    choice = learn(scene, tmp_path, replace(CONFIG, steps=80))
+    assert choice["steps"] == 80 and max(int(path.name) for path in (tmp_path / "checkpoints").iterdir()) == 80
+    assert all(one["step"] <= 80 for one in json.loads((tmp_path / TESTS_FILE).read_text()))
+
+
+@pytest.mark.slow
+def test_tests_are_whole_episodes_as_in_training_with_the_same_result_each_time(scene, tmp_path, monkeypatch):
+    seen = []
+
+    def spy(policy, envs, seeds, watch):
+        o = envs.get(0, "options")
+        seen.append((o.start_along, o.lighting, o.randomise))
+        driven = run_episodes(policy, envs, seeds[:2], watch)
+        assert driven == run_episodes(policy, envs, seeds[:2], watch)
+        assert all(np.isfinite(one.reward) and one.steps > 0 and one.lighting for one in driven)
+        return driven
+
+    for module in (selection, training):
+        monkeypatch.setattr(module, "run_episodes", spy)
+    learn(scene, tmp_path, replace(CONFIG, steps=40))
+    assert set(map(str, seen)) == {str((0.0, "day", CONFIG.options()["randomise"]))}
+
+
+def test_the_last_word_of_a_training_in_varied_light_is_under_held_out_light(scene, tmp_path, scripted):
+    _, asked = scripted
+    choice = learn(scene, tmp_path, replace(CONFIG, steps=40, lighting="training"))
+    assert asked[-1][2] == "held-out" and {light for _, _, light in asked[:-1]} == {"training"}
+    assert choice["chosen"]["condition"] == "held-out+randomised"
+
+
+def test_failures_are_summed_up_by_place_cause_and_light():
+    assert selection.failure_summary([]) == ""
+    near = [Failure("out_of_bounds", 21.0 + k, "training: night 0.6, sun 0.4") for k in range(3)]
+    far = [Failure("stuck", 40.0, "training: sun 0.9, night 0.1")]
+    text = selection.failure_summary([*far, *near])
+    assert text == "3 of 4 failures at 20 to 25 m (3 by out_of_bounds); 3 in light mostly like night"

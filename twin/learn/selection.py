@@ -1,0 +1,255 @@
+"""When a training ends and which of its policies is kept: tests between segments of the training, and a last word.
+
+A *test* drives the newest policy, without exploration, in whole episodes like those of the training. All tests of a run
+have the same episodes, which the training never has. A test is broken off once more episodes failed than the asked
+success rate allows. The training ends
+
+- when a test *reaches* the asked rate;
+- when `PATIENCE` tests in a row did not get `_BETTER` further along the route than the best before them;
+- at the largest number of steps.
+
+Before it ends, the learning rate decays over `config.settle` steps, and the last policy is tested, too. Of the policies
+that drove a whole test the one with most successes is kept, among equals the one with the highest mean reward; if none
+reached the asked rate, the best `_FINALISTS` drive whole tests first. The best of several is partly lucky, so the *last
+word* is its success in fresh episodes, which decided nothing. Where the lighting varies these are under held-out
+lightings with everything randomised, as `twin validate` drives them by default.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin import runtime
+from twin.config import HELD_OUT, Condition
+from twin.env.domain_randomization import condition_options
+from twin.env.vector_env import make_vector_env
+from twin.evaluation.training_curves import CHOICE_FILE
+from twin.files import read_json, wrap_read_errors, write_json
+from twin.learn.policy import copy_policy, load_policy
+from twin.learn.policy_evaluation import EpisodeResult, run_episodes
+from twin.learn.sac import has_state, saved_steps
+from twin.learn.train_config import TrainConfig
+from twin.learn.training import Drive, Segment, Watch, train
+from twin.loading import Twin
+
+TESTS_FILE = "tests.json"
+FRESH_EPISODES = 40
+"""Number of episodes of the last word."""
+PATIENCE = 4
+
+_BATCHES = (8, 12, 20)  # episodes of a test, between which it may be broken off
+_TEST_EPISODES = sum(_BATCHES)
+_BETTER = 0.02  # of the mean distance along the route
+_FINALISTS = 3
+_STREAM = 7  # see `training._TRAINING_STREAM`
+_PLACE = 5.0  # [m] of the route that failures are counted over
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An episode of a test that did not arrive."""
+
+    cause: str
+    progress: float
+    """[m]"""
+    lighting: str
+    """As sampled; see `LocalVectorEnv.info`."""
+
+
+@dataclass(frozen=True)
+class PolicyTest:
+    """A test of the policy of a step, in the first `trials` of the test episodes."""
+
+    step: int
+    trials: int
+    successes: int
+    progress: float
+    """Mean distance along the route [m]."""
+    reward: float
+    """Mean sum of rewards."""
+    failures: tuple[Failure, ...] = ()
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.trials
+
+    def reached(self, success: float) -> bool:
+        """True if all episodes were driven, and the rate is at least `success`."""
+        return self.trials == _TEST_EPISODES and self.rate >= success
+
+    @staticmethod
+    def of(step: int, episodes: Sequence[EpisodeResult]) -> "PolicyTest":
+        lost = [one for one in episodes if one.cause != "goal"]
+        return PolicyTest(
+            step,
+            len(episodes),
+            len(episodes) - len(lost),
+            round(float(np.mean([one.progress for one in episodes])), 3),
+            round(float(np.mean([one.reward for one in episodes])), 3),
+            tuple(Failure(one.cause, round(one.progress, 2), one.lighting) for one in lost),
+        )
+
+
+def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
+    """The segment that follows the tests so far."""
+    last = tests[-1].step if tests else 0
+    settled = min(last + config.settle, config.steps)
+    if tests and tests[-1].reached(config.success):
+        return Segment(settled, last, "reached")
+    best = -np.inf
+    since = 0
+    for one in tests:
+        if best <= 0.0 or one.progress > best * (1.0 + _BETTER):
+            best, since = one.progress, 0
+        else:
+            since += 1
+    if since >= PATIENCE:
+        return Segment(settled, last, "no better")
+    end = max(config.steps - config.settle, config.steps // 2)
+    due = last + config.test_every
+    return Segment(due, None) if due <= end else Segment(config.steps, max(end, last), "steps")
+
+
+def train_until_learnt(
+    twin: Twin, folder: Path, config: TrainConfig, watch: Watch | None = None, processes: int | None = None
+) -> dict[str, Any]:
+    """Trains and tests until the training ends (see the module), and keeps the best policy as the run's.
+
+    An earlier choice is returned as it is unless `config` asks for more steps or more success. A killed call goes on.
+    Arguments and errors are those of `train`.
+
+    Returns:
+        The contents of `choice.json`: steps; the asked success and whether it is reached; why the training ended; the
+        tests; `chosen`, the last word, with its condition; and a sentence on where and why episodes failed.
+    """
+    before = _read_choice(folder)
+    if before and (before["reached"] or config.steps <= before["most"]) and config.success <= before["success"]:
+        return before
+    tests = _read_tests(folder)
+    planned: list[Segment] = []
+
+    def referee(step: int, drive: Drive) -> Segment | None:
+        if planned and step >= planned[-1].until:
+            with runtime.bar(f"test at {step:,}", _TEST_EPISODES, "episode") as bar:
+                tests.append(_test(config, step, lambda seeds: drive(_checkpoint(folder, step), seeds, bar.update)))
+            if planned[-1].why:
+                return None
+            write_json(folder / TESTS_FILE, [asdict(one) for one in tests])
+        planned.append(next_segment(config, tests))
+        return planned[-1]
+
+    train(twin, folder, config, watch, processes, referee)
+    return _choose(twin, folder, config, tests, planned[-1].why, processes)
+
+
+def _choose(
+    twin: Twin, folder: Path, config: TrainConfig, tests: list[PolicyTest], why: str, processes: int | None
+) -> dict[str, Any]:
+    def drive(step: int, seeds: Sequence[int], what: str, condition: dict[str, Any]) -> list[EpisodeResult]:
+        options = {**config.options(), "start_along": 0.0, **condition}
+        bar = runtime.bar(what, len(seeds), "episode")
+        with closing(make_vector_env(twin, config.task, options, [None] * config.worlds, processes)) as envs, bar:
+            return run_episodes(load_policy(_checkpoint(folder, step)), envs, seeds, bar.update)
+
+    seeds = _seeds(config)
+    finalists = [one for one in tests if one.trials == _TEST_EPISODES]
+    if not any(one.reached(config.success) for one in finalists):
+        ranked = sorted(tests, key=lambda one: (one.rate, one.progress, one.step))
+        finalists = [
+            PolicyTest.of(one.step, drive(one.step, seeds[:_TEST_EPISODES], f"test of {one.step:,}", {}))
+            for one in ranked[-_FINALISTS:]
+        ]
+    best = max(finalists, key=lambda one: (one.successes, one.reward))
+    condition = Condition(HELD_OUT, True) if config.lighting_varies else Condition(config.lighting, config.randomise)
+    options = condition_options(condition) if config.lighting_varies else {}
+    fresh = PolicyTest.of(best.step, drive(best.step, seeds[_TEST_EPISODES:], "last word", options))
+    copy_policy(_checkpoint(folder, best.step), folder)
+    by_step = {one.step: one for one in [*tests, *finalists]}
+    out = {
+        "steps": tests[-1].step,
+        "most": config.steps,
+        "success": config.success,
+        "reached": best.reached(config.success),
+        "why": why,
+        "candidates": [asdict(one) for one in by_step.values()],
+        "chosen": {**asdict(fresh), "condition": str(condition)},
+        "failures": failure_summary([*best.failures, *fresh.failures]),
+    }
+    write_json(folder / CHOICE_FILE, out)
+    return dict(read_json(folder / CHOICE_FILE))
+
+
+def failure_summary(failures: Sequence[Failure]) -> str:
+    """Where, why and in which light most of the failures happened; empty without failures."""
+    if not failures:
+        return ""
+    bins = [int(one.progress // _PLACE) for one in failures]
+    where, count = _most(bins)
+    cause, by_cause = _most([one.cause for one, b in zip(failures, bins, strict=True) if b == where])
+    light, by_light = _most([_main_light(one.lighting) for one in failures])
+    place = f"{count} of {len(failures)} failures at {where * _PLACE:g} to {(where + 1) * _PLACE:g} m"
+    return f"{place} ({by_cause} by {cause}); {by_light} in light mostly like {light}"
+
+
+def _main_light(lighting: str) -> str:
+    """The filmed lighting with the largest share in a sampled one, such as sun in `training: sun 0.62, night 0.38`."""
+    _, _, mixture = lighting.partition(": ")
+    return mixture.split(" ")[0] if mixture else lighting
+
+
+def _most(values: list[Any]) -> tuple[Any, int]:
+    """The most frequent value, the first among equals, and its count."""
+    best = max(values, key=values.count)
+    return best, values.count(best)
+
+
+def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[EpisodeResult]]) -> PolicyTest:
+    """Tests a policy in batches of episodes, until more failed than the asked success rate allows."""
+    allowed = int(_TEST_EPISODES * (1.0 - config.success) + 1e-9)
+    seeds, driven = _seeds(config), list[EpisodeResult]()
+    for start, end in pairwise(np.cumsum([0, *_BATCHES]).tolist()):
+        driven += drive(seeds[start:end])
+        if sum(one.cause != "goal" for one in driven) > allowed:
+            break
+    return PolicyTest.of(step, driven)
+
+
+def _seeds(config: TrainConfig) -> tuple[int, ...]:
+    """Seeds of the test episodes, then of the fresh ones."""
+    sequence = np.random.SeedSequence([config.seed, _STREAM])
+    return tuple(int(seed) for seed in sequence.generate_state(_TEST_EPISODES + FRESH_EPISODES))
+
+
+def _checkpoint(folder: Path, step: int) -> Path:
+    return folder / "checkpoints" / f"{step:09d}"
+
+
+def _read_choice(folder: Path) -> dict[str, Any] | None:
+    """The earlier choice of the training as it is saved; None if there is none."""
+    path = folder / CHOICE_FILE
+    if not path.exists() or not has_state(folder / "state"):
+        return None
+    with wrap_read_errors(path, "delete it, and the best policy is selected again"):
+        choice = dict(read_json(path))
+        if choice["steps"] != saved_steps(folder / "state"):
+            return None
+        _ = [choice["chosen"][name] + 0 for name in ("step", "trials", "successes")]
+        _ = choice["most"] + choice["success"], choice["reached"] is True, choice["failures"] + ""
+        return choice
+
+
+def _read_tests(folder: Path) -> list[PolicyTest]:
+    """Tests of the training so far, of saved policies."""
+    path = folder / TESTS_FILE
+    if not path.exists() or not has_state(folder / "state"):
+        return []
+    with wrap_read_errors(path, "delete it, and the policies are tested again"):
+        tests = [
+            PolicyTest(**{**one, "failures": tuple(Failure(**f) for f in one["failures"])}) for one in read_json(path)
+        ]
+        return [one for one in tests if one.step <= saved_steps(folder / "state")]
