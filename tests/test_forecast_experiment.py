@@ -4,6 +4,9 @@ import gzip
 import importlib
 import importlib.util
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -287,3 +290,17 @@ def test_few_places_have_no_intervals_and_what_is_incomplete_is_named(forecast, 
     assert best["spearman_within"] == {"value": pytest.approx(1.0), "low": None, "high": None}
     assert found["met"]["log_score_better"] is None
     assert "2 of 6 places are complete" in forecast.place_scores.tables(protocol, found)
+
+
+def test_at_the_deadline_or_by_a_signal_commands_are_ended(forecast):
+    wait = ("timeit", "-n", "1", "-r", "1", "-s", "import time", "time.sleep(60)")
+    began = time.monotonic()
+    with pytest.raises(forecast.command.TimeIsUp):
+        forecast.command.Commands(0.02)(*wait)
+    commands = forecast.command.Commands(10)
+    threading.Timer(1.0, commands.stop).start()
+    with ThreadPoolExecutor(2) as pool, pytest.raises(forecast.command.TimeIsUp):
+        list(pool.map(lambda _: commands(*wait), range(2)))
+    assert time.monotonic() - began < 30
+    with pytest.raises(forecast.command.TimeIsUp):
+        commands(*wait)

@@ -47,7 +47,7 @@ _GRACE = 60.0  # [s] that a command has to save its state
 
 
 class TimeIsUp(Exception):
-    """The time given by `--minutes` is over."""
+    """The time given by `--minutes` is over, or a signal asked to stop."""
 
 
 class Commands:
@@ -55,6 +55,13 @@ class Commands:
 
     def __init__(self, minutes: float) -> None:
         self._end = time.monotonic() + 60.0 * min(minutes, 1e6)
+        self._running: set[subprocess.Popen] = set()
+
+    def stop(self, *_: object) -> None:
+        """Moves the deadline to now; a signal handler."""
+        self._end = 0.0
+        for process in tuple(self._running):
+            process.send_signal(signal.SIGTERM)
 
     def __call__(self, *arguments: str | Path, cores: int = 1) -> int:
         """Returns the exit status. Raises TimeIsUp at the deadline, after the command has saved its state."""
@@ -63,18 +70,27 @@ class Commands:
         print("+", " ".join(map(str, arguments)), flush=True)
         environment = {**os.environ, "OMP_NUM_THREADS": str(cores)}
         process = subprocess.Popen([sys.executable, "-m", *map(str, arguments)], env=environment)
+        self._running.add(process)
         try:
-            return process.wait(max(0.0, self._end - time.monotonic()))
+            status = process.wait(max(0.0, self._end - time.monotonic()))
         except subprocess.TimeoutExpired:
-            raise TimeIsUp from None
+            status = None
         finally:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
-                try:
-                    process.wait(_GRACE)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            self._end_of(process)
+        if status is None or self._end == 0.0:
+            raise TimeIsUp
+        return status
+
+    def _end_of(self, process: subprocess.Popen) -> None:
+        """Lets a command that still runs save its state."""
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(_GRACE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._running.discard(process)
 
     def must(self, *arguments: str | Path, cores: int = 1) -> None:
         """Raises InputError: the command failed."""
@@ -239,11 +255,13 @@ def _run(protocol: Protocol, given: argparse.Namespace) -> None:
         if place not in protocol.places:
             raise InputError(f"--places {place}: the protocol has {', '.join(map(str, protocol.places))}")
     commands = Commands(given.minutes)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, commands.stop)
     for place in places:
         try:
             run_place(PlaceRun(protocol, place, given.work, given.results, commands, given.jobs), given.ray)
         except TimeIsUp:
-            print(f"the time is up at place {place}; the same command goes on", flush=True)
+            print(f"stopped at place {place}; the same command goes on", flush=True)
             return
         except InputError as error:
             print_error(error)
