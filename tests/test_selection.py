@@ -155,7 +155,7 @@ def test_a_new_training_keeps_nothing_of_the_previous_one(scene, tmp_path, scrip
     learn(scene, tmp_path, CONFIG)
     shutil.rmtree(tmp_path / "state")
     (tmp_path / "state").mkdir()
-    assert selection._read_tests(tmp_path) == []
+    assert selection.read_tests(tmp_path) == []
     choice = learn(scene, tmp_path, replace(CONFIG, steps=80))
     assert choice["steps"] == 80 and max(int(path.name) for path in (tmp_path / "checkpoints").iterdir()) == 80
     assert all(one["step"] <= 80 for one in json.loads((tmp_path / TESTS_FILE).read_text()))

@@ -151,7 +151,7 @@ def forecast(case: Case) -> None:
 def run_metadata(case: Case) -> None:
     """JSON beside runs and validations: what was trained and validated, configs, checkpoints, choices."""
     from twin.evaluation.training_curves import CHOICE_FILE, write_success_curve
-    from twin.learn import sac, training
+    from twin.learn import sac, selection, training
 
     rng, root = case.rng, case.folder / "scene"
     which = rng.random()
@@ -170,11 +170,17 @@ def run_metadata(case: Case) -> None:
             (root / "state" / name).write_bytes(mutated_json(rng, state))
         sac.saved_steps(root / "state")
     else:
-        root.mkdir()
+        (root / "state").mkdir(parents=True)
+        (root / "state" / "state.json").write_text('{"steps": 200}')
         (root / "episodes.csv").write_text(TRAINING_CSV)
-        one = {"step": 100, "trials": 8, "successes": 4, "reward": 1.0}
-        choice = {"steps": 200, "candidates": [one, one | {"step": 150}], "chosen": one | {"trials": 20}}
+        failure = {"cause": "stuck", "progress": 3.0, "lighting": "training: sun 1.00"}
+        one = {"step": 100, "trials": 8, "successes": 4, "progress": 9.0, "reward": 1.0, "failures": [failure]}
+        ends = {"most": 300, "success": 0.95, "reached": False, "why": "steps", "failures": ""}
+        choice = {"steps": 200, "candidates": [one, one | {"step": 150}], "chosen": one | {"trials": 20}, **ends}
         (root / CHOICE_FILE).write_bytes(mutated_json(rng, choice))
+        (root / selection.TESTS_FILE).write_bytes(mutated_json(rng, [one]))
+        selection.read_choice(root)
+        selection.read_tests(root)
         write_success_curve(root)
 
 

@@ -41,6 +41,8 @@ TESTS_FILE = "tests.json"
 FRESH_EPISODES = 40
 """Number of episodes of the last word."""
 PATIENCE = 4
+REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
+"""Reasons to end a training."""
 
 _BATCHES = (8, 12, 20)  # episodes of a test, between which it may be broken off
 _TEST_EPISODES = sum(_BATCHES)
@@ -100,7 +102,7 @@ def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
     last = tests[-1].step if tests else 0
     settled = min(last + config.settle, config.steps)
     if tests and tests[-1].reached(config.success):
-        return Segment(settled, last, "reached")
+        return Segment(settled, last, REACHED)
     best = -np.inf
     since = 0
     for one in tests:
@@ -109,10 +111,10 @@ def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
         else:
             since += 1
     if since >= PATIENCE:
-        return Segment(settled, last, "no better")
+        return Segment(settled, last, NO_BETTER)
     end = max(config.steps - config.settle, config.steps // 2)
     due = last + config.test_every
-    return Segment(due, None) if due <= end else Segment(config.steps, max(end, last), "steps")
+    return Segment(due, None) if due <= end else Segment(config.steps, max(end, last), ALL_STEPS)
 
 
 def train_until_learnt(
@@ -127,10 +129,10 @@ def train_until_learnt(
         The contents of `choice.json`: steps; the asked success and whether it is reached; why the training ended; the
         tests; `chosen`, the last word, with its condition; and a sentence on where and why episodes failed.
     """
-    before = _read_choice(folder)
+    before = read_choice(folder)
     if before and (before["reached"] or config.steps <= before["most"]) and config.success <= before["success"]:
         return before
-    tests = _read_tests(folder)
+    tests = read_tests(folder)
     planned: list[Segment] = []
 
     def referee(step: int, drive: Drive) -> Segment | None:
@@ -229,7 +231,7 @@ def _checkpoint(folder: Path, step: int) -> Path:
     return folder / "checkpoints" / f"{step:09d}"
 
 
-def _read_choice(folder: Path) -> dict[str, Any] | None:
+def read_choice(folder: Path) -> dict[str, Any] | None:
     """The earlier choice of the training as it is saved; None if there is none."""
     path = folder / CHOICE_FILE
     if not path.exists() or not has_state(folder / "state"):
@@ -238,18 +240,29 @@ def _read_choice(folder: Path) -> dict[str, Any] | None:
         choice = dict(read_json(path))
         if choice["steps"] != saved_steps(folder / "state"):
             return None
-        _ = [choice["chosen"][name] + 0 for name in ("step", "trials", "successes")]
-        _ = choice["most"] + choice["success"], choice["reached"] is True, choice["failures"] + ""
+        counts = [int(choice["chosen"][name]) for name in ("step", "successes", "trials")]
+        known = choice["why"] in ENDS and 0 <= counts[1] <= counts[2] and counts[2] > 0
+        texts = choice["failures"], choice["chosen"]["condition"]
+        if not known or not all(isinstance(one, str) for one in texts) or not isinstance(choice["reached"], bool):
+            raise ValueError("no such choice")
+        float(choice["most"]), float(choice["success"])
         return choice
 
 
-def _read_tests(folder: Path) -> list[PolicyTest]:
+def read_tests(folder: Path) -> list[PolicyTest]:
     """Tests of the training so far, of saved policies."""
     path = folder / TESTS_FILE
     if not path.exists() or not has_state(folder / "state"):
         return []
     with wrap_read_errors(path, "delete it, and the policies are tested again"):
-        tests = [
-            PolicyTest(**{**one, "failures": tuple(Failure(**f) for f in one["failures"])}) for one in read_json(path)
-        ]
+        tests = [_parse_test(one) for one in read_json(path)]
         return [one for one in tests if one.step <= saved_steps(folder / "state")]
+
+
+def _parse_test(row: dict[str, Any]) -> PolicyTest:
+    failures = tuple(Failure(str(f["cause"]), float(f["progress"]), str(f["lighting"])) for f in row["failures"])
+    counts = int(row["step"]), int(row["trials"]), int(row["successes"])
+    test = PolicyTest(*counts, float(row["progress"]), float(row["reward"]), failures)
+    if not 0 <= test.successes <= test.trials <= _TEST_EPISODES or not test.trials:
+        raise ValueError(f"{test.successes} successes in {test.trials} trials")
+    return test

@@ -128,9 +128,10 @@ def _selection(folder: Path) -> list[str]:
         choice = read_json(folder / _CHOICE)
         last, count = choice["chosen"], len(choice["candidates"])
         measured = rate_summary(int(last["successes"]), int(last["trials"]))
+        under = f" under `{last['condition']}`" if "condition" in last else ""  # which older runs do not say
     return [
         "",
-        f"Selected among {count} checkpoints. In episodes after the selection it reached the goal "
+        f"Selected among {count} tested checkpoints. In fresh episodes{under} it reached the goal "
         f"{measured['successes']} times of {measured['trials']} ({_interval(measured['low'], measured['high'])}).",
     ]
 
