@@ -242,6 +242,12 @@ def _film(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; default: a file in SCENE/films")
     parser.add_argument(
+        "--rerun",
+        type=Path,
+        metavar="FILE",
+        help="write the drive as a recording of Rerun, too: drive.rrd (pip install 'twin[rerun]')",
+    )
+    parser.add_argument(
         "--lerobot",
         type=Path,
         metavar="DIR",

@@ -2,12 +2,13 @@
 
     python -m twin.film scenes/demo --task right_turn --lighting night --obstacles 4
     python -m twin.film scenes/demo --policy first --task straight --lighting held-out --seed 7 --out drive.mp4
+    python -m twin.film scenes/demo --policy first --task straight --rerun drive.rrd
     python -m twin.film scenes/demo --lerobot drives --episodes 20
 
 The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is
 scripted, or a policy that `twin.validate` accepts, in an environment with the policy's options. Task, lighting and seed
-determine the episode: those of a row of `validation/episodes.csv` reproduce it. `--lerobot` records drives as a dataset
-to learn from instead.
+determine the episode: those of a row of `validation/episodes.csv` reproduce it. `--rerun` also writes the drive as a
+recording of Rerun. `--lerobot` records drives as a dataset to learn from instead.
 """
 
 import argparse
@@ -20,9 +21,11 @@ import dm_env
 import numpy as np
 
 from twin import commands, runtime
+from twin.config import STEERING
 from twin.env.suite import load
 from twin.errors import InputError
-from twin.files import new_folder, require_absent
+from twin.files import new_folder, require_absent, require_parent
+from twin.geometry.poses import inverse_pose
 from twin.loading import Twin, load_scene
 from twin.unpack import is_cached
 
@@ -40,6 +43,7 @@ def film(
     seed: int = 0,
     out: Path | None = None,
     trust: bool = False,
+    rerun: Path | None = None,
     **options: Any,
 ) -> tuple[Path, "Episode"]:
     """Drives one episode and films it; returns the film's path and the episode.
@@ -52,22 +56,33 @@ def film(
         out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder, or for a pack
             `<pack>_<task>_<lighting>_<seed>.mp4` in the working folder.
         trust: Allows a policy file to run code.
+        rerun: A file for a recording of Rerun, see `twin.report.rerun_recording`; None: none.
         options: See `twin.env.options.Options`; by default those of the policy.
 
     Raises:
-        InputError: an unknown scene, task, policy or option, or a negative seed.
+        InputError: an unknown scene, task, policy or option, a negative seed, or rerun-sdk is not installed.
     """
     from twin.env.episode import record_episode
     from twin.report.episode_video import write_episode_video
     from twin.report.review_video import load_ground_and_parts
 
+    if rerun:
+        from twin.report.rerun_recording import require_rerun, write_rerun_recording
+
+        require_rerun()
+        require_parent(rerun)
     scene = load_scene(root)
     driver, driver_name, options = _driver(scene, policy, seed, trust, options)
     environment = load(scene, task, seed, **options)
     images: list[np.ndarray] = []
+    motion: list[tuple[float, float]] = []
+    cameras: list[np.ndarray] = []  # on the robot
 
     def watch(step: dm_env.TimeStep) -> None:
         images.append(step.observation["pixels"][-1].copy())
+        motion.append((environment.physics.speed, environment.physics.yaw_rate))
+        if not cameras:  # before the robot moves, so that the camera's latency does not matter
+            cameras.append(inverse_pose(environment.physics.base_to_world) @ environment.physics.camera_to_world)
         progress.update()
 
     max_steps = round(environment.task.time_limit / environment.task.options.control_timestep)
@@ -80,6 +95,12 @@ def film(
     driven, geometry = environment.task, load_ground_and_parts(scene.scene)
     limits, title = (driven.segment.start, driven.segment.end), f"{task.replace('_', ' ')}: {driver_name}"
     write_episode_video(path, episode, images, driven.world, driven.half_width, limits, geometry, title)
+    if rerun:
+        place = driven.world, driven.half_width, f"{scene.scene.root.resolve().name}, {title}"
+        commands = episode.actions
+        if driven.options.action == STEERING:
+            commands = np.column_stack([np.full(len(commands), driven.options.speed), commands])
+        write_rerun_recording(rerun, episode, images, np.array(motion), commands, cameras[0], *place)
     return path, episode
 
 
@@ -104,7 +125,6 @@ def record_dataset(
     Raises:
         InputError: as `film`, or `out` exists, or pyarrow is not installed.
     """
-    from twin.config import STEERING
     from twin.env.episode import record_episode
     from twin.report.drive_dataset import DriveDataset, require_pyarrow
 
@@ -176,6 +196,8 @@ def command(given: argparse.Namespace) -> None:
     if given.lerobot:
         if given.out:
             raise InputError("--out is of a film; --lerobot names the dataset's folder")
+        if given.rerun:
+            raise InputError("--rerun is of one drive; --lerobot records several: give one of them")
         drives = record_dataset(given.scene, given.lerobot, given.episodes, *driven, given.trust, **options)
         if not given.quiet:
             frames, goals = sum(len(one.times) - 1 for one in drives), sum(one.success for one in drives)
@@ -183,9 +205,11 @@ def command(given: argparse.Namespace) -> None:
         return
     if given.episodes != 1:
         raise InputError(f"--episodes {given.episodes}: a film shows one drive; several are for --lerobot DIR")
-    path, episode = film(given.scene, *driven, given.out, given.trust, **options)
+    path, episode = film(given.scene, *driven, given.out, given.trust, given.rerun, **options)
     if not given.quiet:
         print(summary(path, episode))
+        if given.rerun:
+            print(f"look at it: rerun {given.rerun}")
 
 
 def film_options(lighting: str | None) -> dict[str, Any]:
