@@ -131,7 +131,7 @@ def _log_place(
     height, width = size
     fx, fy, cx, cy = world.camera.resized((width, height)).intrinsics
     lens = rr.Pinhole(
-        image_from_camera=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
+        image_from_camera=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
         resolution=[width, height],
         camera_xyz=rr.ViewCoordinates.RDF,
         image_plane_distance=0.6,
