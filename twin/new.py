@@ -22,6 +22,7 @@ import numpy as np
 
 from twin import commands, runtime
 from twin.capture.bag_film import BagContents, CameraSeat, read_contents
+from twin.capture.film_check import check_film
 from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap, read_transforms
 from twin.capture.frames import detect_kind
 from twin.capture.scale import local_east_north_up
@@ -77,7 +78,7 @@ half_width = 1.0               # half the width of the drivable corridor around 
 
 def new_scene(root: Path, films: list[Path], camera_height: float | None = None, topic: str = "") -> Path:
     """Writes a scene folder: copies of the films under `input/`, `robot.toml` if a bag has the camera's seat, then
-    `scene.toml`, whose path is returned. Logs what was taken from bags.
+    `scene.toml`, whose path is returned. Logs what was taken from bags, and what is wrong with films.
 
     Args:
         root: The scene folder; created if it does not exist.
@@ -121,6 +122,10 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     write_text(scene.config_file, text + _REST.format(**scales))
     for bag in bags.values():
         runtime.log_line(_taken(bag))
+    for film in films:
+        if detect_kind(film) == "video":
+            for note in check_film(film):
+                runtime.log_line(f"{film.name}: {note}")
     return scene.config_file
 
 

@@ -23,11 +23,11 @@ from twin.config import CAMERA_MODELS
 from twin.errors import InputError, short_repr
 from twin.files import is_file, read_bytes, read_json, wrap_read_errors
 from twin.geometry.cameras import opencv_to_mujoco
-from twin.geometry.images import image_size
+from twin.geometry.images import HEIF_SUFFIXES, image_size
 from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2", *HEIF_SUFFIXES)
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _MODEL_NAMES = {int(pycolmap.CameraModelId.__members__[name]): name for name in CAMERA_MODELS}
 _CURE = "export the model again"

@@ -27,7 +27,7 @@ from twin.capture.formats import (
     read_transforms,
 )
 from twin.capture.photos import read_photos
-from twin.capture.video import FilmStatistics, damage_note, read_film, video_film
+from twin.capture.video import FilmStatistics, damage_note, format_note, read_film, video_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
 from twin.config_file import MAX_NAME, check_lighting
 from twin.errors import InputError
@@ -195,7 +195,7 @@ def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
             times.append(frame.time)
             bar.total = count.declared
             bar.update(count.decoded - bar.n)
-    if note := damage_note(task.path, count):
+    for note in filter(None, (damage_note(task.path, count), format_note(task.path, count))):
         runtime.log_line(f"  {note}")
     task.check_masked(unmasked, len(index))
     lens = task.given_lens(count.size) or _lens_of_bag(bag, count.size)
@@ -209,6 +209,8 @@ def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
         "duplicates": count.duplicates,
         "damaged": count.damaged,
         "blank": count.blank,
+        "hdr": count.hdr,
+        "interlaced": count.interlaced,
         "duration_s": round(count.duration, 3),
         "width": size[0],
         "height": size[1],

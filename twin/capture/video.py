@@ -10,17 +10,20 @@ rest were cut out; indices and times remain those of the whole film.
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
 import av
 import av.error
+import av.filter
 import cv2
 import numpy as np
 from av.sidedata.sidedata import Type as SideData
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
+from twin.capture.hdr import NAMES, hdr_to_sdr, hdr_transfer
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.files import regular_file
@@ -35,6 +38,7 @@ _MAX_RETURN_ERROR = 0.5  # [px] largest forward-backward tracking error
 _STILL_DIFFERENCE = 1.5  # [gray levels after contrast stretching] below it two texture-free frames are equal
 BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] counts as blank
 _LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
+_DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
 _MIN_DECODED_FRACTION = 0.98  # of the frames declared by the container; below it the user gets a note
 
 
@@ -204,6 +208,8 @@ class FilmStatistics:
     damaged: int = 0
     duplicates: int = 0
     blank: int = 0
+    interlaced: bool = False
+    hdr: str = ""  # HLG or PQ; empty for SDR
     declared: int = 0
     duration: float = 0.0
     size: tuple[int, int] = (0, 0)  # upright width and height of the input [px]
@@ -261,6 +267,7 @@ def read_film(
     last_small: Image | None = None
     for candidate in _sharpest_per_slot(film, config, count, segments):
         image = upright(candidate.frame)
+        count.hdr = count.hdr or NAMES.get(hdr_transfer(candidate.frame) or 0, "")
         count.size = (image.shape[1], image.shape[0])
         size = fitted_size(*count.size, config.max_size)
         if size != count.size:
@@ -332,6 +339,13 @@ def _sharpest_per_slot(
         yield best
 
 
+def format_note(path: Path, count: FilmStatistics) -> str | None:
+    """A note for the user if a film was converted from HDR or deinterlaced, else None."""
+    done = [f"HDR ({count.hdr}), converted to SDR"] if count.hdr else []
+    done += ["interlaced, deinterlaced at a loss of detail"] if count.interlaced else []
+    return f"{path.name}: {'; '.join(done)}; film without it if you can" if done else None
+
+
 def damage_note(path: Path, count: FilmStatistics) -> str | None:
     """A note for the user if a film is truncated or partly damaged, else None."""
     if count.decoded >= _MIN_DECODED_FRACTION * count.declared and not count.damaged:
@@ -347,6 +361,47 @@ def damage_note(path: Path, count: FilmStatistics) -> str | None:
 
 def decode(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
     """Yields a film's undamaged frames from front to back, each after its time stamp in the stream [s] or None.
+
+    Interlaced frames are deinterlaced: both fields would show the scene at two instants.
+    """
+    graph: av.filter.Graph | None = None
+    for stamp, frame in _intact_frames(path, count):
+        if graph is None and not frame.interlaced_frame:
+            yield stamp, frame
+            continue
+        try:
+            if graph is None:
+                count.interlaced = True
+                graph = _deinterlacer(frame)
+            graph.push(frame)
+        except (av.error.FFmpegError, ValueError) as error:
+            raise InputError(f"{path}: cannot be deinterlaced ({error}); convert it to progressive frames") from None
+        yield from _pulled(graph)
+    if graph is not None:
+        graph.push(None)
+        yield from _pulled(graph)
+
+
+def _deinterlacer(frame: av.VideoFrame) -> av.filter.Graph:
+    """A filter from interlaced frames like this one to as many progressive ones; progressive ones pass unchanged."""
+    graph = av.filter.Graph()
+    base = frame.time_base or Fraction(1, 1000)
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=base)
+    graph.link_nodes(source, graph.add("bwdif", _DEINTERLACE), graph.add("buffersink")).configure()
+    return graph
+
+
+def _pulled(graph: av.filter.Graph) -> Iterator[tuple[float | None, av.VideoFrame]]:
+    """The frames that a filter has ready."""
+    with contextlib.suppress(av.error.BlockingIOError, av.error.EOFError):
+        while True:
+            frame = graph.pull()
+            assert isinstance(frame, av.VideoFrame)
+            yield frame.time, frame
+
+
+def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
+    """Frames that are not damaged, and do not depend on damaged ones.
 
     A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from the
     damage to the next key frame are skipped, and the B frames before it that depend on it.
@@ -406,8 +461,9 @@ def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
 
 
 def upright(frame: av.VideoFrame) -> Image:
-    """A frame as RGB, rotated and mirrored by its display matrix in multiples of 90°."""
-    image = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+    """A frame as SDR RGB, rotated and mirrored by its display matrix in multiples of 90°."""
+    transfer = hdr_transfer(frame)
+    image = hdr_to_sdr(frame, transfer) if transfer else np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     side = frame.side_data.get(SideData.DISPLAYMATRIX)  # type: ignore[call-overload]
     if side is None:
         return image

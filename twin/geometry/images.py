@@ -25,6 +25,9 @@ DECODE_ERRORS = (
 )
 """Exceptions that Pillow and OpenCV raise for damaged files."""
 _MAX_BYTES = 2 << 30  # size of an image file
+HEIF_SUFFIXES = (".heic", ".heif")
+"""Of the photos of phones; reading them needs the extra `heif`."""
+_HEIF = "HEIF"  # Pillow's name of the format
 _CURE = "replace or remove it"
 warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # issued at half of MAX_PIXELS
 warnings.filterwarnings("ignore", module="PIL")  # flawed headers; their values then count as unknown
@@ -44,7 +47,9 @@ def decode_image(path: Path, flags: int, cure: str = _CURE) -> NDArray[np.uint8]
     Raises InputError: missing, empty, too large or undecodable file; `cure` ends the message.
     """
     if (header := open_header(path, cure)) is not None:
-        header.close()
+        with header:
+            if header.format == _HEIF:
+                return _decode_heif(path, header, flags, cure)
     data = read_bytes(path, _MAX_BYTES)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
@@ -55,11 +60,28 @@ def decode_image(path: Path, flags: int, cure: str = _CURE) -> NDArray[np.uint8]
     return np.asarray(image, np.uint8)
 
 
+def _decode_heif(path: Path, image: PillowImage.Image, flags: int, cure: str) -> NDArray[np.uint8]:
+    try:
+        if flags & cv2.IMREAD_COLOR:
+            return cv2.cvtColor(np.asarray(image.convert("RGB"), np.uint8), cv2.COLOR_RGB2BGR).astype(np.uint8)
+        return np.asarray(image.convert("L"), np.uint8)
+    except DECODE_ERRORS:
+        raise unreadable_error(path, cure) from None
+
+
 def open_header(path: Path, cure: str = _CURE) -> PillowImage.Image | None:
     """Opens an image file with Pillow, reading only the header; None for a format unknown to Pillow.
 
-    Raises InputError: no file, an empty one, or more than `MAX_PIXELS`.
+    HEIF is upright as opened, whatever its EXIF orientation says.
+
+    Raises InputError: no file, an empty one, more than `MAX_PIXELS`, or HEIF without pillow-heif.
     """
+    if path.suffix.lower() in HEIF_SUFFIXES:
+        try:
+            import pillow_heif
+        except ImportError:
+            raise InputError(f"{path}: HEIC pictures need more: pip install 'twin[heif]', or convert them") from None
+        pillow_heif.register_heif_opener()
     try:
         if not regular_file(path).stat().st_size:
             raise unreadable_error(path, cure)

@@ -1,0 +1,127 @@
+"""Looks at a film before the build: what of it costs quality, and how to film better.
+
+Key frames spread over the film are decoded, or if there are few, other frames, too; timing comes from all packets. What
+a file does not show is not judged: stabilization leaves no trace in it, nor does a rolling shutter.
+"""
+
+import contextlib
+from pathlib import Path
+from typing import Literal
+
+import av
+import av.error
+import cv2
+import numpy as np
+
+from twin.capture.hdr import NAMES, hdr_transfer
+from twin.capture.video import FilmTiming, fitted_size, probe, sharpness, upright
+from twin.geometry.images import resize
+from twin.types import Array
+
+_SAMPLES = 60
+_WIDTH = 320  # [px] at which frames are compared
+_MIN_SIDE = 640  # [px] of the longer side
+_DARK = 35.0  # [gray levels] median brightness
+_CLIPPED, _CLIPPED_SHARE = 250, 0.15  # [gray levels], share of the pixels at or above
+_BLURRED, _BLURRED_SHARE = 0.35, 0.3  # of the film's own sharpest tenth; share of the frames below
+_EXPOSURE_RANGE = 2.0  # ratio of the 95 % and 5 % quantiles of brightness
+_TINT_RANGE = 1.3  # the same of red over blue
+_GAP = 0.5  # [s] without a picture
+_UNEVEN = 1.5  # ratio of the 95 % quantile and the median of the time between frames
+_MIN_TRUSTED = 8  # samples that shares and quantiles are computed from
+
+
+def check_film(path: Path) -> list[str]:
+    """Sentences about what is wrong with a film, each with its cure; empty if nothing is.
+
+    Raises InputError: see `probe`.
+    """
+    timing = probe(path)
+    notes = _timing_notes(timing)
+    frames = _samples(path, "NONKEY")
+    if len(frames) < _MIN_TRUSTED:
+        frames = _samples(path, "DEFAULT")
+    if not frames:
+        return [*notes, "no frame can be decoded; copy it again from the camera"]
+    first = frames[0]
+    if transfer := hdr_transfer(first):
+        notes.append(f"HDR ({NAMES[transfer]}): converted to SDR by a fixed curve; turn HDR off for the next film")
+    if first.interlaced_frame:
+        notes.append("interlaced: deinterlaced, at a loss of detail; film with progressive frames (p, not i)")
+    if max(first.width, first.height) < _MIN_SIDE:
+        notes.append(f"{first.width}x{first.height}: small pictures make a soft twin; film in 1920x1080")
+    return notes + _picture_notes(frames)
+
+
+def _timing_notes(timing: FilmTiming) -> list[str]:
+    steps = np.diff(timing.times)
+    if len(steps) < _MIN_TRUSTED:
+        return []
+    notes = []
+    longest = int(steps.argmax())
+    if steps[longest] > max(_GAP, 3.0 * timing.interval):
+        at = f"{timing.times[longest]:.1f} s"
+        notes.append(
+            f"no picture for {steps[longest]:.1f} s from {at} on; film in one go, or cut it there into two films"
+        )
+    if float(np.quantile(steps, 0.95)) > _UNEVEN * timing.interval:
+        notes.append(
+            "varying frame rate: frames are taken by their time stamps; a fixed rate is better, as in a camera app"
+        )
+    return notes
+
+
+def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> list[av.VideoFrame]:
+    """At most twice `_SAMPLES` frames spread over the film; with `NONKEY` key frames only."""
+    found: list[av.VideoFrame] = []
+    every = 1
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.codec_context.skip_frame = skip
+        stream.thread_type = "AUTO"
+        with contextlib.suppress(av.error.FFmpegError):  # what comes before the damage is enough for a look
+            for number, frame in enumerate(container.decode(stream)):
+                if number % every == 0:
+                    found.append(frame)
+                if len(found) == 2 * _SAMPLES:
+                    found, every = found[::2], 2 * every
+    return found
+
+
+def _picture_notes(frames: list[av.VideoFrame]) -> list[str]:
+    small = []
+    for frame in frames:
+        image = upright(frame)
+        width, height = fitted_size(image.shape[1], image.shape[0], _WIDTH)
+        small.append(np.asarray(resize(image, width, height), np.uint8))
+    gray = [np.asarray(cv2.cvtColor(one, cv2.COLOR_RGB2GRAY), np.uint8) for one in small]
+    brightness = np.array([float(one.mean()) for one in gray])
+    notes = []
+    if float(np.median([np.median(one) for one in gray])) < _DARK:
+        notes.append("dark: half of the picture is nearly black; lock a longer exposure, and walk slower against blur")
+    if float(np.median([(one >= _CLIPPED).mean() for one in gray])) > _CLIPPED_SHARE:
+        notes.append("overexposed: much of the picture is white; lock a shorter exposure, on the road and not the sky")
+    if len(frames) < _MIN_TRUSTED:
+        return notes
+    detail = np.array([sharpness(one) for one in gray])
+    soft = float((detail < _BLURRED * np.quantile(detail, 0.9)).mean())
+    if soft > _BLURRED_SHARE:
+        notes.append(
+            f"{soft:.0%} of the frames are far softer than the sharpest; walk slower, wipe the lens, lock the focus, "
+            "or film in more light"
+        )
+    if (ratio := _range(brightness)) > _EXPOSURE_RANGE:
+        notes.append(
+            f"brightness varies {ratio:.1f}-fold along the film; unless lamps or shade do that, lock the exposure"
+        )
+    tint = np.array([float(one[..., 0].mean() + 1.0) / float(one[..., 2].mean() + 1.0) for one in small])
+    if (ratio := _range(tint)) > _TINT_RANGE:
+        notes.append(
+            f"red over blue varies {ratio:.1f}-fold along the film; unless lamps do that, lock the white balance"
+        )
+    return notes
+
+
+def _range(values: Array) -> float:
+    low, high = np.quantile(values, [0.05, 0.95])
+    return float((high + 1e-6) / (low + 1e-6))
