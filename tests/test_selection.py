@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from twin.learn.selection import FRESH_EPISODES, TESTS_FILE, Failure, PolicyTest
 from twin.learn.train_config import TrainConfig
 
 CONFIG = replace(SHORT, steps=160, save_every=160, checkpoints=8, test_every=40, settle=40)
-PLAN = TrainConfig(steps=24_000, test_every=2_000, settle=2_000, success=0.95)
+PLAN = TrainConfig(steps=24_000, test_every=2_000, settle=2_000, cycle=12_000, success=0.95)
 
 
 @pytest.fixture(scope="module")
@@ -80,13 +81,30 @@ def test_a_training_that_gets_no_better_ends():
     assert next_segment(PLAN, _tests(5.0, 9.0, 9.0, 9.0, 9.1, 9.1)) == selection.Segment(14_000, 12_000, "no better")
     assert next_segment(PLAN, _tests(5.0, 9.0, 9.0, 9.0, 9.1, 9.2)).why == ""  # 2 % further than the best before
     assert next_segment(PLAN, _tests(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)).why == ""  # it has not begun to drive
+    more = [*_tests(5.0, 9.0, 9.0, 9.0, 9.1), PolicyTest(12_000, 40, 2, 9.0, 0.0)]
+    assert next_segment(PLAN, more).why == ""  # no further, but more episodes arrive
 
 
-def test_the_largest_number_of_steps_ends_it_with_a_learning_rate_that_has_decayed():
+def test_the_largest_number_of_steps_ends_it():
     tests = _tests(*(float(k + 1) for k in range(11)))
     assert next_segment(PLAN, tests[:10]) == selection.Segment(22_000, None)
-    assert next_segment(PLAN, tests) == selection.Segment(24_000, 22_000, "steps")
-    assert next_segment(replace(PLAN, steps=3000), []) == selection.Segment(3000, 1500, "steps")
+    assert next_segment(PLAN, tests) == selection.Segment(24_000, None, "steps")
+    assert next_segment(replace(PLAN, steps=1500), []) == selection.Segment(1500, None, "steps")
+
+
+def test_the_learning_rate_falls_in_the_second_half_of_a_cycle_and_while_settling():
+    rate = TrainConfig().learning_rate
+    assert [training.cycle_rate(PLAN, k) for k in (0, 6_000, 12_000, 18_000)] == [rate] * 4  # two cycles of 12,000
+    assert training.cycle_rate(PLAN, 9_000) == pytest.approx(0.55 * rate)
+    assert training.cycle_rate(PLAN, 24_000) == pytest.approx(0.1 * rate)
+    short = replace(PLAN, steps=3_000)
+    assert training.cycle_rate(short, 1_500) == rate and training.cycle_rate(short, 2_250) == pytest.approx(0.55 * rate)
+
+    def settling(step):
+        return training._learning_rate(PLAN, SimpleNamespace(num_timesteps=step), selection.Segment(10_000, 8_000), 0.0)
+
+    assert settling(8_000) == training.cycle_rate(PLAN, 8_000) == pytest.approx(0.7 * rate)
+    assert settling(9_000) == pytest.approx(0.4 * rate) and settling(10_000) == pytest.approx(0.1 * rate)
 
 
 # ---- which policy is kept

@@ -5,14 +5,15 @@ have the same episodes, which the training never has. A test is broken off once 
 success rate allows. The training ends
 
 - when a test *reaches* the asked rate;
-- when `PATIENCE` tests in a row did not get `_BETTER` further along the route than the best before them;
+- when `PATIENCE` tests in a row were not better than those before, neither in their success nor in the distance along
+  the route;
 - at the largest number of steps.
 
-Before it ends, the learning rate decays over `config.settle` steps, and the last policy is tested, too. Of the policies
-that drove a whole test the one with most successes is kept, among equals the one with the highest mean reward; if none
-reached the asked rate, the best `_FINALISTS` drive whole tests first. The best of several is partly lucky, so the *last
-word* is its success in fresh episodes, which decided nothing. Where the lighting varies these are under held-out
-lightings with everything randomised, as `twin validate` drives them by default.
+In the first two cases the training goes on for `config.settle` steps with a falling learning rate (`training.py`) and a
+last test. Of the policies that drove a whole test the one with most successes is kept, among equals the one with the
+highest mean reward; if none reached the asked rate, the best `_FINALISTS` drive whole tests first. The best of several
+is partly lucky, so the *last word* is its success in fresh episodes, which decided nothing. Where the lighting varies
+these are under held-out lightings with everything randomised, as `twin validate` drives them by default.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,7 +47,7 @@ REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 
 _BATCHES = (8, 12, 20)  # episodes of a test, between which it may be broken off
 _TEST_EPISODES = sum(_BATCHES)
-_BETTER = 0.02  # of the mean distance along the route
+_BETTER = 0.02  # of success, or of the mean distance along the route: what counts as better
 _FINALISTS = 3
 _STREAM = 7  # see `training._TRAINING_STREAM`
 _PLACE = 5.0  # [m] of the route that failures are counted over
@@ -103,18 +104,15 @@ def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
     settled = min(last + config.settle, config.steps)
     if tests and tests[-1].reached(config.success):
         return Segment(settled, last, REACHED)
-    best = -np.inf
-    since = 0
+    rate, progress, since = -1.0, 0.0, 0
     for one in tests:
-        if best <= 0.0 or one.progress > best * (1.0 + _BETTER):
-            best, since = one.progress, 0
-        else:
-            since += 1
+        better = one.rate > rate + _BETTER or one.progress > progress * (1.0 + _BETTER) or progress <= 0.0
+        since = 0 if better else since + 1
+        rate, progress = (max(rate, one.rate), max(progress, one.progress)) if better else (rate, progress)
     if since >= PATIENCE:
         return Segment(settled, last, NO_BETTER)
-    end = max(config.steps - config.settle, config.steps // 2)
     due = last + config.test_every
-    return Segment(due, None) if due <= end else Segment(config.steps, max(end, last), ALL_STEPS)
+    return Segment(due, None) if due < config.steps else Segment(config.steps, None, ALL_STEPS)
 
 
 def train_until_learnt(

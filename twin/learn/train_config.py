@@ -44,6 +44,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "checkpoints": (1, 10**6),
     "test_every": (1, 10**10),
     "settle": (1, 10**10),
+    "cycle": (1, 10**10),
     "success": (0, 1),
     "save_every": (1, 10**10),
 }
@@ -108,7 +109,9 @@ class TrainConfig:
     gamma: float = 0.97
     """Discount per step; a reward 33 steps (3 s) away counts a third."""
     learning_rate: float = 5e-4
-    """Until the training settles; see `training.py`."""
+    """Largest; see `training.cycle_rate`."""
+    cycle: int = 12_000
+    """Steps after which the learning rate has fallen, and begins anew if the training goes on."""
     tau: float = 0.01
     """Averaging rate of the target critics, per update."""
     shift: int = 2
@@ -120,7 +123,7 @@ class TrainConfig:
     test_every: int = 2_000
     """Steps between two tests of the policy (`selection.py`)."""
     settle: int = 2_000
-    """Steps at the end of the training over which the learning rate decreases."""
+    """Steps for which a training goes on, with a falling learning rate, after a test has reached `success`."""
     save_every: int = 4_000
     """Steps between two saved states."""
     device: str = "cpu"
@@ -193,6 +196,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "steps": 240_000,
         "test_every": 20_000,
         "settle": 20_000,
+        "cycle": 120_000,
         "shift": 4,
         "device": "cuda",
     },
