@@ -19,7 +19,7 @@ from twin.files import read_json, write_json, write_text
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks" / "forecast"
-SETUPS = ("varied", "half", "quarter", "robot_fixed", "one_light", "simulator")
+SETUPS = ("varied", "short", "shorter", "not_randomised", "one_light", "simulator")
 SEEN_EVERYWHERE = "held-out+randomised"
 
 
@@ -56,7 +56,7 @@ def test_the_protocol_takes_places_that_nobody_looked_at(forecast):
         ("\ntrials = 5", "\ntrials = 4", "trials = 4; expected 5 or more"),
         ("days = 10", "days = 11", "expected 1 to 10, the days of a place"),
         ("places = [100, 101,", "places = [100, 100,", "expected different numbers"),
-        ("half = [", "varied = [", "Cannot overwrite a value"),
+        ("short = [", "varied = [", "Cannot overwrite a value"),
         ("version = 1", "version = 1\nday = 3", "unexpected keyword argument 'day'"),
         ("version = 1", "", "missing 1 required positional argument: 'version'"),
     ],
@@ -203,7 +203,7 @@ def test_a_record_never_loses_or_changes_a_row(forecast, filmed, tmp_path):
         with pytest.raises(InputError, match=r"has 1 rows that the new table lacks.* it is kept"):
             forecast.place_record.keep(table, fewer)
         assert table.read_bytes() == before
-    write_json(one.scene / "runs" / "half" / "policy.json", {"weights": "others"})
+    write_json(one.scene / "runs" / "short" / "policy.json", {"weights": "others"})
     with pytest.raises(InputError, match="has other policies than those trained now"):
         forecast.command.run_place(one, None)
     table.write_bytes(gzip.compress(b"nonsense"))

@@ -143,7 +143,8 @@ class PlaceRun:
 
         def one(setup: str) -> None:
             if not (self._run_folder(setup) / CHOICE_FILE).exists():
-                options = ("--task", self.protocol.task, "--run", setup, "--seed", str(self.place))
+                seed = 10 * self.place + list(self.protocol.setups).index(setup)
+                options = ("--task", self.protocol.task, "--run", setup, "--seed", str(seed))
                 setup_options = self.protocol.options_of(setup, list(lightings))
                 self.run.must("twin.train", self.scene, *options, *setup_options, "--quiet")
 
