@@ -28,7 +28,7 @@ from twin.learn.policy import load_policy
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.selection import FRESH_EPISODES
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import TRAINING_EPISODE_COLUMNS, _check_same, _keep_rows
+from twin.learn.training import TRAINING_EPISODE_COLUMNS, _keep_rows, check_same
 from twin.runtime import exclusive_lock
 
 
@@ -262,8 +262,8 @@ def test_episodes_that_start_along_the_route_do_not_count(tmp_path):
 def test_a_run_of_an_earlier_version_is_refused(tmp_path):
     write_json(tmp_path / "config.json", {"road": "x", "steps": 8})
     with pytest.raises(InputError, match="by an earlier version, which had no centring; give another --run"):
-        _check_same(tmp_path, {"road": "x", "steps": 8, "centring": 1.0})
-    _check_same(tmp_path, {"road": "x", "steps": 9})
+        check_same(tmp_path, {"road": "x", "steps": 8, "centring": 1.0})
+    check_same(tmp_path, {"road": "x", "steps": 9})
 
 
 def test_configurations_set_the_environment():

@@ -161,7 +161,7 @@ def run_metadata(case: Case) -> None:
         root.mkdir()
         config = {"road": "x", "steps": 100, "seed": 0, "task": "ahead"}
         (root / "config.json").write_bytes(mutated_json(rng, config))
-        training._check_same(root, config)
+        training.check_same(root, config)
     elif which < 0.9:
         (root / "state").mkdir(parents=True)
         names = [name for name in vars(sac).values() if isinstance(name, str) and name.endswith(".json")]

@@ -35,7 +35,7 @@ from twin.learn.policy import copy_policy, load_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.sac import has_state, saved_steps
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import Drive, Segment, Watch, train
+from twin.learn.training import Drive, Segment, Watch, check_same, run_settings, train
 from twin.loading import Twin
 
 TESTS_FILE = "tests.json"
@@ -127,6 +127,8 @@ def train_until_learnt(
         The contents of `choice.json`: steps; the asked success and whether it is reached; why the training ended; the
         tests; `chosen`, the last word, with its condition; and a sentence on where and why episodes failed.
     """
+    if has_state(folder / "state"):
+        check_same(folder, run_settings(twin, config))
     before = read_choice(folder)
     if before and (before["reached"] or config.steps <= before["most"]) and config.success <= before["success"]:
         return before

@@ -135,12 +135,11 @@ def train(
             an error of `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
-    road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
-    settings = json.loads(json.dumps({**dataclasses.asdict(config), "road": road}))  # as read from a file
+    settings = run_settings(twin, config)
     pictures = folder / "state" / "pictures.bin"
     resume = has_state(folder / "state")
     if resume:
-        _check_same(folder, settings)
+        check_same(folder, settings)
         if not pictures.exists():
             raise InputError(f"{pictures} is missing; train anew under another name")
     else:
@@ -271,7 +270,13 @@ def _check_run(folder: Path) -> None:
         )
 
 
-def _check_same(folder: Path, settings: dict[str, Any]) -> None:
+def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
+    """Settings that all calls of a run share, as read from its file: the configuration and the state of the road."""
+    road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
+    return dict(json.loads(json.dumps({**dataclasses.asdict(config), "road": road})))
+
+
+def check_same(folder: Path, settings: dict[str, Any]) -> None:
     """Raises InputError if an existing run has another configuration."""
     with wrap_read_errors(folder / "config.json", "train anew under another name"):
         previous = dict(read_json(folder / "config.json"))
