@@ -23,6 +23,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
 }
 """Name → options of `twin.train`."""
 STEPS = {"straight": 12_000, "right": 16_000}
+"""Most steps. The published runs all took them; since then trainings end when they have learnt (`twin.learn.selection`)."""
 SHARES = (0.25, 0.5)
 """Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50
@@ -72,7 +73,7 @@ class Run:
         planned = read_json(path / "config.json")["steps"]
         if planned != steps:  # the learning rate schedule depends on the total, so a longer run is another training
             raise SystemExit(f"{path} is a run of {planned} steps, not of {steps}; move it away")
-        return (path / CHOICE_FILE).exists() and read_json(path / CHOICE_FILE)["steps"] >= steps
+        return (path / CHOICE_FILE).exists()  # it may have ended before the largest number of steps
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:

@@ -96,8 +96,13 @@ def _training(folder: Path) -> dict[str, Any]:
         "memory_mb": float(last["memory_mb"]),
         "whole_episodes": len(success),
         "exploring": _rate((before[-RECENT_EPISODES:] == 1).tolist()),
-        "train": choice["chosen"] if choice else _rate([]),
+        "train": _own_kind(choice) if choice else _rate([]),
     }
+
+
+def _own_kind(choice: dict[str, Any]) -> dict[str, Any]:
+    """Episodes of the chosen policy in the training's own lighting; its last word is under held-out lightings."""
+    return next(one for one in choice["candidates"] if one["step"] == choice["chosen"]["step"])
 
 
 def _evaluations(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:
