@@ -23,7 +23,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
 }
 """Name → options of `twin.train`."""
 STEPS = {"straight": 12_000, "right": 16_000}
-"""Most steps. The published runs all took them; since then trainings end when they have learnt (`twin.learn.selection`)."""
+"""Most steps. The published runs took them all; by now a training ends when it has learnt (`twin.learn.selection`)."""
 SHARES = (0.25, 0.5)
 """Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50
