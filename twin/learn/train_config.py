@@ -120,7 +120,7 @@ class TrainConfig:
     """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
     checkpoints: int = 20
     """Policies saved during the training."""
-    test_every: int = 2_000
+    test_every: int = 3_000
     """Steps between two tests of the policy (`selection.py`)."""
     settle: int = 2_000
     """Steps for which a training goes on, with a falling learning rate, after a test has reached `success`."""
@@ -194,7 +194,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "batch": 256,
         "buffer": 100_000,
         "steps": 240_000,
-        "test_every": 20_000,
+        "test_every": 30_000,
         "settle": 20_000,
         "cycle": 120_000,
         "shift": 4,
