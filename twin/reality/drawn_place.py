@@ -1,8 +1,8 @@
 """A place built from its description: ground, objects, textures, lightings.
 
-Objects are placed one after the other: what stands on firm ground first (houses, lamps, boundaries), then what finds
-room. A candidate is dropped where its footprint touches the road, the mouth of a side road, the free corridor or an
-earlier footprint.
+Objects are placed one after the other: houses, lamps and boundaries first, then poles, cars, furniture and trees. A
+candidate is dropped if its footprint touches the road, the mouth of a side road, the free corridor or an earlier
+footprint.
 """
 
 from collections.abc import Callable
@@ -31,19 +31,19 @@ _EXTRA_CELLS = (
 )
 _ROAD_PIXEL, _VERGE_PIXEL, _LAND_PIXEL, _WALL_PIXEL = 0.0135, 0.022, 0.09, 0.035  # [m]
 _STEP = 0.5  # [m] between vertices along the road
-_LAND_STEP = 1.5  # [m]
-_LAND_MARGIN = 48.0  # [m] of land around the driven line
-_FIELD_MARGIN = 14.0  # [m] of the height field around the driven line
+_LAND_STEP = 1.5  # [m] between vertices of the land
+_LAND_MARGIN = 48.0  # [m] width of the land around the road
+_FIELD_MARGIN = 14.0  # [m] width of `GroundLayout.field` around the driven line
 _MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
 _MIN_GAP = 0.35  # [m] between footprints
 
 
 def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
-    """The place of a description; the result is always the same.
+    """Builds the place of a description; equal arguments give equal places.
 
     Args:
         spec: The description.
-        displaced: The place on another day than the film's: cones, bins, crates and cars stand elsewhere.
+        displaced: True for another day than that of the film: cones, bins, crates and cars have moved.
     """
     road = DrawnRoad(spec)
     stations = np.arange(road.start, road.end + _STEP / 2, _STEP)
@@ -95,7 +95,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 
 @cache
 def build_number(number: int, displaced: bool = False) -> KnownPlace:
-    """The place of a number from 1 on."""
+    """Builds the drawn place with a number from 1 on."""
     return build(draw(number), displaced)
 
 
@@ -106,7 +106,11 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
     section = road.section
 
     def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
-        """A strip through laterals, left first, at heights above the section or on the ground; open at mouths."""
+        """Adds a strip along the road through laterals, left first.
+
+        It lies on the ground, or `lifts` [m] above the driven line. With `gaps` (1 = left, −1 = right) it is open at
+        the mouths on that side.
+        """
         xy = road.at(stations[None], laterals[:, None])
         z = road.ground_height(xy)
         if lifts is not None:
@@ -123,7 +127,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
             part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
         place.objects.append(PlaceObject(name, "ground", part, texture))
 
-    inner = 1e-6  # keeps vertices of the road's edges on the road
+    inner = 1e-6  # keeps the vertices at the road's edges on the road
     strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
     for sign, name, edge, side in (
         (1, "left", section.left, section.sides[0]),
@@ -178,7 +182,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
 
 
 class Site:
-    """The ground that is taken: the road, its mouths, the free corridor, and footprints of what stands already.
+    """Ground that is occupied: the road, its mouths, the free corridor, and the footprints of objects placed so far.
 
     A footprint is a rectangle: its center [m], half sizes [m] and the direction of its first axis [rad].
     """
@@ -190,7 +194,7 @@ class Site:
     def take(
         self, center: Array, half: tuple[float, float], yaw: float, clear: float = CLEARANCE, gap: float = _MIN_GAP
     ) -> bool:
-        """Takes a footprint if it is free of road and footprints; returns False if it is not.
+        """Occupies a footprint and returns True, or returns False if it is not free.
 
         Args:
             center: x, y [m].
@@ -260,7 +264,7 @@ def _reach(spec: PlaceSpec) -> tuple[float, float]:
 
 
 def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tuple[House, str, Rgb, Rgb]]:
-    """Adds rows of houses; returns, by name, each house with the material and color of its walls and its roof's."""
+    """Adds rows of houses; returns by name the house, the material and color of its walls, and its roof's color."""
     rng, houses = stream(spec.number, "houses", 1), spec.houses
     out: dict[str, tuple[House, str, Rgb, Rgb]] = {}
     first, last = _reach(spec)
@@ -373,7 +377,7 @@ def _scatter(
 def _moved(
     other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
 ) -> tuple[float, float]:
-    """Where a movable thing stands: as filmed, or up to 1.5 m away along the road where that is free."""
+    """Station and lateral [m] of a movable object: as filmed, or up to 1.5 m along the road from there on another day."""
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]
@@ -461,7 +465,7 @@ def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
             station = first + (k + float(rng.uniform(0.2, 0.8))) / max(1, count) * (last - first + 8.0)
             beyond = row + float(rng.normal(0.0, 0.15)) if trees.row else float(rng.gamma(2.0, 3.5)) + 0.8
             spots.append((station, side * (_edge(spec, side) + beyond)))
-    for _ in range(14 if spec.setting not in ("town", "works") else 5):  # further off
+    for _ in range(14 if spec.setting not in ("town", "works") else 5):  # farther away from the road
         side = int(rng.choice([-1, 1]))
         spots.append((float(rng.uniform(first, last + 25.0)), side * float(rng.uniform(14.0, 38.0))))
     for k, at in enumerate(spots):
@@ -499,7 +503,7 @@ def _add_tufts(place: KnownPlace, spec: PlaceSpec) -> None:
     for mouth in spec.line.mouths:
         keep &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.2) | (side != mouth.side)
     xy = road.at(station, lateral)
-    keep &= np.abs(road.project(xy)[1]) > 0.5 * edges  # not across the line on the inside of a bend
+    keep &= np.abs(road.project(xy)[1]) > 0.5 * edges  # within a bend, a tuft may lie on another part of the road
     if keep.any():
         add_tufts(place, rng, station[keep], lateral[keep])
 
@@ -571,7 +575,8 @@ def _textures(
     return _painted[spec]
 
 
-_painted: dict[PlaceSpec, dict[str, NDArray[np.uint8]]] = {}  # the last two places, for films under several lightings
+# Textures of the last two places; films under several lightings reuse them.
+_painted: dict[PlaceSpec, dict[str, NDArray[np.uint8]]] = {}
 
 
 def _paint(
