@@ -377,7 +377,7 @@ def _scatter(
 def _moved(
     other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
 ) -> tuple[float, float]:
-    """Station and lateral [m] of a movable object: as filmed, or up to 1.5 m along the road from there on another day."""
+    """Station and lateral [m] of a movable object: as filmed, or up to 1.5 m along the road on another day."""
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]

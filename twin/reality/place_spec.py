@@ -1,9 +1,9 @@
-"""Descriptions of places: plain numbers and names, drawn from a place's number.
+"""Descriptions of places: plain numbers and names, sampled with the place's number as seed.
 
-`draw(number)` returns the description of a place from number 1 on; place 0 is the campus road of `place.py`, which is
-a table of its own. Every aspect of a place (its line, its surface, its trees, ...) has its own random stream,
+`draw(number)` returns the description of a place from number 1 on; place 0 is the campus road, designed in `place.py`.
+Every aspect of a place (its line, its surface, its trees, ...) has its own random stream,
 `np.random.default_rng([SEED, 100, number, index of the aspect])`, so a change of one aspect leaves the others as they
-are. Aspects share only the *setting*, such as `village`, which decides what is likely.
+are. Aspects share only the *setting*, such as `village`, which sets their probabilities and ranges.
 
 The *driven line* is the line that the first film follows and that the robot's tasks lie on. Stations and laterals are
 relative to it; the road need not be symmetrical about it.
@@ -30,9 +30,9 @@ _ASPECTS = (
 )
 """The aspects in the order of their streams; new ones go to the end."""
 
-FREE_HALF_WIDTH = 1.5  # [m] of the corridor along the driven line in which nothing solid stands
+FREE_HALF_WIDTH = 1.5  # [m] half width of the corridor along the driven line that is free of solid objects
 CLEARANCE = 0.15  # [m] between solid objects and the corridor, the road and each other
-MAX_FRAMES = 420  # of all films of a place together
+MAX_FRAMES = 420  # bound of the frames of all films of a place together
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Mouth:
     """A side road that opens onto the road, at right angles to it."""
 
     station: float
-    """Of its middle [m]."""
+    """Station of its middle [m]."""
     side: int
     """1 = left, −1 = right."""
     width: float
@@ -65,7 +65,7 @@ class LineSpec:
     length: float
     """Driven length [m]; the pieces go on beyond it, and before the start the line is straight."""
     grades: tuple[float, ...]
-    """Slopes along the line at stations `GRADE_STEP` apart, from 0; smooth between them, constant beyond."""
+    """Slopes along the line at stations 0, `GRADE_STEP`, ...; linear between these, constant beyond."""
     bumps: float
     """Standard deviation of the unevenness along the road [m]."""
     mouths: tuple[Mouth, ...]
@@ -80,7 +80,7 @@ RUN_IN = 8.0  # [m] of road before the start
 
 @dataclass(frozen=True)
 class Side:
-    """What lies beside the road on one side, from its edge outwards."""
+    """The ground beside the road on one side, from the kerb outwards: a pavement, then a verge."""
 
     pavement: float
     """Width of the pavement [m]; 0 for none."""
@@ -145,7 +145,7 @@ class SurfaceSpec:
     bare: float
     """Fraction of bare earth in the grass, 0 to 1."""
     markings: tuple[str, ...]
-    """Of `centre`, `dashes`, `edges`, `zebra`, `arrows`."""
+    """Any of `centre`, `dashes`, `edges`, `zebra`, `arrows`."""
     paint: Rgb
     wear: float
     """Wear of the markings, 0 to 1."""
@@ -162,7 +162,7 @@ class HousesSpec:
     front: tuple[float, float]
     """Range of the width along the road [m]."""
     storeys: tuple[int, int]
-    """Least and most."""
+    """Least and largest number of storeys."""
     roofs: tuple[str, ...]
     """Kinds to choose from: `gable`, `cross_gable` (gable to the road), `hip`, `flat`, `shed`."""
     pitch: float
@@ -170,7 +170,7 @@ class HousesSpec:
     walls: tuple[str, ...]
     """Materials to choose from: `bricks`, `plaster`, `boards`, `stone`, `sheet`, `panels`."""
     colors: tuple[Rgb, ...]
-    """Of walls."""
+    """Colors of walls."""
     roof_colors: tuple[Rgb, ...]
     window: str
     """`cross`, `casement`, `sash`, `ribbon`, `shutters`."""
@@ -180,7 +180,7 @@ class HousesSpec:
 
 @dataclass(frozen=True)
 class BoundarySpec:
-    """What encloses the ground beside the road on one side."""
+    """The boundary along the road on one side, such as a hedge or a fence."""
 
     kind: str
     """`none`, `hedge`, `picket`, `rails`, `mesh`, `wall`, `boards`, `bollards`."""
@@ -190,7 +190,7 @@ class BoundarySpec:
     covered: float
     """Fraction of the length that it covers."""
     distance: float
-    """From the road's edge [m]."""
+    """Distance from the road's edge [m]."""
 
 
 @dataclass(frozen=True)
@@ -200,9 +200,9 @@ class TreesSpec:
     density: float
     """Trees per 100 m and side."""
     kinds: tuple[str, ...]
-    """To choose from: `broadleaf`, `slender`, `conifer`, `bare`, `birch`, `shrub`."""
+    """Kinds to choose from: `broadleaf`, `slender`, `conifer`, `bare`, `birch`, `shrub`."""
     height: tuple[float, float]
-    """Range [m]."""
+    """Range of the height [m]."""
     greens: tuple[Rgb, Rgb, Rgb, Rgb]
     """Colors of leaves."""
     bark: Rgb
@@ -214,7 +214,7 @@ class TreesSpec:
 
 @dataclass(frozen=True)
 class FurnitureSpec:
-    """Small things beside the road, per 100 m of road."""
+    """Small objects and cars beside the road; amounts are expected numbers per 100 m of road."""
 
     signs: float
     bins: float
@@ -275,9 +275,9 @@ class LightSpec:
     name: str
     """`sun`, `overcast`, `low_sun`, `dusk`, `night`."""
     elevation: float
-    """Of the sun [°]."""
+    """Elevation of the sun, or of the moon at night [°]."""
     azimuth: float
-    """Of the sun, counterclockwise from the start of the driven line [°]."""
+    """Its azimuth, counterclockwise from the direction of the driven line's start [°]."""
     clouds: float
     """Cloud cover, 0 to 1."""
     haze: float
@@ -291,9 +291,9 @@ class PassSpec:
     """One pass along the road; every pass is a film of its own."""
 
     name: str
-    """`out`, `back`, `again`, `lane`; other than `out`, it is appended to the film's name."""
+    """`out`, `back`, `again` or `lane`; the last three are appended to the film's name."""
     lateral: float
-    """Of the camera's path [m]."""
+    """Lateral of the camera's path [m]."""
     backwards: bool
 
 
@@ -310,15 +310,15 @@ class FilmSpec:
     spacing: float
     """Distance between frames [m]; equals speed / fps."""
     camera_height: float
-    """[m], the truth."""
+    """True height of the camera above the ground [m]."""
     stated_height: float
     """The height written into `scene.toml` [m]."""
     height_tolerance: float
     """Standard deviation of the error of the stated height [m]."""
     pitch: float
-    """Downwards [rad]."""
+    """Pitch of the camera, downwards [rad]."""
     fov: float
-    """Horizontal [rad]."""
+    """Horizontal field of view [rad]."""
     size: tuple[int, int]
     """Width, height [px]."""
     shake: float
@@ -329,7 +329,7 @@ class FilmSpec:
 
 @dataclass(frozen=True)
 class PlaceSpec:
-    """A place by its number."""
+    """The description of a place."""
 
     number: int
     setting: str
@@ -345,12 +345,12 @@ class PlaceSpec:
     lamps: LampsSpec
     horizon: HorizonSpec
     lights: tuple[LightSpec, ...]
-    """Lightings of the films, by day first."""
+    """Lightings of the films, those by day first."""
     film: FilmSpec
 
 
 def stream(number: int, aspect: str, *more: int) -> np.random.Generator:
-    """The random generator of one aspect of a place; `more` tells several of one aspect apart."""
+    """The random generator of one aspect of a place; `more` distinguishes several within an aspect."""
     return np.random.default_rng([SEED, 100, number, _ASPECTS.index(aspect), *more])
 
 
@@ -386,10 +386,11 @@ def draw(number: int) -> PlaceSpec:
 
 
 def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
-    """The stretches of a driven line that a robot may be given, by name: start and length [m].
+    """The tasks on a driven line, by name: start station and length of a segment [m].
 
-    They are `straight`, `right_turn`, `left_turn`, `s_bend`, `junction`, `slope` and `whole`, as far as the line has
-    them. They end 4 % before the line does, because a twin's route may be shorter than the truth.
+    `whole` is always there; `straight`, `right_turn`, `left_turn`, `s_bend`, `junction` and `slope` if the line has
+    such a segment. All end before the last 4 % and 0.5 m of the line, because a twin's route may be shorter than the
+    true one.
     """
     end = 0.96 * line.length - 0.5
     found: dict[str, tuple[float, float]] = {}
@@ -422,19 +423,19 @@ def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
 
 
 def _pick(rng: np.random.Generator, weights: Mapping[T, float]) -> T:
-    """A key of a table of weights."""
+    """Samples a key of a table, with probabilities in proportion to the weights."""
     share = np.array(list(weights.values()), float)
     return list(weights)[int(rng.choice(len(share), p=share / share.sum()))]
 
 
 def _subset(rng: np.random.Generator, items: tuple[T, ...], least: int, most: int) -> tuple[T, ...]:
-    """Between `least` and `most` of some items, without repetition."""
+    """Samples between `least` and `most` of the items, without replacement."""
     count = min(len(items), int(rng.integers(least, most + 1)))
     return tuple(items[k] for k in rng.permutation(len(items))[:count])
 
 
 def _shade(rng: np.random.Generator, base: Rgb, spread: float) -> Rgb:
-    """A color near another: brightness and hue vary by about `spread`."""
+    """Samples a color near `base`: its brightness varies by up to `spread`, its hue by about a fifth of that."""
     red, green, blue = np.clip(
         np.array(base) * rng.uniform(1.0 - spread, 1.0 + spread) + rng.normal(0.0, 0.2 * spread, 3), 0.03, 0.93
     ).tolist()
@@ -449,7 +450,8 @@ def _hsv(hue: float, saturation: float, value: float) -> Rgb:
 def _section(rng: np.random.Generator, setting: str) -> SectionSpec:
     streets = {"town": (5.0, 7.0), "suburb": (4.5, 6.5), "village": (3.5, 6.0), "works": (5.5, 7.0)}
     width = float(rng.uniform(*streets.get(setting, (2.5, 5.0))))
-    lane = width >= 5.0 and rng.random() < 0.5  # driven in the right-hand lane, else in the middle
+    # The line runs in the right-hand lane, or in the middle of the road.
+    lane = width >= 5.0 and rng.random() < 0.5
     right = 0.5 * width if not lane else max(1.5, 0.28 * width)
     kerbed = rng.random() < {"town": 0.95, "suburb": 0.8, "village": 0.45, "works": 0.6, "park": 0.3}.get(setting, 0.0)
     paved = {"town": 0.95, "suburb": 0.7, "village": 0.4, "works": 0.35, "park": 0.15}.get(setting, 0.0)
@@ -495,12 +497,12 @@ def _fitted(section: SectionSpec, line: LineSpec) -> SectionSpec:
     )
 
 
-_SEPARATION = 28.0  # [m] between stretches of the line that are more than twice as far apart along it
+_SEPARATION = 28.0  # [m] least distance of points that are more than twice this far apart along the line
 
 
 def _line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineSpec:
     length = float(rng.uniform(42.0, 85.0))
-    while True:  # until the line keeps clear of itself
+    while True:  # until no part of the line comes near another
         pieces = _pieces(rng, setting, section, length + RUN_OUT)
         if _keeps_clear(pieces):
             break
@@ -538,7 +540,7 @@ def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length
             angle = np.deg2rad(rng.uniform(20.0, 100.0)) * bendy
             piece = Piece(min(radius * float(angle), 45.0), (1.0 if left else -1.0) / radius)
         last = straight
-        straight = rng.random() < 0.55 if not last else False  # a bend may follow a bend, then to the other side
+        straight = rng.random() < 0.55 if not last else False  # a second bend turns to the other side
         if not last:
             left = not left if not straight else bool(rng.random() < 0.5)
         pieces.append(piece)
@@ -547,7 +549,7 @@ def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length
 
 
 def _keeps_clear(pieces: tuple[Piece, ...]) -> bool:
-    """True if no stretch of the line comes near another."""
+    """True if points more than 2 `_SEPARATION` apart along the line are more than `_SEPARATION` apart in plan."""
     heading, point, points = 0.0, np.zeros(2), []
     for piece in pieces:
         count = max(1, round(piece.length))
@@ -760,7 +762,7 @@ def _furniture(rng: np.random.Generator, cars: np.random.Generator, setting: str
         "field": (1.5, 0.0, 0.5, 1.5, 0.5, 1.5, 0.5, 5.0, 0.7),
     }[setting]
     amounts = [float(most * rng.uniform(0.0, 1.0)) for most in bounds]
-    if rng.random() < 0.15:  # almost nothing
+    if rng.random() < 0.15:  # an almost empty roadside
         amounts = [0.2 * amount for amount in amounts]
     paints = (
         *((0.80, 0.80, 0.79), (0.10, 0.10, 0.11), (0.50, 0.52, 0.54), (0.30, 0.31, 0.33), (0.12, 0.22, 0.46)),
@@ -813,7 +815,7 @@ def _horizon(rng: np.random.Generator, setting: str) -> HorizonSpec:
         "flat": ((0.01, 0.02), (0.002, 0.005), (0.1, 0.4)),
         "mountains": ((0.12, 0.26), (0.04, 0.10), (0.4, 1.2)),
     }[kind]
-    far = float(rng.uniform(0.0, 1.0))  # the farther, the paler and bluer
+    far = float(rng.uniform(0.0, 1.0))  # 1 is the farthest; a farther horizon is paler and bluer
     pale = {"trees": 0.3, "flat": 0.6}.get(kind, 0.95) * far
     base = np.array([0.95, 0.95, 0.85]) * rng.uniform(0.75, 1.15, 3)
     red, green, blue = ((1.0 - pale) * base + pale * np.array([1.75, 1.72, 1.95])).tolist()
