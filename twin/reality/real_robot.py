@@ -459,7 +459,7 @@ class RealRobot:
         return self._current[0], self._current[1]
 
     def base_to_world(self, at: float) -> Array:
-        """Pose of the base at a past time [s], axes forward, left, up, shape (4, 4); at the earliest the oldest kept one."""
+        """Pose of the base (4, 4), axes forward, left, up, at a past time [s], or the nearest one that is kept."""
         return pose_matrix(self._pose_at(at))
 
     def _pose_at(self, at: float) -> tuple[float, ...]:

@@ -176,7 +176,7 @@ def task_for(policy: Policy, task: str | RoadTask, place: int) -> RoadTask:
     if task.control_timestep != c.control_timestep:
         raise InputError(
             f"task {task.name!r} has a control step of {task.control_timestep:g} s, policy {policy.name} one of "
-            f"{c.control_timestep:g} s; write the task's control_timestep anew, or give another policy"
+            f"{c.control_timestep:g} s; change the task's control_timestep, or give another policy"
         )
     return task
 
@@ -247,7 +247,7 @@ def _check_setup(setup: Setup, table: Path, record: Path) -> None:
         with wrap_read_errors(record, "give another --out"):
             known = {name: read_json(record)[name] for name in given}
         if known != given:
-            raise InputError(f"{table} is of {known}; this is {given}; give another --out")
+            raise InputError(f"{table} has trials of {known}; this call has {given}; give another --out")
     elif table.exists():
         raise InputError(
             f"{table} was driven in the reality of version 1; this is {REALITY_VERSION}; give another --out"
