@@ -36,7 +36,8 @@ from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
 from twin.reality.lighting import LIGHTINGS, WEATHER
-from twin.reality.place_spec import PlaceSpec, draw, tasks
+from twin.reality.place_sampling import draw
+from twin.reality.place_spec import PlaceSpec, tasks
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth

@@ -1,5 +1,5 @@
-"""The road of a drawn place (sampled at random, see `place_spec.py`): its driven line in plan, and the height of the
-ground on and around it.
+"""The road of a drawn place (sampled at random, see `place_sampling.py`): its driven line in plan, and the height of
+the ground on and around it.
 
 Along the line, the height follows the drawn grades and a slight unevenness; across the line, it follows the drawn cross
 section. The section ends with the verge, where the ground blends into open land, a smooth surface through the heights
@@ -11,7 +11,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twin.reality.place_spec import GRADE_STEP, RUN_IN, RUN_OUT, Mouth, PlaceSpec, stream
+from twin.reality.place_sampling import stream
+from twin.reality.place_spec import GRADE_STEP, RUN_IN, RUN_OUT, Mouth, PlaceSpec
 from twin.types import Array
 
 _CROWN_ROUNDING = 0.3  # [m] half width of the rounding of a crown
@@ -20,6 +21,7 @@ _SWELL_LENGTHS = (25.0, 80.0)  # [m] wave lengths of the swells of the land
 _LAND_SAMPLE = 2.0  # [m] between the heights of the line that determine the land
 _LAND_SMOOTHING = 3.0  # [m] length over which these heights are smoothed
 _DROP_LENGTH = 0.8  # [m] over which a kerb drops beside the mouth of a side road
+MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
 _CHUNK = 40_000  # points whose land height is evaluated together
 
 

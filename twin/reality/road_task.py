@@ -17,7 +17,8 @@ from twin.errors import InputError, short_repr
 from twin.files import read_json, wrap_read_errors
 from twin.geometry.poses import Similarity
 from twin.reality.filming import FilmingPlan
-from twin.reality.place_spec import draw, tasks
+from twin.reality.place_sampling import draw
+from twin.reality.place_spec import tasks
 from twin.reality.trial_place import place_on_test_day, true_route
 from twin.types import Array
 

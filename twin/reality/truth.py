@@ -22,7 +22,8 @@ from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import CAMERA_HEIGHT
 from twin.reality.place_objects import KnownPlace
-from twin.reality.place_spec import FREE_HALF_WIDTH, draw
+from twin.reality.place_sampling import draw
+from twin.reality.place_spec import FREE_HALF_WIDTH
 from twin.types import Array
 
 HALF_WIDTH = FREE_HALF_WIDTH  # [m] half width of the free corridor around the route
