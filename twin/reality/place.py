@@ -45,7 +45,7 @@ _CRATES = (  # station, lateral, side [m]
     *((18.5, -5.0, 1.1), (18.6, -6.3, 0.9), (29.5, -5.6, 1.2)),
     *((45.5, 6.5, 1.0), (54.0, -5.3, 1.15), (65.0, -4.9, 1.0)),
 )
-_MIN_LATERAL = 2.15  # [m] a displaced object comes no closer to the center line, unless it already was
+_MIN_LATERAL = 2.15  # [m] displaced objects come no closer to the center line than this, unless they already were
 _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
